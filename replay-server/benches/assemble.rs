@@ -6,9 +6,9 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, Replay};
+use driml_replay_server::{Config, Replay};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -61,27 +61,17 @@ fn chunk(sequence: u64) -> Chunk {
 }
 
 fn filled(frame_stack: u32) -> (Replay, Chunk) {
-    let config = Config {
-        capacity_transitions: CAPACITY,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
-        disk_bytes_max: None,
-        fsync_ms: None,
-        since: None,
-        replay_ratio: 1e9,
-        warmup_transitions: 0,
-        slack_transitions: 1 << 50,
-        transitions_max: None,
-    };
+    let config: Config = toml::from_str(&format!(
+        "capacity_transitions = {CAPACITY}
+         shards = 1
+         replay_ratio = 1e9
+         warmup_transitions = 0
+         slack_transitions = 1125899906842624"
+    ))
+    .unwrap();
     let mut replay = Replay::new(&spec(frame_stack), &config, ROWS).unwrap();
-    replay
-        .join_actor(ActorJoin {
-            actor: 0,
-            incarnation: 1,
-        })
-        .unwrap();
+    let (actor, incarnation) = (0, 1);
+    replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
     let mut chunk = chunk(0);
     while replay.inserted_total() < CAPACITY + 1000 {
         insert_next(&mut replay, &mut chunk);

@@ -12,10 +12,8 @@
 //! proportion to what it holds, and priorities count within it: the learner's weights are by the chance that a row had in all.
 //!
 //! ```
-//! use driml_protocol::{
-//!     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
-//! };
-//! use driml_replay_server::{Compression, Config, Replay};
+//! use driml_protocol::{ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
+//! use driml_replay_server::{Config, Replay};
 //!
 //! let spec = RunSpec {
 //!     world: "counter".into(),
@@ -31,20 +29,13 @@
 //!     horizon: Horizon::Fixed { k: 2 },
 //!     timeout: TimeoutRule::Terminal,
 //! };
-//! let config = Config {
-//!     capacity_transitions: 1000,
-//!     shards: 1,
-//!     sampling: Sampling::Uniform,
-//!     compression: Compression::None,
-//!     compressed_bytes_max: None,
-//!     disk_bytes_max: None,
-//!     fsync_ms: None,
-//!     replay_ratio: 8.0,
-//!     warmup_transitions: 10,
-//!     slack_transitions: 100,
-//!     transitions_max: None,
-//!     since: None,
-//! };
+//! let config: Config = toml::from_str(
+//!     "capacity_transitions = 1000
+//!      shards = 1
+//!      replay_ratio = 8.0
+//!      warmup_transitions = 10
+//!      slack_transitions = 100",
+//! )?;
 //! let mut replay = Replay::new(&spec, &config, 4)?;
 //! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
 //!

@@ -4,6 +4,8 @@
 use driml_protocol::{Tally, Waiting};
 use serde::{Deserialize, Serialize};
 
+use crate::config::Config;
+
 /// Counts transitions in and rows out, and keeps rows / transitions after the warm-up at the replay ratio.
 ///
 /// Its one quantity is the credit, in rows: replay ratio * transitions after the warm-up - rows sampled. A batch of B rows
@@ -54,10 +56,21 @@ impl RateLimiter {
         }
     }
 
-    /// The same with a ratio that holds from this point on, as it was another before.
-    #[must_use]
-    pub const fn since(self, since: Tally) -> Self {
-        Self { since, ..self }
+    /// That of a run with these settings, whose ratio may have been another before it was resumed.
+    pub(crate) fn of(config: &Config) -> Self {
+        let mut limiter = Self::new(
+            config.replay_ratio,
+            config.warmup_transitions,
+            config.slack_transitions,
+            config.transitions_max,
+        );
+        if let Some(since) = config.since {
+            limiter.since = Tally {
+                inserted: since.transitions,
+                rows_sampled: since.rows,
+            };
+        }
+        limiter
     }
 
     /// The same after so much was counted here and in the replay's other shards.

@@ -245,7 +245,7 @@ fn everybody_waits_for_a_server_that_reads_its_replay_back() {
     server
         .stop()
         .expect_code(0)
-        .expect_said("goes on with the replay in replay");
+        .expect_said("continues with the replay in replay");
 }
 
 /// A server that is told to end does, however much is left to read; the next one reads it all.

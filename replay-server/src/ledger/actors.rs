@@ -25,7 +25,7 @@ pub(crate) struct Stream {
 }
 
 /// What is counted of one life of an actor.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Count {
     incarnation: u64,
     /// Transitions it has produced by its own account, as far as heard.
@@ -43,7 +43,7 @@ impl Count {
     }
 }
 
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Actor {
     current: Count,
     /// Number of the chunk that comes next in the current life.
@@ -104,16 +104,13 @@ pub(crate) struct Actors {
 }
 
 impl Actors {
-    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again.
-    ///
-    /// # Errors
-    /// One actor more than a run may have, or a life that another one has replaced; the reason, for a person.
+    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again. One actor more than a run may have,
+    /// or a life that another one has replaced, is an error: the reason, for a person.
     pub(crate) fn join(&mut self, join: ActorJoin) -> Result<(), String> {
         let ActorJoin { actor, incarnation } = join;
-        let fresh = Count {
+        let current = Count {
             incarnation,
-            produced: 0,
-            said_goodbye: false,
+            ..Count::default()
         };
         if let Some(known) = self.actors.get_mut(&actor) {
             if known.current.incarnation == incarnation {
@@ -127,7 +124,7 @@ impl Actors {
             }
             known.past.push_back(known.current);
             known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
-            (known.current, known.expected) = (fresh, 0);
+            (known.current, known.expected) = (current, 0);
             known.streams.clear();
             return Ok(());
         }
@@ -136,17 +133,11 @@ impl Actors {
                 "actor {actor} is one more than the {ACTORS_MAX} that a run may have: use the numbers of actors that have ended"
             ));
         }
-        self.actors.insert(
-            actor,
-            Actor {
-                current: fresh,
-                expected: 0,
-                streams: Vec::new(),
-                past: VecDeque::new(),
-                earlier_incarnations: 0,
-                insisted: None,
-            },
-        );
+        let fresh = Actor {
+            current,
+            ..Actor::default()
+        };
+        self.actors.insert(actor, fresh);
         Ok(())
     }
 
@@ -211,10 +202,7 @@ impl Actors {
         Verdict::Next
     }
 
-    /// Checks that a chunk can be counted: it is of a life that counts, and has its streams.
-    ///
-    /// # Errors
-    /// It cannot; the reason, for a person.
+    /// Checks that a chunk can be counted: it is of a life that counts, and has its streams. If not, the error says why.
     pub(crate) fn check_known(&self, header: &ChunkHeader) -> Result<(), String> {
         let streams = self.living(header.actor, header.incarnation)?.streams.len();
         if header.sequence == 0 || streams == 0 || streams == header.streams as usize {
@@ -276,10 +264,7 @@ impl Actors {
             .map(|(&number, _)| number)
     }
 
-    /// Whether a chunk is stored.
-    ///
-    /// # Errors
-    /// It is of no life that counts; the reason, for a person.
+    /// Whether a chunk is stored; an error says why it is not of a life that counts.
     pub(crate) fn is_stored(&self, claim: &Claim) -> Result<bool, String> {
         let actor = self.living(claim.actor, claim.incarnation)?;
         Ok(claim.sequence < actor.expected)
@@ -314,10 +299,7 @@ impl Actors {
     }
 
     /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
-    /// reveals nothing.
-    ///
-    /// # Errors
-    /// A life that never joined; the reason, for a person.
+    /// reveals nothing. A life that never joined is an error: the reason, for a person.
     pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
         let actor = self.actors.get_mut(&goodbye.actor);
         let mut lives = actor
@@ -341,6 +323,6 @@ impl Actors {
 
 fn replaced(actor: u32) -> String {
     format!(
-        "another process has joined as actor {actor} since this one did: give each actor a number of its own (--id)"
+        "another process has joined as actor {actor} since this one did: give each actor another number (--id)"
     )
 }

@@ -13,7 +13,7 @@ const CLIENTS_MAX: usize = 1024;
 pub(crate) enum Dedup {
     /// To be answered. It repeats one that was given rows with these k, and did not receive them; none if it does not.
     Fresh(Vec<u32>),
-    /// Answered already, or its client has sent it again or another since: nobody waits for it.
+    /// Answered already, or its client has sent it again or another since: it was given up.
     Superseded,
 }
 
@@ -81,22 +81,25 @@ mod tests {
     fn what_did_not_arrive_is_told_once() {
         let mut requests = Requests::default();
         let first = RequestId::first(7);
-        assert_eq!(requests.begin(first), fresh(&[]));
-        assert_eq!(requests.begin(first), fresh(&[]), "it still waits");
-        requests.complete(7, vec![1, 2]);
-        assert_eq!(requests.begin(first), Dedup::Superseded, "it was answered");
-        assert_eq!(requests.begin(first.again()), fresh(&[1, 2]));
-        assert_eq!(
-            requests.begin(first.again()),
-            fresh(&[]),
-            "taken back before"
-        );
-        assert_eq!(requests.begin(first), Dedup::Superseded);
-        requests.complete(7, vec![3]);
-        let second = first.again().next();
-        assert_eq!(requests.begin(second), fresh(&[]), "the first one arrived");
-        assert_eq!(requests.begin(first.again().again()), Dedup::Superseded);
-        assert_eq!(requests.begin(RequestId::first(8)), fresh(&[]));
+        let again = first.again();
+        let other = RequestId::first(8);
+        let cases = [
+            (first, fresh(&[]), None, "the first"),
+            (first, fresh(&[]), Some(vec![1, 2]), "it still waits"),
+            (first, Dedup::Superseded, None, "it was answered"),
+            (again, fresh(&[1, 2]), None, "the answer did not arrive"),
+            (again, fresh(&[]), None, "taken back before"),
+            (first, Dedup::Superseded, Some(vec![3]), "given up"),
+            (again.next(), fresh(&[]), None, "the one before arrived"),
+            (again.again(), Dedup::Superseded, None, "given up"),
+            (other, fresh(&[]), None, "another client"),
+        ];
+        for (id, expected, given, what) in cases {
+            assert_eq!(requests.begin(id), expected, "{what}");
+            if let Some(ks) = given {
+                requests.complete(id.client_id, ks);
+            }
+        }
     }
 
     #[test]
@@ -106,18 +109,13 @@ mod tests {
             requests.begin(RequestId::first(client_id));
             requests.complete(client_id, vec![1]);
         }
-        assert_eq!(requests.begin(RequestId::first(0).again()), fresh(&[1]));
+        let again = RequestId::first(0).again();
+        assert_eq!(requests.begin(again), fresh(&[1]));
         requests.complete(0, vec![2]);
         requests.begin(RequestId::first(u64::MAX));
         assert_eq!(requests.last.len(), CLIENTS_MAX);
-        assert_eq!(
-            requests.begin(RequestId::first(0).again().again()),
-            fresh(&[2])
-        );
-        assert_eq!(
-            requests.begin(RequestId::first(1).again()),
-            fresh(&[]),
-            "forgotten"
-        );
+        assert_eq!(requests.begin(again.again()), fresh(&[2]));
+        let forgotten = RequestId::first(1).again();
+        assert_eq!(requests.begin(forgotten), fresh(&[]));
     }
 }

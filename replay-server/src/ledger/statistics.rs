@@ -1,14 +1,15 @@
 //! Counters over what was stored and served: episodes, returns, actions, k and ages.
-//! It decides nothing.
 
 use std::collections::VecDeque;
 
-use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, Returns};
+use driml_protocol::{
+    EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus, Returns,
+};
 use serde::{Deserialize, Serialize};
 
 use super::actors::Difference;
 
-/// Ended episodes that are kept for whoever asks for them; of more the oldest are let go.
+/// Ended episodes that are kept for those who ask for them; of more the oldest are let go.
 const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
 /// The same in what a log keeps of a moment, where somebody records them: those for which he has not asked yet.
 const EPISODES_LOGGED_MAX: usize = 1_024;
@@ -30,7 +31,7 @@ pub(crate) struct Statistics {
     pub(crate) episodes: u64,
     /// The newest of them.
     newest: VecDeque<EndedEpisode>,
-    /// How many whoever records them had when he asked last; none if nobody has asked.
+    /// How many the process that records them had when it asked last; none before it asks.
     #[serde(skip)]
     recorded: Option<u64>,
     returns_known: u64,
@@ -40,6 +41,8 @@ pub(crate) struct Statistics {
     pub(crate) action_histogram: Vec<u64>,
     pub(crate) learner_waited_s: f64,
     pub(crate) actors_waited_s: f64,
+    /// Connected now.
+    #[serde(skip)]
     pub(crate) actors: u32,
 }
 
@@ -55,7 +58,7 @@ impl Statistics {
 
     /// Without what is counted of messages that change nothing, which no log knows of.
     pub(crate) fn of_changes(mut self) -> Self {
-        (self.chunks_retried, self.messages_refused, self.actors) = (0, 0, 0);
+        (self.chunks_retried, self.messages_refused) = (0, 0);
         (self.learner_waited_s, self.actors_waited_s) = (0.0, 0.0);
         self
     }
@@ -157,11 +160,28 @@ impl Statistics {
         logged
     }
 
-    /// Returns of the last [`RETURNS_OF`] episodes.
-    pub(crate) fn returns(&self) -> Returns {
-        Returns {
-            known: self.returns_known,
-            newest: self.returns.iter().copied().collect(),
+    /// What a status says of these counts; the rest is at its default.
+    pub(crate) fn status(&self) -> ReplayStatus {
+        ReplayStatus {
+            transitions_lost: self.transitions_lost,
+            transitions_duplicated: self.transitions_duplicated,
+            chunks_retried: self.chunks_retried,
+            batches_retried: self.batches_retried,
+            messages_refused: self.messages_refused,
+            rows_unlearned: self.rows_unlearned,
+            updates_relearned: self.updates_relearned,
+            episodes: self.episodes,
+            returns: Returns {
+                known: self.returns_known,
+                newest: self.returns.iter().copied().collect(),
+            },
+            k_histogram: self.k_histogram.clone(),
+            mean_age: self.mean_age,
+            action_histogram: self.action_histogram.clone(),
+            learner_waited_s: self.learner_waited_s,
+            actors_waited_s: self.actors_waited_s,
+            actors: self.actors,
+            ..ReplayStatus::default()
         }
     }
 }
@@ -191,17 +211,13 @@ mod tests {
         let first = statistics.episodes_since(0);
         assert_eq!((first.before, first.episodes.len()), (0, EPISODES_MAX));
         let second = statistics.episodes_since(first.up_to());
-        let frames: Vec<_> = second.episodes.iter().map(|it| it.frames).collect();
+        let frames = second.episodes.iter().map(|it| it.frames);
         let most = EPISODES_MAX as u64;
-        assert_eq!(frames, [most, most + 1, most + 2, most + 3, most + 4]);
+        assert!(frames.eq(most..most + 5));
         assert_eq!(second.up_to(), second.ended);
-        assert!(
-            statistics
-                .episodes_since(second.up_to())
-                .episodes
-                .is_empty()
-        );
-        // Whoever knows of more knows another server's.
+        let third = statistics.episodes_since(second.up_to());
+        assert_eq!(third.episodes, []);
+        // One who knows of more knows another server's.
         assert_eq!(statistics.episodes_since(u64::MAX).before, most + 5);
 
         for n in most + 5..EPISODES_KEPT_MAX as u64 + 7 {

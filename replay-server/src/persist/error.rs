@@ -2,8 +2,6 @@
 
 use std::{io, path::PathBuf};
 
-use driml_protocol::CodecError;
-
 use crate::config::ConfigError;
 
 /// What keeps a replay from its folder.
@@ -16,50 +14,22 @@ pub enum PersistError {
         doing: &'static str,
         /// With which file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// What the system answered.
         source: io::Error,
     },
     /// Another replay server uses the folder.
     #[error("another replay server keeps its replay in {}: end it first, or choose another --replay-dir", .0.display())]
     InUse(PathBuf),
-    /// The folder is that of another run.
-    #[error(
-        "{} holds the replay of another run ({why}): go on with that run's settings, or choose another --replay-dir",
-        folder.display()
-    )]
-    Foreign {
-        /// The folder.
-        folder: PathBuf,
-        /// How it differs.
-        why: String,
-    },
-    /// The folder was written by another version.
-    #[error("{} holds a replay of format {theirs}, this version reads {ours}: choose another --replay-dir", folder.display())]
-    Format {
-        /// The folder.
-        folder: PathBuf,
-        /// Its format.
-        theirs: u32,
-        /// Ours.
-        ours: u32,
-    },
-    /// A state that does not fit this run although its checksum does.
-    #[error("{}: {why}", path.display())]
-    State {
-        /// The segment.
-        path: PathBuf,
-        /// What is wrong.
-        why: String,
-    },
-    /// The log does not reach back to a mark.
+    /// What is in this file or folder is not this run's, is of another version, or makes no sense although its checksum is right: why,
+    /// and what to do.
+    #[error("{path} {1}", path = .0.display())]
+    Unusable(PathBuf, String),
+    /// The log does not reach back to a mark, which is this file.
     #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
     NoMark(PathBuf),
     /// The process was told to end before the log was read.
-    #[error("it was told to end while it read its replay back; what is kept is as it was")]
+    #[error("it was told to end while it read its replay back; what is kept was not changed")]
     Stopped,
-    /// A value that cannot be written.
-    #[error(transparent)]
-    Codec(#[from] CodecError),
     /// Settings that cannot work.
     #[error(transparent)]
     Config(#[from] ConfigError),

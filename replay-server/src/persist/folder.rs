@@ -1,5 +1,5 @@
 //! The folder of a log: one server alone uses it, and it says whose replay is in it.
-//! What the segments hold is for `recovery`.
+//! What the segments hold is for `recover`.
 
 use std::{
     fs::{self, File},
@@ -11,7 +11,7 @@ use driml_protocol::{lock_file, whole_file};
 
 use super::{
     error::PersistError,
-    segment::{self, FORMAT, LogId},
+    segment::{self, FORMAT, LogId, SegmentFile},
 };
 
 /// The file that says which log it is.
@@ -50,10 +50,9 @@ impl LogFolder {
         })
     }
 
-    /// Number of the first segment of a new log: none that is there has it.
-    pub(super) fn first_number(&self) -> Result<u64, PersistError> {
-        let segments = segment::list(&self.path).map_err(io_error("listing", &self.path))?;
-        Ok(segments.last().map_or(0, |it| it.number + 1))
+    /// All segments in the folder, by number.
+    pub(super) fn segments(&self) -> Result<Vec<SegmentFile>, PersistError> {
+        segment::list(&self.path).map_err(io_error("listing", &self.path))
     }
 
     /// Which log is in the folder; none if it is a new one.
@@ -64,8 +63,8 @@ impl LogFolder {
             read => read.map_err(io_error("reading", &path))?,
         };
         toml::from_str(&text).map(Some).map_err(|e| {
-            let why = e.message().to_owned();
-            PersistError::State { path, why }
+            let why = format!("cannot be read: {}", e.message());
+            PersistError::Unusable(path, why)
         })
     }
 
@@ -80,13 +79,12 @@ impl LogFolder {
 
     /// Checks that `found` is the log of the run and shard of `ours`.
     pub(super) fn check(&self, found: &LogId, ours: &LogId) -> Result<(), PersistError> {
-        let folder = self.path.clone();
+        let unusable = |why| Err(PersistError::Unusable(self.path.clone(), why));
         if found.format != FORMAT {
-            return Err(PersistError::Format {
-                folder,
-                theirs: found.format,
-                ours: FORMAT,
-            });
+            return unusable(format!(
+                "holds a replay of format {}, this version reads {FORMAT}: choose another --replay-dir",
+                found.format
+            ));
         }
         let why = if found.shard != ours.shard {
             format!(
@@ -99,6 +97,8 @@ impl LogFolder {
         } else {
             return Ok(());
         };
-        Err(PersistError::Foreign { folder, why })
+        unusable(format!(
+            "holds the replay of another run ({why}): use that run's settings, or choose another --replay-dir"
+        ))
     }
 }

@@ -1,12 +1,12 @@
-//! The log as it is written: records at the end of the newest segment, new segments, and the oldest removed.
-//! What is in a record, and when one is due, is for `mod`; it reads nothing back.
+//! The writing side of the log: records at the end of the newest segment, new segments, and the oldest removed.
+//! When a record is due is for `upkeep`; it reads nothing back.
 
 use std::{
     collections::VecDeque,
     fs::{self, File},
     io,
     os::unix::fs::FileExt,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -17,7 +17,7 @@ use super::{
     error::PersistError,
     folder::io_error,
     record::{self, RecordKind},
-    segment::{self, LogId, Mark, SegmentHeader},
+    segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
     snapshot::{Note, Snapshot},
     sync::Syncer,
 };
@@ -48,10 +48,11 @@ pub(crate) struct Journal {
     failing: Option<Failing>,
 }
 
-/// Which log it is, and where it goes on.
+/// Where a log is continued.
+#[derive(Default)]
 pub(super) struct Place {
-    pub(super) folder: PathBuf,
-    pub(super) id: LogId,
+    /// The segments that are of use, each with its first transition.
+    pub(super) segments: Vec<(SegmentFile, u64)>,
     /// Number of the next segment.
     pub(super) number: u64,
     /// Number of the next record.
@@ -75,50 +76,38 @@ struct Failing {
 }
 
 impl Journal {
-    /// Continues after `older` segments, each with its first transition, in a new one that begins with `snapshot`.
+    /// Continues the log `id` from `place` on, in a new segment that begins with `snapshot`.
     pub(super) fn begin(
-        place: Place,
-        older: &[(segment::SegmentFile, u64)],
+        folder: &Path,
+        id: LogId,
+        place: &Place,
         limits: Limits,
         fsync: Duration,
         snapshot: &Snapshot,
     ) -> Result<Self, PersistError> {
-        let Place {
-            folder,
-            id,
-            number,
-            ordinal,
-        } = place;
         let mut segments = VecDeque::new();
-        for (file, first_row) in older {
-            let bytes = fs::metadata(&file.path)
-                .map_err(io_error("looking at", &file.path))?
-                .len();
+        for (file, first_row) in &place.segments {
+            let metadata = fs::metadata(&file.path).map_err(io_error("looking at", &file.path))?;
             segments.push_back(Segment {
                 number: file.number,
                 first_row: *first_row,
-                bytes,
+                bytes: metadata.len(),
             });
         }
-        let syncer = File::open(&folder)
+        let syncer = File::open(folder)
             .and_then(|opened| Syncer::start(opened, fsync))
-            .map_err(io_error("opening", &folder))?;
-        let path = segment::path(&folder, number);
-        let first_row = snapshot.inserted;
-        let head = header_record(id, number, ordinal, snapshot)?;
-        let file = new_file(&path, &head).map_err(io_error("writing", &path))?;
-        segments.push_back(Segment {
-            number,
-            first_row,
-            bytes: head.len() as u64,
-        });
-        syncer.opened(number, file.clone());
+            .map_err(io_error("opening", folder))?;
+        let path = segment::path(folder, place.number);
+        let begun = begin_segment(folder, id, place.number, place.ordinal, snapshot);
+        let (segment, file) = begun.map_err(io_error("writing", &path))?;
+        segments.push_back(segment);
+        syncer.opened(place.number, file.clone());
         Ok(Self {
-            folder,
+            folder: folder.to_owned(),
             id,
             segments,
             file,
-            ordinal: ordinal + 1,
+            ordinal: place.ordinal + 1,
             limits,
             largest: 0,
             syncer,
@@ -169,8 +158,8 @@ impl Journal {
     }
 
     /// Appends a note of what has happened; if the disk refuses, it is the first to be written later.
-    pub(super) fn append_note(&mut self, note: &Note) -> Result<(), PersistError> {
-        let body = codec::encode_value(note)?;
+    pub(super) fn append_note(&mut self, note: &Note) {
+        let body = codec::encode_value(note).expect("a note is far below the codec's limit");
         let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
         self.ordinal += 1;
         if !self.is_ready() {
@@ -179,7 +168,6 @@ impl Journal {
             self.pending = record;
             self.note_failing(&e);
         }
-        Ok(())
     }
 
     /// Appends a chunk that is to be stored: head and payload of its message. `false`: the disk refuses, and it must not be.
@@ -282,42 +270,31 @@ impl Journal {
     }
 
     /// Begins another segment with `snapshot`. If the disk refuses, the newest one grows.
-    pub(super) fn rotate(&mut self, snapshot: &Snapshot) -> Result<(), PersistError> {
+    pub(super) fn rotate(&mut self, snapshot: &Snapshot) {
         let number = self.newest().number + 1;
-        let path = segment::path(&self.folder, number);
-        let first_row = snapshot.inserted;
         // The record that closes the old one comes first.
-        let head = header_record(self.id, number, self.ordinal + 1, snapshot)?;
-        match new_file(&path, &head) {
-            Ok(file) => {
-                let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
-                if let Err(e) = self.write(&closed, &[]) {
-                    // Without it the new one is one too many.
-                    self.note_failing(&e);
-                    if let Err(e) = fs::remove_file(&path) {
-                        tracing::debug!("removing {}: {e}", path.display());
-                    }
-                    return Ok(());
-                }
-                self.ordinal += 2;
-                self.file = file.clone();
-                self.syncer.opened(number, file);
-                self.segments.push_back(Segment {
-                    number,
-                    first_row,
-                    bytes: head.len() as u64,
-                });
-            }
-            Err(e) => self.note_failing(&e),
+        let begun = begin_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
+        let (segment, file) = match begun {
+            Ok(begun) => begun,
+            Err(e) => return self.note_failing(&e),
+        };
+        let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
+        if let Err(e) = self.write(&closed, &[]) {
+            // Without it the new one is one too many.
+            remove(&segment::path(&self.folder, number));
+            return self.note_failing(&e);
         }
-        Ok(())
+        self.ordinal += 2;
+        self.file = file.clone();
+        self.syncer.opened(number, file);
+        self.segments.push_back(segment);
     }
 
     /// Begins another segment with `snapshot`, which is on the disk when this returns.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
         if self.is_ready() {
-            self.rotate(snapshot)?;
+            self.rotate(snapshot);
         }
         let number = self.newest().number;
         if number == before {
@@ -337,41 +314,51 @@ impl Journal {
             && self.segments[0].number < keep
         {
             let number = self.segments[0].number;
-            let path = segment::path(&self.folder, number);
             self.syncer.removed(number);
-            match fs::remove_file(&path) {
-                Err(e) if e.kind() != io::ErrorKind::NotFound => {
-                    tracing::debug!("removing {}: {e}", path.display());
-                    return;
-                }
-                _ => self.segments.pop_front(),
-            };
+            if !remove(&segment::path(&self.folder, number)) {
+                return;
+            }
+            self.segments.pop_front();
         }
     }
 }
 
-fn header_record(
+/// A new segment whose only record has the number `ordinal`; nothing stays if it cannot be written.
+fn begin_segment(
+    folder: &Path,
     log: LogId,
     number: u64,
     ordinal: u64,
     snapshot: &Snapshot,
-) -> Result<Vec<u8>, PersistError> {
-    let body = codec::encode_value(&SegmentHeader {
+) -> io::Result<(Segment, Arc<File>)> {
+    let header = SegmentHeader {
         log,
         number,
         snapshot: snapshot.clone(),
-    })?;
-    Ok(record::head(RecordKind::Segment, ordinal, &body, 0))
-}
-
-/// A new file with these bytes; nothing stays if they cannot be written.
-fn new_file(path: &PathBuf, bytes: &[u8]) -> io::Result<Arc<File>> {
-    let file = File::create(path)?;
-    if let Err(e) = file.write_all_at(bytes, 0) {
-        if let Err(e) = fs::remove_file(path) {
-            tracing::debug!("removing {}: {e}", path.display());
-        }
+    };
+    let body = codec::encode_value(&header).map_err(io::Error::other)?;
+    let head = record::head(RecordKind::Segment, ordinal, &body, 0);
+    let path = segment::path(folder, number);
+    let file = File::create(&path)?;
+    if let Err(e) = file.write_all_at(&head, 0) {
+        remove(&path);
         return Err(e);
     }
-    Ok(Arc::new(file))
+    let segment = Segment {
+        number,
+        first_row: snapshot.inserted,
+        bytes: head.len() as u64,
+    };
+    Ok((segment, Arc::new(file)))
+}
+
+/// Removes a file; if that fails it is tried again, or does no harm.
+fn remove(path: &Path) -> bool {
+    match fs::remove_file(path) {
+        Err(e) if e.kind() != io::ErrorKind::NotFound => {
+            tracing::debug!("removing {}: {e}", path.display());
+            false
+        }
+        _ => true,
+    }
 }

@@ -1,14 +1,10 @@
-//! The log of a replay that is in use: what is written when, and which segments stay.
+//! The log of a replay that is in use: its chunks, and its marks with the segments that these need.
 //! How a record is written is for `journal`, and what a snapshot holds for `snapshot`.
 
 use std::collections::VecDeque;
 
 use super::{
-    error::PersistError,
-    folder::LogFolder,
-    journal::Journal,
-    segment::Mark,
-    snapshot::{Note, Snapshot},
+    error::PersistError, folder::LogFolder, journal::Journal, segment::Mark, snapshot::Snapshot,
 };
 use crate::storage::frame_store::PackedChunk;
 
@@ -34,10 +30,7 @@ pub(super) struct Marked {
 }
 
 impl Log {
-    /// Writes a chunk that is to be stored; `false`: the disk refuses, and it must not be.
-    ///
-    /// # Errors
-    /// A chunk that makes no message; the reason, for a person.
+    /// Writes a chunk that is to be stored; `false`: the disk refuses, and it must not be. The error says why it makes no message.
     pub(crate) fn chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
         let chunk = &packed.chunk;
         match &packed.sealed {
@@ -47,20 +40,6 @@ impl Log {
                 .seal(self.spec_hash)
                 .map(|(head, payload)| self.journal.append_chunk(&head, payload))
                 .map_err(|e| e.to_string()),
-        }
-    }
-
-    /// Writes down who came or went.
-    pub(crate) fn note(&mut self, note: &Note) {
-        if let Err(e) = self.journal.append_note(note) {
-            // A value over the codec's limit.
-            tracing::error!("a note cannot be written to the replay's log: {e}");
-        }
-    }
-
-    pub(crate) fn rotate(&mut self, snapshot: &Snapshot) {
-        if let Err(e) = self.journal.rotate(snapshot) {
-            tracing::error!("a segment of the replay's log cannot be begun: {e}");
         }
     }
 

@@ -22,9 +22,11 @@ mod recover;
 pub(crate) mod segment;
 pub(crate) mod snapshot;
 mod sync;
+mod upkeep;
 
 pub use error::PersistError;
 pub(crate) use opening::shard_dir;
-pub use opening::{KeptReplay, PersistArgs, Recovery};
+pub use opening::{KeptReplay, PersistArgs};
 pub use progress::Reading;
+pub use recover::Recovery;
 pub use segment::Mark;

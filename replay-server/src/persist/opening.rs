@@ -1,5 +1,5 @@
-//! Opening the folder of a replay: what is there is taken up, and a log goes on or begins.
-//! Reading it back is for `recovery`.
+//! Opening the folder of a replay: what is there is taken up, and a log is continued or begun.
+//! Reading it back is for `recover`.
 
 use std::{
     path::{Path, PathBuf},
@@ -11,10 +11,10 @@ use driml_protocol::{RunSpec, Shutdown, TRANSITION_BYTES};
 use super::{
     error::PersistError,
     folder::LogFolder,
-    journal::{Journal, Limits, Place},
+    journal::{Journal, Limits},
     log::{Log, Marked},
     progress::Reading,
-    recover::{Recovered, find_id, go_back, recover},
+    recover::{Recovery, find_id, go_back, recover},
     segment::{FORMAT, LogId, Mark},
 };
 use crate::{
@@ -42,19 +42,6 @@ pub struct PersistArgs {
     pub mark: Option<Mark>,
 }
 
-/// What was found in the folder.
-#[derive(Clone, Debug, Default)]
-pub struct Recovery {
-    /// There was a replay.
-    pub found: bool,
-    /// Bytes of the log that were read.
-    pub bytes: u64,
-    /// How long that took.
-    pub took: Duration,
-    /// Damage, and what came of it: sentences for a person.
-    pub warnings: Vec<String>,
-}
-
 impl Replay {
     /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
     ///
@@ -66,34 +53,26 @@ impl Replay {
         config: &Config,
         batch_size: u32,
     ) -> Result<(Self, Recovery), PersistError> {
-        let kept = KeptReplay::find(args, spec, config, batch_size)?;
-        kept.read(&Reading::begin(Shutdown::default()))
+        let empty = Self::shard(spec, config, batch_size, args.shard)?;
+        let kept = KeptReplay::find(args, spec, config)?;
+        kept.read(empty, &Reading::begin(Shutdown::default()))
     }
 }
 
-/// The folder of a replay, which nobody else uses any more and which is this run's. What is kept there is not read yet.
+/// The folder of a replay, which no other process uses any more and which is this run's. What is kept there is not read yet.
 pub struct KeptReplay {
     args: PersistArgs,
-    /// Of this run and shard, if the log is new.
     id: LogId,
-    is_new: bool,
     limits: Limits,
     folder: LogFolder,
-    replay: Replay,
 }
 
 impl KeptReplay {
     /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
     ///
     /// # Errors
-    /// Settings that cannot work; a folder that cannot be written, is in use, or holds the replay of another run.
-    pub fn find(
-        args: &PersistArgs,
-        spec: &RunSpec,
-        config: &Config,
-        batch_size: u32,
-    ) -> Result<Self, PersistError> {
-        let replay = Replay::shard(spec, config, batch_size, args.shard)?;
+    /// A folder that cannot be written, is in use, or holds the replay of another run.
+    pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {
             format: FORMAT,
@@ -110,59 +89,39 @@ impl KeptReplay {
         Ok(Self {
             args: args.clone(),
             id,
-            is_new: known.is_none(),
             limits: limits(args, spec, config),
             folder,
-            replay,
         })
     }
 
-    /// Reads what is kept: the replay as it was, or an empty one.
+    /// Reads what is kept into `replay`, which is empty.
     ///
     /// # Errors
-    /// A folder that cannot be read or written; [`PersistError::Stopped`] if `reading` is told so. Damage is no error: what is left is
-    /// used, and what was lost is said.
-    pub fn read(self, reading: &Reading) -> Result<(Replay, Recovery), PersistError> {
+    /// A folder that cannot be read or written; [`PersistError::Stopped`] if `reading` is told so. Damage is not an error: what is left
+    /// is used, and what was lost is in the warnings.
+    pub fn read(
+        self,
+        mut replay: Replay,
+        reading: &Reading,
+    ) -> Result<(Replay, Recovery), PersistError> {
         let started = Instant::now();
         let Self {
             args,
             id,
-            is_new,
             limits,
             folder,
-            mut replay,
         } = self;
         if let Some(mark) = args.mark {
             go_back(&folder, mark)?;
         }
-        let known = match is_new {
-            false => recover(&folder, id, &mut replay, args.mark, reading)?,
-            true => None,
-        };
-        let was_found = known.is_some();
-        let found = match known {
-            Some(found) => found,
-            None => {
-                folder.write_id(&id)?;
-                Recovered::nothing(folder.first_number()?)
-            }
-        };
-        let fsync = replay
-            .config
-            .fsync_ms
-            .map_or(FSYNC_DEFAULT, Duration::from_millis);
-        let journal = Journal::begin(
-            Place {
-                folder: args.dir.clone(),
-                id,
-                number: found.number,
-                ordinal: found.ordinal,
-            },
-            &found.segments,
-            limits,
-            fsync,
-            &replay.snapshot(),
-        )?;
+        let (place, mut recovery) = recover(&folder, id, &mut replay, args.mark, reading)?;
+        if !recovery.found {
+            folder.write_id(&id)?;
+        }
+        let fsync_ms = replay.config.fsync_ms;
+        let fsync = fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis);
+        let snapshot = replay.snapshot();
+        let journal = Journal::begin(&args.dir, id, &place, limits, fsync, &snapshot)?;
         let oldest_row = replay.ring.oldest();
         let marked = args.mark.map(|mark| Marked { mark, oldest_row });
         replay.log = Some(Log {
@@ -172,12 +131,7 @@ impl KeptReplay {
             _folder: folder,
         });
         replay.tidy();
-        let recovery = Recovery {
-            found: was_found,
-            bytes: found.bytes,
-            took: started.elapsed(),
-            warnings: found.warnings,
-        };
+        recovery.took = started.elapsed();
         Ok((replay, recovery))
     }
 }

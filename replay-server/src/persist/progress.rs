@@ -1,5 +1,4 @@
 //! How far a log has been read back, for those who ask meanwhile, and the word that it need not be read to its end.
-//! It reads nothing.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering},
@@ -38,7 +37,7 @@ impl Reading {
         self.bytes_read.fetch_add(bytes, Ordering::Relaxed);
     }
 
-    /// Whether nobody needs the rest.
+    /// Whether the rest need not be read.
     pub(super) fn is_stopped(&self) -> bool {
         self.stop.is_set()
     }

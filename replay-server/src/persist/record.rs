@@ -1,10 +1,10 @@
 //! The bytes of the log: records one after the other, each with its number, its length and a checksum.
-//! What a record means is for `snapshot` and `segment`; where a segment ends is for `recovery`.
+//! What a record means is for `snapshot` and `segment`; where a segment ends is for `recover`.
 //!
 //! A record is a head of 32 bytes, little-endian, and a body:
 //! magic u32, kind u32, ordinal u64, length of the body u64, bytes of the body that the checksum covers u32, crc32 u32.
 //! The checksum covers the head before it too. Of a chunk, whose body is the message as it came, it covers the message's head; the
-//! message has a checksum of its own over all of it.
+//! message has another checksum over all of it.
 
 use std::{
     fs::File,
@@ -38,14 +38,9 @@ pub(super) enum RecordKind {
 }
 
 impl RecordKind {
-    const fn of(number: u32) -> Option<Self> {
-        Some(match number {
-            1 => Self::Segment,
-            2 => Self::Note,
-            3 => Self::Chunk,
-            4 => Self::Closed,
-            _ => return None,
-        })
+    fn of(number: u32) -> Option<Self> {
+        let all = [Self::Segment, Self::Note, Self::Chunk, Self::Closed];
+        all.into_iter().find(|kind| *kind as u32 == number)
     }
 }
 
@@ -77,7 +72,7 @@ pub(super) struct Record<'a> {
 pub(super) enum Broken {
     /// The last record was not written whole.
     Torn,
-    /// Bytes that are no record, with others after them.
+    /// Bytes that are not a record, with others after them.
     Damaged,
 }
 

@@ -12,6 +12,7 @@ use driml_protocol::{BufferPool, Chunk, codec};
 use super::{
     error::PersistError,
     folder::{LogFolder, io_error},
+    journal::Place,
     progress::Reading,
     record::{Broken, Record, RecordKind, RecordReader},
     segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
@@ -22,51 +23,28 @@ use crate::{replay::Replay, storage::frame_store::Packer};
 /// How often it is logged how far the reading is.
 const SAY: Duration = Duration::from_secs(5);
 
-/// Where a log goes on, and what was found on the way there.
-pub(super) struct Recovered {
-    /// The segments that are of use, each with its first transition.
-    pub(super) segments: Vec<(SegmentFile, u64)>,
-    /// Number of the next segment.
-    pub(super) number: u64,
-    /// Number of the next record.
-    pub(super) ordinal: u64,
-    /// Bytes of the records that were read.
-    pub(super) bytes: u64,
-    /// What a person should know: damage, and what came of it.
-    pub(super) warnings: Vec<String>,
+/// What was found in the folder of a log.
+#[derive(Clone, Debug, Default)]
+pub struct Recovery {
+    /// There was a replay.
+    pub found: bool,
+    /// Bytes of the log that were read.
+    pub bytes: u64,
+    /// How long that took.
+    pub took: Duration,
+    /// Damage, and what came of it: sentences for a person.
+    pub warnings: Vec<String>,
 }
 
-impl Recovered {
-    /// Nothing was found: a log begins with segment `number`.
-    pub(super) const fn nothing(number: u64) -> Self {
-        Self {
-            segments: Vec::new(),
-            number,
-            ordinal: 0,
-            bytes: 0,
-            warnings: Vec::new(),
-        }
-    }
-}
-
-/// How the records of one segment ended.
-#[derive(Debug)]
-enum SegmentEnd {
-    /// With its last byte; whether it says that another one follows.
-    Whole { closed: bool },
-    /// Before: the rest is of no use.
-    Broken(Broken),
-}
-
-struct Recovery<'a> {
+/// A log on its way back into a replay.
+struct Reader<'a> {
     folder: &'a LogFolder,
     id: LogId,
     replay: &'a mut Replay,
     packer: Packer,
     pool: BufferPool,
-    found: Recovered,
-    /// Number of the next record; none before the first.
-    expected: Option<u64>,
+    place: Place,
+    recovery: Recovery,
     /// The oldest transition that was held, as far as records say.
     oldest: u64,
     /// Whether which transitions are held follows from their number, as it did before.
@@ -77,7 +55,7 @@ struct Recovery<'a> {
 
 /// Removes what the log in `folder` says after `mark`.
 pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
-    let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
+    let files = folder.segments()?;
     let Some(marked) = files.iter().find(|it| it.number == mark.segment()) else {
         return Err(PersistError::NoMark(segment::path(
             &folder.path,
@@ -93,7 +71,7 @@ pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError
     if !begins {
         return Err(PersistError::NoMark(marked.path.clone()));
     }
-    // The newest first: whatever is left then is a log that ends earlier.
+    // The newest first: what is left at any moment is a log that ends earlier.
     for later in files.iter().rev() {
         if later.number > mark.segment() {
             fs::remove_file(&later.path).map_err(io_error("removing", &later.path))?;
@@ -111,40 +89,43 @@ fn cut_off(file: &SegmentFile, at: u64) -> Result<(), PersistError> {
         .map_err(io_error("cutting off the end of", &file.path))
 }
 
-/// Rebuilds `replay`, which is empty, from the segments in `folder`; `None` if there are none of log `id`. With a `mark`, which is
-/// the last that the log says, all of the replay's state is taken from there.
+/// Rebuilds `replay`, which is empty, from the segments of log `id` in `folder`. With a `mark`, which is the last that the log says, all
+/// of the replay's state is taken from there.
 pub(super) fn recover(
     folder: &LogFolder,
     id: LogId,
     replay: &mut Replay,
     mark: Option<Mark>,
     reading: &Reading,
-) -> Result<Option<Recovered>, PersistError> {
-    let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
-    let number = files.last().map_or(0, |it| it.number + 1);
+) -> Result<(Place, Recovery), PersistError> {
+    let files = folder.segments()?;
     let packer = replay.packer();
     replay.quiet = true;
-    let mut recovery = Recovery {
+    let mut reader = Reader {
         folder,
         id,
         replay,
         packer,
         pool: BufferPool::new(2),
-        found: Recovered::nothing(number),
-        expected: None,
+        place: Place {
+            number: files.last().map_or(0, |it| it.number + 1),
+            ..Place::default()
+        },
+        recovery: Recovery::default(),
         oldest: 0,
         same_capacity: false,
         mark,
     };
-    let last = files.len().saturating_sub(1);
     let bytes = |file: &SegmentFile| fs::metadata(&file.path).map_or(0, |it| it.len());
     let total: u64 = files.iter().map(bytes).sum();
     let dir = folder.path.display();
-    tracing::info!(
-        "reads the replay in {dir}: {} segments, {} MiB; whoever asks hears how far it is",
-        files.len(),
-        total >> 20
-    );
+    if !files.is_empty() {
+        tracing::info!(
+            "reads the replay in {dir}: {} segments, {} MiB; requests are answered with its progress",
+            files.len(),
+            total >> 20
+        );
+    }
     reading.set_bytes(total);
     let mut due = Instant::now() + SAY;
     for (at, file) in files.iter().enumerate() {
@@ -156,15 +137,15 @@ pub(super) fn recover(
             return Err(PersistError::Stopped);
         }
         let of_it = bytes(file);
-        recovery.read_segment(file, at == last)?;
+        reader.read_segment(file, at + 1 == files.len())?;
         reading.add_read(of_it);
     }
-    recovery.finish()
+    reader.finish()
 }
 
 /// Which log the newest segment in `folder` that can be read is of; none if there is none.
 pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
-    let files = segment::list(&folder.path).map_err(io_error("listing", &folder.path))?;
+    let files = folder.segments()?;
     for file in files.iter().rev() {
         let mut reader = RecordReader::open(&file.path).map_err(io_error("reading", &file.path))?;
         let first = reader.next().map_err(io_error("reading", &file.path))?;
@@ -177,9 +158,14 @@ pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError>
     Ok(None)
 }
 
-impl Recovery<'_> {
+impl Reader<'_> {
     fn warn(&mut self, text: String) {
-        self.found.warnings.push(text);
+        self.recovery.warnings.push(text);
+    }
+
+    /// Whether `ordinal` may be that of the next record, after none or some that are missing.
+    const fn may_follow(&self, ordinal: u64) -> bool {
+        !self.recovery.found || ordinal >= self.place.ordinal
     }
 
     fn read_segment(&mut self, file: &SegmentFile, is_last: bool) -> Result<(), PersistError> {
@@ -201,56 +187,53 @@ impl Recovery<'_> {
             self.set_aside(file, "its beginning is damaged");
             return Ok(());
         };
+        let unusable = |why: String| {
+            PersistError::Unusable(file.path.clone(), format!("cannot be used: {why}"))
+        };
         let snapshot = header.snapshot;
         if header.log != self.id {
-            self.warn(format!("{name} is not of this log and was left as it is"));
+            self.warn(format!("{name} is not of this log and was left unchanged"));
             return Ok(());
         }
-        if header.number != file.number || self.expected.is_some_and(|next| ordinal < next) {
+        if header.number != file.number || !self.may_follow(ordinal) {
             self.set_aside(file, "it is not the segment that belongs here");
             return Ok(());
         }
         let is_mark = self.mark.is_some_and(|mark| mark.segment() == file.number);
-        if is_mark && !self.replay.draws_by_rule_of(&snapshot.rows) {
-            return Err(PersistError::State {
-                path: file.path.clone(),
-                why: "replay.sampling is another rule than it was".into(),
-            });
+        let is_prioritised = self.replay.config.sampling.is_prioritised();
+        if is_mark && snapshot.rows.is_prioritised() != is_prioritised {
+            let why = "replay.sampling is another rule than it was".into();
+            return Err(unusable(why));
         }
         let (stored, first_row) = (self.replay.ring.inserted(), snapshot.inserted);
-        let is_first = self.expected.is_none();
+        let is_first = !self.recovery.found;
         self.oldest = snapshot.oldest;
         self.same_capacity = snapshot.capacity == self.replay.ring.capacity()
             && self.replay.config.compressed_bytes_max.is_none();
-        let gap = self.replay.restore(snapshot).map_err(|why| {
-            let path = file.path.clone();
-            PersistError::State { path, why }
-        })?;
+        self.replay.restore(snapshot).map_err(unusable)?;
         if !is_first && first_row > stored {
             self.warn(format!(
-                "the transitions {stored} to {} are gone ({gap} of those that were held): something before {name} is damaged or missing. \
-                 All others are there, and all counts are right",
+                "the transitions {stored} to {} are gone: something before {name} is damaged or missing. All others are there, and all \
+                 counts are right",
                 first_row - 1
             ));
         }
-        self.expected = Some(ordinal + 1);
-        self.found.segments.push((file.clone(), first_row));
+        self.recovery.found = true;
+        self.place.ordinal = ordinal + 1;
+        self.place.segments.push((file.clone(), first_row));
         let ended = self.read_records(&mut reader).map_err(reading())?;
-        self.found.bytes += reader.at();
-        let cut = reader.length() - reader.at();
+        let at = reader.at();
+        self.recovery.bytes += at;
+        let cut = reader.length() - at;
         match ended {
-            SegmentEnd::Whole { closed: true } if is_last => self.warn(format!(
+            Ok(is_closed) if is_closed && is_last => self.warn(format!(
                 "the segment after {name} is missing: the replay is what it was when that one began; what was stored and served since is lost"
             )),
-            SegmentEnd::Whole { .. } => {}
-            SegmentEnd::Broken(broken) => {
-                let at = reader.at();
-                if is_last {
-                    self.cut(file, at, cut, &broken)?;
-                } else {
-                    self.warn(format!("{name} is damaged at byte {at}: {cut} bytes of it are of no use"));
-                }
-            }
+            Ok(_) => {}
+            Err(broken) if is_last => self.cut(file, at, cut, &broken)?,
+            Err(_) => self.warn(format!(
+                "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
+            )),
         }
         Ok(())
     }
@@ -265,7 +248,7 @@ impl Recovery<'_> {
     ) -> Result<(), PersistError> {
         let name = file_name(&file.path);
         match broken {
-            // Nobody was told that it is stored.
+            // No actor was told that it is stored.
             Broken::Torn => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
@@ -289,34 +272,28 @@ impl Recovery<'_> {
         self.warn(format!("{name} cannot be used, {why}: {so}"));
     }
 
-    fn read_records(&mut self, reader: &mut RecordReader) -> io::Result<SegmentEnd> {
-        let mut closed = false;
+    /// Takes the records of a segment: whether the last one says that another segment follows, or why the rest is of no use.
+    fn read_records(&mut self, reader: &mut RecordReader) -> io::Result<Result<bool, Broken>> {
+        let mut is_closed = false;
         loop {
             // So that the reader ends before a record that says what cannot be.
             let before = reader.at();
-            match reader.next()? {
-                None => return Ok(SegmentEnd::Whole { closed }),
-                Some(Err(broken)) => return Ok(SegmentEnd::Broken(broken)),
-                Some(Ok(record)) => {
-                    let is_next = !closed && Some(record.ordinal) == self.expected;
-                    let applied = if is_next {
-                        self.apply(&record)
-                    } else {
-                        Err(format!("record {} is not the next one", record.ordinal))
-                    };
-                    match applied {
-                        Ok(()) => {
-                            self.expected = Some(record.ordinal + 1);
-                            closed = record.kind == RecordKind::Closed;
-                        }
-                        Err(why) => {
-                            tracing::debug!("record {}: {why}", record.ordinal);
-                            reader.go_back_to(before);
-                            return Ok(SegmentEnd::Broken(Broken::Damaged));
-                        }
-                    }
-                }
+            let record = match reader.next()? {
+                None => return Ok(Ok(is_closed)),
+                Some(Err(broken)) => return Ok(Err(broken)),
+                Some(Ok(record)) => record,
+            };
+            let applied = match !is_closed && record.ordinal == self.place.ordinal {
+                true => self.apply(&record),
+                false => Err("it is not the next one".into()),
+            };
+            if let Err(why) = applied {
+                tracing::debug!("record {}: {why}", record.ordinal);
+                reader.go_back_to(before);
+                return Ok(Err(Broken::Damaged));
             }
+            self.place.ordinal += 1;
+            is_closed = record.kind == RecordKind::Closed;
         }
     }
 
@@ -332,7 +309,7 @@ impl Recovery<'_> {
                 if let Some(why) = self.replay.unfit(&chunk) {
                     return Err(why);
                 }
-                self.replay.actors.check_known(&chunk.header)?;
+                self.replay.state.actors.check_known(&chunk.header)?;
                 let packed = self.packer.pack(std::borrow::Cow::Owned(chunk));
                 self.replay.store(&packed);
                 Ok(())
@@ -347,20 +324,14 @@ impl Recovery<'_> {
         }
     }
 
-    fn finish(mut self) -> Result<Option<Recovered>, PersistError> {
-        let Some(ordinal) = self.expected else {
-            if !self.found.warnings.is_empty() {
-                let why = self.found.warnings.join("; ");
-                let path = self.folder.path.clone();
-                return Err(PersistError::State {
-                    path,
-                    why: format!(
-                        "no segment can be read ({why}): to begin a new replay there, remove them"
-                    ),
-                });
-            }
-            return Ok(None);
-        };
+    fn finish(mut self) -> Result<(Place, Recovery), PersistError> {
+        if !self.recovery.found && !self.recovery.warnings.is_empty() {
+            let why = self.recovery.warnings.join("; ");
+            let why = format!(
+                "cannot be used: no segment can be read ({why}); to begin a new replay there, remove them"
+            );
+            return Err(PersistError::Unusable(self.folder.path.clone(), why));
+        }
         // Older segments are removed once none of their transitions is held.
         let ring = &self.replay.ring;
         let (first, end) = (ring.first(), ring.inserted());
@@ -371,9 +342,11 @@ impl Recovery<'_> {
                 first - 1
             ));
         }
-        self.replay.recovered(self.mark.is_some());
-        self.found.ordinal = ordinal;
-        Ok(Some(self.found))
+        self.replay.quiet = false;
+        if self.recovery.found && self.mark.is_none() {
+            self.replay.await_learner();
+        }
+        Ok((self.place, self.recovery))
     }
 }
 

@@ -1,5 +1,5 @@
 //! Segments: the files of a log, by number, and what each begins with.
-//! Which are kept and how they are read back is for `journal` and `recovery`.
+//! Which are kept and how they are read back is for `journal` and `recover`.
 
 use std::{
     fs, io,

@@ -1,11 +1,13 @@
 //! All of the replay but the transitions themselves, as a value that is written and taken back, and what changes it between two chunks.
 //! When one is written is for the facade; where it lies, for `journal`.
 
-use driml_protocol::{ActorJoin, Goodbye, Learned, LearnerJoin};
+use driml_protocol::{ActorJoin, Goodbye, Learned, LearnerJoin, RunSpec};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::{
+    config::SHARDS_MAX,
     ledger::{actors::Actors, statistics::Statistics},
     rate_limiter::Counts,
     sampling::{horizon::Affinity, rows::sampler::RowsState},
@@ -14,12 +16,62 @@ use crate::{
 /// Most of anything that a run counts.
 const COUNT_MAX: u64 = 1 << 60;
 
+/// The replay server's own stream of the run's seed, so that no other process draws the same numbers.
+const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
+
 /// Who came and went: what the log holds beside chunks and snapshots.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Note {
     ActorJoined(ActorJoin),
     Goodbye(Goodbye),
     LearnerJoined(LearnerJoin),
+}
+
+/// What a replay knows beside its transitions: a snapshot takes all of it and brings all of it back.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct State {
+    pub(crate) actors: Actors,
+    /// The learner that is served, as it joined.
+    pub(crate) learner: Option<LearnerJoin>,
+    pub(crate) learned: Learned,
+    /// Updates after which the run was resumed without this replay.
+    pub(crate) resumed_after: u64,
+    /// Transitions that the run had stored then.
+    pub(crate) inserted_before: u64,
+    /// Rows that were sampled and are in no histogram of this replay; below 0 if some of those that are were not sampled.
+    pub(crate) rows_before: i64,
+    pub(crate) affinity: Affinity,
+    pub(crate) rng: ChaCha8Rng,
+    pub(crate) statistics: Statistics,
+    /// The learner found no anchor: one chunk may pass the limiter, or both sides would wait for each other.
+    pub(crate) starving: bool,
+}
+
+impl State {
+    /// The start of a run in shard `shard`.
+    pub(crate) fn new(spec: &RunSpec, shard: u32) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
+        rng.set_stream(RNG_STREAM + u64::from(shard));
+        Self {
+            actors: Actors::default(),
+            learner: None,
+            learned: Learned::default(),
+            resumed_after: 0,
+            inserted_before: 0,
+            rows_before: 0,
+            affinity: Affinity::uniform(spec.num_actions),
+            rng,
+            statistics: Statistics::new(spec.horizon.k_max(), spec.num_actions),
+            starving: false,
+        }
+    }
+
+    /// Draws other numbers in this shard than at the start of the run, after `resumed` transitions or updates.
+    pub(crate) fn draw_anew(&mut self, shard: u32, resumed: u64) {
+        let beyond = resumed.wrapping_mul(u64::from(SHARDS_MAX));
+        let stream = RNG_STREAM + u64::from(shard);
+        self.rng.set_stream(stream.wrapping_add(beyond));
+    }
 }
 
 /// The replay without the transitions that it holds.
@@ -30,45 +82,32 @@ pub(crate) struct Snapshot {
     /// The oldest that is held.
     pub(crate) oldest: u64,
     pub(crate) capacity: u64,
-    pub(crate) actors: Actors,
-    pub(crate) learner: Option<LearnerJoin>,
-    pub(crate) learned: Learned,
-    pub(crate) resumed_after: u64,
-    pub(crate) inserted_before: u64,
-    pub(crate) rows_before: i64,
     pub(crate) counts: Counts,
-    pub(crate) affinity: Affinity,
-    pub(crate) rng: ChaCha8Rng,
-    pub(crate) statistics: Statistics,
-    pub(crate) starving: bool,
     pub(crate) rows: RowsState,
+    pub(crate) state: State,
 }
 
 impl Snapshot {
-    /// Why this is none of a replay like `fresh`, whatever its checksum says; none if it is. One that is taken can be counted on from:
+    /// Why this is none of a replay like `ours`, whatever its checksum says; none if it is. One that is taken can be counted on from:
     /// no count overflows, and none becomes less than nothing.
-    pub(crate) fn unfit(&self, fresh: &Self, num_actions: u32) -> Option<&'static str> {
-        let Self {
-            inserted,
-            counts,
-            statistics,
-            ..
-        } = self;
-        let is_ours = self.affinity.is_for(num_actions)
-            && statistics.k_histogram.len() == fresh.statistics.k_histogram.len()
-            && statistics.action_histogram.len() == fresh.statistics.action_histogram.len();
+    pub(crate) fn unfit(&self, ours: &State) -> Option<&'static str> {
+        let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
+        let (statistics, num_actions) = (&state.statistics, ours.statistics.action_histogram.len());
+        let is_ours = state.affinity.is_for(num_actions as u32)
+            && statistics.action_histogram.len() == num_actions
+            && statistics.k_histogram.len() == ours.statistics.k_histogram.len();
         if !is_ours {
             return Some("a state of a run with other actions or another horizon");
         }
         let sum = |counts: &[u64]| counts.iter().copied().fold(0, u64::saturating_add);
         let served = sum(&statistics.k_histogram);
         let counted = [
-            *inserted,
+            inserted,
             served,
             statistics.rows_unlearned,
             statistics.episodes,
-            self.inserted_before,
-            self.rows_before.unsigned_abs(),
+            state.inserted_before,
+            state.rows_before.unsigned_abs(),
             counts.this_shard.inserted,
             counts.this_shard.rows_sampled,
             counts.refilled,
@@ -78,15 +117,15 @@ impl Snapshot {
             return Some("a state with counts that no run reaches");
         }
         let rows = counts.this_shard.rows_sampled + statistics.rows_unlearned;
-        let agrees = sum(&statistics.action_histogram) == *inserted
-            && self.inserted_before + inserted == counts.this_shard.inserted + counts.refilled
-            && self.rows_before + served as i64 == rows as i64
-            && self.oldest <= *inserted;
+        let agrees = sum(&statistics.action_histogram) == inserted
+            && state.inserted_before + inserted == counts.this_shard.inserted + counts.refilled
+            && state.rows_before + served as i64 == rows as i64
+            && self.oldest <= inserted;
         if !agrees {
             return Some("a state whose counts contradict each other");
         }
-        self.actors
-            .unfit(*inserted)
+        let actors = state.actors.unfit(inserted);
+        actors
             .or_else(|| statistics.unfit())
             .or_else(|| self.rows.unfit(inserted - self.oldest))
     }

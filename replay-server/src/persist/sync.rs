@@ -1,18 +1,18 @@
-//! Flushes the log to the disk once a period, on a thread of its own.
+//! Flushes the log to the disk once a period, on a separate thread.
 //! What the process has written survives its death without this; what the machine has flushed survives a power cut too.
 
 use std::{
     fs::File,
     io,
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Seldom, fault};
+use driml_protocol::{Seldom, Shutdown, fault};
 
 /// Segments that wait to be flushed; with one more they are flushed before anything else is written.
 const OPEN_MAX: usize = 32;
@@ -24,14 +24,12 @@ struct Files {
     open: Vec<(u64, Arc<File>)>,
     /// The folder, if a file was made or removed.
     folder: Option<Arc<File>>,
-    stop: bool,
 }
 
 struct Shared {
     files: Mutex<Files>,
-    wake: Condvar,
     dirty: AtomicBool,
-    /// One flush at a time: whoever asks for another one gets it done, not only begun.
+    /// One flush at a time: a caller that asks for another one gets it done, not only begun.
     flushing: Mutex<()>,
     /// When the last flush that succeeded began.
     flushed: Mutex<Instant>,
@@ -41,7 +39,6 @@ impl Shared {
     fn new() -> Self {
         Self {
             files: Mutex::default(),
-            wake: Condvar::new(),
             dirty: AtomicBool::new(false),
             flushing: Mutex::default(),
             flushed: Mutex::new(Instant::now()),
@@ -61,17 +58,18 @@ impl Shared {
 pub(super) struct Syncer {
     shared: Arc<Shared>,
     folder: Arc<File>,
+    stop: Shutdown,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Syncer {
     /// Flushes every `period`, or, where that is zero, whenever [`Syncer::written`] is called.
     pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
-        let shared = Arc::new(Shared::new());
+        let (shared, stop) = (Arc::new(Shared::new()), Shutdown::default());
         let mut thread = None;
         if !period.is_zero() {
-            let shared = shared.clone();
-            let work = move || work(&shared, period);
+            let (shared, stop) = (shared.clone(), stop.clone());
+            let work = move || work(&shared, &stop, period);
             thread = Some(
                 std::thread::Builder::new()
                     .name("replay-fsync".into())
@@ -81,6 +79,7 @@ impl Syncer {
         Ok(Self {
             shared,
             folder: Arc::new(folder),
+            stop,
             thread,
         })
     }
@@ -106,15 +105,12 @@ impl Syncer {
         self.shared.flushed().elapsed().as_secs_f64()
     }
 
-    /// Segment `number` is gone: nobody needs it on the disk.
+    /// Segment `number` is gone, and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
         self.shared.files().open.retain(|(open, _)| *open != number);
     }
 
-    /// Something was written to the newest file.
-    ///
-    /// # Errors
-    /// Where each write is flushed: the disk refuses.
+    /// Something was written to the newest file; where each write is flushed, the disk may refuse.
     pub(super) fn written(&self) -> io::Result<()> {
         self.shared.dirty.store(true, Ordering::Release);
         match self.thread {
@@ -137,8 +133,7 @@ impl Syncer {
 
 impl Drop for Syncer {
     fn drop(&mut self) {
-        self.shared.files().stop = true;
-        self.shared.wake.notify_all();
+        self.stop.set();
         match self.thread.take().map(JoinHandle::join) {
             None | Some(Ok(())) => {}
             Some(Err(_)) => tracing::error!("the thread that flushes the replay's log panicked"),
@@ -147,18 +142,9 @@ impl Drop for Syncer {
     }
 }
 
-fn work(shared: &Shared, period: Duration) {
+fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
     let mut said = Seldom::default();
-    loop {
-        let files = shared.files();
-        let (files, _) = shared
-            .wake
-            .wait_timeout_while(files, period, |files| !files.stop)
-            .unwrap_or_else(PoisonError::into_inner);
-        if files.stop {
-            return;
-        }
-        drop(files);
+    while !stop.wait_timeout(period) {
         fault::point("replay-fsync");
         if let Err(e) = flush(shared)
             && let Some(more) = said.due()

@@ -2,8 +2,9 @@
 //! Nothing here changes what is stored or decides whether a batch may be served.
 
 pub(crate) mod assemble;
-pub(crate) mod episodes;
+pub(crate) mod batch;
+mod episodes;
 pub mod horizon;
-pub(crate) mod needed_frames;
+mod needed_frames;
 pub(crate) mod packed_batch;
 pub(crate) mod rows;

@@ -11,71 +11,18 @@ use driml_protocol::{
     Alive, PartName, PartStatus, Report, WARNINGS_MAX, Waiting, Warning, last_warning,
 };
 
-use crate::{ledger::actors::ACTORS_MAX, replay::Replay};
+use crate::ledger::actors::ACTORS_MAX;
 
 /// Parts that are known to be connected at a time, far more than take part: further ones count as absent.
 const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
 
-/// Who is connected, and which actors have delivered.
-#[derive(Default)]
-pub(super) struct Members {
-    pub(super) connected: HashSet<Alive>,
-    /// Actors of which a chunk has come.
-    acting: HashSet<u32>,
-}
-
-impl Members {
-    /// Takes note that a part is connected, or no longer.
-    pub(super) fn note(&mut self, who: Alive, is_connected: bool) {
-        if is_connected {
-            if self.connected.len() < CONNECTED_MAX {
-                self.connected.insert(who);
-            }
-        } else {
-            self.connected.remove(&who);
-        }
-    }
-
-    /// Whether this life of an actor is connected.
-    pub(super) fn is_connected(&self, actor: u32, incarnation: u64) -> bool {
-        self.connected.contains(&Alive::actor(actor, incarnation))
-    }
-
-    /// Actors that are connected and have joined.
-    pub(super) fn actors(&self, replay: &Replay) -> u32 {
-        let takes_part = |who: &&Alive| match **who {
-            Alive::Actor { actor, .. } => replay
-                .actor_incarnation(actor)
-                .is_some_and(|life| Alive::actor(actor, life) == **who),
-            Alive::Learner { .. } => false,
-        };
-        self.connected.iter().filter(takes_part).count() as u32
-    }
-
-    /// No process is connected yet; chunks of these actors have come before.
-    pub(super) fn with_acting(actors: impl Iterator<Item = u32>) -> Self {
-        Self {
-            connected: HashSet::new(),
-            acting: actors.collect(),
-        }
-    }
-
-    /// A chunk of an actor has come.
-    pub(super) fn note_acting(&mut self, actor: u32) {
-        self.acting.insert(actor);
-    }
-
-    /// Actors of which a chunk has come, those that have ended too.
-    pub(super) fn actors_acting(&self) -> u32 {
-        self.acting.len() as u32
-    }
-}
-
-/// The accounts of all parts that have joined.
+/// The accounts of all parts that have joined, and who is connected.
 pub(super) struct Accounts {
     started: Instant,
     waiting: (Waiting, Instant),
     weights_at: Option<Instant>,
+    /// Those that have not joined too.
+    connected: HashSet<Alive>,
     parts: BTreeMap<PartName, Account>,
 }
 
@@ -106,12 +53,13 @@ impl Accounts {
             started: now,
             waiting: (Waiting::Nobody, now),
             weights_at: None,
+            connected: HashSet::new(),
             parts: BTreeMap::new(),
         }
     }
 
     /// A part takes part. One that asks again has joined once.
-    pub(super) fn joined(&mut self, who: Alive, is_connected: bool, now: Instant) {
+    pub(super) fn joined(&mut self, who: Alive, now: Instant) {
         let earlier = self.parts.get(&name(who));
         if earlier.is_some_and(|account| account.alive == who) {
             return;
@@ -119,7 +67,7 @@ impl Accounts {
         let account = Account {
             alive: who,
             lives: earlier.map_or(0, |account| account.lives) + 1,
-            is_connected,
+            is_connected: self.is_connected(who),
             changed: now,
             heard: None,
             weights_version: None,
@@ -141,13 +89,30 @@ impl Accounts {
         (account.alive == who).then_some(account)
     }
 
+    /// Whether this life of a part is connected, also if it has not joined.
+    pub(super) fn is_connected(&self, who: Alive) -> bool {
+        self.connected.contains(&who)
+    }
+
     /// A part is connected, or no longer.
     pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
+        if !is_connected {
+            self.connected.remove(&who);
+        } else if self.connected.len() < CONNECTED_MAX {
+            self.connected.insert(who);
+        }
         if let Some(account) = self.of(who)
             && account.is_connected != is_connected
         {
             (account.is_connected, account.changed) = (is_connected, now);
         }
+    }
+
+    /// Actors that are connected and have joined.
+    pub(super) fn actors_connected(&self) -> u32 {
+        let actors = self.parts.iter();
+        let connected = actors.filter(|(who, it)| **who != PartName::Learner && it.is_connected);
+        connected.count() as u32
     }
 
     /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
@@ -205,7 +170,7 @@ impl Accounts {
         accounts.filter(|account| account.is_connected).count()
     }
 
-    /// Which part the run cannot go on without and does not have, for a person; `finished` says whether all transitions are in.
+    /// Which part the run cannot continue without and does not have, for a person; `finished` says whether all transitions are in.
     pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
         let of = |learner: bool| {
             let parts = self.parts.iter();
@@ -298,21 +263,15 @@ mod tests {
         let at = |seconds| start + Duration::from_secs(seconds);
         let mut accounts = Accounts::new(start);
         accounts.note_connected(actor(1), true, at(1));
-        assert!(
-            accounts.parts(at(1), |_| None).is_empty(),
-            "who has not joined has no account"
-        );
-        accounts.joined(actor(1), true, at(2));
-        accounts.joined(actor(1), true, at(5));
+        let parts = accounts.parts(at(1), |_| None);
+        assert_eq!(parts, [], "who has not joined has no account");
+        accounts.joined(actor(1), at(2));
+        accounts.joined(actor(1), at(5));
         accounts.heard(actor(1), Some(7), at(6));
         accounts.heard(actor(9), Some(8), at(7));
         let report = |incarnation| {
-            let warning = Some(Warning::new("late", 1.0));
-            let who = Life::Actor {
-                actor: 3,
-                incarnation,
-            };
-            Report::new(who, "plays", 2.0, warning)
+            let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
+            Report::new(Life::Actor { actor, incarnation }, "plays", 2.0, warning)
         };
         assert!(accounts.reported(report(1), at(8)));
         assert!(!accounts.reported(report(9), at(8)));
@@ -331,8 +290,11 @@ mod tests {
         };
         assert_eq!(accounts.parts(at(12), |_| Some(at(11))), [expected]);
 
-        accounts.joined(actor(2), true, at(20));
-        accounts.joined(Alive::learner(1), true, at(20));
+        assert_eq!(accounts.actors_connected(), 0);
+        accounts.note_connected(actor(2), true, at(20));
+        accounts.joined(actor(2), at(20));
+        accounts.joined(Alive::learner(1), at(20));
+        assert_eq!(accounts.actors_connected(), 1);
         assert_eq!(accounts.actor_lives(), 2);
         let again = &accounts.parts(at(21), |_| None)[1];
         assert_eq!(
@@ -347,10 +309,13 @@ mod tests {
         let mut accounts = Accounts::new(now);
         assert_eq!(accounts.missing(false), Some("no learner has joined yet"));
         let learner = Alive::learner(5);
-        accounts.joined(learner, true, now);
+        for who in [learner, actor(1)] {
+            accounts.note_connected(who, true, now);
+        }
+        accounts.joined(learner, now);
         assert_eq!(accounts.missing(false), Some("no actor has joined yet"));
         assert_eq!(accounts.missing(true), None);
-        accounts.joined(actor(1), true, now);
+        accounts.joined(actor(1), now);
         assert_eq!(accounts.missing(false), None);
         accounts.note_connected(actor(1), false, now);
         assert_eq!(accounts.missing(false), Some("all actors are gone"));
@@ -379,11 +344,9 @@ mod tests {
         let now = Instant::now();
         let mut accounts = Accounts::new(now);
         for actor in 0..200 {
-            let who = Life::Actor {
-                actor,
-                incarnation: 1,
-            };
-            accounts.joined(who.alive(), true, now);
+            let incarnation = 1;
+            let who = Life::Actor { actor, incarnation };
+            accounts.joined(who.alive(), now);
             // The higher the number the newer, and many of one age.
             let age = f64::from((200 - actor) / 50);
             let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));

@@ -37,11 +37,8 @@ impl Service {
         let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
         let heard = is_allowed.and_then(|()| self.hear_learner(&mut state.replay, &request));
         if let Err(why) = heard {
-            state.replay.note_refused_message();
-            state.say(
-                "batch",
-                &format!("a request for a batch was refused: {why}"),
-            );
+            let line = format!("a request for a batch was refused: {why}");
+            state.refuse("batch", &line);
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }

@@ -114,7 +114,6 @@ impl State {
         let Self {
             replay,
             chunks,
-            members,
             timings,
             said,
             ..
@@ -139,22 +138,16 @@ impl State {
             tracing::warn!("a chunk of actor {actor} was refused: {why}{more}");
         }
         let mut answers = Answers::new();
-        match reply {
-            InsertReply::Wait { .. } => {
-                members.note_acting(header.actor);
-                if let Err(question) = chunks.park(packed, question, arrived) {
-                    answers.push((question, reply));
-                }
-            }
-            reply => {
-                if matches!(reply, InsertReply::Stored { .. }) {
-                    members.note_acting(header.actor);
-                    let older = chunks.take_copy(&header).and_then(|it| it.question);
-                    answers.extend(older.map(|question| (question, reply.clone())));
-                }
-                answers.push((question, reply));
-            }
+        if matches!(reply, InsertReply::Wait { .. }) {
+            let no_room = chunks.park(packed, question, arrived).err();
+            answers.extend(no_room.map(|question| (question, reply)));
+            return answers;
         }
+        if matches!(reply, InsertReply::Stored { .. }) {
+            let older = chunks.take_copy(&header).and_then(|it| it.question);
+            answers.extend(older.map(|question| (question, reply.clone())));
+        }
+        answers.push((question, reply));
         answers
     }
 

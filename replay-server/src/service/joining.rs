@@ -13,15 +13,13 @@ use super::{
 
 impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
-        let (mut state, is_connected) = (self.state(), kind == SampleKind::Put);
-        state.members.note(who, is_connected);
-        // A part that this server's predecessor took, whose replay it goes on with, does not join again.
+        let (mut state, now) = (self.state(), Instant::now());
+        let is_connected = kind == SampleKind::Put;
+        state.accounts.note_connected(who, is_connected, now);
+        // A part that joined this server's predecessor, whose replay it has, does not join again.
         if state.takes_part(who) {
-            state.open_account(who);
+            state.accounts.joined(who, now);
         }
-        state
-            .accounts
-            .note_connected(who, is_connected, Instant::now());
         state.count_actors();
     }
 
@@ -74,9 +72,8 @@ impl Service {
             },
             Err(Rejection::Taken(why)) => JoinReply::Taken { why },
             Err(Rejection::Refused(why)) => {
-                let mut state = self.state();
-                state.replay.note_refused_message();
-                state.say("join", &format!("a part was not let in: {why}"));
+                let line = format!("a part was not let in: {why}");
+                self.state().refuse("join", &line);
                 JoinReply::Refused { why }
             }
         };
@@ -94,8 +91,7 @@ enum Rejection {
 
 impl State {
     fn count_actors(&mut self) {
-        let actors = self.members.actors(&self.replay);
-        self.replay.set_actors(actors);
+        self.replay.set_actors(self.accounts.actors_connected());
     }
 
     /// Whether this life of a part is the one that takes part.
@@ -112,10 +108,7 @@ impl State {
         }
     }
 
-    /// Whether `learner` is the one that is served.
-    ///
-    /// # Errors
-    /// It is not; what happened, for a person.
+    /// Checks that `learner` is the one that is served; if not, the error says to a person what happened.
     pub(super) fn check_learner(&self, learner: u64) -> Result<(), String> {
         match self.replay.learner() {
             Some(served) if served == learner => Ok(()),
@@ -133,15 +126,17 @@ impl State {
             .replay
             .actor_incarnation(actor)
             .filter(|&other| other != incarnation);
-        if other.is_some_and(|life| self.members.is_connected(actor, life)) {
+        let accounts = &mut self.accounts;
+        let is_connected = |actor, life| accounts.is_connected(Alive::actor(actor, life));
+        if other.is_some_and(|life| is_connected(actor, life)) {
             return Err(Rejection::Taken(format!(
-                "another process is actor {actor} of this run: give each actor a number of its own (--id)"
+                "another process is actor {actor} of this run: give each actor another number (--id)"
             )));
         }
-        self.replay
-            .forget_absent_actors(|actor, life| self.members.is_connected(actor, life));
+        // Else a process that joins under one number after the other would use them up.
+        self.replay.state.actors.forget_absent(is_connected);
         let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
-        self.open_account(Alive::actor(actor, incarnation));
+        accounts.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -161,8 +156,7 @@ impl State {
                 "the run is finished, with {done} updates; to train on, resume it with more --frames"
             )));
         }
-        let connected = |other| self.members.connected.contains(&Alive::learner(other));
-        if other.is_some_and(connected) {
+        if other.is_some_and(|other| self.accounts.is_connected(Alive::learner(other))) {
             let why = "another learner takes part in this run, which has one alone";
             return Err(Rejection::Taken(why.into()));
         }
@@ -175,13 +169,9 @@ impl State {
         }
         if is_new {
             self.requests.keep_only(learner);
-            self.open_account(Alive::learner(learner));
+            let learner = Alive::learner(learner);
+            self.accounts.joined(learner, Instant::now());
         }
         Ok(0)
-    }
-
-    fn open_account(&mut self, who: Alive) {
-        let is_connected = self.members.connected.contains(&who);
-        self.accounts.joined(who, is_connected, Instant::now());
     }
 }

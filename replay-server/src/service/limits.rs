@@ -1,5 +1,4 @@
 //! What a run takes by its own settings: how long a message of each kind can be, as longer ones are no part's, and shared memory.
-//! It refuses nothing and takes none.
 
 use anyhow::Context;
 use driml_protocol::{
@@ -42,9 +41,6 @@ pub(super) struct Limits {
 
 impl Limits {
     /// The limits of a run with these settings and weights of so many bytes.
-    ///
-    /// # Errors
-    /// A number of another part's settings that is missing.
     pub(super) fn of(
         settings: &Settings,
         spec: &RunSpec,

@@ -1,8 +1,8 @@
-//! What has to wait until the rate limiter opens: one chunk an actor and one request an client, with whoever asked.
+//! What has to wait until the rate limiter opens: one chunk an actor and one request a client, each with its question.
 //! It neither stores, draws nor answers; `Q` is the question to be answered.
 
 use std::{
-    collections::{HashMap, VecDeque},
+    collections::VecDeque,
     time::{Duration, Instant},
 };
 
@@ -10,7 +10,7 @@ use driml_protocol::{BatchRequest, ChunkHeader, Claim};
 
 use crate::storage::frame_store::PackedChunk;
 
-/// Bytes of the chunks kept; whoever sends one more is told to send it again later.
+/// Bytes of the chunks kept; an actor that sends one more is told to send it again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
 /// Requests kept; the one that has waited longest gives way to one more, and its client asks again.
 const REQUESTS_MAX: usize = 1024;
@@ -18,25 +18,22 @@ const REQUESTS_MAX: usize = 1024;
 /// A chunk that is stored as soon as the limiter lets it pass.
 pub(super) struct ParkedChunk<Q> {
     pub(super) chunk: PackedChunk<'static>,
-    /// Who waits for the answer; none between a `Wait` and the actor's claim.
+    /// Where the answer goes; none between a `Wait` and the actor's claim.
     pub(super) question: Option<Q>,
     pub(super) arrived: Instant,
     /// When the question came.
     asked: Instant,
 }
 
-/// The chunks that wait, at most one an actor: the newest copy.
+/// The chunks that wait, at most one an actor: the newest copy. They stand in the order in which their actors' first copies came.
 pub(super) struct ParkedChunks<Q> {
-    by_actor: HashMap<u32, ParkedChunk<Q>>,
-    /// Actors in the order in which their chunks came, each once.
-    line: VecDeque<u32>,
+    line: VecDeque<ParkedChunk<Q>>,
     bytes: usize,
 }
 
 impl<Q> Default for ParkedChunks<Q> {
     fn default() -> Self {
         Self {
-            by_actor: HashMap::new(),
             line: VecDeque::new(),
             bytes: 0,
         }
@@ -48,17 +45,26 @@ impl<Q> ParkedChunks<Q> {
         self.line.len()
     }
 
+    pub(super) fn is_empty(&self) -> bool {
+        self.line.is_empty()
+    }
+
     pub(super) const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// When the chunk of an actor came that waits.
-    pub(super) fn arrived(&self, actor: u32) -> Option<Instant> {
-        self.by_actor.get(&actor).map(|parked| parked.arrived)
+    /// Whose chunks wait.
+    pub(super) fn actors(&self) -> impl Iterator<Item = u32> {
+        self.line.iter().map(|it| it.header().actor)
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        self.line.is_empty()
+    fn place(&self, actor: u32) -> Option<usize> {
+        self.actors().position(|it| it == actor)
+    }
+
+    /// When the chunk of an actor came that waits.
+    pub(super) fn arrived(&self, actor: u32) -> Option<Instant> {
+        self.place(actor).map(|at| self.line[at].arrived)
     }
 
     /// Keeps a chunk in the place of an older one of its actor, or at the end of the line; gives the question back if there is
@@ -69,86 +75,86 @@ impl<Q> ParkedChunks<Q> {
         question: Q,
         now: Instant,
     ) -> Result<(), Q> {
-        let actor = chunk.chunk.header.actor;
-        let freed = self.by_actor.get(&actor).map_or(0, |old| old.chunk.bytes());
+        let place = self.place(chunk.chunk.header.actor);
+        let others = self.bytes - place.map_or(0, |at| self.line[at].chunk.bytes());
         // One chunk of any size is kept, or an actor with large ones would send for ever.
-        if self.bytes > freed && self.bytes - freed + chunk.bytes() > CHUNK_BYTES_MAX {
+        if others > 0 && others + chunk.bytes() > CHUNK_BYTES_MAX {
             return Err(question);
         }
-        self.bytes = self.bytes - freed + chunk.bytes();
+        self.bytes = others + chunk.bytes();
         let mut parked = ParkedChunk {
             chunk,
             question: Some(question),
             arrived: now,
             asked: now,
         };
-        match self.by_actor.get(&actor) {
-            Some(old) => parked.arrived = old.arrived,
-            None => self.line.push_back(actor),
+        match place {
+            Some(at) => {
+                parked.arrived = self.line[at].arrived;
+                self.line[at] = parked;
+            }
+            None => self.line.push_back(parked),
         }
-        self.by_actor.insert(actor, parked);
         Ok(())
     }
 
     /// The parked chunk that `claim` is about.
     pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
-        self.by_actor.get_mut(&claim.actor).filter(|parked| {
-            let header = &parked.chunk.chunk.header;
-            (header.incarnation, header.sequence) == (claim.incarnation, claim.sequence)
+        self.line.iter_mut().find(|parked| {
+            let header = parked.header();
+            (header.actor, header.incarnation, header.sequence)
+                == (claim.actor, claim.incarnation, claim.sequence)
         })
     }
 
     /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
     pub(super) fn take_copy(&mut self, stored: &ChunkHeader) -> Option<ParkedChunk<Q>> {
-        let parked = &self.by_actor.get(&stored.actor)?.chunk.chunk.header;
+        let parked = self.line[self.place(stored.actor)?].header();
         let is_copy =
             parked.incarnation == stored.incarnation && parked.sequence <= stored.sequence;
-        if is_copy {
-            self.take(stored.actor)
-        } else {
-            None
-        }
+        is_copy.then(|| self.take(stored.actor)).flatten()
     }
 
     /// The chunk that has waited longest.
     pub(super) fn first(&self) -> Option<&ParkedChunk<Q>> {
-        self.by_actor.get(self.line.front()?)
+        self.line.front()
     }
 
     /// Takes an actor's chunk out of the line.
     pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
-        let parked = self.by_actor.remove(&actor)?;
-        self.line.retain(|&it| it != actor);
+        let parked = self.line.remove(self.place(actor)?)?;
         self.bytes -= parked.chunk.bytes();
         Some(parked)
     }
 
     /// Takes the chunk that has waited longest out of the line.
     pub(super) fn take_first(&mut self) -> Option<ParkedChunk<Q>> {
-        let actor = self.line.pop_front()?;
-        let parked = self.by_actor.remove(&actor)?;
-        self.bytes -= parked.chunk.bytes();
-        Some(parked)
+        let actor = self.actors().next()?;
+        self.take(actor)
     }
 
     /// Takes the questions that have been held for `hold_max`; the chunks stay.
     pub(super) fn overdue(&mut self, now: Instant, hold_max: Duration) -> Vec<Q> {
         let late =
             |parked: &&mut ParkedChunk<Q>| now.saturating_duration_since(parked.asked) >= hold_max;
-        let parked = self.by_actor.values_mut().filter(late);
+        let parked = self.line.iter_mut().filter(late);
         parked.filter_map(|parked| parked.question.take()).collect()
     }
 
-    /// How long until a question has been held for `hold_max`; none if nobody waits.
+    /// How long until a question has been held for `hold_max`; none where none is.
     pub(super) fn due_in(&self, now: Instant, hold_max: Duration) -> Option<Duration> {
-        let held = self.by_actor.values().filter(|it| it.question.is_some());
+        let held = self.line.iter().filter(|it| it.question.is_some());
         let left = held.map(|it| hold_max.saturating_sub(now.saturating_duration_since(it.asked)));
         left.min()
     }
 }
 
 impl<Q> ParkedChunk<Q> {
-    /// Takes another question about the same chunk; nobody waits for the answer to the older one any more.
+    fn header(&self) -> &ChunkHeader {
+        &self.chunk.chunk.header
+    }
+
+    /// Takes another question about the same chunk; the older one was given up.
     pub(super) fn ask(&mut self, question: Q, now: Instant) {
         (self.question, self.asked) = (Some(question), now);
     }
@@ -170,7 +176,7 @@ impl<Q> ParkedRequest<Q> {
     }
 }
 
-/// The requests that wait, at most one an client: the newest attempt. The oldest is first.
+/// The requests that wait, at most one a client: the newest attempt. The oldest is first.
 pub(super) struct ParkedRequests<Q>(VecDeque<ParkedRequest<Q>>);
 
 impl<Q> Default for ParkedRequests<Q> {
@@ -180,7 +186,7 @@ impl<Q> Default for ParkedRequests<Q> {
 }
 
 impl<Q> ParkedRequests<Q> {
-    /// Keeps a request in the place of an older one of its client; nobody waits for the answer to that one any more.
+    /// Keeps a request in the place of an older one of its client, which was given up.
     pub(super) fn park(&mut self, parked: ParkedRequest<Q>) {
         let id = parked.request.id;
         self.0.retain(|it| it.request.id.client_id != id.client_id);
@@ -264,26 +270,18 @@ mod tests {
             parked.park(chunk(actor, 0, 1, 1), question, now).unwrap();
         }
         assert_eq!(parked.len(), 2);
-        assert_eq!(
-            parked.first().unwrap().question,
-            Some("a again"),
-            "its place is kept"
-        );
+        let first = parked.first().unwrap().question;
+        assert_eq!(first, Some("a again"), "its place is kept");
         assert!(parked.claimed(&claim(1, 1)).is_none(), "another chunk");
         assert!(parked.claimed(&claim(3, 0)).is_none(), "another actor");
-        assert!(parked.take_copy(&chunk(3, 0, 1, 1).chunk.header).is_none());
         parked.park(chunk(4, 7, 1, 1), "d", now).unwrap();
-        assert!(
-            parked.take_copy(&chunk(4, 6, 1, 1).chunk.header).is_none(),
-            "a later one"
-        );
-        assert_eq!(
-            parked
-                .take_copy(&chunk(4, 7, 1, 1).chunk.header)
-                .unwrap()
-                .question,
-            Some("d")
-        );
+        let mut take_copy = |actor, sequence| {
+            let copy = parked.take_copy(&chunk(actor, sequence, 1, 1).chunk.header);
+            copy.and_then(|it| it.question)
+        };
+        assert_eq!(take_copy(3, 0), None);
+        assert_eq!(take_copy(4, 6), None, "a later one");
+        assert_eq!(take_copy(4, 7), Some("d"));
         parked.claimed(&claim(1, 0)).unwrap().ask("claimed", now);
         assert_eq!(parked.take_first().unwrap().question, Some("claimed"));
         assert_eq!(parked.take(2).unwrap().question, Some("b"));
@@ -299,13 +297,12 @@ mod tests {
         parked.park(chunk(1, 0, 1, 1), "a", start).unwrap();
         parked.park(chunk(2, 0, 1, 1), "b", start + second).unwrap();
         assert_eq!(parked.due_in(start + second, hold), Some(second));
-        assert_eq!(parked.overdue(start + hold, hold), ["a"]);
-        assert_eq!(parked.overdue(start + hold, hold), [""; 0]);
-        assert_eq!(parked.due_in(start + hold, hold), Some(second));
-        parked
-            .claimed(&claim(1, 0))
-            .unwrap()
-            .ask("a again", start + hold);
+        let later = start + hold;
+        assert_eq!(parked.overdue(later, hold), ["a"]);
+        assert_eq!(parked.overdue(later, hold), [""; 0]);
+        assert_eq!(parked.due_in(later, hold), Some(second));
+        let claimed = parked.claimed(&claim(1, 0)).unwrap();
+        claimed.ask("a again", later);
         assert_eq!(parked.overdue(start + 5 * second, hold).len(), 2);
         assert_eq!(parked.len(), 2);
     }

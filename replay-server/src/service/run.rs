@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Recovering,
-    Request, Responder, RunClient, RunSpec, Sampling, SeldomEach, Shutdown,
+    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
+    RunClient, RunSpec, Sampling, SeldomEach, Shutdown,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
@@ -20,7 +20,7 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
-    accounts::{Accounts, Members},
+    accounts::Accounts,
     limits::{Limits, number, shared_memory_bytes},
     parked::{ParkedChunks, ParkedRequests},
     server::{Entrance, Service, State},
@@ -87,7 +87,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
     // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
     let incarnation = rand::random();
-    let origin = Origin::find(&args, &spec, &config, batch_size)?;
+    let empty = Replay::shard(&spec, &config, batch_size, args.shard)?;
+    let dir = args.dir.as_ref();
+    let kept = dir.map(|dir| Kept::find(dir, args.shard, &spec, &config));
+    let kept = kept.transpose()?;
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
     // Of the whole run: where it does not fit, all go through sockets.
@@ -99,14 +102,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     } else {
         BufferPool::new(SPARE_MAX)
     };
-    let reads_shared_memory = is_granted
-        && match shared_memory::check_lockable(needed) {
-            Ok(()) => true,
-            Err(why) => {
-                tracing::warn!("chunks come through sockets, which is slower: {why}");
-                false
-            }
-        };
+    let slower =
+        |why: &String| tracing::warn!("chunks come through sockets, which is slower: {why}");
+    let is_lockable = || shared_memory::check_lockable(needed).inspect_err(slower);
+    let reads_shared_memory = is_granted && is_lockable().is_ok();
     let limits = Limits::of(&settings, &spec, args.weights_bytes_max)?;
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints {
@@ -136,10 +135,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         args.listen,
         client.spec_hash()
     );
-    let (replay, weights) = match origin.read(entrance.reading(), spec.hash()) {
+    let read = match kept {
+        Some(kept) => kept.read(empty, entrance.reading(), spec.hash()),
+        None => Ok((empty, WeightsStore::default())),
+    };
+    let (replay, weights) = match read {
         Ok(read) => read,
         Err(e) => {
-            // So that whoever waits for the replay hears at once that nobody is there any more.
+            // So that those who wait for the replay notice at once that the server is gone.
             drop(queryables);
             let closed = client.session().close().wait();
             join_within(threads, THREADS_END_MAX);
@@ -163,7 +166,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         pool,
         packer: replay.packer(),
         state: Mutex::new(State {
-            members: Members::with_acting(replay.actors_delivered()),
             replay,
             accounts: Accounts::new(Instant::now()),
             chunks: ParkedChunks::default(),
@@ -185,14 +187,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         threads.push(service.clone().start_hearing(reports)?);
     }
     service.wait_until_over(&args.ending, args.stay);
-    // Threads of its own wait for that.
+    // Its threads wait for that.
     shutdown.set();
     service.changed.notify_all();
     tracing::info!(
         "replay server stops with {} transitions stored",
         service.state().replay.inserted_total()
     );
-    // Without the queryables no more comes, without the session nobody waits for a slow asker: the threads end.
+    // Without the queryables no more comes, without the session none is sent to a slow client: the threads end.
     drop(queryables);
     let closed = client.session().close().wait();
     join_within(threads, THREADS_END_MAX);
@@ -212,87 +214,62 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// Where the replay comes from.
-enum Origin {
-    /// It begins empty, and is kept in memory alone.
-    Memory(Box<Replay>),
-    /// It is kept in this folder, and not read yet.
-    Folder(PathBuf, Box<KeptReplay>),
+/// A replay that is kept on disk, and its folder.
+struct Kept {
+    dir: PathBuf,
+    replay: KeptReplay,
 }
 
-impl Origin {
-    /// Finds it at once, however much is kept.
-    ///
-    /// # Errors
-    /// Settings that cannot work, memory that the system does not grant, a folder that cannot be used.
-    fn find(
-        args: &RunArgs,
-        spec: &RunSpec,
-        config: &Config,
-        batch_size: u32,
-    ) -> Result<Self, PersistError> {
-        let Some(dir) = &args.dir else {
-            let replay = Replay::shard(spec, config, batch_size, args.shard)?;
-            return Ok(Self::Memory(Box::new(replay)));
-        };
-        let dir = shard_dir(dir, args.shard, config.shards);
-        let kept = PersistArgs {
-            dir: dir.clone(),
-            shard: args.shard,
+impl Kept {
+    fn find(dir: &Path, shard: u32, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
+        let args = PersistArgs {
+            dir: shard_dir(dir, shard, config.shards),
+            shard,
             segment_bytes: None,
             mark: None,
         };
-        let kept = KeptReplay::find(&kept, spec, config, batch_size)?;
-        Ok(Self::Folder(dir, Box::new(kept)))
+        let replay = KeptReplay::find(&args, spec, config)?;
+        let dir = args.dir;
+        Ok(Self { dir, replay })
     }
 
-    /// The replay, and the newest weights that were handed over.
+    /// Reads it into `empty`, with the newest weights that were handed over, and logs what was found.
     fn read(
         self,
+        empty: Replay,
         reading: &Reading,
         spec_hash: u64,
     ) -> Result<(Replay, WeightsStore), PersistError> {
-        match self {
-            Self::Memory(replay) => Ok((*replay, WeightsStore::default())),
-            Self::Folder(dir, kept) => {
-                let replay = read_kept(&dir, *kept, reading)?;
-                Ok((replay, WeightsStore::kept_in(&dir, spec_hash)))
-            }
+        let (replay, recovery) = self.replay.read(empty, reading)?;
+        let dir = self.dir.display();
+        for warning in &recovery.warnings {
+            tracing::warn!("{dir}: {warning}");
         }
-    }
-}
-
-/// Reads the replay that is kept in `dir`, and says what was found.
-fn read_kept(dir: &Path, kept: KeptReplay, reading: &Reading) -> Result<Replay, PersistError> {
-    let (replay, recovery) = kept.read(reading)?;
-    for warning in &recovery.warnings {
-        tracing::warn!("{}: {warning}", dir.display());
-    }
-    if recovery.found {
-        let status = replay.status();
-        tracing::info!(
-            "goes on with the replay in {}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
-            dir.display(),
-            status.transitions_inserted,
-            status.transitions_held,
-            status.rows_sampled,
-            recovery.bytes >> 20,
-            recovery.took.as_secs_f64()
-        );
-        if replay.priority_counts().is_some() {
+        if recovery.found {
+            let status = replay.status();
             tracing::info!(
-                "priorities are those of the last checkpoint: each transition that came later has the highest one"
+                "continues with the replay in {dir}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+                status.transitions_inserted,
+                status.transitions_held,
+                status.rows_sampled,
+                recovery.bytes >> 20,
+                recovery.took.as_secs_f64()
             );
+            if replay.priority_counts().is_some() {
+                tracing::info!(
+                    "priorities are those of the last checkpoint: each transition that came later has the highest one"
+                );
+            }
+        } else {
+            tracing::info!("keeps the replay in {dir}");
         }
-    } else {
-        tracing::info!("keeps the replay in {}", dir.display());
+        Ok((replay, WeightsStore::kept_in(&self.dir, spec_hash)))
     }
-    Ok(replay)
 }
 
 type Threads = Vec<JoinHandle<()>>;
 
-/// Everything that the replay server answers: each message by threads of its own.
+/// Everything that the replay server answers: each kind of message by separate threads.
 struct Answers<'a> {
     client: &'a RunClient,
     entrance: &'a Arc<Entrance>,
@@ -324,7 +301,7 @@ impl<'a> Answers<'a> {
         if sampling.is_prioritised() {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
-        this.offer("hello", 1, Service::hello, Entrance::put_off_with_settings)?;
+        this.offer("hello", Service::hello)?;
         this.answer("join-actor", 1, limits.small, Service::join_actor)?;
         this.answer("join-learner", 1, limits.small, Service::join_learner)?;
         this.answer("goodbye", 1, limits.small, Service::goodbye)?;
@@ -336,8 +313,8 @@ impl<'a> Answers<'a> {
             Service::give_weights,
         )?;
         this.answer("report", 1, limits.small, Service::report)?;
-        this.offer("status", 1, Service::status, Entrance::put_off)?;
-        this.offer("parts", 1, Service::parts, Entrance::put_off)?;
+        this.offer("status", Service::status)?;
+        this.offer("parts", Service::parts)?;
         this.answer("episodes", 1, limits.small, Service::episodes)?;
         Ok(this)
     }
@@ -359,20 +336,18 @@ impl<'a> Answers<'a> {
         self.add(name, bytes_max, workers)
     }
 
-    /// Gives an `M` to whoever fetches it, on so many threads of this name; what it says before there is one is `put_off`'s.
+    /// Gives an `M` to those who fetch it, on a thread of this name.
     fn offer<M: Keyed + 'static>(
         &mut self,
         name: &'static str,
-        threads: usize,
         give: fn(&Service, Responder<M>),
-        put_off: fn(&Entrance) -> Recovering,
     ) -> zenoh::Result<()> {
         let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
         let give = move |responder: Responder<M>| match entrance.service() {
             Some(service) => give(service, responder),
-            None => responder.put_off(&put_off(&entrance)),
+            None => responder.put_off(&entrance.put_off()),
         };
-        let workers = QueryWorkers::offer(name, threads, spec_hash, give)?;
+        let workers = QueryWorkers::offer(name, 1, spec_hash, give)?;
         self.add(name, self.limits.small, workers)
     }
 

@@ -12,7 +12,7 @@ use driml_protocol::{
 };
 
 use super::{
-    accounts::{Accounts, Members},
+    accounts::Accounts,
     limits::Limits,
     parked::{ParkedChunks, ParkedRequests},
     timings::Timings,
@@ -35,7 +35,7 @@ pub(super) struct Service {
     pub(super) pool: BufferPool,
     pub(super) packer: Packer,
     pub(super) state: Mutex<State>,
-    /// Something was stored, sampled or parked: whoever waits for the limiter looks again.
+    /// Something was stored, sampled or parked: what waits for the limiter is looked at again.
     pub(super) changed: Condvar,
     pub(super) weights: Mutex<WeightsStore>,
     pub(super) announcements: Announcer<WeightsVersion>,
@@ -45,7 +45,6 @@ pub(super) struct Service {
 /// What changes, under one lock.
 pub(super) struct State {
     pub(super) replay: Replay,
-    pub(super) members: Members,
     pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
@@ -69,20 +68,16 @@ impl Service {
 
     /// Counts and logs a message that cannot be read.
     pub(super) fn refuse(&self, what: &str, e: &CodecError) {
-        let mut state = self.state();
-        state.replay.note_refused_message();
-        state.say(what, &format!("{what} was refused: {e}"));
+        let line = format!("{what} was refused: {e}");
+        self.state().refuse(what, &line);
     }
 
     /// Counts and logs a message that is longer than any of its kind.
     pub(super) fn refuse_long(&self, kind: &'static str, bytes: usize, bytes_max: usize) {
-        let mut state = self.state();
-        state.replay.note_refused_message();
-        let why = "has more than a message of this kind can have in this run";
-        state.say(
-            kind,
-            &format!("a message of {bytes} bytes to {kind:?} was refused: it {why}, {bytes_max}"),
+        let line = format!(
+            "a message of {bytes} bytes to {kind:?} was refused: it has more than a message of this kind can have in this run, {bytes_max}"
         );
+        self.state().refuse(kind, &line);
     }
 
     /// Reads a request without payload, or counts it as refused.
@@ -119,6 +114,12 @@ impl State {
     pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
         self.note_waiting(now);
         !self.chunks.is_empty() || self.requests.len() > 0
+    }
+
+    /// Counts a message that was refused, and logs a line of this kind.
+    pub(super) fn refuse(&mut self, kind: &str, line: &str) {
+        self.replay.note_refused_message();
+        self.say(kind, line);
     }
 
     /// Logs a line of this kind, or counts it where one was logged a short while ago.
@@ -162,19 +163,11 @@ impl Entrance {
         &self.reading
     }
 
-    /// The answer to a request until then.
+    /// The answer to a request until then, with the run's settings.
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
             progress: self.reading.progress(),
-            config_toml: None,
-        }
-    }
-
-    /// The answer to a request for the run's settings.
-    pub(super) fn put_off_with_settings(&self) -> Recovering {
-        Recovering {
             config_toml: Some(self.config_toml.clone()),
-            ..self.put_off()
         }
     }
 }

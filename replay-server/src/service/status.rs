@@ -1,7 +1,7 @@
-//! What needs no file of its own: an actor's goodbye, the learner's affinity, reports, the status, and who was not let in.
-//! None of it ever waits.
+//! The smaller messages: an actor's goodbye, the learner's affinity, reports, the status, and who was not let in.
 
 use std::{
+    collections::HashSet,
     sync::{
         Arc,
         mpsc::{Receiver, RecvTimeoutError},
@@ -15,7 +15,10 @@ use driml_protocol::{
     PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault, tls,
 };
 
-use super::{accounts::own_warning, server::Service};
+use super::{
+    accounts::own_warning,
+    server::{Service, State},
+};
 
 /// How often the thread that hears of who was refused looks whether it should end.
 const TICK: Duration = Duration::from_millis(200);
@@ -25,7 +28,7 @@ const LOOK: Duration = Duration::from_secs(1);
 const FAREWELL_MAX: Duration = Duration::from_secs(30);
 /// How long it stays when its launcher has died, for parts that hear of that as it does and deliver what they have.
 const ABANDONED_MAX: Duration = Duration::from_secs(10);
-/// How long somebody may be missing before it is said.
+/// How long a part may be missing before it is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
@@ -37,7 +40,7 @@ impl Service {
             }
             let is_ready = state.replay.is_ready();
             drop(state);
-            // Whoever says goodbye has nothing to do any more, with whatever it has said.
+            // Also if it was refused: the actor ends.
             if is_ready {
                 incoming.into_responder().reply(&Done);
             }
@@ -49,20 +52,11 @@ impl Service {
             return;
         };
         let mut state = self.state();
-        let set = match state.check_learner(update.learner) {
-            Ok(()) => state
-                .replay
-                .set_affinity(&update)
-                .map_err(|e| e.to_string()),
-            Err(why) => {
-                state.replay.note_refused_message();
-                Err(why)
-            }
-        };
+        let allowed = state.check_learner(update.learner);
+        let set = allowed.and_then(|()| state.replay.set_affinity(&update));
         if let Err(why) = set {
             let line = format!("an affinity matrix was refused: {why}");
-            state.say("affinity", &line);
-            return;
+            return state.refuse("affinity", &line);
         }
         let is_ready = state.replay.is_ready();
         drop(state);
@@ -80,9 +74,8 @@ impl Service {
         let allowed = allowed.and_then(|()| self.check_priorities(update.rows()));
         let set = allowed.and_then(|()| state.replay.set_priorities(&update));
         if let Err(why) = set {
-            state.replay.note_refused_message();
             let line = format!("priorities were refused: {why}");
-            return state.say("priorities", &line);
+            return state.refuse("priorities", &line);
         }
         drop(state);
         incoming.into_responder().reply(&Done);
@@ -145,7 +138,7 @@ impl Service {
     /// Says whom the run waits for, where it could not go on without: after some seconds, then now and then. The thread's whole
     /// work until the end of the process.
     pub(super) fn say_who_is_missing(&self) {
-        // Who, since when, and after how long it is said next: ever more seldom.
+        // Who, since when, and after how long it is logged next: ever more seldom.
         let mut missing: Option<(&str, Instant, Duration)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
             fault::point("missing");
@@ -165,7 +158,7 @@ impl Service {
         }
     }
 
-    /// Waits until the run is over or this process `ending`, and nobody is left who would ask; or for the end from outside. With `stay`
+    /// Waits until the run is over or this process `ending`, and no part is left that would ask; or for the end from outside. With `stay`
     /// a run that is over does not end it.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, stay: bool) {
         let mut waits: Option<(bool, Instant)> = None;
@@ -209,12 +202,9 @@ impl Service {
         let mut status = state.replay.status();
         status.connections_refused = state.connections_refused;
         status.learner_finished = state.accounts.is_over();
-        status.actors_acting = state.members.actors_acting();
+        status.actors_acting = state.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
-        status.answer_ms = state.timings.answer_ms();
-        status.insert_ms = state.timings.insert_ms();
-        status.weights_behind_s = state.timings.weights_behind_s();
-        status.weights_behind_updates = state.timings.weights_behind_updates();
+        state.timings.report(&mut status);
         drop(state);
         responder.reply(&status);
     }
@@ -245,9 +235,17 @@ impl Service {
                 state.say(&why, &format!("a connection was refused: {why}"));
             }
             tls::Report::Message(why) => {
-                state.replay.note_refused_message();
-                state.say(&why, &format!("a message was refused: {why}"));
+                state.refuse(&why, &format!("a message was refused: {why}"));
             }
         }
+    }
+}
+
+impl State {
+    /// Actors of which a chunk has come, those that have ended too.
+    fn actors_acting(&self) -> u32 {
+        let mut acting: HashSet<u32> = self.replay.state.actors.delivered().collect();
+        acting.extend(self.chunks.actors());
+        acting.len() as u32
     }
 }

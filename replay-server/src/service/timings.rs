@@ -1,12 +1,11 @@
 //! How long chunks wait and how old the weights are that acted, as distributions in fixed memory.
-//! It measures nothing by itself: whoever knows a time tells it.
 
 use std::{
     collections::VecDeque,
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Quantiles, WeightsHeader};
+use driml_protocol::{Quantiles, ReplayStatus, WeightsHeader};
 use hdrhistogram::Histogram;
 
 /// Decimal digits to which quantiles are right.
@@ -16,18 +15,15 @@ const VALUE_MAX: u64 = 1 << 40;
 /// Versions of weights whose times are remembered; what acted with older ones counts as behind by the oldest of them.
 const VERSIONS_MAX: usize = 4096;
 
-/// Distributions since the start.
+/// Distributions since the start; times in microseconds.
 pub(super) struct Timings {
-    answers: Times,
-    inserts: Times,
-    behind: Times,
+    answers: Histogram<u64>,
+    inserts: Histogram<u64>,
+    behind: Histogram<u64>,
     behind_updates: Histogram<u64>,
     /// Versions of the weights that came, the updates behind them, and when: oldest first.
     versions: VecDeque<(u64, u64, Instant)>,
 }
-
-/// A distribution of times, in microseconds.
-struct Times(Histogram<u64>);
 
 fn empty() -> Histogram<u64> {
     Histogram::new_with_bounds(1, VALUE_MAX, DIGITS)
@@ -43,19 +39,16 @@ fn quantiles(histogram: &Histogram<u64>, unit: f64) -> Option<Quantiles> {
     })
 }
 
-impl Times {
-    fn add(&mut self, time: Duration) {
-        let micros = u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
-        self.0.saturating_record(micros);
-    }
+fn add(times: &mut Histogram<u64>, time: Duration) {
+    times.saturating_record(u64::try_from(time.as_micros()).unwrap_or(u64::MAX));
 }
 
 impl Default for Timings {
     fn default() -> Self {
         Self {
-            answers: Times(empty()),
-            inserts: Times(empty()),
-            behind: Times(empty()),
+            answers: empty(),
+            inserts: empty(),
+            behind: empty(),
             behind_updates: empty(),
             versions: VecDeque::new(),
         }
@@ -65,12 +58,12 @@ impl Default for Timings {
 impl Timings {
     /// A question about a chunk was answered after so long.
     pub(super) fn answered(&mut self, after: Duration) {
-        self.answers.add(after);
+        add(&mut self.answers, after);
     }
 
     /// A chunk that weights of `version` chose was stored `after` its arrival.
     pub(super) fn stored(&mut self, version: u64, after: Duration, now: Instant) {
-        self.inserts.add(after);
+        add(&mut self.inserts, after);
         let Some(&(_, newest_updates, _)) = self.versions.back() else {
             return;
         };
@@ -79,7 +72,7 @@ impl Timings {
         let behind = replaced.map_or(Duration::ZERO, |&(_, _, at)| {
             now.saturating_duration_since(at)
         });
-        self.behind.add(behind);
+        add(&mut self.behind, behind);
         let acted = self.versions.get(newer.saturating_sub(1));
         let updates = acted.map_or(0, |&(_, updates, _)| newest_updates.saturating_sub(updates));
         self.behind_updates.saturating_record(updates);
@@ -93,24 +86,12 @@ impl Timings {
             .push_back((weights.version, weights.updates, now));
     }
 
-    /// Milliseconds from a question about a chunk to its answer.
-    pub(super) fn answer_ms(&self) -> Option<Quantiles> {
-        quantiles(&self.answers.0, 1e3)
-    }
-
-    /// Milliseconds from a chunk's arrival until it was stored.
-    pub(super) fn insert_ms(&self) -> Option<Quantiles> {
-        quantiles(&self.inserts.0, 1e3)
-    }
-
-    /// Seconds for which newer weights had been there when a chunk was stored.
-    pub(super) fn weights_behind_s(&self) -> Option<Quantiles> {
-        quantiles(&self.behind.0, 1e6)
-    }
-
-    /// Updates by which the weights that acted were behind.
-    pub(super) fn weights_behind_updates(&self) -> Option<Quantiles> {
-        quantiles(&self.behind_updates, 1.0)
+    /// Fills in what a status says of them.
+    pub(super) fn report(&self, status: &mut ReplayStatus) {
+        status.answer_ms = quantiles(&self.answers, 1e3);
+        status.insert_ms = quantiles(&self.inserts, 1e3);
+        status.weights_behind_s = quantiles(&self.behind, 1e6);
+        status.weights_behind_updates = quantiles(&self.behind_updates, 1.0);
     }
 }
 
@@ -122,8 +103,14 @@ mod tests {
     fn weights_are_behind_from_when_newer_ones_came() {
         let (mut timings, start) = (Timings::default(), Instant::now());
         let at = |seconds| start + Duration::from_secs(seconds);
+        let report = |timings: &Timings| {
+            let mut status = ReplayStatus::default();
+            timings.report(&mut status);
+            status
+        };
         timings.stored(1, Duration::from_millis(7), start);
-        assert_eq!(timings.weights_behind_s(), None, "no weights came here");
+        let behind = report(&timings).weights_behind_s;
+        assert_eq!(behind, None, "no weights came here");
         for version in 1..=3 {
             let weights = WeightsHeader::new(version, 8 * version, &[]);
             timings.weights_came(&weights, at(10 * version));
@@ -132,22 +119,18 @@ mod tests {
             timings.stored(3, Duration::from_millis(5), at(35));
         }
         timings.stored(1, Duration::from_millis(500), at(35));
-        let behind = timings.weights_behind_s().unwrap();
+        let found = report(&timings);
+        let behind = found.weights_behind_s.unwrap();
         assert_eq!(behind.p50, 0.0, "the newest");
         // Version 2 came 15 seconds before.
         assert!((14.8..15.2).contains(&behind.max), "{behind:?}");
-        let updates = timings.weights_behind_updates().unwrap();
+        let updates = found.weights_behind_updates.unwrap();
         assert_eq!((updates.p50, updates.max), (0.0, 16.0));
-        let inserts = timings.insert_ms().unwrap();
-        assert!(
-            (4.9..5.1).contains(&inserts.p50) && inserts.max > 495.0,
-            "{inserts:?}"
-        );
+        let inserts = found.insert_ms.unwrap();
+        let are_right = (4.9..5.1).contains(&inserts.p50) && inserts.max > 495.0;
+        assert!(are_right, "{inserts:?}");
         timings.stored(9, Duration::ZERO, at(36));
-        assert_eq!(
-            timings.weights_behind_updates().unwrap().p50,
-            0.0,
-            "newer than all"
-        );
+        let updates = report(&timings).weights_behind_updates.unwrap();
+        assert_eq!(updates.p50, 0.0, "newer than all");
     }
 }

@@ -1,5 +1,4 @@
 //! Weights on their way: taken from the learner once a version, announced, and given to actors in pieces.
-//! It does not read them.
 
 use std::{
     sync::{MutexGuard, PoisonError},
@@ -44,9 +43,8 @@ impl Service {
                 incoming.into_responder().reply(&Done);
             }
             Err(why) => {
-                let mut state = self.state();
-                state.replay.note_refused_message();
-                state.say("weights", &format!("weights were refused: {why}"));
+                let line = format!("weights were refused: {why}");
+                self.state().refuse("weights", &line);
             }
         }
     }

@@ -1,5 +1,4 @@
 //! The newest weights and the older ones that actors still pull, whole, as they came.
-//! It neither reads nor sends them.
 
 use std::{
     fs::{self, File},
@@ -17,12 +16,12 @@ use driml_protocol::{
 /// The file with the newest weights.
 const FILE: &str = "weights.message";
 
-/// Versions that are kept while actors pull them. When so many are being pulled, whoever begins gets the newest of these: many
+/// Versions that are kept while actors pull them. When so many are being pulled, one that begins gets the newest of these: many
 /// actors that pull slowly are served to the end, with weights that are a little older.
 const KEPT_MAX: usize = 8;
 /// How long a version is kept after its last piece was asked for.
 const KEPT_FOR: Duration = Duration::from_secs(5);
-/// Most versions that one upload may be ahead of the one before: more is no count of a learner's.
+/// Most versions that one upload may be ahead of the one before: a learner does not count so far.
 const VERSION_STEP_MAX: u64 = 1 << 20;
 
 /// The newest weights, and older ones that are being pulled.
@@ -76,10 +75,8 @@ impl WeightsStore {
         self.newest.as_ref().map_or(0, |it| it.header.version)
     }
 
-    /// Takes newer weights; the same ones may come again. Returns whether they are new.
-    ///
-    /// # Errors
-    /// A version that cannot follow the newest one; the reason, for a person.
+    /// Takes newer weights; the same ones may come again. Returns whether they are new; an error says why they cannot follow the
+    /// newest ones.
     pub(super) fn put(
         &mut self,
         header: WeightsHeader,
@@ -210,42 +207,29 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_actor_gets_what_it_began_with_while_others_go_on() {
+    fn a_slow_actor_gets_what_it_began_with_while_others_get_the_newest() {
         let (mut store, start) = (WeightsStore::default(), Instant::now());
-        let newest = WeightsRequest::NewerThan(0);
+        let newer = WeightsRequest::NewerThan;
         let file = vec![7; 3 * PIECE_BYTES];
-        assert_eq!(
-            found(&mut store, newest, start),
-            Err(WeightsReply::NoneNewer)
-        );
+        let none = Err(WeightsReply::NoneNewer);
+        assert_eq!(found(&mut store, newer(0), start), none);
         store.put(header(1), &file).unwrap();
-        assert_eq!(found(&mut store, newest, start), Ok((1, 0)));
+        assert_eq!(found(&mut store, newer(0), start), Ok((1, 0)));
         for version in 2..20 {
             let now = start + Duration::from_secs(version);
             store.put(header(version), &file).unwrap();
-            let next = WeightsRequest::NewerThan(version - 1);
-            assert_eq!(found(&mut store, next, now), Ok((version, 0)));
-            let slow = piece(1, PIECE_BYTES);
-            assert_eq!(found(&mut store, slow, now), Ok((1, PIECE_BYTES)));
+            let next = found(&mut store, newer(version - 1), now);
+            assert_eq!(next, Ok((version, 0)));
+            let slow = found(&mut store, piece(1, PIECE_BYTES), now);
+            assert_eq!(slow, Ok((1, PIECE_BYTES)));
             assert!(store.pulled.len() <= KEPT_MAX);
         }
         let now = start + Duration::from_secs(20);
-        let current = WeightsRequest::NewerThan(19);
-        assert_eq!(
-            found(&mut store, current, now),
-            Err(WeightsReply::NoneNewer)
-        );
-        for gone in [
-            piece(2, 0),
-            piece(99, 0),
-            piece(19, 1),
-            piece(19, 3 * PIECE_BYTES),
-        ] {
-            assert_eq!(
-                found(&mut store, gone, now),
-                Err(WeightsReply::Gone),
-                "{gone:?}"
-            );
+        assert_eq!(found(&mut store, newer(19), now), none);
+        // One that was pulled to the end, one that never was, and places where no piece begins.
+        for (version, offset) in [(2, 0), (99, 0), (19, 1), (19, 3 * PIECE_BYTES)] {
+            let gone = found(&mut store, piece(version, offset), now);
+            assert_eq!(gone, Err(WeightsReply::Gone), "{version}, {offset}");
         }
     }
 
@@ -268,9 +252,7 @@ mod tests {
         }
         let newer = WeightsRequest::NewerThan(last);
         assert_eq!(found(&mut store, newer, later), Ok((last + 5, 0)));
-        assert_eq!(
-            found(&mut store, piece(1, 0), later),
-            Err(WeightsReply::Gone)
-        );
+        let gone = found(&mut store, piece(1, 0), later);
+        assert_eq!(gone, Err(WeightsReply::Gone));
     }
 }

@@ -110,10 +110,7 @@ pub(crate) struct Ring {
 }
 
 impl Ring {
-    /// An empty ring of `capacity` transitions with their `frames`.
-    ///
-    /// # Errors
-    /// The system refuses to reserve that much memory: the bytes asked for.
+    /// An empty ring of `capacity` transitions with their `frames`. An error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
         let asked = capacity.saturating_mul(size_of::<Step>() as u64);
         let mut steps = Vec::new();
@@ -129,12 +126,9 @@ impl Ring {
         })
     }
 
-    /// The same, empty, where the next transition has the number `first`.
-    ///
-    /// # Panics
-    /// Transitions are stored already.
+    /// Lets go of everything; the next transition has the number `first`.
     pub(crate) fn start_at(&mut self, first: u64) {
-        assert!(self.steps.is_empty(), "an empty ring starts anywhere");
+        self.steps.clear();
         (self.first, self.oldest, self.inserted) = (first, first, first);
         self.frames.start_at(first);
     }
@@ -150,7 +144,7 @@ impl Ring {
         self.frames.forget_before(self.oldest);
     }
 
-    /// Takes the place of consecutive transitions that are gone, which hang together with nothing and are no anchors.
+    /// Takes the place of consecutive transitions that are gone, which hang together with nothing and cannot be anchors.
     pub(crate) fn push_gone(&mut self, frames: Run<'_>, count: u64) {
         let inserted = self.inserted + count;
         let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
@@ -251,46 +245,28 @@ impl Ring {
 
     /// Checks sizes and every link; panics at the first that is wrong. Slow: for tests.
     pub(crate) fn check_valid(&self) {
-        assert_eq!(
-            self.steps.len() as u64,
-            (self.inserted - self.first).min(self.capacity),
-            "one step a transition, until they are overwritten"
-        );
-        assert!(
-            self.inserted - self.oldest <= self.capacity,
-            "no more are held than fit"
-        );
-        self.frames
-            .check_valid(self.first, self.oldest, self.inserted);
-        for index in self.oldest()..self.inserted {
+        let (first, oldest, inserted) = (self.first, self.oldest, self.inserted);
+        // One step a transition, until they are overwritten.
+        let steps = (inserted - first).min(self.capacity);
+        assert_eq!(self.steps.len() as u64, steps);
+        assert!(inserted - oldest <= self.capacity, "more are held than fit");
+        self.frames.check_valid(first, oldest, inserted);
+        for index in oldest..inserted {
             let step = self.step(index);
             if let Some(next) = step.next() {
-                assert!(
-                    index < next && next < self.inserted,
-                    "{index} is followed by {next}"
-                );
-                assert!(
-                    !step.end.is_episode_end(),
-                    "{index} ended its episode, yet {next} follows"
-                );
-                let back = if step.end == End::Running {
-                    index
-                } else {
-                    LEVEL_START
+                assert!((index + 1..inserted).contains(&next), "{index}, {next}");
+                let ended = step.end.is_episode_end();
+                assert!(!ended, "{index} ended its episode, yet {next} follows");
+                let back = match step.end {
+                    End::Running => index,
+                    _ => LEVEL_START,
                 };
                 assert_eq!(self.step(next).previous, back, "{next} follows {index}");
             }
             if let Previous::Held(previous) = self.previous(index) {
-                assert_eq!(
-                    self.step(previous).next,
-                    index,
-                    "{previous} precedes {index}"
-                );
-                assert_eq!(
-                    self.step(previous).end,
-                    End::Running,
-                    "{previous} precedes {index}"
-                );
+                let before = self.step(previous);
+                let follows = (before.next, before.end) == (index, End::Running);
+                assert!(follows, "{previous} precedes {index}");
             }
         }
     }

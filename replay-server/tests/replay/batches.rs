@@ -1,5 +1,5 @@
 //! Batches against the reference, through wrap-around, restarts, losses, retries and strays.
-//! It does not test how often each row or k comes: `anchors` and `horizon` do.
+//! It does not test how often each row or k comes: `rows` and `horizon` do.
 
 use std::collections::{HashMap, HashSet};
 
@@ -42,7 +42,7 @@ pub(crate) fn check_rows(batch: &Batch, history: &History) -> (f64, (u64, u64)) 
         let (key, t) = identity(spec, &state(&states_t, row));
         assert!(
             history.is_valid(key, t),
-            "{key:?} step {t} is no valid anchor"
+            "{key:?} step {t} is not a valid anchor"
         );
         let want = history.row(key, t);
         let context = format!("{key:?} step {t}: {want:?}");

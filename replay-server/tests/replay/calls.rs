@@ -1,16 +1,20 @@
 //! What tests say to a replay, and its answers.
-//! It tests nothing.
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Goodbye, Horizon, InsertReply, Learned,
     LearnerJoin, RunSpec, Tally,
 };
-use driml_replay_server::Replay;
+use driml_replay_server::{Config, Replay};
 
 use crate::history::spec;
 
 pub(crate) fn small_spec() -> RunSpec {
     spec(3, 1, 1, Horizon::None)
+}
+
+/// The first shard of a replay of `small_spec`, for batches of 8 rows.
+pub(crate) fn small(config: &Config) -> Replay {
+    Replay::new(&small_spec(), config, 8).unwrap()
 }
 
 /// Of a chunk with frames as `small_spec` and other runs of three channels have them.

@@ -1,14 +1,14 @@
 //! A compressed replay gives the same batches as a plain one, bit for bit, and keeps within its memory.
 //! It does not test what the batches hold: `batches` does, with and without compression.
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, RunSpec, TimeoutRule};
 use driml_replay_server::{Compression, Config, Replay};
 use proptest::prelude::*;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{header, is_stored, join},
+    calls::{header, is_refused, is_stored, join},
     history::{spec, unlimited},
 };
 
@@ -166,11 +166,8 @@ fn memory_follows_what_is_held() {
     let overhead = (3 << 20) + 16 * spec.frame_bytes() as u64 + 64 * CAPACITY;
     let mut replay = Replay::new(&spec, &lz4(CAPACITY), 16).unwrap();
     join(&mut replay, 0, 1);
-    assert_eq!(
-        replay.status().frame_bytes_held,
-        0,
-        "taken only as transitions come"
-    );
+    let held = |replay: &Replay| replay.status().frame_bytes_held;
+    assert_eq!(held(&replay), 0, "taken only as transitions come");
     let mut actor = Actor::new(&spec, 2, 1);
     for (content, most) in [
         (Content::Noise, plain_bytes + overhead),
@@ -179,15 +176,15 @@ fn memory_follows_what_is_held() {
     ] {
         for _ in 0..80 {
             store(&mut replay, &actor.chunk(8, content));
-            let held = replay.status().frame_bytes_held;
-            assert!(held <= plain_bytes + overhead, "{held}");
+            assert!(held(&replay) <= plain_bytes + overhead);
         }
         replay.check_valid();
-        let held = replay.status().frame_bytes_held;
-        assert!(held <= most, "{content:?}: {held} of {most}");
+        assert!(held(&replay) <= most, "{content:?}: {}", held(&replay));
     }
-    let held = replay.status().frame_bytes_held;
-    assert!(held >= plain_bytes, "{held} cannot hold all that noise");
+    assert!(
+        held(&replay) >= plain_bytes,
+        "this cannot be all that noise"
+    );
 }
 
 /// Where the bytes allowed do not suffice, the oldest go first, and what is held is sampled as ever.
@@ -203,10 +200,9 @@ fn the_bytes_allowed_are_kept() {
     join(&mut replay, 0, 1);
     let mut actor = Actor::new(&spec, 2, 1);
     for round in 0..120 {
-        let content = if round / 40 == 1 {
-            Content::Constant
-        } else {
-            Content::Noise
+        let content = match round / 40 {
+            1 => Content::Constant,
+            _ => Content::Noise,
         };
         let mut chunk = actor.chunk(12, content);
         // Every frame begins with its own number.
@@ -224,15 +220,11 @@ fn the_bytes_allowed_are_kept() {
             let number = u64::from_le_bytes(frame[..8].try_into().unwrap());
             assert!((oldest..status.transitions_inserted).contains(&number));
         }
+        let held = status.transitions_held;
         if round == 39 || round == 119 {
-            assert!(
-                (350..500).contains(&status.transitions_held),
-                "{}",
-                status.transitions_held
-            );
+            assert!((350..500).contains(&held), "{held}");
         }
     }
     let chunk = actor.chunk(250, Content::Constant);
-    let reply = replay.insert(&chunk);
-    assert!(matches!(reply, InsertReply::Refused { .. }), "{reply:?}");
+    assert!(is_refused(&replay.insert(&chunk)));
 }

@@ -1,5 +1,4 @@
 //! Settings that cannot work are refused, by key, with what to do.
-//! It does not test the effects of settings.
 
 use driml_protocol::{Horizon, RunSpec};
 use driml_replay_server::{Compression, Config, ConfigError, Replay};
@@ -17,10 +16,8 @@ fn good() -> Config {
 }
 
 fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
-    Replay::new(spec, config, batch_size)
-        .map(|_| ())
-        .unwrap_err()
-        .to_string()
+    let refused = Replay::new(spec, config, batch_size).map(drop);
+    refused.unwrap_err().to_string()
 }
 
 #[test]
@@ -54,27 +51,21 @@ fn each_fault_names_its_key_and_a_way_out() {
         let mut config = good();
         spoil(&mut config);
         let text = refusal(&config, &spec, 256);
-        assert!(
-            text.starts_with("replay.") && text.contains(expected),
-            "{text}"
-        );
+        assert!(text.starts_with("replay."), "{text}");
+        assert!(text.contains(expected), "{text}");
     }
     assert!(refusal(&good(), &spec, 0).contains("learner.batch_size = 0"));
     assert!(refusal(&good(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
     let broken = RunSpec { gamma: 2.0, ..spec };
-    assert!(matches!(
-        Replay::new(&broken, &good(), 256),
-        Err(ConfigError::RunSpec(_))
-    ));
+    let refused = good().validate(&broken, 256).unwrap_err();
+    assert!(matches!(refused, ConfigError::RunSpec(_)), "{refused}");
 }
 
 #[test]
 fn unknown_and_missing_keys_are_refused() {
     let text = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8\nwarmup_transitions = 1\nslack_transitions = 2\n";
-    assert_eq!(
-        toml::from_str::<Config>(text).unwrap().transitions_max,
-        None
-    );
-    assert!(toml::from_str::<Config>(&format!("{text}slack = 3\n")).is_err());
-    assert!(toml::from_str::<Config>(&text.replace("warmup_transitions = 1\n", "")).is_err());
+    let read = |text: &str| toml::from_str::<Config>(text);
+    assert_eq!(read(text).unwrap().transitions_max, None);
+    assert!(read(&format!("{text}slack = 3\n")).is_err());
+    assert!(read(&text.replace("warmup_transitions = 1\n", "")).is_err());
 }

@@ -3,14 +3,14 @@
 //! It does not look at rows.
 
 use driml_protocol::{Buffer, ChunkHeader, Claim, Horizon, InsertReply, LearnerJoin, RequestId};
-use driml_replay_server::{Replay, Unready};
+use driml_replay_server::{Config, Replay, Unready};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{
-        affinity, header, insert, is_refused, join, last_word, learned, learner, life, small_spec,
+        affinity, header, insert, is_refused, join, last_word, learned, learner, life, small,
         stored,
     },
     history::{spec, unlimited},
@@ -20,10 +20,12 @@ proptest! {
     #[test]
     fn delays_repeats_and_drops_change_nothing(seed in any::<u64>(), actors in 1u32..4, chunks in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut config = unlimited(10_000);
         // A limiter that blocks now and then; the learner below frees it.
-        (config.replay_ratio, config.slack_transitions) = (1.0, 16);
-        let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+        let mut replay = small(&Config {
+            replay_ratio: 1.0,
+            slack_transitions: 16,
+            ..unlimited(10_000)
+        });
         let mut next = vec![0u64; actors as usize];
         let mut in_flight: Vec<ChunkHeader> = vec![];
         let steps = |actor: u32, sequence: u64| 1 + (u64::from(actor) * 7 + sequence * 3) % 5;
@@ -115,55 +117,76 @@ proptest! {
     }
 }
 
-#[test]
-fn what_never_arrived_counts_as_lost_once() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
-    let lost = |replay: &Replay| replay.status().transitions_lost;
-    assert_eq!(insert(&mut replay, header(0, 1, 0, 4)), stored(6));
-    assert_eq!(lost(&replay), 4, "before the first chunk");
-    assert_eq!(insert(&mut replay, header(0, 1, 1, 10)), stored(12));
-    assert_eq!(insert(&mut replay, header(0, 1, 2, 17)), stored(18));
-    assert_eq!(lost(&replay), 5, "between chunks");
-    replay.goodbye(&last_word(0, 1, 30));
-    replay.goodbye(&last_word(0, 1, 30));
-    assert_eq!(lost(&replay), 12, "after the last chunk, heard twice");
-    let nothing_arrived = last_word(1, 1, 3);
-    replay.goodbye(&nothing_arrived);
-    assert_eq!(lost(&replay), 12, "nobody that has joined");
-    join(&mut replay, 1, 1);
-    replay.goodbye(&nothing_arrived);
-    assert_eq!(lost(&replay), 15, "an actor of which nothing arrived");
-    assert_eq!(replay.status().transitions_duplicated, 0);
+/// What an actor says, with its life.
+enum Said {
+    Joins(u32, u64),
+    Leaves(u32, u64, u64),
+    /// Its next chunk: the number, and the transitions that it says came before.
+    Sends(u32, u64, u64, u64),
 }
+use Said::{Joins, Leaves, Sends};
+/// With (lost, duplicated, refused) after it, and what it is.
+type Story = [(Said, (u64, u64, u64), &'static str)];
 
+/// What was produced and never stored, or the reverse, is counted once.
 #[test]
-fn what_was_stored_and_never_produced_counts_as_duplicated() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
-    insert(&mut replay, header(0, 1, 0, 0));
-    insert(&mut replay, header(0, 1, 1, 4));
-    assert_eq!(replay.status().transitions_duplicated, 2);
-    replay.goodbye(&last_word(0, 1, 9));
-    assert_eq!(replay.status().transitions_duplicated, 3);
-    for actor in [1, 2] {
-        join(&mut replay, actor, 0);
-        replay.goodbye(&last_word(actor, 0, u64::MAX));
+fn what_was_lost_or_stored_twice_is_counted_once() {
+    let absurd = u64::MAX;
+    let most = 1 << 48;
+    let lost: &Story = &[
+        (Sends(0, 1, 0, 4), (4, 0, 0), "before the first chunk"),
+        (Sends(0, 1, 1, 10), (4, 0, 0), "nothing"),
+        (Sends(0, 1, 2, 17), (5, 0, 0), "between chunks"),
+        (Leaves(0, 1, 30), (12, 0, 0), "after the last chunk"),
+        (Leaves(0, 1, 30), (12, 0, 0), "heard twice"),
+        (Leaves(1, 1, 3), (12, 0, 1), "one that has not joined"),
+        (Joins(1, 1), (12, 0, 1), "nothing was said"),
+        (Leaves(1, 1, 3), (15, 0, 1), "of which nothing came"),
+    ];
+    let duplicated: &Story = &[
+        (Sends(0, 1, 0, 0), (0, 0, 0), "the first chunk"),
+        (Sends(0, 1, 1, 4), (0, 2, 0), "chunks that overlap"),
+        (Leaves(0, 1, 9), (0, 3, 0), "fewer than were stored"),
+        (Joins(1, 0), (0, 3, 0), "nothing was said"),
+        (Leaves(1, 0, absurd), (0, 3, 1), "an absurd count"),
+        (Leaves(1, 0, most), (most, 3, 1), "the largest there can be"),
+        (Joins(2, 0), (most, 3, 1), "nothing was said"),
+        (Leaves(2, 0, most), (2 * most, 3, 1), "no overflow"),
+    ];
+    let replaced: &Story = &[
+        (Sends(0, 1, 0, 0), (0, 0, 0), "a life's first chunk"),
+        (Joins(0, 2), (0, 0, 0), "its next life"),
+        (Sends(0, 1, 1, 6), (0, 0, 1), "a chunk of the past life"),
+        (Leaves(0, 1, 18), (12, 0, 1), "what that could not deliver"),
+        (Leaves(0, 1, 18), (12, 0, 1), "heard twice"),
+        (Sends(0, 2, 0, 0), (12, 0, 1), "the next life"),
+    ];
+    for story in [lost, duplicated, replaced] {
+        let mut replay = small(&unlimited(1000));
+        for (said, expected, what) in story {
+            match *said {
+                Joins(actor, life) => join(&mut replay, actor, life),
+                Leaves(actor, life, produced) => {
+                    replay.goodbye(&last_word(actor, life, produced));
+                }
+                Sends(actor, life, sequence, first) => {
+                    insert(&mut replay, header(actor, life, sequence, first));
+                }
+            }
+            let status = replay.status();
+            let counted = (
+                status.transitions_lost,
+                status.transitions_duplicated,
+                status.messages_refused,
+            );
+            assert_eq!(counted, *expected, "{what}");
+        }
     }
-    let status = replay.status();
-    assert_eq!(
-        (status.transitions_lost, status.messages_refused),
-        (0, 2),
-        "absurd counts are refused"
-    );
-    // The largest that a run could have add up without an overflow.
-    for actor in [1, 2] {
-        replay.goodbye(&last_word(actor, 0, 1 << 48));
-    }
-    assert_eq!(replay.status().transitions_lost, 1 << 49);
 }
 
 #[test]
 fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
+    let mut replay = small(&unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.goodbye(&last_word(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
@@ -188,31 +211,19 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
 }
 
 #[test]
-fn what_a_replaced_life_could_not_deliver_counts_as_lost() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
-    insert(&mut replay, header(0, 1, 0, 0));
-    join(&mut replay, 0, 2);
-    assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
-    let last_word = last_word(0, 1, 18);
-    replay.goodbye(&last_word);
-    replay.goodbye(&last_word);
-    assert_eq!(replay.status().transitions_lost, 12);
-    assert_eq!(insert(&mut replay, header(0, 2, 0, 0)), stored(12));
-}
-
-#[test]
 fn a_claim_says_what_became_of_a_chunk() {
-    let mut config = unlimited(1000);
-    config.transitions_max = Some(12);
-    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    let mut replay = small(&Config {
+        transitions_max: Some(12),
+        ..unlimited(1000)
+    });
     let claim = |incarnation, sequence| Claim {
         actor: 0,
         incarnation,
         sequence,
         leaving: false,
     };
-    let nobody = replay.claim(&claim(1, 0)).unwrap();
-    assert!(is_refused(&nobody), "{nobody:?}");
+    let unknown = replay.claim(&claim(1, 0)).unwrap();
+    assert!(is_refused(&unknown), "{unknown:?}");
     insert(&mut replay, header(0, 1, 0, 0));
     assert_eq!(replay.claim(&claim(1, 0)), Some(stored(6)));
     assert_eq!(replay.claim(&claim(1, 1)), None, "it is still to come");
@@ -223,16 +234,24 @@ fn a_claim_says_what_became_of_a_chunk() {
     assert_eq!(replay.status().chunks_retried, 0, "nothing was sent twice");
 }
 
-/// A learner that died had learned from fewer rows than were served to it: they are served again to its successor.
-#[test]
-fn rows_that_nobody_learned_from_do_not_count() {
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.slack_transitions) = (4.0, 100);
-    config.transitions_max = Some(18);
-    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+/// A replay after three chunks, whose ratio is 4.
+fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
+    let mut replay = small(&Config {
+        replay_ratio: 4.0,
+        slack_transitions: 100,
+        transitions_max,
+        ..unlimited(1000)
+    });
     for sequence in 0..3 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
+    replay
+}
+
+/// A learner that died had learned from fewer rows than were served to it: they are served again to its successor.
+#[test]
+fn rows_that_were_not_learned_from_do_not_count() {
+    let mut replay = with_three_chunks(Some(18));
     replay.join_learner(learner(1, 0, 0, 0)).unwrap();
     for _ in 0..9 {
         replay.sample(8).unwrap();
@@ -281,12 +300,7 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
         ("that asks again", learner(1, 0, 0, 0), Ok(0)),
     ];
     for (which, join, expected) in cases {
-        let mut config = unlimited(1000);
-        (config.replay_ratio, config.slack_transitions) = (4.0, 100);
-        let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
-        for sequence in 0..3 {
-            insert(&mut replay, header(0, 1, sequence, 6 * sequence));
-        }
+        let mut replay = with_three_chunks(None);
         // A run in which nothing was learned takes any learner.
         replay.join_learner(learner(0, 0, 0, 0)).unwrap();
         replay.join_learner(learner(1, 0, 0, 0)).unwrap();

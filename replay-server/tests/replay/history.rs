@@ -64,7 +64,7 @@ pub(crate) fn spec(
     }
 }
 
-/// Settings under which nobody ever waits.
+/// Settings under which neither side ever waits.
 pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
     Config {
         capacity_transitions,
@@ -213,7 +213,7 @@ impl History {
         if !held(&t) || timed_out || !self.stack_steps(key, t).iter().all(held) {
             return false;
         }
-        // After a loss nobody knows what came before the part's first step.
+        // After a loss it is not known what came before the part's first step.
         let reaches_into_the_lost = t + 1 < self.spec.frame_stack as usize;
         if key.3 > 0 && reaches_into_the_lost && Self::level_start(records, t) == 0 {
             return false;

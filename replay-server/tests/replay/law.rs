@@ -1,5 +1,4 @@
 //! Whether counts follow a law: Pearson's chi-square test.
-//! It does not draw anything.
 
 /// The chance that a right sampler fails one of these tests; seeds are fixed, so a pass stays a pass.
 pub(crate) const SIGNIFICANCE: f64 = 1e-4;

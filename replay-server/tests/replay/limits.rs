@@ -1,88 +1,69 @@
 //! What a replay refuses or lets wait, and where a run ends.
 //! It does not look at rows, and no message is lost or repeated.
 
-use driml_protocol::{Chunk, ChunkHeader, End, InsertReply, RunSpec, Tally, Waiting};
-use driml_replay_server::{ACTORS_MAX, Replay, STREAMS_MAX, Unready};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Tally, Waiting};
+use driml_replay_server::{ACTORS_MAX, Config, Replay, STREAMS_MAX, Unready};
 
 use crate::{
     calls::{
-        affinity, header, insert, is_refused, is_stored, join, last_word, life, small_spec, stored,
-        wait,
+        affinity, header, insert, is_refused, is_stored, join, last_word, life, small, small_spec,
+        stored, wait,
     },
-    history::unlimited,
+    history::{spec, unlimited},
 };
 
+const HUNGRY: Waiting = Waiting::LearnerWaitsForActors;
+
 #[test]
-fn rewards_whose_sum_is_no_float_are_refused() {
+fn unfit_chunks_are_refused_with_a_reason() {
     let spec = RunSpec {
         n_step: 7,
         ..small_spec()
     };
-    let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
-    join(&mut replay, 0, 1);
-    let with = |reward| {
-        let mut chunk = Chunk::zeroed(header(0, 1, 0, 0));
-        chunk.set(4, 0, reward, End::Running);
+    let mut replay = Replay::new(&spec, &unlimited(100), 8).unwrap();
+    insert(&mut replay, header(0, 1, 0, 0));
+    type Spoil = fn(&mut ChunkHeader);
+    let headers: [(Spoil, &str); 6] = [
+        (|it| it.frame_bytes = 7, "frames of 7 bytes"),
+        (|it| it.streams = 3, "3 streams after 2"),
+        (|it| it.steps = 51, "102 transitions"),
+        (|it| it.steps = 0, "0 transitions"),
+        (
+            |it| it.first_transition = u64::MAX,
+            "counts that no run reaches",
+        ),
+        (|it| it.sequence = u64::MAX, "counts that no run reaches"),
+    ];
+    let good = Chunk::zeroed(header(0, 1, 1, 6));
+    let with = |action, reward| {
+        let mut chunk = good.clone();
+        chunk.set(2, action, reward, End::Running);
         chunk
     };
+    let mut unfit = vec![(with(5, 0.0), "action 5; this run has 5")];
+    // Of rewards the sum of seven must be a float.
     for reward in [3e38, -3e38, f32::MAX] {
-        match replay.insert(&with(reward)) {
-            InsertReply::Refused { why } => {
-                assert!(why.contains("scale the world's rewards"), "{why}")
-            }
-            reply => panic!("{reply:?} for {reward}"),
-        }
+        unfit.push((with(0, reward), "scale the world's rewards"));
     }
-    assert_eq!(replay.insert(&with(f32::MAX / 7.0)), stored(6));
-}
-
-#[test]
-fn unfit_chunks_are_refused_with_a_reason() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(100), 8).unwrap();
-    insert(&mut replay, header(0, 1, 0, 0));
-    let good = header(0, 1, 1, 6);
-    let unfit = [
-        (
-            "frames of 7 bytes",
-            ChunkHeader {
-                frame_bytes: 7,
-                ..good
-            },
-        ),
-        ("3 streams after 2", ChunkHeader { streams: 3, ..good }),
-        ("102 transitions", ChunkHeader { steps: 51, ..good }),
-        ("0 transitions", ChunkHeader { steps: 0, ..good }),
-        (
-            "counts that no run reaches",
-            ChunkHeader {
-                first_transition: u64::MAX,
-                ..good
-            },
-        ),
-        (
-            "counts that no run reaches",
-            ChunkHeader {
-                sequence: u64::MAX,
-                ..good
-            },
-        ),
-    ];
-    for (reason, header) in unfit {
-        match insert(&mut replay, header) {
+    for (spoil, reason) in headers {
+        let mut header = good.header;
+        spoil(&mut header);
+        unfit.push((Chunk::zeroed(header), reason));
+    }
+    for (chunk, reason) in &unfit {
+        match replay.insert(chunk) {
             InsertReply::Refused { why } => assert!(why.contains(reason), "{why}"),
-            reply => panic!("{reply:?} for {header:?}"),
+            reply => panic!("{reply:?} instead of {reason}"),
         }
     }
-    let mut chunk = Chunk::zeroed(good);
-    chunk.set(2, 5, 0.0, End::Running);
-    assert!(is_refused(&replay.insert(&chunk)), "action 5 of 0..5");
-    assert_eq!(replay.status().messages_refused, unfit.len() as u64 + 1);
-    assert_eq!(insert(&mut replay, good), stored(12), "the actor goes on");
+    assert_eq!(replay.status().messages_refused, unfit.len() as u64);
+    let largest = with(0, f32::MAX / 7.0);
+    assert_eq!(replay.insert(&largest), stored(12), "the actor continues");
 }
 
 #[test]
 fn actors_and_streams_are_bounded() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1 << 15), 8).unwrap();
+    let mut replay = small(&unlimited(1 << 15));
     for actor in 0..ACTORS_MAX as u32 {
         join(&mut replay, actor, 1);
         let reply = replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0)));
@@ -95,7 +76,7 @@ fn actors_and_streams_are_bounded() {
     replay.goodbye(&last_word(one_more, 1, 6));
     assert_eq!(replay.status().transitions_lost, 0);
     let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
-    assert!(is_stored(&last), "the known ones go on");
+    assert!(is_stored(&last), "the known ones continue");
     let wide = ChunkHeader {
         streams: STREAMS_MAX + 1,
         steps: 1,
@@ -106,16 +87,18 @@ fn actors_and_streams_are_bounded() {
 
 #[test]
 fn the_run_ends_when_all_is_in_and_sampled() {
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.slack_transitions) = (4.0, 6);
-    (config.warmup_transitions, config.transitions_max) = (6, Some(18));
-    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    let mut replay = small(&Config {
+        replay_ratio: 4.0,
+        slack_transitions: 6,
+        warmup_transitions: 6,
+        transitions_max: Some(18),
+        ..unlimited(1000)
+    });
     let warm_up = Waiting::WarmUp { have: 0, need: 6 };
     assert_eq!(replay.waiting(), warm_up);
     assert_eq!(replay.sample(8), Err(Unready::Wait(warm_up)));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    let hungry = Err(Unready::Wait(Waiting::LearnerWaitsForActors));
-    assert_eq!(replay.sample(8), hungry);
+    assert_eq!(replay.sample(8), Err(Unready::Wait(HUNGRY)));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
     // 6 ahead, of a slack of 6.
     assert_eq!(insert(&mut replay, header(1, 1, 0, 0)), stored(18));
@@ -139,9 +122,11 @@ fn the_run_ends_when_all_is_in_and_sampled() {
 
 #[test]
 fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.slack_transitions) = (4.0, 2);
-    let mut replay = Replay::new(&small_spec(), &config, 8).unwrap();
+    let mut replay = small(&Config {
+        replay_ratio: 4.0,
+        slack_transitions: 2,
+        ..unlimited(1000)
+    });
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
     let early = insert(&mut replay, header(0, 1, 2, 12));
@@ -164,15 +149,50 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(18));
     let foreign = affinity(1, 4, vec![0.25; 16]);
     assert!(replay.set_affinity(&foreign).is_err());
-    assert_eq!(replay.status().messages_refused, 3);
+    assert_eq!(replay.status().messages_refused, 2);
+}
+
+/// Nothing ends and no stream is long enough: both sides would wait for each other, were actors not let on.
+#[test]
+fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
+    let config = Config {
+        replay_ratio: 64.0,
+        slack_transitions: 1,
+        transitions_max: Some(60),
+        ..unlimited(10_000)
+    };
+    let mut replay = Replay::new(&spec(3, 1, 4, Horizon::None), &config, 64).unwrap();
+    let chunk = |sequence| ChunkHeader {
+        streams: 20,
+        steps: 1,
+        ..header(0, 1, sequence, 20 * sequence)
+    };
+    for sequence in 0..3 {
+        let total = 20 * (sequence + 1);
+        assert_eq!(insert(&mut replay, chunk(sequence)), stored(total));
+        let next = insert(&mut replay, chunk(sequence + 1));
+        let drawn = replay.sample(64);
+        if total < 60 {
+            assert_eq!(next, wait(total));
+            assert_eq!(drawn, Err(Unready::Wait(HUNGRY)));
+            assert_eq!(replay.waiting(), HUNGRY);
+        } else {
+            assert_eq!(next, InsertReply::Finished { inserted_total: 60 });
+            assert!(matches!(drawn, Err(Unready::Refused { .. })), "{drawn:?}");
+        }
+    }
 }
 
 #[test]
 fn what_other_shards_are_said_to_have_counted_is_bounded() {
-    let mut config = unlimited(1000);
-    (config.shards, config.replay_ratio) = (2, 4.0);
-    (config.slack_transitions, config.transitions_max) = (100, Some(5000));
-    let mut replay = Replay::shard(&small_spec(), &config, 8, 0).unwrap();
+    let config = Config {
+        shards: 2,
+        replay_ratio: 4.0,
+        slack_transitions: 100,
+        transitions_max: Some(5000),
+        ..unlimited(1000)
+    };
+    let mut replay = small(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     let tally = |inserted, rows_sampled| Tally {
         inserted,
@@ -191,16 +211,13 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     replay.set_other_shards(tally(100, 400)).unwrap();
     replay.sample(8).expect("of the lies nothing was counted");
     replay.set_other_shards(tally(100, 4824)).unwrap();
-    assert_eq!(
-        replay.sample(8),
-        Err(Unready::Wait(Waiting::LearnerWaitsForActors))
-    );
+    assert_eq!(replay.sample(8), Err(Unready::Wait(HUNGRY)));
     replay.check_valid();
 }
 
 #[test]
 fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
-    let mut replay = Replay::new(&small_spec(), &unlimited(1000), 8).unwrap();
+    let mut replay = small(&unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
     let affinity = |version| affinity(version, 5, vec![0.2; 25]);
@@ -208,14 +225,10 @@ fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
     let most: u64 = 8 + (1 << 32);
     for version in [most + 1, u64::MAX] {
         let why = replay.set_affinity(&affinity(version)).unwrap_err();
-        let why = why.to_string();
-        assert!(
-            why.contains("of the affinity, in a run that has served 8 rows"),
-            "{why}"
-        );
+        let expected = "of the affinity, in a run that has served 8 rows";
+        assert!(why.contains(expected), "{why}");
     }
-    let status = replay.status();
-    assert_eq!((status.messages_refused, status.affinity_version), (2, 0));
+    assert_eq!(replay.status().affinity_version, 0);
     replay.set_affinity(&affinity(most)).unwrap();
     assert_eq!(replay.status().affinity_version, most);
 }

@@ -2,7 +2,6 @@
 //! They open no socket and start no thread.
 #![allow(clippy::unwrap_used)]
 
-mod anchors;
 mod batches;
 mod calls;
 mod compression;
@@ -15,6 +14,6 @@ mod limits;
 mod persist;
 mod persist_damage;
 mod persist_marks;
-mod priorities;
 mod rate_limiter;
 mod resume;
+mod rows;

@@ -1,5 +1,5 @@
 //! A replay that is kept on disk, stopped at any record and at any byte of its last write: what comes back is what was there.
-//! What damage costs is in `durable_damage`.
+//! What damage costs is in `persist_damage`.
 
 use std::{
     fs,
@@ -194,7 +194,7 @@ impl Life {
                 self.replay.join_learner(join).unwrap();
             }
             _ => {
-                // One that nobody can answer yet, or ever.
+                // One that cannot be answered yet, or ever.
                 let id = RequestId::first(9);
                 let _ = self.replay.draw_for(id, 1, Buffer::zeroed);
             }
@@ -227,16 +227,18 @@ fn check_goes_on(life: &Life, mut replay: Replay) {
 fn configs() -> impl Strategy<Value = Config> {
     let capacity = 20u64..200;
     (capacity, any::<bool>(), any::<bool>(), 0u64..3).prop_map(|(capacity, lz4, tight, bounded)| {
-        let mut config = unlimited(capacity);
-        if lz4 {
-            config.compression = Compression::Lz4;
+        let compression = if lz4 {
+            Compression::Lz4
+        } else {
+            Compression::None
+        };
+        Config {
+            compression,
+            replay_ratio: if tight { 2.0 } else { 1e6 },
+            disk_bytes_max: (bounded == 0).then_some(4 << 20),
+            fsync_ms: (bounded == 1).then_some(0),
+            ..unlimited(capacity)
         }
-        if tight {
-            (config.replay_ratio, config.slack_transitions) = (2.0, 1 << 40);
-        }
-        config.disk_bytes_max = (bounded == 0).then_some(4 << 20);
-        config.fsync_ms = (bounded == 1).then_some(0);
-        config
     })
 }
 
@@ -343,8 +345,10 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     assert_eq!(bytes_in(&life.args.dir), bytes);
 
     // A ring that is larger than the budget: the oldest leave it too.
-    let mut config = unlimited(1_000_000);
-    config.disk_bytes_max = Some(4 << 20);
+    let config = Config {
+        disk_bytes_max: Some(4 << 20),
+        ..unlimited(1_000_000)
+    };
     let mut life = Life::begin(&root.path().join("budget"), config, 200_000, 5);
     while life.history.inserted < 150_000 {
         life.store(1);
@@ -365,8 +369,11 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
 #[test]
 fn a_resumed_run_goes_on_with_what_was_kept() {
     let root = tempfile::tempdir().unwrap();
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.warmup_transitions) = (4.0, 10);
+    let config = Config {
+        replay_ratio: 4.0,
+        warmup_transitions: 10,
+        ..unlimited(1000)
+    };
     let mut life = Life::begin(root.path(), config, 4000, 5);
     while life.history.inserted < 100 {
         life.store(0);
@@ -396,7 +403,7 @@ fn a_resumed_run_goes_on_with_what_was_kept() {
         replay.check_valid();
     }
 
-    // A folder in which a run goes on that kept no replay before counts from its checkpoint, also after a restart.
+    // A folder in which a run is resumed that kept no replay before counts from its checkpoint, also after a restart.
     args.dir = root.path().join("fresh");
     let (mut replay, _) = open(&args, &config).unwrap();
     replay.join_learner(learner(80, 70, 280, 90)).unwrap();
@@ -418,12 +425,13 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let (before, args, config) = (stored(&life.replay), life.args.clone(), life.config.clone());
     drop(life);
     let bytes = || bytes_in(root.path());
-    let find = || KeptReplay::find(&args, &test_spec(), &config, ROWS).unwrap();
+    let find = || KeptReplay::find(&args, &test_spec(), &config).unwrap();
+    let empty = || Replay::new(&test_spec(), &config, ROWS).unwrap();
 
     let (kept, all, stop) = (find(), bytes(), Shutdown::default());
     stop.set();
     let reading = Reading::begin(stop);
-    let broken_off = kept.read(&reading).map(drop);
+    let broken_off = kept.read(empty(), &reading).map(drop);
     assert!(
         matches!(broken_off, Err(PersistError::Stopped)),
         "{broken_off:?}"
@@ -438,7 +446,7 @@ fn reading_says_how_far_it_is_and_can_be_broken_off() {
         "the folder is taken before it is read"
     );
     let reading = Reading::begin(Shutdown::default());
-    let (replay, recovery) = kept.read(&reading).unwrap();
+    let (replay, recovery) = kept.read(empty(), &reading).unwrap();
     assert!(recovery.found && recovery.warnings.is_empty());
     let progress = reading.progress();
     assert_eq!((progress.bytes_read, progress.bytes), (all, all));

@@ -1,4 +1,4 @@
-//! A log with bits flipped, files missing or foreign: it is said, the rest is used, and rows of batches are right all the same.
+//! A log with bits flipped, files missing or foreign: a warning says so, the rest is used, and rows of batches are right all the same.
 
 use std::{
     fs,
@@ -154,74 +154,99 @@ proptest! {
     }
 }
 
-#[test]
-fn a_flipped_bit_costs_its_segment_alone() {
-    let kept = Kept::new(10_000);
-    let segments = kept.segments();
-    flip(&segments[5], |length| length * 2 / 3);
-    let mut replay = kept.open_saying(&["is damaged at byte", "are gone"]);
-    let status = replay.status();
-    assert_eq!(status.transitions_inserted, kept.history.inserted);
-    assert_eq!(status.transitions_lost, 0);
-    // All counts are those of before.
-    kept.check(&mut replay);
-    // The next chunk of the actor is the next.
-    drop(replay);
-    // As long as they would be held.
-    kept.open_saying(&["are gone"]);
+/// Copies a segment to where another would be, as far as `bytes`.
+fn copy_to(segment: &Path, number: u64, bytes: usize) {
+    let other = segment.with_file_name(format!("segment-{number:012}.log"));
+    let copied = fs::read(segment).unwrap();
+    fs::write(other, &copied[..bytes.min(copied.len())]).unwrap();
 }
 
-/// A length that became too large looks like a write that the end of the process cut off. Nobody was told of such a one; of what is
-/// lost here somebody was.
-#[test]
-fn a_damaged_length_is_no_torn_write() {
-    let kept = Kept::new(10_000);
-    let newest = kept.segments().pop().unwrap();
-    let bytes = fs::read(&newest).unwrap();
+/// The third byte of the length of the second record: it looks like a write that the end of the process cut off. No actor was told of
+/// such a one; of what is lost here one was.
+fn lengthen_a_record(segment: &Path) {
+    let bytes = fs::read(segment).unwrap();
     let heads = bytes.windows(4).enumerate();
     let heads: Vec<_> = heads.filter(|(_, it)| it == b"DRL1").collect();
     assert!(heads.len() > 4, "{}", heads.len());
-    // The third byte of the length of the second record.
-    flip(&newest, |_| heads[1].0 + 16 + 3);
-    let replay = kept.open_saying(&["are cut off"]);
-    replay.check_valid();
+    flip(segment, |_| heads[1].0 + 16 + 3);
 }
 
-#[test]
-fn a_damaged_beginning_costs_its_segment_and_it_is_set_aside() {
-    let kept = Kept::new(10_000);
-    let segments = kept.segments();
-    flip(&segments[4], |_| 40);
-    let mut replay = kept.open_saying(&["its beginning is damaged"]);
-    assert!(segments[4].with_extension("unusable").exists());
-    assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
-    kept.check(&mut replay);
+fn remove(path: &Path) {
+    fs::remove_file(path).unwrap();
 }
 
+fn append_zeros(segment: &Path) {
+    let mut bytes = fs::read(segment).unwrap();
+    bytes.extend_from_slice(&[0; 5_000]);
+    fs::write(segment, &bytes).unwrap();
+}
+
+/// What is left: all that was stored, all counts and the transitions of other segments, or what was stored before.
+#[derive(Clone, Copy, PartialEq)]
+enum Left {
+    All,
+    Counts,
+    Beginning,
+}
+use Left::{All, Beginning, Counts};
+
+/// Something happens to the last segment, or to an earlier one.
 #[test]
-fn missing_segments_are_said_wherever_they_are() {
-    let kept = Kept::new(10_000);
-    let all = kept.segments();
-    fs::remove_file(&all[7]).unwrap();
-    let mut replay = kept.open_saying(&["are gone", "missing"]);
-    assert_eq!(replay.status().transitions_inserted, kept.history.inserted);
-    kept.check(&mut replay);
-
-    let kept = Kept::new(10_000);
-    let all = kept.segments();
-    fs::remove_file(&all[0]).unwrap();
-    fs::remove_file(&all[1]).unwrap();
-    let mut replay = kept.open_saying(&["the oldest segments are missing"]);
-    assert_eq!(stored(&replay).len(), kept.stored.len());
-    kept.check(&mut replay);
-
-    let kept = Kept::new(10_000);
-    let all = kept.segments();
-    fs::remove_file(all.last().unwrap()).unwrap();
-    let replay = kept.open_saying(&["is missing: the replay is what it was"]);
-    assert!(replay.status().transitions_inserted < kept.history.inserted);
-    replay.check_valid();
-
+fn damage_costs_what_it_hits_and_is_said() {
+    type Spoil = fn(&Path);
+    let last = usize::MAX;
+    let gone = "are gone";
+    let next = "is missing: the replay is what it was";
+    let misplaced = "not the segment that belongs here";
+    let cases: &[(usize, Spoil, &[&str], Left)] = &[
+        (
+            5,
+            |it| flip(it, |length| length * 2 / 3),
+            &["damaged at byte", gone],
+            Counts,
+        ),
+        (
+            4,
+            |it| flip(it, |_| 40),
+            &["its beginning is damaged", "is now", gone],
+            Counts,
+        ),
+        (7, remove, &[gone, "missing"], Counts),
+        (0, remove, &["the oldest segments are missing"], Counts),
+        (last, remove, &[next], Beginning),
+        (last, lengthen_a_record, &["are cut off"], Beginning),
+        (last, append_zeros, &[], All),
+        // One that was just begun, one under another's name, and who it is: that is in the segments, too.
+        (3, |it| copy_to(it, 999, 20), &[], All),
+        (3, |it| copy_to(it, 600, 1 << 20), &[misplaced], All),
+        (0, |it| remove(&it.with_file_name("log.toml")), &[], All),
+    ];
+    for (number, (segment, spoil, words, left)) in cases.iter().enumerate() {
+        let kept = Kept::new(10_000);
+        let segments = kept.segments();
+        spoil(&segments[*segment.min(&(segments.len() - 1))]);
+        let mut replay = kept.open_saying(words);
+        let status = replay.status();
+        assert_eq!(status.transitions_lost, 0, "case {number}");
+        let inserted = kept.history.inserted;
+        let is_whole = status.transitions_inserted == inserted;
+        assert_eq!(is_whole, *left != Beginning, "case {number}");
+        assert!(
+            *left != All || stored(&replay) == kept.stored,
+            "case {number}"
+        );
+        replay.check_valid();
+        if is_whole {
+            kept.check(&mut replay);
+        }
+        // The warning of what is gone comes again for as long as it would be held, and no other one.
+        let after = stored(&replay);
+        drop(replay);
+        let (replay, recovery) = kept.open();
+        assert!(stored(&replay) == after, "case {number}");
+        let says_gone = recovery.warnings.iter().any(|it| it.contains(gone));
+        assert_eq!(says_gone, *left == Counts, "case {number}: {recovery:?}");
+    }
     // None is missing where the oldest were removed with their transitions.
     let kept = Kept::new(100);
     let mut replay = kept.open_saying(&[]);
@@ -229,7 +254,7 @@ fn missing_segments_are_said_wherever_they_are() {
     kept.check(&mut replay);
 }
 
-/// What was acknowledged and is lost never comes again: the actor, which goes on, is taken at its word, and the loss is counted.
+/// What was acknowledged and is lost never comes again: the actor, which continues, is taken at its word, and the loss is counted.
 #[test]
 fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
     let kept = Kept::new(10_000);
@@ -265,49 +290,13 @@ fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
 }
 
 #[test]
-fn a_power_cut_that_leaves_zeros_is_a_torn_write() {
-    let kept = Kept::new(10_000);
-    let newest = kept.segments().pop().unwrap();
-    let mut bytes = fs::read(&newest).unwrap();
-    bytes.extend_from_slice(&[0; 5_000]);
-    fs::write(&newest, &bytes).unwrap();
-    let replay = kept.open_saying(&[]);
-    assert_eq!(stored(&replay), kept.stored);
-    assert!(fs::metadata(&newest).unwrap().len() < bytes.len() as u64);
-    drop(replay);
-    // A segment that was just begun.
-    let next = kept.segments().pop().unwrap();
-    let next = next.with_file_name("segment-000000000999.log");
-    fs::write(&next, &bytes[..20]).unwrap();
-    let replay = kept.open_saying(&[]);
-    assert_eq!(stored(&replay), kept.stored);
-}
-
-#[test]
-fn what_is_not_of_this_log_is_left_alone() {
+fn a_segment_of_another_log_is_left_alone() {
     let (kept, other) = (Kept::new(10_000), Kept::new(10_000));
     let foreign = kept.args.dir.join("segment-000000000500.log");
     fs::copy(&other.segments()[3], &foreign).unwrap();
     let replay = kept.open_saying(&["segment-000000000500.log is not of this log"]);
     assert_eq!(stored(&replay), kept.stored);
     assert!(foreign.exists());
-    drop(replay);
-    fs::remove_file(&foreign).unwrap();
-
-    // Its own one, under another's name.
-    fs::copy(
-        &kept.segments()[3],
-        kept.args.dir.join("segment-000000000600.log"),
-    )
-    .unwrap();
-    let replay = kept.open_saying(&["is not the segment that belongs here"]);
-    assert_eq!(stored(&replay), kept.stored);
-    drop(replay);
-
-    // Who it is is known from the segments, too.
-    fs::remove_file(kept.args.dir.join("log.toml")).unwrap();
-    let replay = kept.open_saying(&[]);
-    assert_eq!(stored(&replay), kept.stored);
 }
 
 #[test]

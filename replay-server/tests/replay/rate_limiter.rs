@@ -1,5 +1,4 @@
-//! The rate limiter: nobody waits for ever, and the ratio comes out exactly.
-//! It does not test what is stored or sampled.
+//! The rate limiter: neither side waits for ever, and the ratio comes out exactly.
 
 use driml_protocol::Waiting;
 use driml_replay_server::RateLimiter;
@@ -44,7 +43,7 @@ fn a_run_from_first_to_last() {
 
 proptest! {
     #[test]
-    fn nobody_waits_for_ever_and_the_ratio_is_kept(
+    fn neither_side_waits_for_ever_and_the_ratio_is_kept(
         ratio in 0.02f64..70.0,
         rows in 1u32..600,
         warmup in 0u64..3000,

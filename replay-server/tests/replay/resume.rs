@@ -10,10 +10,13 @@ use crate::{
 };
 
 fn config() -> Config {
-    let mut config = unlimited(1000);
-    (config.replay_ratio, config.warmup_transitions) = (4.0, 60);
-    (config.slack_transitions, config.transitions_max) = (12, Some(180));
-    config
+    Config {
+        replay_ratio: 4.0,
+        warmup_transitions: 60,
+        slack_transitions: 12,
+        transitions_max: Some(180),
+        ..unlimited(1000)
+    }
 }
 
 /// Plays to the end of the run: the chunks of 6 transitions that were stored, and the batches of `rows` that were served.
@@ -62,7 +65,7 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         ("another ratio", &other_ratio, at(29, 120), 8, (20, 15), 60),
         // 240 rows.
         (
-            "larger batches",
+            "larger ones",
             &larger_batches,
             at(29, 120),
             16,
@@ -79,12 +82,8 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         assert_eq!(status.transitions_refilled, refilled, "{what}");
         let inserted = join.tally.inserted + stored - refilled;
         assert_eq!(status.transitions_inserted, inserted, "{what}");
-        let served = expected.1 * u64::from(rows);
-        assert_eq!(
-            status.rows_sampled,
-            join.tally.rows_sampled + served,
-            "{what}"
-        );
+        let served = join.tally.rows_sampled + expected.1 * u64::from(rows);
+        assert_eq!(status.rows_sampled, served, "{what}");
         assert_eq!(status.transitions_held, stored, "{what}");
         assert_eq!(replay.resumed_after(), join.updates, "{what}");
     }

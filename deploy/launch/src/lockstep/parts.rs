@@ -305,7 +305,8 @@ impl Lockstep {
         }
         self.learner.note(&report, &mut self.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER) {
-            self.replay.set_affinity(&affinity)?;
+            let set = self.replay.set_affinity(&affinity);
+            set.map_err(anyhow::Error::msg)?;
         }
         if self.learner.publication_is_due() {
             self.publish()?;

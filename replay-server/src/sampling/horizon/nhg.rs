@@ -1,11 +1,11 @@
-//! The non-homogeneous geometric rule (DRIML-ada): a walk along the stored actions that goes on while they are expected.
+//! The non-homogeneous geometric rule (DRIML-ada): a walk along the stored actions for as long as they are expected.
 //! It does not estimate the affinity: that comes from the learner.
 
 use rand::Rng;
 
 use super::affinity::Affinity;
 
-/// Largest difference between the probability with which the walk goes on and A: what is drawn has 2^24 values.
+/// Largest difference between the probability with which the walk continues and A: what is drawn has 2^24 values.
 pub const GO_ON_ERROR: f64 = 1.0 / (1 << 24) as f64;
 
 /// Walks i = 1..H along `actions` and stops at the first b = 0, b ~ Bernoulli(A_i), A_i = A[a_{t+i-1}, a_{t+i}].

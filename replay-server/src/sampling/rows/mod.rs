@@ -13,10 +13,7 @@ use prioritised::Priorities;
 use sampler::RowSampler;
 use uniform::Uniform;
 
-/// The sampler of a ring of `capacity` transitions.
-///
-/// # Errors
-/// The system refuses to reserve that much memory: the bytes asked for.
+/// The sampler of a ring of `capacity` transitions. An error gives the bytes that the system refuses to reserve.
 pub(crate) fn sampler(
     sampling: &Sampling,
     spec: &RunSpec,

@@ -23,8 +23,8 @@ use crate::{
 /// add as much to the loss.
 pub const PRIORITY_MIN: f64 = 1e-10;
 
-/// Largest error of the chance that a batch says of a row, as a share of it: half of an f32's last place. One below 1.2e-38 is said to
-/// be that.
+/// Largest error of the chance that a batch says of a row, as a share of it: half of an f32's last place. One below 1.2e-38 is sent
+/// as that.
 pub const CHANCE_ERROR: f64 = 6.1e-8;
 
 /// The highest priority before the first is known, as in Dopamine: any would do, as all are equal then.
@@ -50,10 +50,8 @@ pub(super) struct Priorities {
 }
 
 impl Priorities {
-    /// Those of an empty ring of `capacity` transitions, where `reach` steps must follow an anchor.
-    ///
-    /// # Errors
-    /// The system refuses to reserve that much memory: the bytes asked for.
+    /// Those of an empty ring of `capacity` transitions, where `reach` steps must follow an anchor. An error gives the bytes that the
+    /// system refuses to reserve.
     pub(super) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
         Ok(Self {
             alpha,
@@ -78,9 +76,8 @@ impl Priorities {
 
     /// Whether an update of this number comes from `learner` for the first time; if so, it is remembered as the last.
     fn is_new(&mut self, learner: u64, number: u64) -> bool {
-        let is_new = self
-            .last
-            .is_none_or(|last| last.0 != learner || number > last.1);
+        let last = self.last;
+        let is_new = last.is_none_or(|last| last.0 != learner || number > last.1);
         if is_new {
             self.last = Some((learner, number));
         }
@@ -92,7 +89,7 @@ impl Priorities {
         for (&index, &priority) in part.transitions.iter().zip(&part.priorities) {
             let slot = self.slot(index);
             let is_held = (ring.oldest()..ring.inserted()).contains(&index);
-            // What is no anchor has none.
+            // Only anchors have one.
             if !is_held || self.masses.get(slot) == 0.0 {
                 self.counts.gone += 1;
                 continue;
@@ -161,7 +158,7 @@ impl RowSampler for Priorities {
             if episodes.walk(ring, newest - behind, window) {
                 return true;
             }
-            // The first frame of its stack was overwritten: it is no anchor any more, and never again.
+            // The first frame of its stack was overwritten: it can never be an anchor again.
             self.masses.set(slot, 0.0);
         }
         false
@@ -220,13 +217,7 @@ impl RowSampler for Priorities {
         })
     }
 
-    fn restore(
-        &mut self,
-        Held { ring, episodes }: Held<'_>,
-        oldest: u64,
-        state: &RowsState,
-        _: &mut Window,
-    ) {
+    fn restore(&mut self, Held { ring, episodes }: Held<'_>, oldest: u64, state: &RowsState) {
         // Of a run that drew by another rule: each transition keeps the highest.
         let RowsState::Prioritised(saved) = state else {
             return;
@@ -236,7 +227,7 @@ impl RowSampler for Priorities {
             if !(ring.oldest()..ring.inserted()).contains(&index) {
                 continue;
             }
-            // Where steps that followed it are gone, it is no anchor any more.
+            // Where steps that followed it are gone, it cannot be an anchor any more.
             let lacks_steps = self.masses.get(slot) == 0.0 && episodes.is_whole(ring, index);
             if !lacks_steps {
                 self.masses.set(slot, mass);

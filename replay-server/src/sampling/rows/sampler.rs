@@ -1,5 +1,4 @@
 //! What a rule of drawing anchors does, and what of it is kept.
-//! The rules are in files of their own.
 
 use driml_protocol::{Origin, PriorityUpdate};
 use rand_chacha::ChaCha8Rng;
@@ -49,42 +48,46 @@ pub(crate) struct Held<'a> {
     pub(crate) episodes: &'a Episodes,
 }
 
-/// A rule by which anchors are drawn.
+/// A rule by which anchors are drawn. What only rules with priorities do has a default.
 pub(crate) trait RowSampler: Send {
     /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
-    fn stored(&mut self, held: Held<'_>, first: u64, link: Link);
+    fn stored(&mut self, _held: Held<'_>, _first: u64, _link: Link) {}
 
     /// Transitions were let go.
-    fn forget(&mut self, ring: &Ring);
+    fn forget(&mut self, _ring: &Ring) {}
 
     /// Leaves the window of an anchor in `window`; false if there is none.
     fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
 
     /// The probability with which each draw gives the anchor `index`; none where all anchors are equally likely.
-    fn probability(&self, index: u64) -> Option<f64>;
+    fn probability(&self, _index: u64) -> Option<f64> {
+        None
+    }
 
-    /// Takes the priorities that the learner found; those drawn by another `origin` change nothing.
-    ///
-    /// # Errors
-    /// A rule without priorities, or a transition that was never stored; the reason, for a person. Nothing has then changed.
+    /// Takes the priorities that the learner found; those drawn by another `origin` change nothing. On an error, which says why for a
+    /// person, nothing has changed.
     fn update(
         &mut self,
-        ring: &Ring,
-        update: &PriorityUpdate,
-        origin: Origin,
-    ) -> Result<(), String>;
+        _ring: &Ring,
+        _update: &PriorityUpdate,
+        _origin: Origin,
+    ) -> Result<(), String> {
+        Err("priorities, in a run that draws uniformly".into())
+    }
 
     /// What became of the priorities that came; none where there are no priorities.
-    fn priority_counts(&self) -> Option<PriorityCounts>;
+    fn priority_counts(&self) -> Option<PriorityCounts> {
+        None
+    }
 
     /// What decides the next draws, beside what is held.
     fn state(&self, ring: &Ring) -> RowsState;
 
     /// Takes back a state; of transitions that are no longer held, or were not, nothing. `oldest` is the oldest that was held.
-    fn restore(&mut self, held: Held<'_>, oldest: u64, state: &RowsState, window: &mut Window);
+    fn restore(&mut self, held: Held<'_>, oldest: u64, state: &RowsState);
 
     /// Panics at the first thing that is wrong. Slow: for tests.
-    fn check_valid(&self, held: Held<'_>);
+    fn check_valid(&self, _held: Held<'_>) {}
 }
 
 /// [`RowSampler::state`].
@@ -98,6 +101,10 @@ pub(crate) enum RowsState {
 }
 
 impl RowsState {
+    pub(crate) const fn is_prioritised(&self) -> bool {
+        matches!(self, Self::Prioritised(_))
+    }
+
     /// Why this cannot be the state of a replay that held `held` transitions; none if it can.
     pub(crate) fn unfit(&self, held: u64) -> Option<&'static str> {
         match self {

@@ -15,10 +15,7 @@ pub(super) struct SumTree {
 }
 
 impl SumTree {
-    /// All 0. Its memory is taken as places are used.
-    ///
-    /// # Errors
-    /// The system refuses to reserve that much memory: the bytes asked for.
+    /// All 0. Its memory is taken as places are used. An error gives the bytes that the system refuses to reserve.
     pub(super) fn new(capacity: u64) -> Result<Self, u64> {
         let leaves = capacity.checked_next_power_of_two().unwrap_or(u64::MAX);
         let asked = leaves.saturating_mul(2 * size_of::<f64>() as u64);

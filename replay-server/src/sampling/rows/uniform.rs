@@ -1,15 +1,11 @@
 //! Draws anchors, each valid one equally likely.
 //! It does not decide what is valid: that is `episodes`.
 
-use driml_protocol::{Origin, PriorityUpdate};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::sampler::{Held, PriorityCounts, RowSampler, RowsState};
-use crate::{
-    sampling::episodes::Window,
-    storage::ring::{Link, Ring},
-};
+use super::sampler::{Held, RowSampler, RowsState};
+use crate::{sampling::episodes::Window, storage::ring::Ring};
 
 /// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
 const TRIES_MAX: u32 = 64;
@@ -30,20 +26,17 @@ impl Uniform {
         self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
     }
 
-    fn list(&mut self, Held { ring, episodes }: Held<'_>, window: &mut Window) {
+    fn list(&mut self, Held { ring, episodes }: Held<'_>) {
+        let mut window = Window::default();
         self.valid.clear();
         let held = ring.oldest()..ring.inserted();
         self.valid
-            .extend(held.filter(|&t| episodes.walk(ring, t, window)));
+            .extend(held.filter(|&t| episodes.walk(ring, t, &mut window)));
         (self.listed_at, self.listed_from) = (ring.inserted(), ring.oldest());
     }
 }
 
 impl RowSampler for Uniform {
-    fn stored(&mut self, _: Held<'_>, _: u64, _: Link) {}
-
-    fn forget(&mut self, _: &Ring) {}
-
     /// By rejection; after [`TRIES_MAX`] misses by listing, which takes time proportional to the transitions held.
     fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
         let Held { ring, episodes } = held;
@@ -57,7 +50,7 @@ impl RowSampler for Uniform {
                     return true;
                 }
             }
-            self.list(held, window);
+            self.list(held);
         }
         if self.valid.is_empty() {
             return false;
@@ -68,29 +61,15 @@ impl RowSampler for Uniform {
         valid
     }
 
-    fn probability(&self, _: u64) -> Option<f64> {
-        None
-    }
-
-    fn update(&mut self, _: &Ring, _: &PriorityUpdate, _: Origin) -> Result<(), String> {
-        Err("priorities, in a run that draws uniformly".into())
-    }
-
-    fn priority_counts(&self) -> Option<PriorityCounts> {
-        None
-    }
-
     fn state(&self, ring: &Ring) -> RowsState {
         RowsState::Uniform {
             are_listed: self.are_listed(ring),
         }
     }
 
-    fn restore(&mut self, held: Held<'_>, _: u64, state: &RowsState, window: &mut Window) {
+    fn restore(&mut self, held: Held<'_>, _: u64, state: &RowsState) {
         if *state == (RowsState::Uniform { are_listed: true }) {
-            self.list(held, window);
+            self.list(held);
         }
     }
-
-    fn check_valid(&self, _: Held<'_>) {}
 }

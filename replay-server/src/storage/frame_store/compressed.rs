@@ -117,7 +117,7 @@ impl CompressedFrames {
         self.part(block, parts - 1).place.end
     }
 
-    /// Copies a part, as it is stored, to the end of `out`.
+    /// Copies a part, still packed, to the end of `out`.
     pub(crate) fn copy(&self, part: &BlockPart, out: &mut Vec<u8>) {
         self.log.copy(part.place.clone(), out);
     }
@@ -127,10 +127,7 @@ impl CompressedFrames {
     }
 
     pub(crate) fn check_valid(&self, oldest: u64, inserted: u64) {
-        assert!(
-            self.log.len() <= self.blocks_bytes_max,
-            "the bytes allowed are kept"
-        );
+        assert!(self.log.len() <= self.blocks_bytes_max, "too many bytes");
         let mut place = self.log.start();
         let first = self.blocks.front().map_or(oldest, |block| block.first);
         let mut next = first;
@@ -138,30 +135,20 @@ impl CompressedFrames {
             assert_eq!((block.first, block.start), (next, place), "no gaps");
             for part in 0..self.layout.parts(block.frames as usize) {
                 let part = self.part(block, part);
-                assert_eq!(
-                    (part.transitions.start, part.place.start),
-                    (next, place),
-                    "no gaps"
-                );
+                let begins = (part.transitions.start, part.place.start);
+                assert_eq!(begins, (next, place), "no gaps");
+                let frames_bytes = (part.transitions.end - next) * self.layout.frame_bytes as u64;
+                let bytes = part.place.end - place;
+                assert!(bytes <= frames_bytes, "no part is larger than its frames");
                 (next, place) = (part.transitions.end, part.place.end);
-                let frames = part.transitions.end - part.transitions.start;
-                assert!(
-                    part.place.end - part.place.start <= frames * self.layout.frame_bytes as u64,
-                    "no part is larger than its frames"
-                );
             }
         }
         assert_eq!(next, inserted, "every transition has a frame");
-        assert_eq!(
-            place,
-            self.log.start() + self.log.len(),
-            "no bytes are left over"
-        );
+        let end = self.log.start() + self.log.len();
+        assert_eq!(place, end, "no bytes are left over");
         if let Some(block) = self.blocks.front() {
-            assert!(
-                (block.first..block.end()).contains(&oldest),
-                "what is overwritten is gone"
-            );
+            let holds_oldest = (block.first..block.end()).contains(&oldest);
+            assert!(holds_oldest, "what is overwritten is gone");
         }
     }
 }

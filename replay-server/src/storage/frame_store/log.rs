@@ -1,5 +1,4 @@
 //! Bytes that come at one end and go at the other, in segments of one size, so that memory cannot fragment.
-//! It does not know what the bytes are.
 
 use std::{collections::VecDeque, ops::Range};
 

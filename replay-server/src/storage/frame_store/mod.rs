@@ -20,10 +20,8 @@ pub(crate) enum Frames {
 }
 
 impl Frames {
-    /// Room for the frames of `capacity` transitions; compressed ones take `bytes_max` bytes at most, if there is a limit.
-    ///
-    /// # Errors
-    /// The system refuses to reserve that much memory: the bytes asked for.
+    /// Room for the frames of `capacity` transitions; compressed ones take `bytes_max` bytes at most, if there is a limit. An error
+    /// gives the bytes that the system refuses to reserve.
     pub(crate) fn new(
         compression: Compression,
         capacity: u64,
@@ -59,12 +57,12 @@ impl Frames {
         }
     }
 
-    /// The next frame, the first, is that of transition `first`.
+    /// Lets go of all frames; the next one is that of transition `first`.
     pub(crate) fn start_at(&mut self, first: u64) {
         match self {
             Self::Plain(frames) => frames.start_at(first),
             // A block begins where the last ended, the first one at what `push` is told.
-            Self::Compressed(_) => {}
+            Self::Compressed(frames) => frames.forget_before(u64::MAX),
         }
     }
 

@@ -1,5 +1,4 @@
 //! Frames as they came, in one buffer: number `i` since the start lies in slot `(i - first) % capacity`.
-//! It compresses nothing and frees nothing.
 
 /// The newest `capacity` frames.
 pub(crate) struct PlainFrames {
@@ -13,10 +12,7 @@ pub(crate) struct PlainFrames {
 }
 
 impl PlainFrames {
-    /// An empty buffer for `capacity` frames.
-    ///
-    /// # Errors
-    /// The system refuses to reserve that much memory: the bytes asked for.
+    /// An empty buffer for `capacity` frames. An error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(capacity: u64, frame_bytes: usize) -> Result<Self, u64> {
         let asked = capacity.saturating_mul(frame_bytes as u64);
         let length = usize::try_from(asked).map_err(|_| asked)?;
@@ -31,9 +27,10 @@ impl PlainFrames {
         })
     }
 
-    /// The next frame, the first, has the number `first`.
-    pub(crate) const fn start_at(&mut self, first: u64) {
-        self.first = first;
+    /// Lets go of all frames; the next one has the number `first`.
+    pub(crate) fn start_at(&mut self, first: u64) {
+        self.bytes.clear();
+        (self.first, self.next) = (first, 0);
     }
 
     /// Stores frames, over the oldest ones once the buffer is full.
@@ -62,10 +59,8 @@ impl PlainFrames {
     }
 
     pub(crate) fn check_valid(&self, stored: u64) {
-        assert_eq!(
-            self.bytes_held(),
-            stored.min(self.capacity) * self.frame_bytes as u64,
-            "one frame a transition, until they are overwritten"
-        );
+        // One frame a transition, until they are overwritten.
+        let bytes = stored.min(self.capacity) * self.frame_bytes as u64;
+        assert_eq!(self.bytes_held(), bytes);
     }
 }

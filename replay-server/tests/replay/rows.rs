@@ -1,10 +1,11 @@
-//! Prioritised sampling: the law of the draws, who can be drawn, and what becomes of priorities that come late, twice or from elsewhere.
-//! The tree by itself is tested beside its code.
+//! Which rows are drawn: the law of both rules, who can be drawn, and what becomes of priorities that come late, twice or from elsewhere.
+//! It does not check what the rows hold: `batches` does.
 
 use std::collections::HashMap;
 
 use driml_protocol::{
-    Batch, ChunkHeader, Horizon, Origin, PriorityPart, PriorityUpdate, Sampling, TimeoutRule,
+    Batch, ChunkHeader, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, Sampling,
+    TimeoutRule,
 };
 use driml_replay_server::{Config, PRIORITY_MIN, PriorityCounts, Replay};
 use proptest::prelude::*;
@@ -38,7 +39,8 @@ struct Setup {
     replay: Replay,
     history: History,
     rng: ChaCha8Rng,
-    alpha: f64,
+    /// None where rows are drawn uniformly.
+    alpha: Option<f64>,
     /// Of each transition that was learned from.
     priorities: HashMap<u64, f64>,
     /// Of each that became an anchor, the highest priority then.
@@ -50,9 +52,13 @@ struct Setup {
 }
 
 impl Setup {
-    fn new(capacity: u64, alpha: f64, frame_stack: u32, horizon: Horizon) -> Self {
-        let spec = spec(3, frame_stack, 4, horizon);
-        let mut replay = Replay::new(&spec, &prioritised(capacity, alpha), ROWS).unwrap();
+    fn new(capacity: u64, alpha: Option<f64>, frame_stack: u32, timeout: TimeoutRule) -> Self {
+        let spec = RunSpec {
+            timeout,
+            ..spec(3, frame_stack, 4, Horizon::Uniform { k_max: 6 })
+        };
+        let config = alpha.map_or(unlimited(capacity), |alpha| prioritised(capacity, alpha));
+        let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
         for actor in 0..4 {
             join(&mut replay, actor, 1);
         }
@@ -104,10 +110,11 @@ impl Setup {
         states.map(index).collect()
     }
 
-    /// Draws a batch and says what its rows' losses are.
-    fn learn(&mut self) -> PriorityUpdate {
+    /// Draws a batch and, where that counts, says what its rows' losses are.
+    fn learn(&mut self) -> Option<PriorityUpdate> {
         let batch = self.replay.sample(ROWS).unwrap();
         check_rows(&batch, &self.history);
+        self.alpha?;
         let found: Vec<f32> = (0..ROWS)
             .map(|_| self.rng.random_range(0.0f32..4.0).powi(3))
             .collect();
@@ -120,14 +127,15 @@ impl Setup {
             self.highest = self.highest.max(f64::from(*found));
         }
         self.replay.set_priorities(&update).unwrap();
-        update
+        Some(update)
     }
 
-    /// The paper's law over the anchors, by a plain loop.
+    /// The law over the anchors, by a plain loop: the paper's, or the uniform one.
     fn law(&self) -> HashMap<u64, f64> {
         let mass = |index| {
             let priority = self.priorities.get(&index).or(self.first.get(&index));
-            (priority.unwrap() + PRIORITY_MIN).powf(self.alpha)
+            let alpha = self.alpha.unwrap_or(0.0);
+            (priority.unwrap() + PRIORITY_MIN).powf(alpha)
         };
         let anchors = self.anchors().into_iter();
         let masses: Vec<_> = anchors.map(|index| (index, mass(index))).collect();
@@ -140,6 +148,7 @@ impl Setup {
 
     /// Draws follow the law, and say how likely they were.
     fn check_law(&mut self, what: &str) {
+        let what = format!("alpha {:?}: {what}", self.alpha);
         let law = self.law();
         let mut counts: HashMap<u64, u64> = law.keys().map(|&index| (index, 0)).collect();
         // The first frames of some stacks may be gone: each is found once, then chances are those of the law.
@@ -148,9 +157,12 @@ impl Setup {
         }
         for _ in 0..law.len() * 4 {
             let batch = self.replay.sample(ROWS).unwrap();
-            let chances = batch.probabilities().unwrap();
-            for (index, chance) in self.indices(&batch).into_iter().zip(chances) {
-                *counts.get_mut(&index).unwrap() += 1;
+            let indices = self.indices(&batch);
+            for index in &indices {
+                *counts.get_mut(index).unwrap() += 1;
+            }
+            let chances = batch.probabilities().into_iter().flatten();
+            for (index, chance) in indices.into_iter().zip(chances) {
                 let (chance, expected) = (f64::from(chance), law[&index]);
                 assert!(chance <= expected * (1.0 + 1e-5), "{chance}, {expected}");
                 let may_hide = self.history.spec.frame_stack > 1;
@@ -164,71 +176,47 @@ impl Setup {
             .unzip();
         let mut chi = ChiSquare::default();
         chi.add(&counts, &chances);
-        chi.check(what);
+        chi.check(&what);
     }
 }
 
 #[test]
-fn draws_follow_the_paper_s_law() {
-    for (alpha, frame_stack) in [(0.0, 1), (0.5, 1), (0.5, 4), (1.0, 1)] {
-        let mut setup = Setup::new(200, alpha, frame_stack, Horizon::Uniform { k_max: 3 });
-        for _ in 0..12 {
-            setup.insert(0, 2, 5);
-            setup.insert(1, 1, 3);
-            setup.learn();
+fn draws_follow_the_law_of_their_rule() {
+    let cases = [
+        (None, 1),
+        (None, 4),
+        (Some(0.0), 1),
+        (Some(0.5), 1),
+        (Some(0.5), 4),
+        (Some(1.0), 1),
+    ];
+    for (alpha, frame_stack) in cases {
+        let mut setup = Setup::new(200, alpha, frame_stack, TimeoutRule::Terminal);
+        for (rounds, what) in [(12, "a ring that is not full"), (20, "a full ring")] {
+            for _ in 0..rounds {
+                setup.insert(0, 2, 5);
+                setup.insert(1, 1, 3);
+                setup.learn();
+            }
+            setup.check_law(&format!("{what}, stack {frame_stack}"));
         }
-        setup.check_law(&format!("alpha = {alpha}, a ring that is not full"));
-        for _ in 0..20 {
-            setup.insert(0, 2, 5);
-            setup.insert(1, 1, 3);
-            setup.learn();
-        }
-        assert!(setup.history.oldest() > 0);
-        setup.check_law(&format!(
-            "alpha = {alpha}, stack {frame_stack}, a full ring"
-        ));
+        assert!(setup.history.oldest() > 0 && setup.anchors().len() > 100);
     }
 }
 
-/// Streams of a step each: most of what is held is no anchor, and none of it is in the way.
+/// Streams of a step each: most of what is held can be no anchor. The uniform rule lists those that can, the other has them alone.
 #[test]
-fn what_is_no_anchor_is_never_tried() {
-    let mut setup = Setup::new(2000, 0.5, 1, Horizon::Uniform { k_max: 3 });
-    setup.history.ends = false;
-    setup.insert(0, 1, 20);
-    setup.insert(1, 900, 1);
-    setup.insert(2, 900, 1);
-    assert_eq!(setup.anchors().len(), 16);
-    setup.learn();
-    setup.check_law("few anchors");
-}
-
-/// k is drawn as it is where rows are drawn uniformly.
-#[test]
-fn k_follows_its_own_rule() {
-    let k_max = 3;
-    let mut setup = Setup::new(300, 0.5, 1, Horizon::Uniform { k_max });
-    for _ in 0..20 {
-        setup.insert(0, 2, 8);
+fn few_anchors_follow_the_law_too() {
+    for alpha in [None, Some(0.5)] {
+        let mut setup = Setup::new(2000, alpha, 1, TimeoutRule::Terminal);
+        setup.history.ends = false;
+        setup.insert(0, 1, 20);
+        setup.insert(1, 900, 1);
+        setup.insert(2, 900, 1);
+        assert_eq!((setup.anchors().len(), setup.history.inserted), (14, 1820));
         setup.learn();
+        setup.check_law("few anchors");
     }
-    let mut counts = vec![[0u64; 3]; k_max as usize + 1];
-    for _ in 0..1000 {
-        let batch = setup.replay.sample(ROWS).unwrap();
-        let spec = &setup.history.spec;
-        let states_t = batch.states_t();
-        let states = states_t.chunks(spec.state_bytes());
-        for (state, &k) in states.zip(batch.ks()).filter(|(_, k)| **k > 0) {
-            let (key, t) = identity(spec, state);
-            let left = setup.history.row(key, t).steps_left;
-            counts[left][usize::from(k) - 1] += 1;
-        }
-    }
-    let mut chi = ChiSquare::default();
-    for left in 1..=k_max as usize {
-        chi.add(&counts[left][..left], &vec![1.0 / left as f64; left]);
-    }
-    chi.check("k");
 }
 
 fn counts(replay: &Replay) -> PriorityCounts {
@@ -237,9 +225,9 @@ fn counts(replay: &Replay) -> PriorityCounts {
 
 #[test]
 fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
-    let mut setup = Setup::new(100, 1.0, 1, Horizon::None);
+    let mut setup = Setup::new(100, Some(1.0), 1, TimeoutRule::Terminal);
     setup.insert(0, 1, 60);
-    let first = setup.learn();
+    let first = setup.learn().unwrap();
     let rows = u64::from(ROWS);
     assert_eq!(counts(&setup.replay).set, rows);
 
@@ -298,9 +286,9 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
 
 #[test]
 fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
-    let mut setup = Setup::new(100, 0.5, 1, Horizon::None);
+    let mut setup = Setup::new(100, Some(0.5), 1, TimeoutRule::Terminal);
     setup.insert(0, 1, 60);
-    let mut update = setup.learn();
+    let mut update = setup.learn().unwrap();
     update.number += 1;
     update.parts[0].transitions[3] = 60;
     let refused = setup.replay.set_priorities(&update).unwrap_err();
@@ -331,13 +319,8 @@ proptest! {
         frame_stack in 1u32..5,
         bootstraps in any::<bool>(),
     ) {
-        let mut setup = Setup::new(capacity, 0.5, frame_stack, Horizon::Uniform { k_max: 6 });
-        if bootstraps {
-            setup.history.spec.timeout = TimeoutRule::Bootstrap;
-            let config = prioritised(capacity, 0.5);
-            setup.replay = Replay::new(&setup.history.spec, &config, ROWS).unwrap();
-            (0..4).for_each(|actor| join(&mut setup.replay, actor, 1));
-        }
+        let timeout = if bootstraps { TimeoutRule::Bootstrap } else { TimeoutRule::Terminal };
+        let mut setup = Setup::new(capacity, Some(0.5), frame_stack, timeout);
         for (actor, steps, learns) in steps {
             setup.insert(actor, 1 + actor % 2, steps.min(capacity as u32 / 2));
             if learns && !setup.anchors().is_empty() {

@@ -1,0 +1,285 @@
+//! What a replay does with its log: snapshots, segments and marks while it runs, and taking a snapshot back.
+//! How the log is written is for `journal`, how it is read for `recover`. A replay in memory has none, and does nothing here.
+
+use std::borrow::Cow;
+
+use driml_protocol::{Chunk, ChunkHeader, CodecError, LogStatus, Tally, codec};
+
+use super::{
+    error::PersistError,
+    segment::Mark,
+    snapshot::{Note, Snapshot, State},
+};
+use crate::{replay::Replay, sampling::rows::sampler::RowsState};
+
+/// Transitions of one piece of what is gone.
+const GONE_PIECE: u64 = 256;
+
+/// What is written, and what others hear of it.
+impl Replay {
+    /// Bytes of the log; 0 without one.
+    pub fn log_bytes(&self) -> u64 {
+        self.log.as_ref().map_or(0, |log| log.journal.bytes())
+    }
+
+    /// How the log stands; none without one.
+    pub(crate) fn log_status(&self) -> Option<LogStatus> {
+        self.log.as_ref().map(|log| log.journal.status())
+    }
+
+    /// Whether all notes are on disk; until then joins and goodbyes get no answer.
+    pub(crate) fn is_ready(&mut self) -> bool {
+        let log = self.log.as_mut();
+        log.is_none_or(|log| log.journal.is_ready())
+    }
+
+    /// Whether the disk refused what was to be written last.
+    pub fn is_refused_by_disk(&self) -> bool {
+        let log = self.log.as_ref();
+        log.is_some_and(|log| log.journal.is_failing())
+    }
+
+    /// Flushes what was written to the disk: nothing more is to come.
+    pub(crate) fn flush(&mut self) {
+        if let Some(log) = &mut self.log {
+            log.journal.flush();
+        }
+    }
+
+    /// Marks this moment in the log, on the disk. The log can be opened there again, also after it was continued: then all of the
+    /// replay is the same as now, to the last bit. The last two marks hold, without those that were given up.
+    ///
+    /// # Errors
+    /// A disk that refuses.
+    pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
+        let snapshot = self.snapshot();
+        let marked = self.log.as_mut().map(|log| log.mark(snapshot));
+        self.prune();
+        marked.transpose()
+    }
+
+    /// Nothing will go back to `mark`, as the checkpoint that was to name it could not be saved: it does not take the place of one
+    /// to which a checkpoint goes back.
+    pub fn give_up_mark(&mut self, mark: Mark) {
+        if let Some(log) = &mut self.log {
+            log.give_up(mark);
+        }
+    }
+
+    pub(crate) fn note(&mut self, note: Note) {
+        if let Some(log) = &mut self.log {
+            log.journal.append_note(&note);
+        }
+        self.tidy();
+    }
+
+    /// Begins another segment when one is full, and removes those that are not needed any more.
+    pub(crate) fn tidy(&mut self) {
+        let journal = self.log.as_ref().map(|log| &log.journal);
+        if let Some(journal) = journal.filter(|it| it.is_full()) {
+            if let Some(oldest) = journal.over_budget() {
+                self.forget_before(oldest);
+                self.prune();
+            }
+            self.begin_segment();
+        }
+        self.prune();
+    }
+
+    pub(crate) fn begin_segment(&mut self) {
+        if self.log.is_some() {
+            let snapshot = self.snapshot();
+            let log = self.log.iter_mut();
+            log.for_each(|log| log.journal.rotate(&snapshot));
+        }
+    }
+
+    fn prune(&mut self) {
+        let oldest = self.ring.oldest();
+        self.log.iter_mut().for_each(|log| log.prune(oldest));
+    }
+
+    fn forget_before(&mut self, oldest: u64) {
+        self.ring.forget_before(oldest);
+        self.sampler.rows.forget(&self.ring);
+    }
+}
+
+/// What is read back.
+impl Replay {
+    /// All of it but the transitions.
+    pub(crate) fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            inserted: self.ring.inserted(),
+            oldest: self.ring.oldest(),
+            capacity: self.ring.capacity(),
+            counts: self.limiter.counts(),
+            rows: self.sampler.rows.state(&self.ring),
+            state: State {
+                statistics: self.state.statistics.logged(),
+                ..self.state.clone()
+            },
+        }
+    }
+
+    /// Takes back a snapshot. The transitions between what is stored and those that the snapshot knows are gone: they leave a gap, or,
+    /// where it is larger than the ring, an empty ring. The error says for a person why the snapshot is not of this run.
+    pub(super) fn restore(&mut self, snapshot: Snapshot) -> Result<(), String> {
+        if let Some(why) = snapshot.unfit(&self.state) {
+            return Err(why.into());
+        }
+        let Snapshot {
+            inserted,
+            oldest,
+            mut state,
+            ..
+        } = snapshot;
+        let stored = self.ring.inserted();
+        let is_empty = self.ring.first() == stored;
+        if !is_empty && inserted < stored {
+            return Err(format!(
+                "a state after {inserted} transitions, where {stored} are stored"
+            ));
+        }
+        if !is_empty && inserted > stored {
+            state.actors.cut_streams(stored);
+        }
+        if is_empty || inserted - stored >= self.ring.capacity() {
+            self.ring.start_at(inserted);
+        } else {
+            self.push_gone(inserted - stored);
+        }
+        self.forget_before(oldest);
+        self.limiter.set_counts(snapshot.counts);
+        self.sampler.restore(&self.ring, oldest, &snapshot.rows);
+        state.actors.note_restored();
+        let statistics = &mut state.statistics;
+        statistics.keep_newest_of(&mut self.state.statistics);
+        self.state = state;
+        Ok(())
+    }
+
+    /// Takes the place of `count` transitions that are gone.
+    fn push_gone(&mut self, mut count: u64) {
+        let packer = self.packer();
+        while count > 0 {
+            let steps = count.min(GONE_PIECE).min(self.ring.capacity());
+            let chunk = Chunk::zeroed(blank(steps as u32, self.spec.frame_bytes()));
+            let packed = packer.pack(Cow::Owned(chunk));
+            for run in packed.runs() {
+                self.ring.push_gone(run, steps);
+            }
+            count -= steps;
+        }
+    }
+
+    /// What was drawn since the last snapshot is not known: the learner says it, and other numbers are drawn from here on.
+    pub(super) fn await_learner(&mut self) {
+        self.awaits_learner = self.state.learner.is_some();
+        let stored = self.ring.inserted();
+        self.state.draw_anew(self.origin.shard, stored);
+    }
+
+    /// All but the transitions, as bytes that are the same where it is: what a mark brings back. For tests.
+    ///
+    /// # Errors
+    /// A state over the codec's limit.
+    pub fn state_bytes(&self) -> Result<Vec<u8>, CodecError> {
+        let mut snapshot = self.snapshot();
+        snapshot.state.statistics = snapshot.state.statistics.of_changes();
+        codec::encode_value(&snapshot)
+    }
+
+    /// The same without what was drawn: what a log brings back after its server died at any moment. For tests.
+    ///
+    /// # Errors
+    /// A state over the codec's limit.
+    pub fn stored_bytes(&self) -> Result<Vec<u8>, CodecError> {
+        let Snapshot {
+            mut counts, state, ..
+        } = self.snapshot();
+        counts.this_shard.rows_sampled = 0;
+        counts.other_shards = Tally::default();
+        codec::encode_value(&Snapshot {
+            counts,
+            rows: RowsState::Uniform { are_listed: false },
+            state: State {
+                actors: state.actors,
+                learner: state.learner,
+                resumed_after: state.resumed_after,
+                inserted_before: state.inserted_before,
+                statistics: state.statistics.of_stored(),
+                ..State::new(&self.spec, self.origin.shard)
+            },
+            ..self.snapshot()
+        })
+    }
+}
+
+/// Of a chunk that holds nothing.
+const fn blank(steps: u32, frame_bytes: usize) -> ChunkHeader {
+    ChunkHeader {
+        actor: 0,
+        incarnation: 0,
+        sequence: 0,
+        first_transition: 0,
+        weights_version: 0,
+        leaving: false,
+        streams: 1,
+        steps,
+        frame_bytes: frame_bytes as u32,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::{ActorJoin, Horizon, RunSpec, TimeoutRule};
+
+    use super::*;
+
+    /// What it counts after the gap was logged when it happened: it must not be logged again.
+    #[test]
+    fn a_gap_larger_than_the_ring_does_not_end_a_recovery() {
+        let spec = RunSpec {
+            world: "test".into(),
+            agent: "test".into(),
+            seed: 1,
+            frame_height: 1,
+            frame_width: 1,
+            frame_channels: 1,
+            frame_stack: 1,
+            num_actions: 1,
+            n_step: 1,
+            gamma: 0.9,
+            horizon: Horizon::None,
+            timeout: TimeoutRule::Terminal,
+        };
+        let config = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8.0\nwarmup_transitions = 0\nslack_transitions = 9";
+        let config = toml::from_str(config).unwrap();
+        let replay = |chunks| {
+            let mut replay = Replay::new(&spec, &config, 1).unwrap();
+            let (actor, incarnation) = (0, 1);
+            replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
+            for sequence in 0..chunks {
+                replay.insert(&Chunk::zeroed(ChunkHeader {
+                    incarnation,
+                    sequence,
+                    first_transition: 5 * sequence,
+                    leaving: true,
+                    ..blank(5, 1)
+                }));
+            }
+            replay
+        };
+        let mut recovered = replay(1);
+        recovered.quiet = true;
+        recovered.restore(replay(9).snapshot()).unwrap();
+        assert!(recovered.quiet);
+        recovered.check_valid();
+        let status = recovered.status();
+        assert_eq!(
+            (status.transitions_inserted, status.transitions_held),
+            (45, 0)
+        );
+    }
+}

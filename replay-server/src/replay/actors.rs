@@ -1,0 +1,209 @@
+//! The actors of a replay, and the chunks that they send.
+//! Which chunk is the next of its actor is the ledger's to say, and when one may come in the limiter's.
+
+use std::borrow::Cow;
+
+use driml_protocol::{ActorJoin, Chunk, Claim, EndedEpisode, Goodbye, InsertReply, Played};
+
+use super::Replay;
+use crate::{
+    admission::{self, TRANSITIONS_MAX},
+    ledger::actors::{Difference, Verdict},
+    persist::snapshot::Note,
+    storage::{
+        frame_store::{PackedChunk, Packer},
+        ring::Step,
+    },
+};
+
+impl Replay {
+    /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer. Gives the number
+    /// of earlier ones.
+    ///
+    /// # Errors
+    /// Too many actors, or a life that another one has replaced; the reason, for a person.
+    pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
+        let before = self.actor_incarnation(join.actor);
+        self.state.actors.join(join)?;
+        if before != Some(join.incarnation) {
+            self.note(Note::ActorJoined(join));
+        }
+        Ok(self.state.actors.earlier_incarnations(join.actor))
+    }
+
+    /// The life of `actor` whose chunks are stored; none before it joins.
+    pub fn actor_incarnation(&self, actor: u32) -> Option<u64> {
+        self.state.actors.current_incarnation(actor)
+    }
+
+    /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
+    pub fn packer(&self) -> Packer {
+        Packer {
+            compression: self.config.compression,
+            seal_for: self.log.as_ref().map(|log| log.spec_hash),
+        }
+    }
+
+    /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.
+    pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
+        self.insert_packed(&self.packer().pack(Cow::Borrowed(chunk)))
+    }
+
+    /// Stores a chunk that this replay's packer packed, whole, or says why not.
+    pub fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+        self.settle(packed).unwrap_or_else(|| self.admit(packed))
+    }
+
+    /// The answer to a chunk that is not to be stored, now or ever: it is stored already, is not the next of its actor, makes no
+    /// sense, or comes after the end of the run. `None`: it is for [`Replay::admit`].
+    ///
+    /// A retry is answered `Stored`, whatever the limiter says; a chunk that is not next is never stored.
+    pub(crate) fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
+        let chunk = &*packed.chunk;
+        let verdict = match self.unfit(chunk) {
+            Some(why) => Verdict::Refused(why),
+            None => self.state.actors.judge(&chunk.header),
+        };
+        match verdict {
+            Verdict::Refused(why) => Some(self.refused(why)),
+            Verdict::Retried => {
+                self.state.statistics.chunks_retried += 1;
+                Some(self.stored())
+            }
+            _ if self.limiter.all_in() => Some(self.run_is_full()),
+            Verdict::OutOfOrder { .. } if self.state.actors.insists(&chunk.header) => None,
+            Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
+            Verdict::Next => None,
+        }
+    }
+
+    /// Stores a chunk that [`Replay::settle`] has nothing to say of, on disk before in memory, if the limiter lets it pass or its actor
+    /// leaves; else, and while the disk refuses, the answer is to wait.
+    pub(crate) fn admit(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+        let is_leaving = packed.chunk.header.leaving;
+        if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
+            return self.wait(false);
+        }
+        match self.log.as_mut().map_or(Ok(true), |log| log.chunk(packed)) {
+            Ok(true) => {}
+            Ok(false) => return self.wait(false),
+            Err(why) => return InsertReply::Refused { why },
+        }
+        self.store(packed);
+        self.tidy();
+        self.stored()
+    }
+
+    /// What became of a chunk: stored, not wanted any more, or never to be stored; none where it is still to come.
+    pub fn claim(&mut self, claim: &Claim) -> Option<InsertReply> {
+        match self.state.actors.is_stored(claim) {
+            Ok(true) => Some(self.stored()),
+            Ok(false) => self.limiter.all_in().then(|| self.run_is_full()),
+            Err(why) => Some(self.refused(why)),
+        }
+    }
+
+    /// The answer that a chunk has to wait; `kept` says whether it waits here.
+    pub(crate) const fn wait(&self, kept: bool) -> InsertReply {
+        InsertReply::Wait {
+            inserted_total: self.inserted_total(),
+            kept,
+        }
+    }
+
+    fn refused(&mut self, why: String) -> InsertReply {
+        self.note_refused_message();
+        InsertReply::Refused { why }
+    }
+
+    fn stored(&self) -> InsertReply {
+        let actors = self.state.statistics.actors;
+        InsertReply::Stored {
+            inserted_total: self.inserted_total(),
+            actors: actors.saturating_mul(self.config.shards),
+            waited: false,
+        }
+    }
+
+    const fn run_is_full(&self) -> InsertReply {
+        InsertReply::Finished {
+            inserted_total: self.inserted_total(),
+        }
+    }
+
+    pub(crate) fn unfit(&self, chunk: &Chunk) -> Option<String> {
+        admission::unfit(&self.spec, &self.config, self.ring.capacity(), chunk)
+    }
+
+    /// Stores a chunk that is the next of its actor.
+    pub(crate) fn store(&mut self, packed: &PackedChunk<'_>) {
+        let chunk = &*packed.chunk;
+        let header = chunk.header;
+        let statistics = &mut self.state.statistics;
+        let (streams, difference) = self.state.actors.accept(&header);
+        self.limiter.inserted(header.transitions() as u64);
+        let steps = header.steps as usize;
+        // In all shards, as far as heard.
+        let frames = self.limiter.inserted_total();
+        for ((number, stream), run) in streams.iter_mut().enumerate().zip(packed.runs()) {
+            let rows = number * steps..(number + 1) * steps;
+            let step = |row| {
+                let (action, reward) = (chunk.actions()[row], chunk.reward(row));
+                Step::new(action, reward, chunk.end(row), header.weights_version)
+            };
+            let (link, first) = (stream.link, self.ring.inserted());
+            stream.link = self.ring.push_run(run, rows.clone().map(step), link);
+            self.sampler.stored(&self.ring, first, link);
+            for step in rows.map(step) {
+                statistics.action_histogram[usize::from(step.action)] += 1;
+                if let Some(episode) = &mut stream.episode {
+                    episode.episode_return += f64::from(step.reward);
+                    episode.steps += 1;
+                }
+                if step.end.is_episode_end() {
+                    statistics.episode_ended(EndedEpisode {
+                        frames,
+                        actor: header.actor,
+                        copy: number as u32,
+                        played: stream.episode.replace(Played::default()),
+                    });
+                }
+            }
+        }
+        self.state.starving = false;
+        self.count(header.actor, difference);
+    }
+
+    fn count(&mut self, actor: u32, difference: Difference) {
+        let Difference { lost, duplicated } = difference;
+        // An actor that sends nonsense could make the line come at any rate.
+        if self.state.statistics.count(difference) && !self.quiet {
+            tracing::warn!(
+                "actor {actor}: {lost} transitions lost, {duplicated} stored twice, by its own count"
+            );
+        }
+    }
+
+    /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice. One of a life
+    /// that never joined, or with a count that no run reaches, is refused: gives the reason.
+    pub fn goodbye(&mut self, goodbye: &Goodbye) -> Option<String> {
+        let said = match goodbye.produced {
+            0..=TRANSITIONS_MAX => self.state.actors.goodbye(goodbye),
+            produced => Err(format!(
+                "actor {} says it produced {produced} transitions, a count that no run reaches",
+                goodbye.actor
+            )),
+        };
+        match said {
+            Ok(difference) => {
+                self.count(goodbye.actor, difference);
+                self.note(Note::Goodbye(*goodbye));
+                None
+            }
+            Err(why) => {
+                self.note_refused_message();
+                Some(why)
+            }
+        }
+    }
+}

@@ -1,0 +1,274 @@
+//! The learner of a replay, and the batches that it is served.
+//! How rows are drawn and put together is for `sampling`.
+
+use driml_protocol::{
+    AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, PriorityUpdate, RequestId,
+    Waiting,
+};
+
+use super::{Replay, Unready};
+use crate::{
+    config,
+    ledger::requests::{Dedup, Requests},
+    persist::snapshot::Note,
+    sampling::{packed_batch::PackedBatch, rows::sampler::PriorityCounts},
+};
+
+/// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
+/// know all.
+const VERSION_AHEAD_MAX: u64 = 1 << 32;
+/// Most updates and rows that a learner can have behind it.
+const LEARNED_MAX: u64 = 1 << 60;
+
+/// Who learns, and what it says it has learned.
+impl Replay {
+    /// Serves this learner from now on, and it alone. How many rows were learned is what it says: what was served beyond them counts as
+    /// not sampled. A replay that is empty counts on from where its checkpoint stands, and fills again before the next row is sampled.
+    /// Gives the number of updates that are learned again.
+    ///
+    /// # Errors
+    /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
+    pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
+        let counts = [join.tally, join.other_shards].map(|it| it.inserted.max(it.rows_sampled));
+        if join.updates.max(counts[0]).max(counts[1]) > LEARNED_MAX {
+            return Err(format!(
+                "a learner after {} updates, {:?} and {:?}: counts that no run reaches",
+                join.updates, join.tally, join.other_shards
+            ));
+        }
+        let done = self.state.learned.updates;
+        match self.state.learner {
+            // It has not heard the answer.
+            Some(known) if known.learner == join.learner => return Ok(0),
+            Some(known) if known.run == join.run || join.restart => {}
+            Some(_) if done == 0 && join.updates == 0 => {}
+            Some(_) => {
+                return Err(format!(
+                    "the run has learned {done} updates, and the learner has no checkpoint of it: start the learner with the --run-dir \
+                     that holds its checkpoints, or with --restart to begin again from the first update"
+                ));
+            }
+            None => self.resume_empty(&join),
+        }
+        let learned = join.tally.rows_sampled;
+        let unlearned = self.tally().rows_sampled.saturating_sub(learned);
+        let again = done.saturating_sub(join.updates);
+        self.limiter.refund(unlearned);
+        self.set_rows_sampled(learned);
+        self.limiter.adopt_other_shards(join.other_shards);
+        let state = &mut self.state;
+        state.statistics.rows_unlearned += unlearned;
+        state.statistics.updates_relearned += again;
+        state.learned = Learned {
+            updates: join.updates,
+            saved_updates: join.updates,
+            rows_received: learned,
+        };
+        state.learner = Some(join);
+        state.affinity.expect_another_source();
+        self.awaits_learner = false;
+        self.requests = Requests::default();
+        self.note(Note::LearnerJoined(join));
+        Ok(again)
+    }
+
+    /// Counts on from a learner's checkpoint, if nothing is stored here.
+    fn resume_empty(&mut self, join: &LearnerJoin) {
+        if join.updates == 0 || self.ring.inserted() > 0 {
+            return;
+        }
+        let shards = u64::from(self.config.shards);
+        let refill = self.config.warmup_transitions.div_ceil(shards);
+        // All shards' credit decides whether anything is left to fill it for.
+        self.limiter.adopt_other_shards(join.other_shards);
+        self.limiter
+            .resume_empty(join.tally, refill, self.batch_size);
+        self.state.inserted_before = join.tally.inserted;
+        self.state.rows_before = join.tally.rows_sampled as i64;
+        self.state.resumed_after = join.updates;
+        self.state.draw_anew(self.origin.shard, join.updates);
+    }
+
+    /// So many rows were sampled here, whatever was counted.
+    fn set_rows_sampled(&mut self, rows: u64) {
+        let counted = self.tally().rows_sampled;
+        self.state.rows_before += rows as i64 - counted as i64;
+        self.limiter.set_rows_sampled(rows);
+    }
+
+    /// The learner that is served.
+    pub fn learner(&self) -> Option<u64> {
+        self.state.learner.map(|it| it.learner)
+    }
+
+    /// Updates after which the run was resumed without its replay; 0 if it never was, or before its learner has joined.
+    pub const fn resumed_after(&self) -> u64 {
+        self.state.resumed_after
+    }
+
+    /// Takes what the learner says it has done. If it has saved a checkpoint, so does a replay that is kept on disk.
+    ///
+    /// # Errors
+    /// Counts that no run reaches; the reason, for a person.
+    pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
+        let Learned {
+            updates,
+            saved_updates,
+            rows_received,
+        } = learned;
+        if updates.max(saved_updates).max(rows_received) > LEARNED_MAX {
+            return Err(format!(
+                "a learner with {updates} updates and {rows_received} rows, counts that no run reaches"
+            ));
+        }
+        if std::mem::take(&mut self.awaits_learner) {
+            self.set_rows_sampled(rows_received);
+        }
+        // A request may overtake another.
+        if updates >= self.state.learned.updates {
+            let has_saved = saved_updates > self.state.learned.saved_updates;
+            self.state.learned = learned;
+            if has_saved {
+                self.begin_segment();
+            }
+        }
+        Ok(())
+    }
+
+    /// The learner has done so many updates.
+    pub(crate) fn note_updates(&mut self, updates: u64) {
+        let done = &mut self.state.learned.updates;
+        *done = updates.min(LEARNED_MAX).max(*done);
+    }
+
+    /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.
+    ///
+    /// # Errors
+    /// A matrix of another size or with an entry that is not a probability, or a version that no run reaches; the reason, for a person.
+    pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), String> {
+        // A version is a count of updates, each of at least one row.
+        let rows = self.limiter.rows_sampled_total();
+        if update.version.saturating_sub(rows) > VERSION_AHEAD_MAX {
+            return Err(format!(
+                "version {} of the affinity, in a run that has served {rows} rows",
+                update.version
+            ));
+        }
+        let affinity = &mut self.state.affinity;
+        affinity.update(update).map_err(|e| e.to_string())
+    }
+
+    /// Takes the priorities of rows that were drawn here; those of other shards are none of its business. An update that has come
+    /// before changes nothing, nor does a row whose transition was overwritten meanwhile: both are counted.
+    ///
+    /// # Errors
+    /// A run that draws uniformly, or a transition that was never stored; the reason, for a person. Nothing has then changed.
+    pub fn set_priorities(&mut self, update: &PriorityUpdate) -> Result<(), String> {
+        self.sampler.rows.update(&self.ring, update, self.origin)
+    }
+
+    /// What became of the priorities that came; none where rows are drawn uniformly.
+    pub fn priority_counts(&self) -> Option<PriorityCounts> {
+        self.sampler.rows.priority_counts()
+    }
+}
+
+/// The batches that it is served.
+impl Replay {
+    /// Makes a batch: [`Replay::draw`] and [`PackedBatch::unpack`] in one.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`].
+    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+        self.draw(rows).map(PackedBatch::unpack)
+    }
+
+    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
+    /// compression its frames are left to be unpacked, which needs the replay no more.
+    ///
+    /// # Errors
+    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
+    pub fn draw(&mut self, rows: u32) -> Result<PackedBatch, Unready> {
+        self.draw_in(rows, Buffer::zeroed)
+    }
+
+    /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
+    /// does not count as sampled.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`]; a request that its client has given up is told to wait.
+    pub fn draw_for(
+        &mut self,
+        id: RequestId,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Buffer,
+    ) -> Result<PackedBatch, Unready> {
+        let Dedup::Fresh(lost) = self.requests.begin(id) else {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
+        };
+        if !lost.is_empty() {
+            tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
+            self.limiter.refund(lost.len() as u64);
+            self.state.statistics.refund(&lost);
+        }
+        let draft = self.draw_in(rows, memory)?;
+        self.requests.complete(id.client_id, draft.ks.clone());
+        Ok(draft)
+    }
+
+    /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
+    ///
+    /// # Errors
+    /// As [`Replay::draw`].
+    pub fn draw_in(
+        &mut self,
+        rows: u32,
+        memory: impl FnOnce(usize) -> Buffer,
+    ) -> Result<PackedBatch, Unready> {
+        let rows_max = config::rows_max(&self.spec, &self.config.sampling);
+        let rows_max = rows_max.min(self.limiter.rows_max());
+        if rows == 0 || rows > rows_max {
+            self.note_refused_message();
+            let why = format!(
+                "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
+            );
+            return Err(Unready::Refused { why });
+        }
+        if self.limiter.finished(rows) {
+            return Err(Unready::Finished);
+        }
+        if !self.limiter.may_sample(rows) {
+            return Err(Unready::Wait(self.limiter.waiting(rows)));
+        }
+        let is_prioritised = self.config.sampling.is_prioritised();
+        let header = BatchHeader {
+            held: self.ring.inserted() - self.ring.oldest(),
+            origin: is_prioritised.then_some(self.origin),
+            ..BatchHeader::of(&self.spec, rows)
+        };
+        let state = &mut self.state;
+        let (affinity, rng) = (&state.affinity, &mut state.rng);
+        let drawn = self.sampler.draw(&self.ring, affinity, rng, header, memory);
+        let Some(mut drawn) = drawn else {
+            return Err(self.no_anchor());
+        };
+        self.limiter.sampled(rows);
+        drawn.batch.header.tally = self.limiter.tally();
+        state.statistics.mean_age = drawn.batch.header.mean_age;
+        state.statistics.served(&drawn.ks);
+        state.starving = false;
+        Ok(drawn)
+    }
+
+    fn no_anchor(&mut self) -> Unready {
+        if self.limiter.all_in() {
+            let why = format!(
+                "none of the {} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies",
+                self.ring.inserted() - self.ring.oldest()
+            );
+            return Unready::Refused { why };
+        }
+        self.state.starving = true;
+        Unready::Wait(Waiting::LearnerWaitsForActors)
+    }
+}

@@ -1,0 +1,219 @@
+//! The replay server's core: chunks in, batches out, who takes part, and its account of itself.
+//! It keeps no time and starts no thread: the service around it does. What it writes to disk is in `persist`, how rows are drawn in
+//! `sampling`, what is counted in `ledger` and `rate_limiter`.
+
+mod actors;
+mod learner;
+
+use driml_protocol::{BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, Tally, Waiting};
+
+use crate::{
+    config::{Config, ConfigError},
+    ledger::requests::Requests,
+    persist::{log::Log, snapshot::State},
+    rate_limiter::RateLimiter,
+    sampling::batch::BatchSampler,
+    storage::{frame_store::Frames, ring::Ring},
+};
+
+/// Why there is no batch.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Unready {
+    /// Not yet: who waits for what.
+    Wait(Waiting),
+    /// Never again: all transitions are in and sampled.
+    Finished,
+    /// Never: the reason, for a person.
+    Refused {
+        /// Why, and what to do about it.
+        why: String,
+    },
+}
+
+impl From<Unready> for BatchReply {
+    fn from(unready: Unready) -> Self {
+        match unready {
+            Unready::Wait(waiting) => Self::Wait(waiting),
+            Unready::Finished => Self::Finished,
+            Unready::Refused { why } => Self::Refused { why },
+        }
+    }
+}
+
+/// Everything the replay server knows. Kept in memory alone, or, with a log, on disk too: [`KeptReplay`](crate::KeptReplay).
+pub struct Replay {
+    pub(crate) spec: RunSpec,
+    pub(crate) config: Config,
+    batch_size: u32,
+    pub(crate) ring: Ring,
+    pub(crate) limiter: RateLimiter,
+    pub(crate) sampler: BatchSampler,
+    pub(crate) state: State,
+    requests: Requests,
+    /// Who draws, as batches say it that are drawn by priority.
+    pub(crate) origin: Origin,
+    /// It is being read back: what is counted was logged when it happened.
+    pub(crate) quiet: bool,
+    /// It was read back: how many rows the learner has, it says with its next request.
+    pub(crate) awaits_learner: bool,
+    pub(crate) log: Option<Log>,
+}
+
+/// An empty replay, and who draws from it.
+impl Replay {
+    /// An empty replay in memory for batches of `batch_size` rows; its draws follow from `spec.seed` and the order of calls. Of several
+    /// shards it is the first: [`Replay::shard`].
+    ///
+    /// # Errors
+    /// Settings that cannot work, or more memory than the system grants.
+    pub fn new(spec: &RunSpec, config: &Config, batch_size: u32) -> Result<Self, ConfigError> {
+        Self::shard(spec, config, batch_size, 0)
+    }
+
+    /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
+    ///
+    /// # Errors
+    /// As [`Replay::new`], and a shard that does not exist.
+    pub fn shard(
+        spec: &RunSpec,
+        config: &Config,
+        batch_size: u32,
+        shard: u32,
+    ) -> Result<Self, ConfigError> {
+        config.validate(spec, batch_size)?;
+        if shard >= config.shards {
+            return Err(ConfigError::Key {
+                key: "replay.shards",
+                value: config.shards.to_string(),
+                why: format!("there is no shard {shard}; the first is shard 0"),
+            });
+        }
+        let shards = u64::from(config.shards);
+        let capacity = config.capacity_transitions / shards;
+        let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
+        let not_granted = |bytes: u64| ConfigError::Key {
+            key: "replay.capacity_transitions",
+            value: config.capacity_transitions.to_string(),
+            why: format!("the system does not grant the {bytes} bytes that this takes; hold fewer"),
+        };
+        let frames = Frames::new(config.compression, capacity, spec.frame_bytes(), bytes_max)
+            .map_err(not_granted)?;
+        Ok(Self {
+            spec: spec.clone(),
+            config: config.clone(),
+            batch_size,
+            ring: Ring::new(capacity, frames).map_err(not_granted)?,
+            limiter: RateLimiter::of(config),
+            sampler: BatchSampler::new(spec, &config.sampling, capacity).map_err(not_granted)?,
+            state: State::new(spec, shard),
+            requests: Requests::default(),
+            origin: Origin {
+                shard,
+                incarnation: 0,
+            },
+            quiet: false,
+            awaits_learner: false,
+            log: None,
+        })
+    }
+
+    /// The same, drawing under this number: priorities of rows that were drawn under another one are counted and change nothing.
+    /// A replay server that is started again numbers its transitions anew, or has lost some, and so draws another number.
+    #[must_use]
+    pub(crate) const fn with_incarnation(mut self, incarnation: u64) -> Self {
+        self.origin.incarnation = incarnation;
+        self
+    }
+}
+
+/// What it says of itself, and what the service around it tells it to count.
+impl Replay {
+    /// Counts a message that could not be read.
+    pub(crate) fn note_refused_message(&mut self) {
+        self.state.statistics.messages_refused += 1;
+    }
+
+    /// Counts `seconds` that a request for a batch waited at the limiter.
+    pub(crate) fn note_learner_waited(&mut self, seconds: f64) {
+        self.state.statistics.learner_waited_s += seconds;
+    }
+
+    /// Counts `seconds` that a chunk waited at the limiter.
+    pub(crate) fn note_actors_waited(&mut self, seconds: f64) {
+        self.state.statistics.actors_waited_s += seconds;
+    }
+
+    /// Sets how many actors are connected.
+    pub(crate) fn set_actors(&mut self, actors: u32) {
+        self.state.statistics.actors = actors;
+    }
+
+    /// Transitions of the run that were stored, in all shards as far as heard.
+    pub const fn inserted_total(&self) -> u64 {
+        self.limiter.inserted_total()
+    }
+
+    /// Whether all transitions of the run are in.
+    pub(crate) fn all_in(&self) -> bool {
+        self.limiter.all_in()
+    }
+
+    /// What was counted here since the start of the run.
+    pub const fn tally(&self) -> Tally {
+        self.limiter.tally()
+    }
+
+    /// Takes what the replay's other shards have counted.
+    ///
+    /// # Errors
+    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
+    pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
+        let held_max = self.config.capacity_transitions;
+        self.limiter.set_other_shards(other_shards, held_max)
+    }
+
+    /// Who waits for whom now, for batches of the size that the replay was made for.
+    pub fn waiting(&self) -> Waiting {
+        match self.limiter.waiting(self.batch_size) {
+            Waiting::ActorsWaitForLearner | Waiting::Nobody if self.state.starving => {
+                Waiting::LearnerWaitsForActors
+            }
+            waiting => waiting,
+        }
+    }
+
+    /// The account of itself; what the service alone knows is left at its default.
+    pub fn status(&self) -> ReplayStatus {
+        let counts = self.limiter.counts();
+        ReplayStatus {
+            transitions_inserted: counts.this_shard.inserted,
+            transitions_refilled: counts.refilled,
+            transitions_held: self.ring.inserted() - self.ring.oldest(),
+            frame_bytes_held: self.ring.frames().bytes_held(),
+            rows_sampled: counts.this_shard.rows_sampled,
+            updates: self.state.learned.updates,
+            warmup_transitions: self.config.warmup_transitions,
+            waiting: self.waiting(),
+            affinity_version: self.state.affinity.version(),
+            finished: self.limiter.all_in(),
+            ..self.state.statistics.status()
+        }
+    }
+
+    /// Episodes that ended after the first `since`, at most as many as one answer holds.
+    pub fn episodes_since(&self, since: u64) -> EpisodesReply {
+        self.state.statistics.episodes_since(since)
+    }
+
+    /// Somebody has recorded the first so many episodes that ended.
+    pub fn note_recorded(&mut self, episodes: u64) {
+        self.state.statistics.note_recorded(episodes);
+    }
+
+    /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.
+    pub fn check_valid(&self) {
+        self.ring.check_valid();
+        self.sampler.check_valid(&self.ring);
+        assert_eq!(self.snapshot().unfit(&self.state), None);
+    }
+}

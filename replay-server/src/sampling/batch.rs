@@ -1,0 +1,131 @@
+//! Draws the rows of a batch and puts it together: anchors by `rows`, each row by `assemble`, frames by `needed_frames`.
+//! Whether a batch may be drawn is for the rate limiter.
+
+use driml_protocol::{Batch, BatchHeader, Buffer, RunSpec, Sampling};
+use rand_chacha::ChaCha8Rng;
+
+use super::{
+    assemble::{Assembler, RowStates},
+    episodes::{Episodes, Window},
+    horizon::Affinity,
+    needed_frames::NeededFrames,
+    packed_batch::{PackedBatch, PackedFrames},
+    rows::{
+        self,
+        sampler::{Held, RowSampler, RowsState},
+    },
+};
+use crate::storage::ring::{Link, Ring};
+
+/// Everything that drawing needs beside the ring and the generator.
+pub(crate) struct BatchSampler {
+    pub(crate) rows: Box<dyn RowSampler>,
+    episodes: Episodes,
+    assembler: Assembler,
+    window: Window,
+    frame_bytes: usize,
+}
+
+impl BatchSampler {
+    /// The sampler of a ring of `capacity` transitions; an error gives the bytes that the system refuses to reserve.
+    pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
+        Ok(Self {
+            episodes: Episodes::new(spec),
+            rows: rows::sampler(sampling, spec, capacity)?,
+            assembler: Assembler::new(spec),
+            window: Window::default(),
+            frame_bytes: spec.frame_bytes(),
+        })
+    }
+
+    /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
+    pub(crate) fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
+        let episodes = &self.episodes;
+        self.rows.stored(Held { ring, episodes }, first, link);
+    }
+
+    /// A batch of as many rows as `header` says, whose mean age and weights are filled in here; none if there is no anchor.
+    pub(crate) fn draw(
+        &mut self,
+        ring: &Ring,
+        affinity: &Affinity,
+        rng: &mut ChaCha8Rng,
+        mut header: BatchHeader,
+        memory: impl FnOnce(usize) -> Buffer,
+    ) -> Option<PackedBatch> {
+        let rows = header.rows as usize;
+        let mut scalars = Vec::with_capacity(rows);
+        let mut states: Vec<RowStates> = Vec::with_capacity(rows);
+        let mut age_total = 0;
+        let episodes = &self.episodes;
+        for _ in 0..rows {
+            let held = Held { ring, episodes };
+            if !self.rows.draw(held, rng, &mut self.window) {
+                return None;
+            }
+            let row = self.assembler.row(affinity, &self.window, rng);
+            scalars.push(row.0);
+            states.push(row.1);
+            age_total += ring.inserted() - 1 - self.window.index(0);
+            let version = self.window.step(0).weights_version;
+            let (newest, oldest) = header.weights_versions;
+            header.weights_versions = (newest.max(version), oldest.min(version));
+        }
+        header.mean_age = age_total as f64 / rows as f64;
+        let mut needed = NeededFrames::default();
+        if let Some(stacked) = &mut header.stacked {
+            needed = NeededFrames::of(ring, episodes, states.iter());
+            stacked.frames = needed.count() as u32;
+        }
+        let mut batch = Batch::of_rows(header, &scalars, memory);
+        // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
+        let probability = |states: &RowStates| {
+            let probability = self.rows.probability(states.anchor())? as f32;
+            Some((states.anchor(), probability.clamp(f32::MIN_POSITIVE, 1.0)))
+        };
+        if let Some(draws) = states.iter().map(probability).collect::<Option<Vec<_>>>() {
+            batch.set_draws(draws.into_iter());
+        }
+        let packed = self.take_frames(ring, &states, &needed, &mut batch);
+        let ks = states.iter().map(RowStates::k).collect();
+        Some(PackedBatch { batch, packed, ks })
+    }
+
+    /// Writes the frames of all rows, or takes what is needed to write them later. Stacked states share the frames of `needed`.
+    fn take_frames(
+        &self,
+        ring: &Ring,
+        states: &[RowStates],
+        needed: &NeededFrames,
+        batch: &mut Batch,
+    ) -> PackedFrames {
+        let mut packed = PackedFrames::new(self.frame_bytes);
+        let is_stacked = batch.header.stacked.is_some();
+        let mut places = batch.states_mut();
+        let mut stacks = needed.stacks();
+        for (row, states) in states.iter().enumerate() {
+            let numbers: Vec<usize> = places.of_row(row).collect();
+            if !is_stacked {
+                let frames = states.indices().zip(numbers);
+                packed.write_or_take_row(ring, frames, &mut places);
+                continue;
+            }
+            for (number, stack) in numbers.into_iter().zip(&mut stacks) {
+                places.set_stack(number, stack);
+            }
+            packed.write_or_take_row(ring, needed.first_in(row), &mut places);
+        }
+        packed
+    }
+
+    /// [`RowSampler::restore`].
+    pub(crate) fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState) {
+        let episodes = &self.episodes;
+        self.rows.restore(Held { ring, episodes }, oldest, state);
+    }
+
+    pub(crate) fn check_valid(&self, ring: &Ring) {
+        let episodes = &self.episodes;
+        self.rows.check_valid(Held { ring, episodes });
+    }
+}
