@@ -11,8 +11,10 @@ use driml_protocol::{
     session::{self, Endpoints},
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, RunFolder, Survivor, TestSystem, skip, wait_for};
+use driml_tests::{Process, RunFolder, Survivor, TestSystem, note, skip, wait_for};
 use nix::sys::signal::Signal;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use crate::{LONG, SHORT, disk_full::Disk, system};
 
@@ -174,9 +176,12 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
     numbers
 }
 
-/// Numbered transitions and counted batches through six deaths of the server: the sets are equal, and so are the counts.
-#[test]
-fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
+/// Rows that are sampled of all transitions.
+const SAMPLED: u64 = (TRANSITIONS - WARMUP) * RATIO;
+
+/// Numbered transitions and counted batches through deaths of the server, after so many rows each: the sets are equal, and so are the
+/// counts.
+fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
     let system = system();
     let flags = format!(
         "--agent c51 --env chain --preset smoke --frames {TRANSITIONS} --set replay.replay_ratio={RATIO} --replay-dir replay"
@@ -202,17 +207,14 @@ fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
         }
         let learner = run();
         let learning = scope.spawn(move || learn(&learner, 7));
-        let rows_max = (TRANSITIONS - WARMUP) * RATIO;
-        for round in 1..=KILLS {
-            client.wait_for_replay("some more rows", |replay| {
-                replay.rows_sampled > round * rows_max / (KILLS + 1)
-            });
+        for rows in moments {
+            client.wait_for_replay("some more rows", |replay| replay.rows_sampled > rows);
             server.take().into_iter().for_each(kill);
             server = Some(system.start_replay_server(&flags));
         }
         learning.join().unwrap()
     });
-    assert_eq!(batches, (TRANSITIONS - WARMUP) * RATIO / u64::from(ROWS));
+    assert_eq!(batches, SAMPLED / u64::from(ROWS));
     let replay = client.replay().unwrap();
     assert_eq!(
         (replay.transitions_lost, replay.transitions_duplicated),
@@ -229,6 +231,25 @@ fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
         .collect();
     assert_eq!(missing, [0; 0]);
     assert_eq!(numbers.len() as u64, TRANSITIONS);
+}
+
+#[test]
+fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
+    kill_after_rows((1..=KILLS).map(|round| round * SAMPLED / (KILLS + 1)));
+}
+
+/// A server of numbered transitions, and servers of two shards in a launched run, killed at moments that follow from the seed.
+#[test]
+#[ignore = "an hour: cargo nextest run --workspace --run-ignored only -E 'test(fifty_seeds)'"]
+fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
+    for seed in 0..50 {
+        note(&format!("seed {seed}"));
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut moments =
+            |max| -> BTreeSet<u64> { (0..KILLS).map(|_| rng.random_range(0..max)).collect() };
+        kill_after_rows(moments(SAMPLED));
+        kill_shards_after_updates(moments(SHARDS_HOLD - 100));
+    }
 }
 
 /// Updates that the settings of `SHORT` and `LONG` plan for so many frames.
@@ -350,29 +371,37 @@ fn parts_by_hand_go_on_when_the_server_is_started_again() {
     server
         .stop()
         .expect_code(0)
-        .expect_said("goes on with the replay in replay");
+        .expect_said("continues with the replay in replay");
 }
+
+/// Updates at which the learner of two shards is held until all kills are done.
+const SHARDS_HOLD: u64 = 2_000;
 
 #[test]
 fn shards_come_back_each_by_itself() {
+    kill_shards_after_updates([500, 1_500]);
+}
+
+fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 6400");
-    system.hold_at(2_000);
+    system.hold_at(SHARDS_HOLD);
     let process = system.start(&format!(
         "local --durable --agent c51 {longer} --actors 2 --replay-shards 2 --run-dir run"
     ));
     let run = system.run_folder("run");
-    for updates in [500, 1_500] {
+    let mut kills = 0;
+    for updates in moments {
         wait_for("some more updates", || {
             run.updates_recorded().filter(|it| *it > updates)
         });
         kill_server(&system);
+        kills += 1;
     }
     system.let_go();
-    process
-        .wait()
-        .expect_code(0)
-        .expect_said("is started again with what it has kept (2 of 8");
+    process.wait().expect_code(0).expect_said(&format!(
+        "is started again with what it has kept ({kills} of 8"
+    ));
     check_exactly_once(&run);
     for shard in ["shard-0", "shard-1"] {
         assert!(
@@ -427,7 +456,7 @@ fn a_resumed_run_goes_on_with_its_replay() {
     assert_eq!(episodes.last().unwrap().episode, summary.episodes);
     let log = run.log("replay-server");
     assert!(
-        log.contains("goes on with the replay in run/replay"),
+        log.contains("continues with the replay in run/replay"),
         "{log}"
     );
     assert!(!log.contains("WARN"), "{log}");
