@@ -113,7 +113,7 @@ const ARROWS: &[(&str, &str, &[&str])] = &[
     // As a user's own package: the program, and the registries that it adds to.
     (
         "driml-examples",
-        "examples",
+        "deploy/examples",
         &[
             "driml",
             "driml-envs",
