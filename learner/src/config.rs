@@ -45,9 +45,7 @@ pub struct Config {
     pub checkpoint_period_updates: u64,
     /// Checkpoints kept; older ones are removed.
     pub checkpoints_kept: u32,
-    /// How long the replay server may be out of reach, milliseconds, before the learner saves and gives up. Settings of earlier
-    /// versions do not have it: a minute.
-    #[serde(default = "a_minute_ms")]
+    /// How long the replay server may be out of reach, milliseconds, before the learner saves and gives up.
     pub unreachable_max_ms: u64,
     /// Losses, optimiser and target network.
     pub update: LearnerSettings,
@@ -55,10 +53,6 @@ pub struct Config {
     pub augment: Option<AugmentSettings>,
     /// How the action affinity A is estimated, if the horizon follows it.
     pub affinity: AffinityConfig,
-}
-
-const fn a_minute_ms() -> u64 {
-    60_000
 }
 
 /// How A is estimated.

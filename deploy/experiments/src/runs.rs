@@ -9,7 +9,6 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far, write_whole};
-use driml_settings::renamed;
 
 /// Where the runs lie in an experiment's folder. Git does not keep them.
 const RUNS: &str = "runs";
@@ -74,7 +73,6 @@ impl Runs {
     /// Whether what lies in the plan's folder was begun by this very plan.
     pub(super) fn is_made_by(&self, plan: &PlannedRun) -> bool {
         let call = fs::read_to_string(self.call(plan)).ok();
-        let call = call.map(|text| renamed::update_json(&text));
         let call = call.and_then(|text| serde_json::from_str::<Vec<String>>(&text).ok());
         call.is_some_and(|args| args == plan.args)
     }
@@ -167,13 +165,6 @@ mod tests {
         runs.write_call(&plan(10)).unwrap();
         assert!(runs.finished(&plan(10)).is_some());
         assert!(runs.finished(&plan(20)).is_none());
-        let sized = PlannedRun {
-            args: vec!["--set".into(), "learner.batch_size=64".into()],
-            ..plan(10)
-        };
-        fs::write(runs.call(&sized), r#"["--set","learner.batch_rows=64"]"#).unwrap();
-        assert!(runs.finished(&sized).is_some(), "the old name of a setting");
-        runs.write_call(&plan(10)).unwrap();
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         assert!(runs.finished(&plan(10)).is_none(), "its metrics are gone");
     }

@@ -18,7 +18,6 @@ use driml_machine::{
     error::{Interrupted, usage},
     resources,
 };
-use driml_settings::renamed;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
@@ -69,7 +68,7 @@ impl Session {
             serde_json::to_string_pretty(settings).context("writing down the settings")?;
         let path = pieces.join(SETTINGS);
         match fs::read(&path) {
-            Ok(found) if renamed::update_json(&String::from_utf8_lossy(&found)) == settings => {}
+            Ok(found) if found == settings.as_bytes() => {}
             Ok(_) => {
                 return Err(usage!(
                     "{} holds what was made with other settings: choose another --out, or remove that folder",
@@ -252,7 +251,7 @@ impl Session {
 /// The settings that the experiment's pieces were made with; none if there are none yet, or they cannot be read.
 pub(super) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
     let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
-    serde_json::from_str(&renamed::update_json(&text)).ok()
+    serde_json::from_str(&text).ok()
 }
 
 /// The folder of the experiment `name`, by what the flags say.

@@ -14,7 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use toml::Table;
 
-use crate::{derived, presets, renamed};
+use crate::{derived, presets};
 
 /// How many processes the launcher starts, and with what.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -172,11 +172,9 @@ impl RunConfig {
     /// # Errors
     /// As [`resolve`](crate::resolve::resolve).
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
-        let mut table: Table = text
+        let table: Table = text
             .parse()
             .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
-        renamed::update(&mut table);
-        derived::complete(&mut table);
         derived::check(&table)
             .and_then(|()| Self::from_table(&table))
             .map_err(|e| usage!("{name}: {e}"))

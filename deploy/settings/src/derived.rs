@@ -254,37 +254,6 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     }
 }
 
-/// Fills in what settings leave open that were written before there were several objectives: DIM, or none where all lambdas
-/// are 0, and the action as the network had it.
-pub(crate) fn complete(read: &mut Table) {
-    let number = |value: &Value| {
-        let whole = value.as_integer().map(|whole| whole as f64);
-        value.as_float().or(whole).unwrap_or(0.0)
-    };
-    if find(read, "local").is_some() && find(read, "local.learner_device").is_none() {
-        put(read, "local.learner_device", Value::String("cpu".into()));
-    }
-    let weighs = find(read, "learner.update.lambda")
-        .and_then(Value::as_table)
-        .is_some_and(|lambda| lambda.values().any(|value| number(value) > 0.0));
-    let action = find(read, "model.dim.action").and_then(Value::as_bool);
-    if find(read, "learner.update.lambda").is_some()
-        && find(read, "learner.update.objective").is_none()
-    {
-        let objective = if weighs { "dim" } else { "none" };
-        put(
-            read,
-            "learner.update.objective",
-            Value::String(objective.into()),
-        );
-        put(
-            read,
-            "learner.update.condition_on_action",
-            Value::Boolean(action.unwrap_or(false)),
-        );
-    }
-}
-
 /// Checks that what a file says of what follows is what follows.
 ///
 /// # Errors

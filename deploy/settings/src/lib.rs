@@ -32,5 +32,4 @@ pub mod memory;
 pub mod menu;
 mod overrides;
 pub mod presets;
-pub mod renamed;
 pub mod resolve;

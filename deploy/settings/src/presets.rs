@@ -3,7 +3,6 @@
 
 #[cfg(test)]
 mod pinned;
-pub(crate) mod prices;
 
 use std::sync::{Mutex, PoisonError};
 
@@ -41,8 +40,8 @@ pub struct Preset {
     layers: &'static [Layer],
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
-    /// Whether a run prints what it gives up for speed, with its measured price, in one line.
-    pub(crate) is_priced: bool,
+    /// What it gives up for speed, with the largest errors that were measured: a line that a run prints.
+    pub(crate) price: Option<&'static str>,
 }
 
 const TUNED: &str = "tuned";
@@ -66,56 +65,60 @@ pub const PRESETS: &[Preset] = &[
         about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
         layers: &[],
         families: &[],
-        is_priced: false,
+        price: None,
     },
     Preset {
         name: TUNED,
         about: "more exploration, fewer and smaller updates, a soft target network (the default on Procgen)",
         layers: &[layer!("variant/tuned")],
         families: &["procgen"],
-        is_priced: false,
+        price: None,
     },
     Preset {
         name: "paper-observation",
         about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
         layers: &[layer!("variant/paper-observation")],
         families: &["procgen"],
-        is_priced: false,
+        price: None,
     },
     Preset {
         name: "split",
         about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
         layers: &[layer!("variant/split")],
         families: &["procgen"],
-        is_priced: false,
+        price: None,
     },
     Preset {
         name: "exact",
         about: "`paper`, with nothing given up for speed, whatever its own choices become",
         layers: &[layer!("variant/exact")],
         families: &[],
-        is_priced: false,
+        price: None,
     },
     Preset {
         name: "balanced",
         about: "`exact` in the learner; actors and broadcasts give up what costs the least, and a run says what",
         layers: &[layer!("variant/balanced")],
         families: &[],
-        is_priced: true,
+        price: Some(
+            "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/experiments/results/tradeoff",
+        ),
     },
     Preset {
         name: "fast",
         about: "bf16 in learner and actors, half the bytes of a broadcast; a run says what that costs",
         layers: &[layer!("variant/fast")],
         families: &[],
-        is_priced: true,
+        price: Some(
+            "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/experiments/results/tradeoff",
+        ),
     },
     Preset {
         name: "smoke",
         about: "a tiny network, batch and replay: shows within a minute that all parts work together",
         layers: &[layer!("variant/smoke")],
         families: &[],
-        is_priced: false,
+        price: None,
     },
 ];
 

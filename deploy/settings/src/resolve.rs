@@ -16,7 +16,6 @@ use crate::{
     memory,
     overrides::Override,
     presets::{self, Preset},
-    renamed,
 };
 
 /// Where the settings come from before flags are applied.
@@ -74,11 +73,9 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             table
         }
         Source::File(name, text) => {
-            let mut read: Table = text
+            let read: Table = text
                 .parse()
                 .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
-            renamed::update(&mut read);
-            derived::complete(&mut read);
             derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
             read
         }
@@ -117,12 +114,8 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         _ => e,
     })?;
     config.notes.extend(note);
-    if let Source::Layers(preset, ..) = source
-        && preset.is_priced
-    {
-        config
-            .notes
-            .extend(presets::prices::note(preset.name, &table));
+    if let Source::Layers(preset, ..) = source {
+        config.notes.extend(preset.price.map(str::to_owned));
     }
     Ok(config)
 }
@@ -132,7 +125,6 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
     let mut capacity_set = false;
     for text in sets {
         let one = Override::parse(text)?;
-        renamed::refuse(&one.path)?;
         derived::refuse(&one.path)?;
         capacity_set |= one.path == "replay.capacity_transitions";
         let mut tried = table.clone();

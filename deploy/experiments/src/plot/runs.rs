@@ -7,7 +7,7 @@ use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::run_folder::{Columns, RunFolder};
 use driml_machine::error::{Usage, nearest, usage};
-use driml_settings::{config::RunConfig, renamed};
+use driml_settings::config::RunConfig;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
@@ -208,7 +208,6 @@ pub(super) fn folder_name(folder: &Path) -> String {
 /// for itself.
 fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
     let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
-    renamed::update(&mut table);
     // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
     let actors = table
         .remove("local")

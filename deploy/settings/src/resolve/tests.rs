@@ -329,46 +329,23 @@ fn a_file_at_odds_with_itself_is_refused() {
 }
 
 #[test]
-fn settings_from_before_there_were_objectives_are_read() {
-    for (world, agent) in [
-        ("mspacman", "c51"),
-        ("mspacman", "driml-ada"),
-        ("ising", "driml-fix"),
+fn a_run_prints_what_its_preset_gives_up() {
+    for (preset, price) in [
+        ("exact", None),
+        ("balanced", Some("6%")),
+        ("fast", Some("15%")),
     ] {
-        let new = with(world, agent, &[]).unwrap();
-        let text = new.to_toml();
-        let without = |line: &&str| {
-            !line.starts_with("objective =") && !line.starts_with("condition_on_action =")
-        };
-        let old: Vec<_> = text.lines().filter(without).collect();
-        assert_eq!(old.len() + 2, text.lines().count());
-        let read = RunConfig::parse("old.toml", &old.join("\n")).unwrap();
-        assert_eq!(
-            (read.learner.update.objective, &read.model),
-            (new.learner.update.objective, &new.model)
-        );
-        assert_eq!(read.run.hash(), new.run.hash());
+        let source = source(preset, "mspacman", "c51");
+        let notes = resolve(&source, &Flags::default(), &MACHINE).unwrap().notes;
+        let printed = notes.iter().find(|note| note.contains("results/tradeoff"));
+        assert_eq!(printed.is_some(), price.is_some(), "{notes:?}");
+        if let (Some(printed), Some(price)) = (printed, price) {
+            assert!(
+                printed.starts_with(preset) && printed.contains(price),
+                "{printed}"
+            );
+        }
     }
-}
-
-#[test]
-fn settings_with_names_of_before_are_read_and_set_by_the_names_of_today() {
-    let new = with("chain", "c51", &[]).unwrap();
-    let old = new.to_toml().replace("batch_size", "batch_rows");
-    assert_ne!(old, new.to_toml());
-    let read = RunConfig::parse("old.toml", &old).unwrap();
-    assert_eq!(read.to_toml(), new.to_toml());
-    let source = Source::File("old.toml".into(), old.clone());
-    let resolved = resolve(&source, &Flags::default(), &MACHINE).unwrap();
-    assert_eq!(resolved.to_toml(), new.to_toml());
-
-    expect!["learner.batch_rows is called learner.batch_size now"]
-        .assert_eq(&with("chain", "c51", &["learner.batch_rows=64"]).unwrap_err());
-    let both = old.replace("batch_rows = 64", "batch_rows = 64\nbatch_size = 64");
-    let said = RunConfig::parse("both.toml", &both)
-        .unwrap_err()
-        .to_string();
-    assert!(said.contains("unknown field `batch_rows`"), "{said}");
 }
 
 #[test]
