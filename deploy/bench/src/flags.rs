@@ -4,7 +4,6 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
-use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
 use driml_machine::{device::DeviceFlag, whole_number};
 
@@ -68,14 +67,6 @@ pub struct BenchLearnerArgs {
     /// Instead: C51 + global DIM as batch, observation, atoms and vectors grow, beside the FLOPs of an update
     #[arg(long)]
     pub(crate) growth: bool,
-    /// Instead: driml-ada on batches that random play gave in these worlds, equal states computed once and each
-    #[arg(
-        long,
-        value_name = "WORLD,..",
-        value_delimiter = ',',
-        conflicts_with = "growth"
-    )]
-    pub(crate) played: Vec<WorldName>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
     #[command(flatten)]

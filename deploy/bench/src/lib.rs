@@ -34,7 +34,6 @@ mod launched;
 mod learner;
 mod measurements;
 mod peers;
-mod played;
 mod policy;
 mod recording;
 mod replay;
@@ -45,7 +44,6 @@ mod system;
 mod table;
 mod taking_part;
 
-use driml_envs::WorldName;
 use driml_learner::{DeviceName, Precision};
 use driml_machine::device::ready_for;
 
@@ -73,9 +71,6 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
                 Instead::Growth => {
                     by_precision(flags, device, &|it| growth::measure(effort, device, it))?
                 }
-                Instead::Played(worlds) => by_precision(flags, device, &|it| {
-                    played::measure(worlds, effort, device, it)
-                })?,
             }
         };
         measurements::report(
@@ -89,10 +84,9 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
     match command {
         BenchCommand::Learner(args) => {
             let (flags, device) = (&args.flags, args.on.device);
-            let instead = match (args.growth, &args.played[..]) {
-                (true, _) => Instead::Growth,
-                (false, []) => Instead::No,
-                (false, worlds) => Instead::Played(worlds),
+            let instead = match args.growth {
+                true => Instead::Growth,
+                false => Instead::No,
             };
             alone(Component::Learner, flags, device, instead)
         }
@@ -132,7 +126,6 @@ pub fn run(command: &BenchCommand) -> anyhow::Result<()> {
 enum Instead<'a> {
     No,
     Growth,
-    Played(&'a [WorldName]),
     Worlds(&'a [String]),
 }
 
@@ -142,10 +135,6 @@ impl Instead<'_> {
         match self {
             Self::No => Vec::new(),
             Self::Growth => vec!["--growth".into()],
-            Self::Played(worlds) => {
-                let worlds: Vec<_> = worlds.iter().map(ToString::to_string).collect();
-                vec!["--played".into(), worlds.join(",")]
-            }
             Self::Worlds(worlds) => worlds
                 .iter()
                 .flat_map(|world| ["--env".to_owned(), world.clone()])

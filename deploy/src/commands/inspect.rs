@@ -1,12 +1,12 @@
-//! `driml inspect`: what a world and an agent build, compute and send, and why.
+//! `driml inspect`: what a configuration builds, holds, sends and computes.
 
 use std::path::PathBuf;
 
 use clap::Args;
 use driml_envs::WorldName;
 use driml_launch::{
-    console::{self, print},
-    inspect::{Inspection, worlds},
+    console::print,
+    inspect::{Inspection, describe_worlds},
     run_folder::RunFolder,
 };
 use driml_machine::{
@@ -25,68 +25,44 @@ pub(crate) struct InspectArgs {
     /// The settings of the run in this folder
     #[arg(long, value_name = "DIR", conflicts_with_all = ["RunFlags", "Flags"])]
     pub(crate) run: Option<PathBuf>,
-    /// Also play all --frames, without learning, and count what the rows of batches hold; some thousand frames are enough
-    #[arg(long, requires = "frames")]
-    pub(crate) play: bool,
-    /// The agent in every world, a Markdown table
-    #[arg(long, conflicts_with_all = ["env", "config", "run", "json"])]
+    /// The agent in every world, one line each
+    #[arg(long, conflicts_with_all = ["env", "config", "run"])]
     pub(crate) worlds: bool,
-    /// With --worlds: as CSV, in bytes and FLOPs
-    #[arg(long, requires = "worlds")]
-    pub(crate) csv: bool,
     /// Print it as JSON
     #[arg(long)]
     pub(crate) json: bool,
 }
 
-/// Prints what there is.
-///
-/// # Errors
-/// Settings that cannot work, or a folder that is no run's.
+/// Prints the table.
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
     if args.worlds {
-        return print(&in_every_world(args)?);
+        let inspections = in_every_world(&args.settings)?;
+        return match args.json {
+            true => print(&(serde_json::to_string_pretty(&inspections)? + "\n")),
+            false => print(&describe_worlds(&inspections)),
+        };
     }
     let config = match &args.run {
         Some(folder) => of_run(&RunFolder::new(folder))?,
         None => resolve(&args.settings, &Machine::this())?.0,
     };
-    let mut inspection = Inspection::of(&config)?;
-    if args.play {
-        config.world.install(&mut console::line)?;
-        inspection.played = Some(Inspection::play(&config)?);
-    }
-    if args.json {
-        print(&inspection.json()?)
-    } else {
-        print(&inspection.describe())
+    let inspection = Inspection::of(&config)?;
+    match args.json {
+        true => print(&(serde_json::to_string_pretty(&inspection)? + "\n")),
+        false => print(&inspection.describe()),
     }
 }
 
-/// The table of the agent in every world.
-fn in_every_world(args: &InspectArgs) -> anyhow::Result<String> {
+fn in_every_world(settings: &RunFlags) -> anyhow::Result<Vec<Inspection>> {
     let machine = Machine::this();
-    let mut configs = Vec::new();
-    for world in WorldName::all() {
-        let name = world.to_string();
+    let of_world = |world: WorldName| {
         let flags = RunFlags {
-            env: Some(name.clone()),
-            ..args.settings.clone()
+            env: Some(world.to_string()),
+            ..settings.clone()
         };
-        let config = resolve(&flags, &machine)?.0;
-        let played = if args.play {
-            console::line(&format!("playing {name}"));
-            config.world.install(&mut console::line)?;
-            Some(Inspection::play(&config)?)
-        } else {
-            None
-        };
-        configs.push((config, played));
-    }
-    match args.csv {
-        true => worlds::csv(&configs),
-        false => worlds::markdown(&configs),
-    }
+        Inspection::of(&resolve(&flags, &machine)?.0)
+    };
+    WorldName::all().map(of_world).collect()
 }
 
 /// The settings of a run.

@@ -1,12 +1,12 @@
-//! The same world and sizes with everything on: what the second column of every table counts.
-//! No agent is so; it is what an agent would cost that left nothing out.
+//! The same world and sizes with everything on: what the second column counts, the cost of an agent that leaves nothing out.
+//! No agent is configured so.
 
 use driml_learner::{Lambda, auxiliary::loss::Passes, cost::UpdateShape};
 use driml_model::{DimHeads, HeadConfig, ModelConfig};
 use driml_protocol::{Horizon, RunSpec};
 use driml_settings::config::RunConfig;
 
-/// What the second column of every table stands for.
+/// What the second column stands for.
 pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
      a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
 

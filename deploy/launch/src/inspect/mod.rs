@@ -1,23 +1,19 @@
-//! `driml inspect`: what a world and an agent build, compute and send, what it would be if everything were on, and why each part is there.
-//! It follows from the settings, but for what rows of batches hold, which is found by playing.
+//! `driml inspect`: what a configuration builds, holds, sends and computes, and what it would with everything on.
+//! It counts from the settings: it builds no network, plays no world and measures no time.
 
-mod bytes;
+mod count;
 mod everything;
-mod line;
-mod networks;
-mod play;
-mod text;
-mod update;
-pub mod worlds;
 
 use anyhow::Context;
-use driml_protocol::Batch;
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
+pub use count::Line;
 use everything::{EVERYTHING, Everything};
-pub use line::Line;
-pub use play::RowShares;
+
+/// Columns of the names; a longer name pushes its row to the right.
+const WHAT_COLUMNS: usize = 26;
+const NUMBER_COLUMNS: usize = 16;
 
 /// What a world and an agent cost.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -30,82 +26,109 @@ pub struct Inspection {
     pub everything: &'static str,
     /// Scalars of all networks that the learner holds, layer by layer.
     pub parameters: Vec<Line>,
-    /// Multiplications and additions of one update, part by part.
+    /// Multiplications and additions of one update, part by part. Rows of a batch that need less are not known before it is drawn.
     pub update_flops: Vec<Line>,
     /// Multiplications and additions of one decision of an actor, layer by layer.
     pub decision_flops: Vec<Line>,
-    /// Bytes of what travels and of what is kept. These are no parts of one sum.
+    /// Bytes of what travels and of what is kept, without headers of some 60 bytes. They do not add up.
     pub bytes: Vec<Line>,
-    /// What rows hold, if that was looked at.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub played: Option<RowShares>,
 }
 
 impl Inspection {
     /// Counts for the settings of a run.
     ///
     /// # Errors
-    /// The sizes of the weights cannot be had.
+    /// The weights' file cannot be laid out.
     pub fn of(config: &RunConfig) -> anyhow::Result<Self> {
         let every = Everything::of(config);
         Ok(Self {
             world: config.run.world.clone(),
             agent: config.run.agent.clone(),
             everything: EVERYTHING,
-            parameters: networks::parameters(config, &every),
-            update_flops: update::update_flops(config, &every),
-            decision_flops: networks::decision_flops(config, &every),
-            bytes: bytes::bytes(config, &every).context("the size of the weights")?,
-            played: None,
+            parameters: count::parameters(config, &every),
+            update_flops: count::update_flops(config, &every),
+            decision_flops: count::decision_flops(config, &every),
+            bytes: count::bytes(config, &every).context("computing the size of the weights")?,
         })
     }
 
-    /// Plays a run of `config`, all its frames, without learning, and counts what the rows of its batches hold.
-    ///
-    /// # Errors
-    /// A world that cannot be had or fails.
-    pub fn play(config: &RunConfig) -> anyhow::Result<RowShares> {
-        play::play(config).with_context(|| format!("playing {}", config.run.world))
-    }
-
-    /// Plays as [`Inspection::play`] does, until there are `count` batches or the run ends.
-    ///
-    /// # Errors
-    /// As there.
-    pub fn batches(config: &RunConfig, count: usize) -> anyhow::Result<Vec<Batch>> {
-        let mut batches = Vec::with_capacity(count);
-        play::each_batch(config, |batch| {
-            batches.push(batch);
-            batches.len() < count
-        })
-        .with_context(|| format!("playing {}", config.run.world))?;
-        Ok(batches)
-    }
-
-    /// As JSON.
-    ///
-    /// # Errors
-    /// A failing serialisation.
-    pub fn json(&self) -> anyhow::Result<String> {
-        Ok(serde_json::to_string_pretty(self)? + "\n")
-    }
-
-    /// As tables for a terminal.
+    /// The table for a terminal.
     pub fn describe(&self) -> String {
-        let heading = format!("{} on {}", self.agent, self.world);
-        let tables = [
-            text::table("parameters", &self.parameters, true),
-            text::table("FLOPs of an update", &self.update_flops, true),
-            text::table("FLOPs of a decision", &self.decision_flops, true),
-            text::table("bytes", &self.bytes, false),
-        ];
-        let played = self.played.as_ref().map(text::played).unwrap_or_default();
-        format!(
-            "{heading}\n\n{}\n{played}everything: {}\n",
-            tables.join("\n"),
-            self.everything
-        )
+        let mut text = format!("{} on {}\n", self.agent, self.world);
+        for (heading, lines, is_summed) in [
+            ("builds: parameters", &self.parameters, true),
+            ("computes: FLOPs an update", &self.update_flops, true),
+            ("computes: FLOPs a decision", &self.decision_flops, true),
+            ("holds and sends: bytes", &self.bytes, false),
+        ] {
+            text += &format!(
+                "\n{}",
+                row(heading, ["is", "everything"].map(str::to_owned))
+            );
+            let sum = is_summed.then(|| sum("all", lines));
+            for Line {
+                what,
+                is,
+                everything,
+            } in lines.iter().chain(&sum)
+            {
+                text += &row(what, [*is, *everything].map(thousands));
+            }
+        }
+        format!("{text}\neverything: {}\n", self.everything)
     }
+}
+
+/// A table of one line a world: the sums of an agent's tables, and in brackets those with everything on.
+pub fn describe_worlds(inspections: &[Inspection]) -> String {
+    let headings = [
+        "parameters",
+        "FLOPs an update",
+        "FLOPs a decision",
+        "bytes a batch",
+    ];
+    let line = |world: &str, cells: [String; 4]| {
+        let cells = cells.map(|cell| format!("{cell:>36}"));
+        format!("{world:WHAT_COLUMNS$}{}\n", cells.concat())
+    };
+    let mut text = line("world", headings.map(str::to_owned));
+    for inspection in inspections {
+        let batch = inspection.bytes.iter().find(|it| it.what == count::BATCH);
+        let sums = [
+            sum("", &inspection.parameters),
+            sum("", &inspection.update_flops),
+            sum("", &inspection.decision_flops),
+            sum("", batch.map_or(&[], std::slice::from_ref)),
+        ];
+        let cells = sums.map(|it| format!("{} ({})", thousands(it.is), thousands(it.everything)));
+        text += &line(&inspection.world, cells);
+    }
+    format!("{text}\nin brackets: {EVERYTHING}\n")
+}
+
+fn sum(what: &str, lines: &[Line]) -> Line {
+    Line {
+        what: what.to_owned(),
+        is: lines.iter().map(|line| line.is).sum(),
+        everything: lines.iter().map(|line| line.everything).sum(),
+    }
+}
+
+fn row(what: &str, [is, everything]: [String; 2]) -> String {
+    format!("{what:WHAT_COLUMNS$}{is:>NUMBER_COLUMNS$}{everything:>NUMBER_COLUMNS$}\n")
+}
+
+/// With a comma at every third digit.
+fn thousands(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
 }
 
 #[cfg(test)]
