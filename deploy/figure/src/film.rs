@@ -1,22 +1,20 @@
-//! Pictures in turn, as an animated GIF that plays over and over. Only what changed from one picture to the next is stored.
+//! Pictures in turn, as an animated GIF that plays over and over. Pixels that did not change are stored as transparent.
 //! It keeps no picture but the last, and knows nothing of what they show.
 
 use std::{
-    collections::HashMap,
     fs::File,
-    io::{BufWriter, Write},
+    io::{self, BufWriter, Write},
     path::{Path, PathBuf},
 };
 
-use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
 
 use crate::{figure::FigureError, picture::Picture};
 
-/// Colours that one picture may bring; one more index of the 256 stands for what did not change.
-const COLOURS_MAX: usize = 255;
 /// Hundredths of a second that viewers show a picture at least; some take less for none.
 const DELAY_MIN: u16 = 2;
+/// Of the search for 256 colours that stand for more, 1 (best) to 30 (fastest).
+const QUANTISER_SPEED: i32 = 10;
 
 /// A film that is being written.
 ///
@@ -25,7 +23,8 @@ pub struct Film {
     path: PathBuf,
     aside: PathBuf,
     encoder: Encoder<BufWriter<File>>,
-    size: (usize, usize),
+    width: u16,
+    height: u16,
     /// Hundredths of a second of each picture, and what is owed as delays are whole numbers.
     delay: f64,
     owed: f64,
@@ -62,20 +61,22 @@ impl Film {
         let mut aside = path.as_os_str().to_owned();
         aside.push(".tmp");
         let aside = PathBuf::from(aside);
-        let failed = |source| FigureError::Write {
+        let begin = || {
+            let file = BufWriter::new(File::create(&aside)?);
+            let mut encoder = Encoder::new(file, width, height, &[]).map_err(io::Error::other)?;
+            let repeated = encoder.set_repeat(Repeat::Infinite);
+            repeated.map_err(io::Error::other).map(|()| encoder)
+        };
+        let encoder = begin().map_err(|source| FigureError::Write {
             path: path.to_owned(),
             source,
-        };
-        let file = File::create(&aside).map_err(failed)?;
-        let begun = Encoder::new(BufWriter::new(file), width, height, &[]);
-        let mut encoder = begun.map_err(|e| failed(std::io::Error::other(e)))?;
-        let repeated = encoder.set_repeat(Repeat::Infinite);
-        repeated.map_err(|e| failed(std::io::Error::other(e)))?;
+        })?;
         Ok(Self {
             path: path.to_owned(),
             aside,
             encoder,
-            size,
+            width,
+            height,
             delay: (100.0 / pictures_per_second).max(DELAY_MIN.into()),
             owed: 0.0,
             shown: None,
@@ -90,16 +91,25 @@ impl Film {
     /// # Panics
     /// If the picture is of another size than the film.
     pub fn add(&mut self, picture: &Picture, times: f64) -> Result<(), FigureError> {
-        assert_eq!(picture.size(), self.size, "a film has pictures of one size");
+        let size = (usize::from(self.width), usize::from(self.height));
+        assert_eq!(picture.size(), size, "a film has pictures of one size");
         let pixels = picture.rgb();
-        let mut frame = changed(self.shown.as_deref(), &pixels, self.size);
+        let changed = |(at, &[r, g, b]): (usize, &[u8; 3])| match &self.shown {
+            Some(shown) if shown[at] == [r, g, b] => [0; 4],
+            _ => [r, g, b, u8::MAX],
+        };
+        let mut rgba: Vec<u8> = pixels.iter().enumerate().flat_map(changed).collect();
+        let mut frame = Frame::from_rgba_speed(self.width, self.height, &mut rgba, QUANTISER_SPEED);
         self.owed += self.delay * times;
         let delay = self.owed.round().clamp(DELAY_MIN.into(), u16::MAX.into());
         self.owed -= delay;
         frame.delay = delay as u16;
-        let written = self.encoder.write_frame(&frame);
         self.shown = Some(pixels);
-        written.map_err(|e| self.failed(std::io::Error::other(e)))
+        let written = self.encoder.write_frame(&frame);
+        written.map_err(|e| FigureError::Write {
+            path: self.path.clone(),
+            source: io::Error::other(e),
+        })
     }
 
     /// Ends the film and gives it its name.
@@ -113,7 +123,7 @@ impl Film {
             encoder,
             ..
         } = self;
-        let ended = encoder.into_inner().map_err(std::io::Error::other);
+        let ended = encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
         let ended = ended.and_then(|()| std::fs::rename(&aside, &path));
         ended.map_err(|source| FigureError::Write { path, source })
@@ -122,87 +132,8 @@ impl Film {
     /// Gives the film up: what was written of it is removed.
     pub fn discard(self) {
         drop(self.encoder);
-        // It is in nobody's way but a full disk's.
+        // A file that stays takes room and nothing else.
         let _ = std::fs::remove_file(&self.aside);
-    }
-
-    fn failed(&self, source: std::io::Error) -> FigureError {
-        let path = self.path.clone();
-        FigureError::Write { path, source }
-    }
-}
-
-/// The smallest rectangle of `pixels` outside of which nothing differs from `shown`, with that index for what did not change within.
-fn changed(
-    shown: Option<&[[u8; 3]]>,
-    pixels: &[[u8; 3]],
-    (width, height): (usize, usize),
-) -> Frame<'static> {
-    let differs = |at: usize| shown.is_none_or(|shown| shown[at] != pixels[at]);
-    let rows = |row: &usize| (0..width).any(|column| differs(row * width + column));
-    let columns = |column: &usize| (0..height).any(|row| differs(row * width + column));
-    // Of two equal pictures the first pixel is stored again: a frame has an area.
-    let first_row = (0..height).find(rows).unwrap_or(0);
-    let last_row = (0..height).rfind(rows).unwrap_or(0);
-    let first_column = (0..width).find(columns).unwrap_or(0);
-    let last_column = (0..width).rfind(columns).unwrap_or(0);
-    let inside = (first_row..=last_row)
-        .flat_map(|row| (first_column..=last_column).map(move |column| row * width + column));
-    let inside: Vec<_> = inside.map(|at| differs(at).then_some(pixels[at])).collect();
-    let Indexed { palette, indices } = Indexed::of(&inside);
-    let side = |length: usize| u16::try_from(length).expect("a film's sides fit");
-    let transparent = u8::try_from(palette.len() / 3).expect("at most 255 colours were kept");
-    let mut frame = Frame::from_palette_pixels(
-        side(last_column - first_column + 1),
-        side(last_row - first_row + 1),
-        indices,
-        // The transparent index has a place in the palette, of any colour.
-        [palette, vec![0; 3]].concat(),
-        Some(transparent),
-    );
-    (frame.left, frame.top) = (side(first_column), side(first_row));
-    frame
-}
-
-/// Pixels as places in a palette of at most [`COLOURS_MAX`] colours; the place behind the last is that of no pixel.
-struct Indexed {
-    palette: Vec<u8>,
-    indices: Vec<u8>,
-}
-
-impl Indexed {
-    fn of(pixels: &[Option<[u8; 3]>]) -> Self {
-        let mut places = HashMap::new();
-        let mut colours = Vec::new();
-        for &colour in pixels.iter().flatten() {
-            places.entry(colour).or_insert_with(|| {
-                colours.push(colour);
-                colours.len() - 1
-            });
-        }
-        let mut palette = colours.concat();
-        if colours.len() > COLOURS_MAX {
-            // Each colour once: an enemy of three pixels keeps its own beside a large sky.
-            let each: Vec<_> = colours
-                .iter()
-                .flat_map(|&[r, g, b]| [r, g, b, u8::MAX])
-                .collect();
-            let fewer = NeuQuant::new(1, COLOURS_MAX, &each);
-            for (colour, place) in &mut places {
-                let [r, g, b] = *colour;
-                *place = fewer.index_of(&[r, g, b, u8::MAX]);
-            }
-            palette = fewer.color_map_rgb();
-        }
-        let none = palette.len() / 3;
-        let indices = pixels.iter().map(|pixel| {
-            let place = pixel.map_or(none, |colour| places[&colour]);
-            u8::try_from(place).expect("256 places")
-        });
-        Self {
-            indices: indices.collect(),
-            palette,
-        }
     }
 }
 
@@ -276,15 +207,21 @@ mod tests {
             .flat_map(|i| [(i % 64) * 4, (i / 64) * 4, 128].map(|c| c as u8))
             .collect();
         let mut film = Film::create(&path, (64, 64), 10.0).unwrap();
-        let first = picture(&pixels, 64);
-        film.add(&first, 1.0).unwrap();
+        // Of the second picture only the lower half is new.
+        let mut later = pixels.clone();
+        later[3 * 32 * 64..].reverse();
+        let wanted = [pixels, later].map(|pixels| picture(&pixels, 64));
+        for picture in &wanted {
+            film.add(picture, 1.0).unwrap();
+        }
         film.finish().unwrap();
         let (_, pictures) = play(&path);
-        let wanted = first.rgb();
-        let off = pictures[0].iter().flatten().zip(wanted.iter().flatten());
-        let off = off.map(|(&a, &b)| u32::from(a.abs_diff(b)));
-        let mean = f64::from(off.clone().sum::<u32>()) / (3.0 * 64.0 * 64.0);
-        assert!(mean < 5.0 && off.max().unwrap() < 40, "{mean}");
+        for (shown, wanted) in pictures.iter().zip(wanted.map(|picture| picture.rgb())) {
+            let off = shown.iter().flatten().zip(wanted.iter().flatten());
+            let off = off.map(|(&a, &b)| u32::from(a.abs_diff(b)));
+            let mean = f64::from(off.clone().sum::<u32>()) / (3.0 * 64.0 * 64.0);
+            assert!(mean < 5.0 && off.max().unwrap() < 40, "{mean}");
+        }
     }
 
     #[test]
