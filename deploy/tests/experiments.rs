@@ -347,7 +347,7 @@ fn tradeoff() {
         "| learner.precision | bf16 | c51 |",
         "| DIM | driml-ada | driml-ada |",
         "at equal wall-clock time",
-        "against float64",
+        "against f32 by candle's operations",
         "over 1 seed of a level and 2 of a base",
         "--dials 'learner.precision' --out t`, then `driml tradeoff --env chain",
     ] {

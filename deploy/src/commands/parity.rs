@@ -22,10 +22,7 @@ pub(crate) struct ParityArgs {
     pub(crate) stock: bool,
 }
 
-/// Checks each file and prints what differs.
-///
-/// # Errors
-/// A file that cannot be read, or that is out of tolerance.
+/// Checks each file and prints what differs. A file out of tolerance is an error.
 pub(crate) fn run(args: &ParityArgs) -> anyhow::Result<()> {
     ready_for(args.on.device)?;
     let mut failed = 0;

@@ -4,11 +4,11 @@
 use std::{
     cell::RefCell,
     collections::{BTreeMap, BTreeSet, HashMap},
-    io,
+    fmt, io,
     path::PathBuf,
 };
 
-use candle_core::{DType, Device, Tensor};
+use candle_core::{DType, Device, Tensor, WithDType};
 use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig};
 use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
@@ -31,7 +31,7 @@ pub enum ParityError {
     Read {
         /// The case's file.
         file: PathBuf,
-        /// What the file system said.
+        /// What the file system reported.
         source: io::Error,
     },
     /// The file was read, but cannot be checked.
@@ -42,29 +42,24 @@ pub enum ParityError {
         /// What is wrong with it.
         why: Box<ParityError>,
     },
-    /// Not a safetensors file, or not all of one.
-    #[error("not a whole safetensors file: {0}")]
-    Format(String),
-    /// The metadata key `config` is missing or says nothing usable.
-    #[error("metadata key `config`: {0}")]
-    Config(String),
-    /// A tensor is missing, or is not what it must be.
-    #[error("tensor {name}: {why}")]
-    Tensor {
-        /// Its name in the file.
-        name: String,
-        /// What is wrong with it.
-        why: String,
-    },
-    /// The update refused the case.
+    /// The file is not a whole case, or not one that this check knows.
+    #[error("{0}")]
+    Case(String),
+    /// The update rejects the case.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// The model refused the case's parameters.
+    /// The model rejects the case's parameters.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// The tensor library refused.
+    /// The tensor library rejects it.
     #[error(transparent)]
     Candle(#[from] candle_core::Error),
+}
+
+impl ParityError {
+    fn tensor(name: &str, why: impl fmt::Display) -> Self {
+        Self::Case(format!("tensor {name}: {why}"))
+    }
 }
 
 /// The metadata key `config` of a case: sizes and settings of the update that the reference computed.
@@ -101,183 +96,78 @@ struct Observation {
 
 #[derive(Debug, Deserialize)]
 struct Sizes {
-    conv: Vec<(usize, usize, usize)>,
+    conv: Vec<ConvLayer>,
     hidden: usize,
     rkhs: usize,
     action_embed: usize,
+}
+
+/// The planes of a [`Batch`].
+struct Inputs {
+    states_t: Vec<u8>,
+    anchors: Option<Vec<u8>>,
+    states_k: Vec<u8>,
+    states_n: Vec<u8>,
+    action: Vec<u8>,
+    next_action: Vec<u8>,
+    n_step_return: Vec<f32>,
+    bootstrap_discount: Vec<f32>,
+    positive_valid: Vec<u8>,
+    importance_weight: Option<Vec<f32>>,
 }
 
 /// One case: a batch, all parameters before the update, and every tensor that must come out.
 pub(super) struct Case {
     config: Config,
     pub(super) settings: LearnerSettings,
-    pub(super) rows: usize,
-    positives: usize,
-    frames: [Vec<u8>; 3],
-    anchors: Option<Vec<u8>>,
-    action: Vec<u8>,
-    next_action: Vec<u8>,
-    n_step_return: Vec<f32>,
-    bootstrap_discount: Vec<f32>,
-    positive_valid: Vec<u8>,
-    /// Not there: the rows are not weighted.
-    importance_weight: Option<Vec<f32>>,
-    tensors: BTreeMap<String, Tensor>,
+    inputs: Inputs,
+    tensors: Tensors,
     /// Expectations that were asked for.
     used: RefCell<BTreeSet<String>>,
 }
 
 impl Case {
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, ParityError> {
-        let format = |why: String| ParityError::Format(why);
-        let (_, header) =
-            SafeTensors::read_metadata(bytes).map_err(|why| format(why.to_string()))?;
-        let text = header
-            .metadata()
-            .as_ref()
-            .and_then(|metadata| metadata.get("config"));
-        let text = text.ok_or_else(|| ParityError::Config("it is missing".to_owned()))?;
-        let config: Config =
-            serde_json::from_str(text).map_err(|why| ParityError::Config(why.to_string()))?;
-        let tensors: BTreeMap<String, Tensor> =
-            candle_core::safetensors::load_buffer(bytes, &Device::Cpu)
-                .map_err(|why| format(why.to_string()))?
+        let cut = |why: String| ParityError::Case(format!("not a whole safetensors file: {why}"));
+        let bad = |why: &str| ParityError::Case(format!("metadata key `config`: {why}"));
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| cut(e.to_string()))?;
+        let metadata = header.metadata().as_ref();
+        let text = metadata.and_then(|metadata| metadata.get("config"));
+        let config: Config = serde_json::from_str(text.ok_or_else(|| bad("it is missing"))?)
+            .map_err(|why| bad(&why.to_string()))?;
+        let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu);
+        let tensors = Tensors(
+            tensors
+                .map_err(|e| cut(e.to_string()))?
                 .into_iter()
-                .collect();
-        let by_lambda = if config.lambda.wanted().contains(&true) {
-            Objective::of(&DIM)
-        } else {
-            Objective::NONE
-        };
-        let objective = config.objective.unwrap_or(by_lambda);
-        // The one number of its own that an objective in the cases has.
-        let own = config.key_tau.map(|key_tau| {
-            let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
-            (objective.name().to_owned(), table.into())
-        });
-        let settings = LearnerSettings {
-            double_dqn: config.double_dqn,
-            objective,
-            condition_on_action: config.condition_on_action.unwrap_or(true),
-            lambda: config.lambda,
-            tanh_clip: config.tanh_clip,
-            max_grad_norm: config.max_grad_norm,
-            adam: config.adam,
-            // One update: the target network does not move.
-            target_period_updates: u64::MAX,
-            target_tau: 1.0,
-            average_tau: None,
-            own: own.into_iter().collect(),
-        };
-        let mut case = Self {
-            rows: 0,
-            positives: 0,
-            frames: Default::default(),
-            anchors: None,
-            action: Vec::new(),
-            next_action: Vec::new(),
-            n_step_return: Vec::new(),
-            bootstrap_discount: Vec::new(),
-            positive_valid: Vec::new(),
-            importance_weight: None,
+                .collect(),
+        );
+        let settings = config.settings();
+        Ok(Self {
+            inputs: Inputs::read(&tensors, &config.obs, &settings)?,
             used: RefCell::default(),
             config,
             settings,
             tensors,
-        };
-        case.read_inputs()?;
-        Ok(case)
-    }
-
-    fn read_inputs(&mut self) -> Result<(), ParityError> {
-        let Observation {
-            height,
-            width,
-            channels,
-        } = self.config.obs;
-        self.rows = self.tensor("input.action")?.elem_count();
-        let rows = self.rows;
-        let state = [rows, height, width, channels];
-        let bytes = |name: &str, shape: &[usize]| -> Result<Vec<u8>, ParityError> {
-            let tensor = self.input(name, DType::U8, shape)?;
-            Ok(tensor.flatten_all()?.to_vec1()?)
-        };
-        let (mut positives, mut anchors) = (1, None);
-        let (states_k, valid) = if self.settings.objective.positives() == Positives::OtherView {
-            anchors = Some(bytes("input.view_query", &state)?);
-            (bytes("input.view_key", &state)?, vec![1; rows])
-        } else {
-            // [B] where a row has one positive, else [P, B].
-            let dims = self.tensor("input.positive_valid")?.dims();
-            let several = if dims.len() > 1 { &dims[..1] } else { &[] };
-            positives = several.iter().product();
-            let later = [several, &state[..]].concat();
-            let valid = [several, &[rows]].concat();
-            (
-                bytes("input.frames_k", &later)?,
-                bytes("input.positive_valid", &valid)?,
-            )
-        };
-        let states_t = bytes("input.frames_t", &state)?;
-        let states_n = bytes("input.frames_n", &state)?;
-        self.frames = [states_t, states_k, states_n];
-        (self.positives, self.anchors, self.positive_valid) = (positives, anchors, valid);
-        let actions: Vec<i64> = self.input("input.action", DType::I64, &[rows])?.to_vec1()?;
-        let action = |action: i64| {
-            u8::try_from(action)
-                .ok()
-                .filter(|&action| action != NO_ACTION)
-        };
-        let narrowed: Option<Vec<u8>> = actions.iter().map(|&a| action(a)).collect();
-        self.action = narrowed.ok_or_else(|| ParityError::Tensor {
-            name: "input.action".to_owned(),
-            why: format!("its actions {actions:?} are not all in 0..255"),
-        })?;
-        self.next_action = vec![NO_ACTION; rows];
-        self.n_step_return = self
-            .input("input.n_step_return", DType::F32, &[rows])?
-            .to_vec1()?;
-        self.bootstrap_discount = self
-            .input("input.bootstrap_discount", DType::F32, &[rows])?
-            .to_vec1()?;
-        let name = "input.importance_weight";
-        if self.tensors.contains_key(name) {
-            let weights = self.input(name, DType::F32, &[rows])?.to_vec1()?;
-            self.importance_weight = Some(weights);
-        }
-        Ok(())
+        })
     }
 
     pub(super) fn model(&self, dim: DimHeads) -> ModelConfig {
-        let Config {
-            obs,
-            actions,
-            atoms,
-            v_min,
-            v_max,
-            model,
-            head,
-            ..
-        } = &self.config;
-        let conv = |&(out, kernel, stride): &(usize, usize, usize)| ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
+        let it = &self.config;
         ModelConfig {
-            height: obs.height,
-            width: obs.width,
-            channels: obs.channels,
-            num_actions: *actions,
-            atoms: *atoms,
-            v_min: *v_min,
-            v_max: *v_max,
-            conv: model.conv.iter().map(conv).collect(),
-            hidden: model.hidden,
-            rkhs: model.rkhs,
-            action_embed: model.action_embed,
+            height: it.obs.height,
+            width: it.obs.width,
+            channels: it.obs.channels,
+            num_actions: it.actions,
+            atoms: it.atoms,
+            v_min: it.v_min,
+            v_max: it.v_max,
+            conv: it.model.conv.clone(),
+            hidden: it.model.hidden,
+            rkhs: it.model.rkhs,
+            action_embed: it.model.action_embed,
             dim,
-            head: *head,
+            head: it.head,
         }
     }
 
@@ -286,8 +176,8 @@ impl Case {
         let of = |who: &str| {
             HeadNoise::of_normals(model, |layer, side, len| {
                 let name = format!("noise.{who}.{layer}.{side}");
-                let tensor = self.input(&name, DType::F32, &[len])?;
-                Ok::<_, ParityError>(tensor.to_dtype(DType::F64)?.to_vec1()?)
+                let normals = self.tensors.read::<f32>(&name, DType::F32, &[len])?;
+                Ok::<_, ParityError>(normals.into_iter().map(f64::from).collect())
             })
         };
         Ok(UpdateNoise {
@@ -298,109 +188,185 @@ impl Case {
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {
-        let [states_t, states_k, states_n] = &self.frames;
+        let it = &self.inputs;
         Batch {
-            rows: self.rows,
-            states_t,
-            anchors: self.anchors.as_deref(),
-            positives: self.positives,
-            states_k,
-            states_n,
-            action: &self.action,
-            next_action: &self.next_action,
-            n_step_return: &self.n_step_return,
-            bootstrap_discount: &self.bootstrap_discount,
-            positive_valid: &self.positive_valid,
-            importance_weight: self.importance_weight.as_deref(),
+            rows: it.action.len(),
+            states_t: &it.states_t,
+            anchors: it.anchors.as_deref(),
+            positives: it
+                .positive_valid
+                .len()
+                .checked_div(it.action.len())
+                .unwrap_or(0),
+            states_k: &it.states_k,
+            states_n: &it.states_n,
+            action: &it.action,
+            next_action: &it.next_action,
+            n_step_return: &it.n_step_return,
+            bootstrap_discount: &it.bootstrap_discount,
+            positive_valid: &it.positive_valid,
+            importance_weight: it.importance_weight.as_deref(),
         }
+    }
+
+    /// The tensors under `prefix`, without it.
+    fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
+        let all = self.tensors.0.iter();
+        all.filter_map(move |(name, tensor)| Some((name.strip_prefix(prefix)?, tensor)))
     }
 
     /// The online parameters, without their prefix.
     pub(super) fn online(&self) -> impl Iterator<Item = (&str, &Tensor)> {
-        self.tensors
-            .iter()
-            .filter_map(|(name, tensor)| Some((name.strip_prefix("online.")?, tensor)))
+        self.under("online.")
     }
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
     pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
-        let DimHeads {
-            psi3,
-            phi3,
-            psi4,
-            phi4,
-            action,
-        } = model.dim;
-        let unused = |name: &str| {
-            [
-                ("psi3", psi3),
-                ("phi3", phi3),
-                ("psi4", psi4),
-                ("phi4", phi4),
-                ("action", action),
-            ]
-            .iter()
-            .any(|(part, built)| !built && name.starts_with(&format!("dim.{part}.")))
-        };
-        let named = self
-            .tensors
-            .iter()
-            .filter_map(|(name, t)| Some((name.strip_prefix(prefix)?, t)));
+        let built: BTreeSet<_> = model
+            .parameter_shapes()
+            .into_iter()
+            .map(|it| it.0)
+            .collect();
+        let named = self.under(prefix).filter(|(name, _)| built.contains(*name));
         named
-            .filter(|(name, _)| !unused(name))
-            .map(|(name, t)| (name.to_owned(), t.clone()))
+            .map(|(name, it)| (name.to_owned(), it.clone()))
             .collect()
     }
 
     /// The values of `expect.<name>`, as f64.
     pub(super) fn expected(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>, ParityError> {
         let name = format!("expect.{name}");
-        let tensor = self.tensor(&name)?;
+        let tensor = self.tensors.get(&name)?;
         if tensor.dims() != shape {
             let why = format!("its shape is {:?}, not {shape:?}", tensor.dims());
-            return Err(ParityError::Tensor { name, why });
+            return Err(ParityError::tensor(&name, why));
         }
-        let values = tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?;
         self.used.borrow_mut().insert(name);
-        Ok(values)
+        values(tensor)
     }
 
     /// An expectation that nothing was compared with must not pass as met.
     pub(super) fn check_all_expectations_used(&self) -> Result<(), ParityError> {
         let used = self.used.borrow();
-        match self
-            .tensors
-            .keys()
-            .find(|name| name.starts_with("expect.") && !used.contains(*name))
-        {
-            None => Ok(()),
-            Some(name) => Err(ParityError::Tensor {
-                name: name.clone(),
-                why: "this expectation is not known here".to_owned(),
-            }),
-        }
+        let mut names = self
+            .under("expect.")
+            .map(|(name, _)| format!("expect.{name}"));
+        names
+            .find(|name| !used.contains(name))
+            .map_or(Ok(()), |name| {
+                Err(ParityError::tensor(
+                    &name,
+                    "this expectation is not known here",
+                ))
+            })
     }
+}
 
-    fn tensor(&self, name: &str) -> Result<&Tensor, ParityError> {
-        let missing = || ParityError::Tensor {
-            name: name.to_owned(),
-            why: "it is missing".to_owned(),
+impl Config {
+    fn settings(&self) -> LearnerSettings {
+        let by_lambda = if self.lambda.wanted().contains(&true) {
+            Objective::of(&DIM)
+        } else {
+            Objective::NONE
         };
-        self.tensors.get(name).ok_or_else(missing)
+        let objective = self.objective.unwrap_or(by_lambda);
+        // The one number of its own that an objective in the cases has.
+        let own = self.key_tau.map(|key_tau| {
+            let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
+            (objective.name().to_owned(), table.into())
+        });
+        LearnerSettings {
+            double_dqn: self.double_dqn,
+            objective,
+            condition_on_action: self.condition_on_action.unwrap_or(true),
+            lambda: self.lambda,
+            tanh_clip: self.tanh_clip,
+            max_grad_norm: self.max_grad_norm,
+            adam: self.adam,
+            // One update: the target network does not move.
+            target_period_updates: u64::MAX,
+            target_tau: 1.0,
+            average_tau: None,
+            own: own.into_iter().collect(),
+        }
+    }
+}
+
+impl Inputs {
+    fn read(
+        tensors: &Tensors,
+        obs: &Observation,
+        settings: &LearnerSettings,
+    ) -> Result<Self, ParityError> {
+        let rows = tensors.get("input.action")?.elem_count();
+        let state = [rows, obs.height, obs.width, obs.channels];
+        let bytes = |name: &str, shape: &[usize]| tensors.read::<u8>(name, DType::U8, shape);
+        let floats = |name: &str| tensors.read::<f32>(name, DType::F32, &[rows]);
+        let mut anchors = None;
+        let (states_k, positive_valid) = if settings.objective.positives() == Positives::OtherView {
+            anchors = Some(bytes("input.view_query", &state)?);
+            (bytes("input.view_key", &state)?, vec![1; rows])
+        } else {
+            // [B] where a row has one positive, else [P, B].
+            let dims = tensors.get("input.positive_valid")?.dims();
+            let several = if dims.len() > 1 { &dims[..1] } else { &[] };
+            let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
+            let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
+            (states_k, valid)
+        };
+        let actions = tensors.read::<i64>("input.action", DType::I64, &[rows])?;
+        let narrow = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
+        let action: Option<Vec<u8>> = actions.iter().map(narrow).collect();
+        let weight = "input.importance_weight";
+        let is_weighted = tensors.0.contains_key(weight);
+        Ok(Self {
+            states_t: bytes("input.frames_t", &state)?,
+            anchors,
+            states_k,
+            states_n: bytes("input.frames_n", &state)?,
+            action: action.ok_or_else(|| {
+                let why = format!("its actions {actions:?} are not all in 0..255");
+                ParityError::tensor("input.action", why)
+            })?,
+            next_action: vec![NO_ACTION; rows],
+            n_step_return: floats("input.n_step_return")?,
+            bootstrap_discount: floats("input.bootstrap_discount")?,
+            positive_valid,
+            importance_weight: is_weighted.then(|| floats(weight)).transpose()?,
+        })
+    }
+}
+
+/// The tensors of a file by name.
+struct Tensors(BTreeMap<String, Tensor>);
+
+impl Tensors {
+    fn get(&self, name: &str) -> Result<&Tensor, ParityError> {
+        let missing = || ParityError::tensor(name, "it is missing");
+        self.0.get(name).ok_or_else(missing)
     }
 
-    fn input(&self, name: &str, dtype: DType, shape: &[usize]) -> Result<&Tensor, ParityError> {
-        let tensor = self.tensor(name)?;
-        if tensor.dtype() != dtype || tensor.dims() != shape {
-            return Err(ParityError::Tensor {
-                name: name.to_owned(),
-                why: format!(
-                    "it is {:?} {:?}, not {dtype:?} {shape:?}",
-                    tensor.dtype(),
-                    tensor.dims()
-                ),
-            });
+    /// The values of a tensor of this type and shape.
+    fn read<T: WithDType>(
+        &self,
+        name: &str,
+        dtype: DType,
+        shape: &[usize],
+    ) -> Result<Vec<T>, ParityError> {
+        let tensor = self.get(name)?;
+        let (found, dims) = (tensor.dtype(), tensor.dims());
+        if found != dtype || dims != shape {
+            let why = format!("it is {found:?} {dims:?}, not {dtype:?} {shape:?}");
+            return Err(ParityError::tensor(name, why));
         }
-        Ok(tensor)
+        Ok(tensor.flatten_all()?.to_vec1()?)
     }
+}
+
+/// The numbers of a tensor, as f64.
+pub(super) fn values(tensor: &Tensor) -> Result<Vec<f64>, ParityError> {
+    Ok(tensor
+        .to_dtype(candle_core::DType::F64)?
+        .flatten_all()?
+        .to_vec1()?)
 }

@@ -1,71 +1,71 @@
-//! How far an update of any precision, network and weights is from the same in float64.
-//! It judges nothing: tolerances are for the cases of the parity check.
+//! How far an update of any precision, network and weights is from the same in f32 by candle's own operations.
+//! It judges nothing: tolerances are for the cases of the parity check, whose float64 holds both ways of computing.
 
-use candle_core::DType;
+use candle_core::{DType, Device};
+use driml_model::{Compute, Kernels};
 use driml_protocol::NO_ACTION;
 
-use super::float64::Float64;
 use crate::{agent::Agent, batch::Batch, error::UpdateError};
 
-/// How far an agent's numbers are from float64's.
+/// How a reference computes: with none of this project's kernels.
+pub const REFERENCE: Compute = Compute {
+    device: Device::Cpu,
+    kernels: Kernels::Candle,
+};
+
+/// How far an agent's numbers are from a reference's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ErrorOfUpdate {
+    /// The reference's total loss.
+    pub reference_loss: f64,
     /// |total - reference| / |reference|.
     pub loss: f64,
     /// 2-norm of the gradients' difference over that of the reference, all parameters together.
     pub gradient: f64,
     /// 1 - cosine of the angle between the gradients.
     pub angle: f64,
-    /// Root mean square error of a value of s_t, in units of return.
-    pub q_rms: f64,
-    /// Largest error of a value of s_t, in units of return.
-    pub q_max: f64,
-    /// Share of rows whose greedy action in s_t is the reference's.
-    pub same_action: f64,
     /// Share of rows that bootstrap whose greedy action in s_{t+n} is the reference's; 1 if none does.
     pub same_next_action: f64,
 }
 
 impl ErrorOfUpdate {
-    /// Of `agent` on `batch`, as it computes it, against `reference` of both.
+    /// Of `agent` on `batch` against `reference`, an agent of the same parameters on [`REFERENCE`]; with the noise of the first.
     ///
     /// # Errors
-    /// What the agent's own arithmetic says.
-    pub fn of(agent: &Agent, batch: &Batch<'_>, reference: &Float64) -> Result<Self, UpdateError> {
-        let own = agent.evaluate(batch)?;
+    /// What the arithmetic of either says.
+    pub fn of(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
+        let noise = agent.noise();
+        let own = agent.evaluate_with(batch, &noise)?;
+        let expected = reference.evaluate_with(batch, &noise)?;
         let (mut apart, mut dot, mut own_square, mut square) = (0.0, 0.0, 0.0, 0.0);
-        for (name, expected) in &reference.gradients {
-            let got: Vec<f64> = match own.gradients.get(name) {
-                Some(gradient) => gradient.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?,
-                None => vec![0.0; expected.len()],
-            };
-            for (got, expected) in got.iter().zip(expected) {
+        for (name, var) in reference.online().iter() {
+            let [got, expected] = [&own.gradients, &expected.gradients].map(|gradients| {
+                let gradient = gradients.get(name);
+                gradient.map_or_else(
+                    || Ok(vec![0.0; var.elem_count()]),
+                    |it| it.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>(),
+                )
+            });
+            for (got, expected) in got?.iter().zip(expected?) {
                 apart += (got - expected).powi(2);
                 dot += got * expected;
                 own_square += got * got;
                 square += expected * expected;
             }
         }
-        let values = QError::of(
-            &agent.q_values_t(batch)?,
-            &reference.q_values_t,
-            agent.model().num_actions,
-        );
-        let next: Vec<bool> = own
-            .next_greedy_action
-            .iter()
-            .zip(&reference.next_greedy_action)
+        let [own_next, next] = [&own, &expected].map(|it| &it.next_greedy_action);
+        let next = own_next.iter().zip(next);
+        let next: Vec<bool> = next
             .filter(|(own, _)| **own != NO_ACTION)
             .map(|(own, expected)| own == expected)
             .collect();
         let same_next = next.iter().filter(|same| **same).count() as f64;
+        let [total, reference_loss] = [own.total, expected.total].map(f64::from);
         Ok(Self {
-            loss: (f64::from(own.total) - reference.total).abs() / reference.total.abs(),
-            gradient: (apart / square).sqrt(),
-            angle: 1.0 - dot / (own_square * square).sqrt(),
-            q_rms: values.rms,
-            q_max: values.max,
-            same_action: values.same_action,
+            reference_loss,
+            loss: (total - reference_loss).abs() / reference_loss.abs(),
+            gradient: f64::sqrt(apart / square),
+            angle: 1.0 - dot / f64::sqrt(own_square * square),
             same_next_action: if next.is_empty() {
                 1.0
             } else {
@@ -88,19 +88,19 @@ pub struct QError {
 
 impl QError {
     /// Of `got` [B, A] against `expected` [B, A].
-    pub fn of(got: &[f32], expected: &[f64], num_actions: usize) -> Self {
-        let errors = got
-            .iter()
-            .zip(expected)
-            .map(|(&got, expected)| (f64::from(got) - expected).abs());
+    pub fn of(got: &[f32], expected: &[f32], num_actions: usize) -> Self {
         let (mut square, mut max) = (0.0, 0f64);
-        for error in errors {
+        for (&got, &expected) in got.iter().zip(expected) {
+            let error = (f64::from(got) - f64::from(expected)).abs();
             square += error * error;
             max = max.max(error);
         }
+        let best = |values: &[f32]| {
+            let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
+            (1..values.len()).fold(0, better)
+        };
         let rows = expected.len() / num_actions;
-        let own = got.chunks_exact(num_actions).map(best);
-        let reference = expected.chunks_exact(num_actions).map(best);
+        let [own, reference] = [got, expected].map(|it| it.chunks_exact(num_actions).map(best));
         let same = own.zip(reference).filter(|(a, b)| a == b).count();
         Self {
             rms: (square / expected.len() as f64).sqrt(),
@@ -108,14 +108,6 @@ impl QError {
             same_action: same as f64 / rows as f64,
         }
     }
-}
-
-/// The place of the first largest value.
-fn best<T: PartialOrd>(values: &[T]) -> usize {
-    (1..values.len()).fold(
-        0,
-        |best, at| if values[at] > values[best] { at } else { best },
-    )
 }
 
 #[cfg(test)]

@@ -3,7 +3,6 @@
 
 mod case;
 pub mod deviation;
-pub mod float64;
 mod tolerance;
 
 use std::{
@@ -11,21 +10,20 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use candle_core::Tensor;
 use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
 use driml_protocol::NO_ACTION;
 
-use case::Case;
 pub use case::ParityError;
+use case::{Case, values};
 use tolerance::Tolerances;
 
 use crate::{
-    agent::{Agent, NetworkParameters},
+    agent::{Agent, Evaluation, NetworkParameters},
     auxiliary::{
         Objective,
         dim::DIM,
         key_encoder::KeyEncoder,
-        loss::{LossInputs, OnlineFeatures, WeightedLoss},
+        loss::{LossInputs, OnlineFeatures},
         settings::{AuxiliarySettings, Lambda},
     },
     losses::scores::{Dots, Scores},
@@ -71,14 +69,11 @@ impl fmt::Display for ParityReport {
         writeln!(f, "{}", self.file.display())?;
         for line in &self.lines {
             let verdict = if line.ok() { "ok" } else { "FAILED" };
-            let ParityLine {
-                name,
-                error,
-                tolerance,
-            } = line;
+            let (error, tolerance) = (line.error, line.tolerance);
             writeln!(
                 f,
-                "  {name:<48} error {error:9.2e}  tolerance {tolerance:9.2e}  {verdict}"
+                "  {:<48} error {error:9.2e}  tolerance {tolerance:9.2e}  {verdict}",
+                line.name
             )?;
         }
         Ok(())
@@ -88,7 +83,7 @@ impl fmt::Display for ParityReport {
 /// Runs one update on a case file, computed as `compute` says, and compares every tensor it expects.
 ///
 /// # Errors
-/// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are no error: see the report.
+/// A file that cannot be read, is not a case, or lacks a tensor. Values out of tolerance are lines of the report.
 pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityReport, ParityError> {
     let path = path.as_ref();
     let bytes = std::fs::read(path).map_err(|source| ParityError::Read {
@@ -109,140 +104,147 @@ pub fn check_file(path: impl AsRef<Path>, compute: &Compute) -> Result<ParityRep
 }
 
 fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError> {
-    let (mut agent, model) = agent_of(case, compute)?;
-
-    let allowed = Tolerances::of(compute.kernels);
-    let mut lines = Vec::new();
+    let mut agent = agent_of(case, compute)?;
     let forward = forward_losses(case, compute)?;
-    let evaluation = agent.evaluate_with(&case.batch(), &case.noise(&model)?)?;
-
-    let width = f64::from(model.v_max - model.v_min);
-    let (rows, num_actions, atoms) = (case.rows, model.num_actions, model.atoms);
-    let expected = case.expected("q_values_t", &[rows, num_actions])?;
-    lines.push(line(
-        "q_values_t",
-        largest(&widened(&agent.q_values_t(&case.batch())?), &expected),
-        allowed.q_values * width,
-    ));
-    let expected = case.expected("next_action", &[rows])?;
-    let chosen: Vec<f64> = evaluation
-        .next_greedy_action
-        .iter()
-        .map(|&action| f64::from(action))
-        .collect();
-    // Of a row that does not bootstrap no action is chosen.
-    let agree = |(&got, &wanted): (&f64, &f64)| got == f64::from(NO_ACTION) || got == wanted;
-    let same: Vec<bool> = chosen.iter().zip(&expected).map(agree).collect();
-    let others = same.iter().filter(|same| !**same).count();
-    lines.push(line(
-        "next_action (share of rows)",
-        others as f64 / rows as f64,
-        allowed.next_action_rows,
-    ));
-    let expected = case.expected("target_projection", &[rows, atoms])?;
-    let error = widened(&evaluation.target_projection)
-        .chunks(atoms)
-        .zip(expected.chunks(atoms))
-        .zip(same)
-        .filter(|(_, same)| *same)
-        .map(|((got, expected), _)| largest(got, expected))
-        .fold(0.0, nan_or_larger);
-    lines.push(line("target_projection", error, allowed.projection));
-
-    if !evaluation.row_kls.is_empty() {
-        let expected = case.expected("row_kl", &[rows])?;
-        let error = largest(&widened(&evaluation.row_kls), &expected);
-        let most = expected.iter().copied().fold(0.0, f64::max);
-        let tolerance = (allowed.loss * most).max(allowed.least_loss);
-        lines.push(line("row_kl", error, tolerance));
-    }
-
-    let mut loss_line = |name: &str, got: f32, saturated: bool| -> Result<(), ParityError> {
-        let expected = case.expected(name, &[1])?[0];
-        let relative = if saturated {
-            allowed.saturated_loss
-        } else {
-            allowed.loss
-        };
-        let tolerance = (relative * expected.abs()).max(allowed.least_loss);
-        lines.push(line(name, (f64::from(got) - expected).abs(), tolerance));
-        Ok(())
+    let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
+    let mut check = Check {
+        case,
+        allowed: Tolerances::of(compute.kernels),
+        lines: Vec::new(),
     };
-    loss_line("loss.c51_kl", evaluation.c51_kl, false)?;
-    let mut total_saturates = false;
-    for alone in forward {
-        // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
-        let in_update = evaluation.losses.iter().find(|it| it.0 == alone.name);
-        let got = in_update.map_or(alone.value, |it| it.1);
-        // The cases call every loss after the pair of levels that it compares; one that does not say compares global features.
-        let pair = alone.name.split_once('_').map_or("4t4", |it| it.1);
-        loss_line(&format!("loss.dim.{pair}"), got, alone.saturates)?;
-        total_saturates |= alone.saturates && in_update.is_some();
-    }
-    loss_line("loss.total", evaluation.total, total_saturates)?;
-
-    let global_norm = case.expected("grad_norm", &[1])?[0];
-    let (mut worst, mut angles) = (Worst::default(), Worst::default());
-    for (name, tensor) in case.online() {
-        let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
-        let got = match evaluation.gradients.get(name) {
-            Some(gradient) => values(gradient)?,
-            None => vec![0.0; expected.len()],
-        };
-        let difference = norm(
-            got.iter()
-                .zip(&expected)
-                .map(|(got, expected)| got - expected),
-        );
-        let own = norm(expected.iter().copied());
-        let tolerance = allowed.gradient * own + allowed.gradient_of_global * global_norm;
-        worst.add("grad", name, difference, tolerance);
-        if let Some(angle) = allowed.angle.filter(|_| own >= 0.1 * global_norm) {
-            let dot: f64 = got.iter().zip(&expected).map(|(a, b)| a * b).sum();
-            let cosine = dot / (own * norm(got.iter().copied()));
-            angles.add("1 - cosine", name, 1.0 - cosine, angle);
-        }
-    }
-    lines.extend(worst.lines);
-    lines.extend(angles.lines);
-    let updated = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
-    let got = agent.apply(&evaluation.gradients)?;
-    lines.push(line(
-        "grad_norm",
-        (got - global_norm).abs(),
-        allowed.norm * global_norm,
-    ));
-
-    let mut worst = Worst::default();
-    for (name, tensor) in case.online() {
-        let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
-        // What no lambda uses is not built, so it stays as the file gives it.
-        let got = values(
-            agent
-                .online()
-                .get(name)
-                .map_or(tensor, |var| var.as_tensor()),
-        )?;
-        worst.add("updated", name, largest(&got, &expected), updated);
-    }
-    lines.extend(worst.lines);
-    let mut worst = Worst::default();
-    for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
-        let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
-        worst.add(
-            "updated_key",
-            name,
-            largest(&values(var)?, &expected),
-            updated,
-        );
-    }
-    lines.extend(worst.lines);
+    check.targets(&agent, &evaluation)?;
+    check.losses(&evaluation, &forward)?;
+    check.gradients(&evaluation)?;
+    let expected = case.expected("grad_norm", &[1])?[0];
+    let error = (agent.apply(&evaluation.gradients)? - expected).abs();
+    check.add("grad_norm", error, check.allowed.norm * expected);
+    check.updated(&agent)?;
     case.check_all_expectations_used()?;
-    Ok(lines)
+    Ok(check.lines)
 }
 
-/// The agent of a case before its update, and its model.
-fn agent_of(case: &Case, compute: &Compute) -> Result<(Agent, ModelConfig), ParityError> {
+/// A comparison under way.
+struct Check<'a> {
+    case: &'a Case,
+    allowed: Tolerances,
+    lines: Vec<ParityLine>,
+}
+
+impl Check<'_> {
+    fn add(&mut self, name: &str, error: f64, tolerance: f64) {
+        self.lines.push(line(name, error, tolerance));
+    }
+
+    /// Values of s_t, greedy actions in s_{t+n} and projected targets.
+    fn targets(&mut self, agent: &Agent, evaluation: &Evaluation) -> Result<(), ParityError> {
+        let (case, allowed, model) = (self.case, self.allowed, agent.model());
+        let batch = case.batch();
+        let expected = case.expected("q_values_t", &[batch.rows, model.num_actions])?;
+        let error = largest(&widened(&agent.q_values_t(&batch)?), &expected);
+        let width = f64::from(model.v_max - model.v_min);
+        self.add("q_values_t", error, allowed.q_values * width);
+
+        let expected = case.expected("next_action", &[batch.rows])?;
+        // Of a row that does not bootstrap no action is chosen.
+        let agree = |(&got, wanted): (&u8, &f64)| got == NO_ACTION || f64::from(got) == *wanted;
+        let chosen = evaluation.next_greedy_action.iter().zip(&expected);
+        let same: Vec<bool> = chosen.map(agree).collect();
+        let others = same.iter().filter(|same| !**same).count();
+        let share = others as f64 / batch.rows as f64;
+        self.add(
+            "next_action (share of rows)",
+            share,
+            allowed.next_action_rows,
+        );
+
+        let expected = case.expected("target_projection", &[batch.rows, model.atoms])?;
+        let found = widened(&evaluation.target_projection);
+        let rows = found.chunks(model.atoms).zip(expected.chunks(model.atoms));
+        let rows = rows.zip(same).filter(|(_, same)| *same);
+        let errors = rows.map(|((got, expected), _)| largest(got, expected));
+        let error = errors.fold(0.0, nan_or_larger);
+        self.add("target_projection", error, allowed.projection);
+        Ok(())
+    }
+
+    fn losses(&mut self, found: &Evaluation, forward: &[Forward]) -> Result<(), ParityError> {
+        if !found.row_kls.is_empty() {
+            let expected = self.case.expected("row_kl", &[found.row_kls.len()])?;
+            let error = largest(&widened(&found.row_kls), &expected);
+            let most = expected.iter().copied().fold(0.0, f64::max);
+            self.add("row_kl", error, self.allowed.of_loss(most, false));
+        }
+        self.loss("loss.c51_kl", found.c51_kl, false)?;
+        let mut total_saturates = false;
+        for alone in forward {
+            // A loss of weight 0 is not in the update: its value comes from the forward pass alone.
+            let in_update = found.losses.iter().find(|it| it.0 == alone.name);
+            let got = in_update.map_or(alone.value, |it| it.1);
+            // The cases call every loss after the pair of levels that it compares; one without a pair compares global features.
+            let pair = alone.name.split_once('_').map_or("4t4", |it| it.1);
+            self.loss(&format!("loss.dim.{pair}"), got, alone.saturates)?;
+            total_saturates |= alone.saturates && in_update.is_some();
+        }
+        self.loss("loss.total", found.total, total_saturates)
+    }
+
+    fn loss(&mut self, name: &str, got: f32, is_saturated: bool) -> Result<(), ParityError> {
+        let expected = self.case.expected(name, &[1])?[0];
+        let tolerance = self.allowed.of_loss(expected, is_saturated);
+        self.add(name, (f64::from(got) - expected).abs(), tolerance);
+        Ok(())
+    }
+
+    fn gradients(&mut self, evaluation: &Evaluation) -> Result<(), ParityError> {
+        let (case, allowed) = (self.case, self.allowed);
+        let global_norm = case.expected("grad_norm", &[1])?[0];
+        let (mut worst, mut angles) = (Worst::default(), Worst::default());
+        for (name, tensor) in case.online() {
+            let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
+            let got = match evaluation.gradients.get(name) {
+                Some(gradient) => values(gradient)?,
+                None => vec![0.0; expected.len()],
+            };
+            let apart = norm(got.iter().zip(&expected).map(|(got, wanted)| got - wanted));
+            let own = norm(expected.iter().copied());
+            let tolerance = allowed.gradient * own + allowed.gradient_of_global * global_norm;
+            worst.add("grad", name, apart, tolerance);
+            if let Some(angle) = allowed.angle.filter(|_| own >= 0.1 * global_norm) {
+                let dot: f64 = got.iter().zip(&expected).map(|(a, b)| a * b).sum();
+                let cosine = dot / (own * norm(got.iter().copied()));
+                angles.add("1 - cosine", name, 1.0 - cosine, angle);
+            }
+        }
+        self.lines
+            .extend(worst.lines.into_iter().chain(angles.lines));
+        Ok(())
+    }
+
+    /// Parameters after the step.
+    fn updated(&mut self, agent: &Agent) -> Result<(), ParityError> {
+        let (case, allowed) = (self.case, self.allowed);
+        let tolerance = allowed.updated + allowed.updated_rates * case.settings.adam.lr;
+        let (mut online, mut keys) = (Worst::default(), Worst::default());
+        for (name, tensor) in case.online() {
+            let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
+            // What no lambda uses is not built, so it stays as the file gives it.
+            let var = agent.online().get(name);
+            let got = values(var.map_or(tensor, |var| var.as_tensor()))?;
+            online.add("updated", name, largest(&got, &expected), tolerance);
+        }
+        for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
+            let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
+            let error = largest(&values(var)?, &expected);
+            keys.add("updated_key", name, error, tolerance);
+        }
+        self.lines
+            .extend(online.lines.into_iter().chain(keys.lines));
+        Ok(())
+    }
+}
+
+/// The agent of a case before its update.
+fn agent_of(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
     let sizes = case.model(DimHeads::NONE);
     let model = case.model(case.settings.dim_heads(sizes.num_actions));
     let slow = model.without_dim();
@@ -252,8 +254,10 @@ fn agent_of(case: &Case, compute: &Compute) -> Result<(Agent, ModelConfig), Pari
         target: Parameters::from_tensors(&slow, case.parameters("target.", &slow), device)?,
         key: key_parameters(case, &model, compute)?,
     };
-    let agent = Agent::from_parameters(model.clone(), case.settings.clone(), compute, parameters)?;
-    Ok((agent, model))
+    let settings = case.settings.clone();
+    Ok(Agent::from_parameters(
+        model, settings, compute, parameters,
+    )?)
 }
 
 /// The parameters of the case's key encoder, if its objective has one.
@@ -314,25 +318,16 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     })?;
     let saturates = |Dots { dots, rkhs }: &Dots| -> Result<bool, ParityError> {
         let scores = Scores::new(*rkhs, settings.tanh_clip);
-        let dots = values(dots)?;
-        let largest = dots
-            .iter()
-            .fold(0.0, |largest: f64, dot| largest.max(dot.abs()));
+        let largest = values(dots)?.into_iter().map(f64::abs).fold(0.0, f64::max);
         Ok(largest * scores.scale > scores.tanh_clip)
     };
     let mut forward = Vec::new();
-    for WeightedLoss {
-        name, loss, dots, ..
-    } in losses
-    {
-        let mut any = false;
-        for dots in &dots {
-            any |= saturates(dots)?;
-        }
+    for it in &losses {
+        let saturating: Result<Vec<bool>, _> = it.dots.iter().map(saturates).collect();
         forward.push(Forward {
-            name,
-            value: loss.to_scalar()?,
-            saturates: any,
+            name: it.name,
+            value: it.loss.to_scalar()?,
+            saturates: saturating?.contains(&true),
         });
     }
     Ok(forward)
@@ -375,13 +370,6 @@ impl Worst {
     }
 }
 
-fn values(tensor: &Tensor) -> Result<Vec<f64>, ParityError> {
-    Ok(tensor
-        .to_dtype(candle_core::DType::F64)?
-        .flatten_all()?
-        .to_vec1()?)
-}
-
 fn widened(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| f64::from(value)).collect()
 }
@@ -395,11 +383,10 @@ fn largest(got: &[f64], expected: &[f64]) -> f64 {
     if got.len() != expected.len() {
         return f64::INFINITY;
     }
-    let differences = got
-        .iter()
-        .zip(expected)
-        .map(|(got, expected)| (got - expected).abs());
-    differences.fold(0.0, nan_or_larger)
+    let pairs = got.iter().zip(expected);
+    pairs
+        .map(|(got, expected)| (got - expected).abs())
+        .fold(0.0, nan_or_larger)
 }
 
 /// The larger one; NaN if either is.
@@ -408,5 +395,50 @@ fn nan_or_larger(largest: f64, d: f64) -> f64 {
         d
     } else {
         largest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_model::{PolicyNetwork, Precision};
+
+    use super::{
+        deviation::{ErrorOfUpdate, REFERENCE},
+        *,
+    };
+
+    /// Beside the report: an actor's values, and the same update by candle's operations.
+    #[test]
+    fn actors_and_candle_s_operations_agree_with_every_case() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/parity");
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.extension().is_none_or(|it| it != "safetensors") {
+                continue;
+            }
+            let case = Case::parse(&std::fs::read(&path).unwrap()).unwrap();
+            let (batch, name) = (case.batch(), path.display());
+            let [agent, reference] =
+                [Compute::CPU, REFERENCE].map(|it| agent_of(&case, &it).unwrap());
+            let error = ErrorOfUpdate::of(&agent, &batch, &reference).unwrap();
+            assert!(
+                error.loss < 1e-5 && error.gradient < 1e-4,
+                "{name}: {error:?}"
+            );
+            assert_eq!(error.same_next_action, 1.0, "{name}");
+
+            let shape = [batch.rows, agent.model().num_actions];
+            let expected = case.expected("q_values_t", &shape).unwrap();
+            let weights = agent.weights().unwrap();
+            let slow = agent.model().without_dim();
+            let mut policy = PolicyNetwork::new(&slow, &weights, Precision::F32).unwrap();
+            let mut acted = vec![0.0; expected.len()];
+            policy.q_values(batch.states_t, &mut acted).unwrap();
+            let scale = expected.iter().fold(1.0, |a: f64, b| a.max(b.abs()));
+            for found in [acted, agent.q_values_t(&batch).unwrap()] {
+                let error = largest(&widened(&found), &expected);
+                assert!(error < 2e-6 * scale, "{name}: {error}");
+            }
+        }
     }
 }

@@ -69,6 +69,16 @@ impl Tolerances {
         updated_rates: 2.0,
     };
 
+    /// Of a loss with this expected value.
+    pub(super) fn of_loss(&self, expected: f64, is_saturated: bool) -> f64 {
+        let relative = if is_saturated {
+            self.saturated_loss
+        } else {
+            self.loss
+        };
+        (relative * expected.abs()).max(self.least_loss)
+    }
+
     pub(super) const fn of(kernels: Kernels) -> Self {
         match kernels {
             Kernels::Fused(Precision::Bf16) => Self::BF16,

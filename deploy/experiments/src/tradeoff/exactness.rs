@@ -1,4 +1,5 @@
-//! How exact a level's arithmetic is: losses, gradients and values of its own run's weights on held rows, against float64.
+//! How exact a level's arithmetic is: losses, gradients and values of its own run's weights on held rows, against f32 by candle's own
+//! operations.
 //! It says nothing of what is learned: a level may be exact and learn less.
 
 use std::fmt;
@@ -7,10 +8,7 @@ use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
 use driml_learner::{
     Agent, Compute, NetworkParameters, checkpoint,
-    parity::{
-        deviation::{ErrorOfUpdate, QError},
-        float64::{float64, q_values},
-    },
+    parity::deviation::{ErrorOfUpdate, QError, REFERENCE},
 };
 use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
@@ -18,12 +16,12 @@ use serde::{Deserialize, Serialize};
 
 use super::held::HeldBatch;
 
-/// Rows of the batch whose loss and gradient are compared, at most: float64 takes seconds for them.
+/// Rows of the batch whose loss and gradient are compared, at most.
 const ROWS_MAX: usize = 64;
 /// States whose values and greedy actions are compared, for each of these rows.
 const STATES_A_ROW: usize = 16;
 
-/// Errors of a level against float64, at the weights of one of its runs.
+/// Errors of a level against the reference, at the weights of one of its runs.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Exactness {
     /// Relative error of the total loss.
@@ -88,13 +86,14 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
         &folder.checkpoints(),
         model,
         update,
-        &Compute::CPU,
+        &REFERENCE,
         config.run.hash(),
     )?;
     let restored = restored.with_context(|| format!("{} has no checkpoint", folder.display()))?;
+    let reference = restored.agent;
     let parameters = NetworkParameters {
-        online: restored.agent.online().copy()?,
-        target: restored.agent.target().copy()?,
+        online: reference.online().copy()?,
+        target: reference.target().copy()?,
         key: None,
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
@@ -102,12 +101,11 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let weights = agent.weights()?;
     let Sizes { rows, states } = Sizes::of(config);
     let held = HeldBatch::play(config, Some(&weights), rows)?;
-    let reference = float64(&agent, &held.batch())?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_as)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
     let held = HeldBatch::play(config, Some(&weights), states)?;
-    let expected = q_values(&agent, &held.states_t)?;
+    let expected = reference.q_values_t(&held.batch())?;
     let [learning, acting] = [
         agent.q_values_t(&held.batch())?,
         acted_values(&mut policy, &held, model.num_actions)?,

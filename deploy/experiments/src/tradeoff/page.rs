@@ -26,7 +26,7 @@ pub(super) const SPEEDS: [&str; 6] = [
     "weights_bytes",
     "frame_bytes",
 ];
-/// The errors against float64, as the data has them.
+/// The errors against the reference, as the data has them.
 pub(super) const ERRORS: [&str; 8] = [
     "loss_error",
     "gradient_error",

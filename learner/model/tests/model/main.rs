@@ -1,4 +1,4 @@
-//! Tests of the network from outside: kernels against stock candle operations, the parity cases, weights, the policy.
+//! Tests of the network from outside: kernels against stock candle operations, weights, the policy.
 //! They know nothing of losses; the learner's tests check the gradients of those.
 #![allow(clippy::unwrap_used, missing_docs)]
 
@@ -6,7 +6,6 @@ mod conv;
 mod head;
 mod linear;
 mod network;
-mod parity;
 mod policy;
 mod support;
 mod weights;

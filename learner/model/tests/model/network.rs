@@ -1,5 +1,5 @@
 //! The whole network: the DIM heads against their plain formula, determinism, and errors for what does not fit.
-//! Values against another framework are in `parity`.
+//! Values against another framework are the learner's `parity`.
 
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
