@@ -1,8 +1,12 @@
-//! Where what is fetched is kept, as the environment says.
-//! It only computes paths; `install` makes and checks what lies there, `deploy/cuda/build.sh` follows the same rule.
+//! The cache folder: where it is, as the environment says, and whether other users can change what lies in it.
+//! It makes nothing; `install` does. `deploy/cuda/build.sh` follows the same rule for the folder.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use nix::unistd::geteuid;
 
 use crate::error::InstallError;
 
@@ -27,67 +31,90 @@ impl Cache {
     /// `DRIML_CACHE`, else `$XDG_CACHE_HOME/driml`, else `$HOME/.cache/driml`. Empty counts as not set.
     fn from_variables(get: impl Fn(&str) -> Option<OsString>) -> Result<Cache, InstallError> {
         let set = |name: &str| get(name).filter(|value| !value.is_empty());
-        let folder = if let Some(folder) = set("DRIML_CACHE") {
-            PathBuf::from(folder)
-        } else if let Some(folder) = set("XDG_CACHE_HOME") {
-            PathBuf::from(folder).join("driml")
-        } else {
-            let home = set("HOME").ok_or(InstallError::NoCacheFolder)?;
-            PathBuf::from(home).join(".cache").join("driml")
-        };
-        let offline = set("DRIML_OFFLINE").is_some_and(|value| value != "0");
-        Ok(Cache { folder, offline })
+        let below = |name: &str, path: &str| set(name).map(|it| PathBuf::from(it).join(path));
+        let folder = set("DRIML_CACHE")
+            .map(PathBuf::from)
+            .or_else(|| below("XDG_CACHE_HOME", "driml"))
+            .or_else(|| below("HOME", ".cache/driml"));
+        let none = "there is no folder for it: set DRIML_CACHE, XDG_CACHE_HOME or HOME";
+        Ok(Cache {
+            folder: folder.ok_or_else(|| InstallError::Cache(none.to_owned()))?,
+            offline: set("DRIML_OFFLINE").is_some_and(|value| value != "0"),
+        })
     }
+}
+
+/// Checks that only this user and root can change the file or folder, as the engine is code that runs as this user. One that is not
+/// there passes.
+pub(crate) fn check_private(path: &Path) -> Result<(), InstallError> {
+    let Ok(data) = fs::metadata(path) else {
+        return Ok(());
+    };
+    let why = if data.uid() != 0 && data.uid() != geteuid().as_raw() {
+        format!("it belongs to user {}", data.uid())
+    } else if data.mode() & 0o022 != 0 {
+        format!("its permissions are {:o}", data.mode() & 0o777)
+    } else {
+        return Ok(());
+    };
+    let path = path.display();
+    Err(InstallError::Cache(format!(
+        "it is code that would run as you, and others can change {path}: {why}. Make it yours alone (`chown -R \"$(id -u)\" {path}` as \
+         root, `chmod -R go-w {path}`), or set DRIML_CACHE to another folder"
+    )))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn cache(variables: &[(&str, &str)]) -> Result<Cache, InstallError> {
-        Cache::from_variables(|name| {
-            variables
-                .iter()
-                .find(|(key, _)| *key == name)
-                .map(|(_, value)| value.into())
-        })
-    }
-
     #[test]
     fn the_nearest_variable_decides() {
-        let folder = |variables: &[(&str, &str)]| cache(variables).unwrap().folder;
-        assert_eq!(folder(&[("HOME", "/h")]), PathBuf::from("/h/.cache/driml"));
-        assert_eq!(
-            folder(&[("HOME", "/h"), ("XDG_CACHE_HOME", "/x")]),
-            PathBuf::from("/x/driml")
-        );
-        assert_eq!(
-            folder(&[
-                ("HOME", "/h"),
-                ("XDG_CACHE_HOME", "/x"),
-                ("DRIML_CACHE", "/d")
-            ]),
-            PathBuf::from("/d")
-        );
-        assert_eq!(
-            folder(&[("HOME", "/h"), ("DRIML_CACHE", "")]),
-            PathBuf::from("/h/.cache/driml")
-        );
+        let cache = |variables: &[(&str, &str)]| {
+            Cache::from_variables(|name| {
+                let found = variables.iter().find(|(key, _)| *key == name);
+                found.map(|(_, value)| value.into())
+            })
+        };
+        let (home, xdg) = (("HOME", "/h"), ("XDG_CACHE_HOME", "/x"));
+        for (variables, folder, offline) in [
+            (&[home][..], "/h/.cache/driml", false),
+            (&[home, xdg], "/x/driml", false),
+            (&[home, xdg, ("DRIML_CACHE", "/d")], "/d", false),
+            (&[home, ("DRIML_CACHE", "")], "/h/.cache/driml", false),
+            (&[home, ("DRIML_OFFLINE", "0")], "/h/.cache/driml", false),
+            (&[home, ("DRIML_OFFLINE", "1")], "/h/.cache/driml", true),
+        ] {
+            let found = cache(variables).unwrap();
+            assert_eq!((found.folder, found.offline), (folder.into(), offline));
+        }
         assert!(cache(&[]).unwrap_err().to_string().contains("DRIML_CACHE"));
     }
 
     #[test]
-    fn offline_is_one_and_not_zero() {
-        assert!(!cache(&[("HOME", "/h")]).unwrap().offline);
-        assert!(
-            !cache(&[("HOME", "/h"), ("DRIML_OFFLINE", "0")])
-                .unwrap()
-                .offline
-        );
-        assert!(
-            cache(&[("HOME", "/h"), ("DRIML_OFFLINE", "1")])
-                .unwrap()
-                .offline
-        );
+    fn what_others_can_change_is_rejected_with_what_to_do() {
+        use std::os::unix::fs::{PermissionsExt, chown};
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path();
+        for mode in [0o700, 0o755, 0o555, 0o775, 0o757, 0o722] {
+            fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+            match check_private(path) {
+                Ok(()) => assert_eq!(mode & 0o022, 0, "{mode:o}"),
+                Err(error) => {
+                    let text = error.to_string();
+                    assert!(text.contains(&format!("are {mode:o}. Make")), "{text}");
+                    assert!(text.contains("chmod -R go-w"), "{text}");
+                }
+            }
+        }
+        fs::set_permissions(path, fs::Permissions::from_mode(0o700)).unwrap();
+        assert!(check_private(&path.join("nothing")).is_ok());
+        assert!(check_private(Path::new("/usr")).is_ok(), "root's");
+        // Only root can give a file away.
+        if geteuid().is_root() {
+            chown(path, Some(4711), None).unwrap();
+            let text = check_private(path).unwrap_err().to_string();
+            assert!(text.contains("it belongs to user 4711"), "{text}");
+        }
     }
 }

@@ -12,7 +12,6 @@ pub(crate) const LIBENV_VERSION: i32 = 1;
 
 pub(crate) const DTYPE_UINT8: u32 = 1;
 pub(crate) const DTYPE_INT32: u32 = 2;
-pub(crate) const DTYPE_FLOAT32: u32 = 3;
 
 pub(crate) const SPACE_OBSERVATION: u32 = 1;
 pub(crate) const SPACE_ACTION: u32 = 2;
@@ -109,52 +108,33 @@ pub(crate) fn name(text: &str) -> [c_char; NAME_BYTES] {
 
 impl LibenvTensortype {
     /// An all-zero value for the engine to write over.
-    pub(crate) fn zeroed() -> LibenvTensortype {
+    pub(crate) const fn zeroed() -> LibenvTensortype {
         let zero = LibenvValue { int32: 0 };
-        let (name, shape) = ([0; NAME_BYTES], [0; DIMENSIONS_MAX]);
         LibenvTensortype {
-            name,
+            name: [0; NAME_BYTES],
             scalar_type: 0,
             dtype: 0,
-            shape,
+            shape: [0; DIMENSIONS_MAX],
             ndim: 0,
             low: zero,
             high: zero,
         }
     }
 
-    /// The name up to its NUL, with anything that is not ASCII replaced.
-    pub(crate) fn name(&self) -> String {
-        let bytes = self
-            .name
-            .iter()
-            .map(|&byte| byte as u8)
-            .take_while(|&byte| byte != 0);
-        bytes
-            .map(|byte| {
-                if byte.is_ascii() {
-                    char::from(byte)
-                } else {
-                    '?'
-                }
-            })
-            .collect()
-    }
-
-    /// The shape's used part.
-    pub(crate) fn shape(&self) -> &[i32] {
-        let ndim = usize::try_from(self.ndim).unwrap_or(0).min(DIMENSIONS_MAX);
-        &self.shape[..ndim]
-    }
-
-    /// Name, dtype and shape in one line, for messages.
+    /// What distinguishes it from others, as [`describe`] has it.
     pub(crate) fn describe(&self) -> String {
-        let dtype = match self.dtype {
-            DTYPE_UINT8 => "uint8".to_owned(),
-            DTYPE_INT32 => "int32".to_owned(),
-            DTYPE_FLOAT32 => "float32".to_owned(),
-            other => format!("dtype {other}"),
-        };
-        format!("{} {dtype} {:?}", self.name(), self.shape())
+        let bytes: Vec<u8> = self.name.iter().map(|&byte| byte as u8).collect();
+        let name = bytes.split(|&byte| byte == 0).next().unwrap_or_default();
+        let ndim = usize::try_from(self.ndim).unwrap_or(0).min(DIMENSIONS_MAX);
+        describe(
+            &String::from_utf8_lossy(name),
+            self.dtype,
+            &self.shape[..ndim],
+        )
     }
+}
+
+/// Name, dtype and shape of a tensor in one line.
+pub(crate) fn describe(name: &str, dtype: u32, shape: &[i32]) -> String {
+    format!("{name} (dtype {dtype}) {shape:?}")
 }

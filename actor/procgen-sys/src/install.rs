@@ -1,42 +1,38 @@
-//! Puts the engine into the cache folder and knows whether it lies there whole.
+//! Puts the engine into the cache folder and finds it there.
 //! It does not load it, and fetches nothing with `DRIML_OFFLINE=1`.
 //!
-//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE, installed.txt}`; `installed.txt` is written last. What makes it
-//! whole is for `check`.
-//! A folder is made beside its place and renamed into it, one process at a time, so that all that race succeed.
+//! Layout: `<cache>/procgen-0.10.7/{libenv.so, assets/, LICENSE}`. The folder is made beside its place, checked and renamed into it, one
+//! process at a time: so it is there whole or not at all, and all processes that race succeed.
 
 use std::fs::{self, File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::cache::Cache;
-use crate::check::{self, Hashes, MARKER, PINNED};
+use crate::cache::{Cache, check_private};
 use crate::error::{InstallError, LoadError};
 use crate::library;
-use crate::release::{VERSION, WHEEL_NAME, WHEEL_SHA256};
-use crate::wheel;
+use crate::wheel::{self, Hashes, PINNED, WHEEL_NAME};
 
-/// How long to wait for another process that fetches or installs; then this one does it for itself.
+/// How long to wait for another process that installs; then this one does it too.
 const WAIT_MAX: Duration = Duration::from_secs(120);
 
 /// The unpacked engine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Engine {
-    root: PathBuf,
     library: PathBuf,
     assets: PathBuf,
 }
 
 impl Engine {
-    /// The engine in the cache folder, if it lies there whole.
+    /// The engine in the cache folder.
     ///
     /// # Errors
-    /// Not installed, damaged, or a machine that cannot run it.
+    /// Not installed, something is gone, others can change it, or a machine that cannot run it.
     pub fn locate() -> Result<Engine, InstallError> {
         Engine::locate_in(&Cache::from_env()?)
     }
 
-    /// The engine in the cache folder; fetched with pip if it is missing or damaged.
+    /// The engine in the cache folder; fetched with pip if it is not there.
     ///
     /// A wheel that already lies in the cache folder under its published name is used instead of fetching.
     /// `progress` is told what is being done, a line at a time; nothing when all is there.
@@ -44,7 +40,7 @@ impl Engine {
     /// # Errors
     /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
     pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, InstallError> {
-        Engine::install_in(&Cache::from_env()?, progress, wheel::fetch)
+        Engine::install_in(&Cache::from_env()?, PINNED, progress, wheel::fetch)
     }
 
     /// From where [`Engine::install`] would take the engine, for a person. Nothing is fetched or looked at more closely.
@@ -52,200 +48,147 @@ impl Engine {
     /// # Errors
     /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
     pub fn source() -> Result<String, InstallError> {
-        Engine::source_in(&Cache::from_env()?, wheel::find_pip)
-    }
-
-    /// Loads the engine's library, which makes no game yet.
-    ///
-    /// # Errors
-    /// A library of the system that is missing, or anything else that the loader says.
-    pub fn check_loads(&self) -> Result<(), LoadError> {
-        library::load(&self.library()).map(drop)
-    }
-
-    /// Unpacks a wheel that the user has fetched; what lay in the cache folder is replaced unless it is whole.
-    ///
-    /// # Errors
-    /// A wrong hash, an unreadable file, a full disk, or a machine that cannot run it.
-    pub fn install_from_wheel(wheel: &Path) -> Result<Engine, InstallError> {
-        library::check_machine()?;
-        Engine::unpack_into(&Cache::from_env()?, wheel, WHEEL_SHA256, PINNED)
+        let cache = Cache::from_env()?;
+        if let Some(provided) = cache.provided("it is not installed")? {
+            return Ok(provided.display().to_string());
+        }
+        wheel::check_pip()?;
+        Ok("the package index with `python3 -m pip`".to_owned())
     }
 
     /// Another build of the engine than the published one, by the path of its library. Its pictures are in the folder `assets`
-    /// beside the library or beside the library's folder, as in Procgen's own source tree. It is code that runs as this user: it is
-    /// loaded as it is, whoever made it.
+    /// beside the library or beside the library's folder, as in Procgen's own source tree. It is code that runs as this user, and is
+    /// loaded without a check of its hash.
     ///
     /// # Errors
     /// A library or pictures that are not there, or a machine that cannot run it.
     pub fn other(library: &Path) -> Result<Engine, InstallError> {
         library::check_machine()?;
         // The loader takes a name without a folder for one of the system's.
-        let library = fs::canonicalize(library).map_err(|error| InstallError::NoLibrary {
-            library: library.to_owned(),
-            reason: error.to_string(),
+        let library = fs::canonicalize(library)
+            .map_err(|error| LoadError::library(library, error.to_string()))?;
+        let mut folders = library.ancestors().skip(1).take(2);
+        let assets =
+            folders.find_map(|folder| Some(folder.join("assets")).filter(|it| it.is_dir()));
+        let assets = assets.ok_or_else(|| {
+            let reason = "put Procgen's folder `assets` beside it or beside its folder";
+            LoadError::library(&library, reason)
         })?;
-        let folders = library.ancestors().skip(1).take(2);
-        let assets = folders
-            .map(|folder| folder.join("assets"))
-            .find(|assets| assets.is_dir());
-        let root = library.parent().unwrap_or(&library).to_owned();
-        match assets {
-            Some(assets) => Ok(Engine {
-                root,
-                library,
-                assets,
-            }),
-            None => Err(InstallError::NoAssets { library }),
-        }
+        Ok(Engine { library, assets })
     }
 
-    /// The folder that holds everything.
-    pub fn root(&self) -> &Path {
-        &self.root
+    /// Loads the engine's library, which makes no game yet.
+    ///
+    /// # Errors
+    /// A library of the system that is missing, or anything else that the loader reports.
+    pub fn check_loads(&self) -> Result<(), LoadError> {
+        library::load(&self.library).map(drop)
     }
 
     /// The engine's library.
-    pub fn library(&self) -> PathBuf {
-        self.library.clone()
+    pub fn library(&self) -> &Path {
+        &self.library
     }
 
     /// The folder of the pictures.
-    pub fn assets(&self) -> PathBuf {
-        self.assets.clone()
-    }
-
-    /// The engine that is unpacked in `root`.
-    fn unpacked_in(root: PathBuf) -> Engine {
-        Engine {
-            library: root.join("libenv.so"),
-            assets: root.join("assets"),
-            root,
-        }
-    }
-
-    fn root_in(cache: &Cache) -> PathBuf {
-        cache.folder.join(format!("procgen-{VERSION}"))
+    pub fn assets(&self) -> &Path {
+        &self.assets
     }
 
     fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
         library::check_machine()?;
-        check::check_private(&cache.folder)?;
-        Engine::whole(Engine::root_in(cache), PINNED)
-    }
-
-    fn source_in(
-        cache: &Cache,
-        pip: impl FnOnce() -> Option<String>,
-    ) -> Result<String, InstallError> {
-        let provided = cache.folder.join(WHEEL_NAME);
-        if provided.is_file() {
-            return Ok(provided.display().to_string());
-        }
-        if cache.offline {
-            return Err(InstallError::Offline {
-                root: Engine::root_in(cache),
-                reason: "it is not installed".to_owned(),
-            });
-        }
-        let pip = pip().ok_or(InstallError::NoPip)?;
-        Ok(format!("the package index with `{pip}`"))
+        let root = cache.root();
+        let engine = Engine {
+            library: root.join("libenv.so"),
+            assets: root.join("assets"),
+        };
+        let reason = if !root.exists() {
+            "it is not installed"
+        } else if !engine.library.is_file() || !engine.assets.is_dir() {
+            "it is damaged, libenv.so or its pictures are gone"
+        } else {
+            for path in [&cache.folder, &root, &engine.library, &engine.assets] {
+                check_private(path)?;
+            }
+            return Ok(engine);
+        };
+        Err(cache.missing(reason))
     }
 
     fn install_in(
         cache: &Cache,
+        hashes: Hashes<'_>,
         progress: &mut dyn FnMut(&str),
         fetch: impl Fn(&Path) -> Result<PathBuf, InstallError>,
     ) -> Result<Engine, InstallError> {
         let reason = match Engine::locate_in(cache) {
-            Ok(engine) => return Ok(engine),
-            Err(InstallError::Missing { .. }) => "it is not installed".to_owned(),
-            Err(InstallError::Damaged { reason, .. }) => {
-                format!("the installed one is damaged ({reason})")
-            }
-            Err(other) => return Err(other),
+            Err(InstallError::Missing { reason, .. }) => reason,
+            other => return other,
         };
-        let root = Engine::root_in(cache);
-        let provided = cache.folder.join(WHEEL_NAME);
-        if provided.is_file() {
-            progress(&format!(
-                "procgen's engine: unpacking {} into {}",
-                provided.display(),
-                root.display()
-            ));
-            return Engine::unpack_into(cache, &provided, WHEEL_SHA256, PINNED);
-        }
-        if cache.offline {
-            return Err(InstallError::Offline { root, reason });
-        }
+        let provided = cache.provided(&reason)?;
+        check_private(&cache.folder)?;
         wheel::make_folder(&cache.folder)?;
-        let _turn = wait_for_turn(cache, "fetch.lock", WAIT_MAX);
+        let _turn = wait_for_turn(cache, WAIT_MAX);
+        // Another process may have been faster.
         if let Ok(engine) = Engine::locate_in(cache) {
             return Ok(engine);
         }
-        progress(&format!(
-            "procgen's engine: {reason}; fetching version {VERSION} with pip (36 MB)"
-        ));
         let folder = tempfile::Builder::new()
-            .prefix("fetch-")
-            .tempdir_in(&cache.folder);
-        let folder =
-            folder.map_err(|error| InstallError::io("making a folder in", &cache.folder, error))?;
-        let wheel = fetch(folder.path())?;
-        progress(&format!(
-            "procgen's engine: unpacking into {}",
-            root.display()
-        ));
-        Engine::unpack_into(cache, &wheel, WHEEL_SHA256, PINNED)
-    }
-
-    /// Checks and unpacks the wheel beside its place, then renames it into it.
-    fn unpack_into(
-        cache: &Cache,
-        wheel: &Path,
-        wheel_hash: &str,
-        hashes: Hashes<'_>,
-    ) -> Result<Engine, InstallError> {
-        check::check_private(&cache.folder)?;
-        wheel::check_hash(wheel, wheel_hash)?;
-        wheel::make_folder(&cache.folder)?;
-        let folder = tempfile::Builder::new()
-            .prefix("unpack-")
-            .tempdir_in(&cache.folder);
-        let folder =
-            folder.map_err(|error| InstallError::io("making a folder in", &cache.folder, error))?;
-        let fresh = folder.path().join("fresh");
-        wheel::make_folder(&fresh)?;
-        wheel::unpack(wheel, &fresh)?;
-        let text = format!("procgen {VERSION} from {WHEEL_NAME}\n");
-        wheel::write(&mut text.as_bytes(), &fresh.join(MARKER))
-            .map_err(|error| InstallError::io("writing", &fresh, error))?;
-
-        let root = Engine::root_in(cache);
-        let _turn = wait_for_turn(cache, "install.lock", WAIT_MAX);
-        if let Ok(engine) = Engine::whole(root.clone(), hashes) {
-            return Ok(engine);
-        }
+            .prefix("install-")
+            .tempdir_in(&cache.folder)
+            .map_err(InstallError::io("making a folder in", &cache.folder))?;
+        let root = cache.root();
+        let (fresh, into) = (folder.path().join("fresh"), root.display());
+        let wheel = if let Some(wheel) = provided {
+            let from = wheel.display();
+            progress(&format!("procgen's engine: unpacking {from} into {into}"));
+            wheel::check_hash(&wheel, hashes.wheel)?;
+            wheel
+        } else {
+            progress(&format!(
+                "procgen's engine: {reason}; fetching it with pip (36 MB) into {into}"
+            ));
+            fetch(folder.path())?
+        };
+        wheel::unpack(&wheel, &fresh)?;
+        wheel::check_hash(&fresh.join("libenv.so"), hashes.library)?;
+        // A crash of the machine must not leave a folder in place whose files are empty.
+        let _ = File::open(&fresh).map(|fresh| nix::unistd::syncfs(fresh));
         if root.exists() {
             // What is moved into the temporary folder goes with it.
             fs::rename(&root, folder.path().join("damaged"))
-                .map_err(|error| InstallError::io("moving away the damaged", &root, error))?;
+                .map_err(InstallError::io("moving away the damaged", &root))?;
         }
-        match fs::rename(&fresh, &root) {
-            Ok(()) => Engine::whole(root, hashes),
-            // Where files cannot be locked, somebody may have been faster: theirs is as good, if it is whole.
-            Err(error) => Engine::whole(root.clone(), hashes)
-                .map_err(|_| InstallError::io("renaming into place", &root, error)),
+        let renamed = fs::rename(&fresh, &root).map_err(InstallError::io("renaming", &root));
+        // Where files cannot be locked, another process may have put the same there.
+        Engine::locate_in(cache).or_else(|error| Err(renamed.err().unwrap_or(error)))
+    }
+}
+
+impl Cache {
+    fn root(&self) -> PathBuf {
+        self.folder.join("procgen-0.10.7")
+    }
+
+    fn missing(&self, reason: &str) -> InstallError {
+        InstallError::Missing {
+            root: self.root(),
+            reason: reason.to_owned(),
         }
     }
 
-    /// The engine in `root`, if it is whole and nobody else can change it.
-    fn whole(root: PathBuf, hashes: Hashes<'_>) -> Result<Engine, InstallError> {
-        if !root.exists() {
-            return Err(InstallError::Missing { root });
+    /// The wheel that the user has put into the cache folder; an error where there is none and none may be fetched.
+    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, InstallError> {
+        let provided = self.folder.join(WHEEL_NAME);
+        if provided.is_file() {
+            return Ok(Some(provided));
         }
-        check::check(&root, hashes)?;
-        Ok(Engine::unpacked_in(root))
+        match self.offline {
+            true => Err(self.missing(&format!(
+                "{reason}, and DRIML_OFFLINE=1 forbids fetching it"
+            ))),
+            false => Ok(None),
+        }
     }
 }
 
@@ -253,8 +196,8 @@ impl Engine {
 ///
 /// `None` when the file cannot be locked or the limit has passed: then two may do the same at once, which wastes
 /// time, and at worst one of them reports an error.
-fn wait_for_turn(cache: &Cache, name: &str, limit: Duration) -> Option<File> {
-    let file = File::create(cache.folder.join(name)).ok()?;
+fn wait_for_turn(cache: &Cache, limit: Duration) -> Option<File> {
+    let file = File::create(cache.folder.join("install.lock")).ok()?;
     let started = Instant::now();
     loop {
         match file.try_lock() {
@@ -268,4 +211,156 @@ fn wait_for_turn(cache: &Cache, name: &str, limit: Duration) -> Option<File> {
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+    use crate::error::WITHOUT_ENGINE;
+
+    /// Those of the made-up wheel; its own is computed.
+    const LIBRARY_HASH: &str = "a2100e1d73fedddfd22587d2ef8b33dd37a9f6480032176d4e0c80b3923f48e1";
+
+    fn cache_in(folder: &Path) -> Cache {
+        let folder = folder.join("cache");
+        fs::create_dir_all(&folder).unwrap();
+        let offline = true;
+        Cache { folder, offline }
+    }
+
+    fn provide_wheel(cache: &Cache) {
+        let names = [
+            "procgen/data/prebuilt/libenv.so",
+            "procgen/data/assets/b/c.png",
+        ];
+        let entries = names.map(|name| (name, name.as_bytes()));
+        wheel::tests::archive(&cache.folder.join(WHEEL_NAME), &entries);
+    }
+
+    /// Installs from a wheel in the cache folder whose hash is taken for the pinned one.
+    fn install(cache: &Cache, library: &str) -> Result<Engine, InstallError> {
+        let path = cache.folder.join(WHEEL_NAME);
+        let wheel = wheel::check_hash(&path, "").unwrap_err().to_string();
+        let wheel = wheel.split("SHA-256 is ").nth(1).unwrap()[..64].to_owned();
+        let wheel = wheel.as_str();
+        let hashes = Hashes { wheel, library };
+        Engine::install_in(cache, hashes, &mut |_| {}, |_| panic!("fetched"))
+    }
+
+    /// Names of what lies in the cache folder, sorted.
+    fn left(cache: &Cache) -> Vec<String> {
+        let entries = fs::read_dir(&cache.folder).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.filter(|name| name != WHEEL_NAME).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn installers_that_race_all_succeed_and_damage_is_repaired() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = cache_in(folder.path());
+        provide_wheel(&cache);
+        for damaged in ["", "libenv.so", "assets"] {
+            if !damaged.is_empty() {
+                fs::rename(cache.root().join(damaged), folder.path().join(damaged)).unwrap();
+                let error = Engine::locate_in(&cache).unwrap_err().to_string();
+                assert!(error.contains("it is damaged"), "{error}");
+            }
+            std::thread::scope(|scope| {
+                let install = || install(&cache, LIBRARY_HASH).unwrap();
+                let threads: Vec<_> = (0..8).map(|_| scope.spawn(install)).collect();
+                for thread in threads {
+                    let engine = thread.join().unwrap();
+                    assert!(engine.assets().join("b/c.png").is_file());
+                }
+            });
+            assert_eq!(left(&cache), ["install.lock", "procgen-0.10.7"]);
+        }
+    }
+
+    #[test]
+    fn a_cache_that_others_can_change_is_rejected() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = cache_in(folder.path());
+        provide_wheel(&cache);
+        let engine = install(&cache, LIBRARY_HASH).unwrap();
+        for path in [
+            &cache.folder,
+            &cache.root(),
+            engine.library(),
+            engine.assets(),
+        ] {
+            let before = fs::metadata(path).unwrap().permissions();
+            assert_eq!(before.mode() & 0o022, 0, "as unpacked: {}", path.display());
+            let shared = fs::Permissions::from_mode(before.mode() | 0o020);
+            fs::set_permissions(path, shared).unwrap();
+            let error = install(&cache, LIBRARY_HASH).unwrap_err().to_string();
+            let text = format!("others can change {}: ", path.display());
+            assert!(error.contains(&text), "{error}");
+            fs::set_permissions(path, before).unwrap();
+        }
+        // Nothing is put into a folder of others either.
+        fs::remove_dir_all(cache.root()).unwrap();
+        fs::set_permissions(&cache.folder, fs::Permissions::from_mode(0o777)).unwrap();
+        assert!(matches!(
+            install(&cache, LIBRARY_HASH),
+            Err(InstallError::Cache(_))
+        ));
+    }
+
+    #[test]
+    fn what_cannot_be_had_is_said_with_what_to_do_and_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut cache = cache_in(folder.path());
+        let fetch = |_: &Path| Err(InstallError::Fetch("no route".to_owned()));
+        let mut said = |cache: &Cache, lines| {
+            let mut told = 0;
+            let error = Engine::install_in(cache, PINNED, &mut |_| told += 1, fetch);
+            let text = error.unwrap_err().to_string();
+            assert!(text.ends_with(WITHOUT_ENGINE) && told == lines, "{text}");
+            text
+        };
+        let text = said(&cache, 0);
+        assert!(
+            text.contains("it is not installed, and DRIML_OFFLINE=1 forbids"),
+            "{text}"
+        );
+        assert!(
+            text.contains("pip download procgen==0.10.7 --no-deps"),
+            "{text}"
+        );
+        cache.offline = false;
+        let text = said(&cache, 1);
+        assert!(
+            text.starts_with("fetching procgen's engine: no route"),
+            "{text}"
+        );
+        provide_wheel(&cache);
+        let text = said(&cache, 1);
+        assert!(
+            text.contains(&format!("expected {}", PINNED.wheel)),
+            "{text}"
+        );
+        let error = install(&cache, PINNED.library).unwrap_err().to_string();
+        assert!(error.contains("libenv.so: its SHA-256 is"), "{error}");
+        assert_eq!(left(&cache), ["install.lock"]);
+        // A cache folder that cannot be written: a file is in its place.
+        cache.folder = cache.folder.join("install.lock");
+        let text = said(&cache, 0);
+        assert!(
+            text.contains("installing procgen's engine: making "),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn one_process_installs_and_the_others_wait_for_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = cache_in(folder.path());
+        let turn = wait_for_turn(&cache, Duration::ZERO);
+        assert!(turn.is_some());
+        assert!(wait_for_turn(&cache, Duration::from_millis(120)).is_none());
+        drop(turn);
+        assert!(wait_for_turn(&cache, Duration::ZERO).is_some());
+    }
+}

@@ -41,7 +41,6 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 mod cache;
-mod check;
 mod error;
 mod ffi;
 mod game;
@@ -50,16 +49,14 @@ mod library;
 mod nap;
 mod options;
 mod pinned;
-mod release;
 mod state;
 mod vec_game;
 mod wheel;
 
 pub use cache::Cache;
 pub use error::{InstallError, LoadError, ProcgenError, WITHOUT_ENGINE};
-pub use game::{DistributionMode, Game, ParseGameError, ParseModeError};
+pub use game::{DistributionMode, Game, ParseGameError};
 pub use install::Engine;
 pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options, OptionsError};
-pub use release::{LIBENV_SHA256, VERSION, WHEEL_NAME, WHEEL_SHA256, download_command};
 pub use state::State;
 pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, VecGame};

@@ -9,7 +9,7 @@ use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 
 use crate::error::LoadError;
 use crate::ffi::{
-    self, GetState, GetTensortypes, LIBENV_VERSION, Make, SetBuffers, SetState, Unit, Version,
+    GetState, GetTensortypes, LIBENV_VERSION, Make, SetBuffers, SetState, Unit, Version,
 };
 
 /// The engine's functions. They stay valid for the rest of the process.
@@ -24,18 +24,12 @@ pub(crate) struct Api {
     pub(crate) set_state: SetState,
 }
 
+const GLIB: &str = "libglib2.0-0` or, since Debian 13 and Ubuntu 24.04, `libglib2.0-0t64";
+
 /// The packages that hold the libraries which the engine needs: file, Debian, Fedora.
 const PACKAGES: [(&str, &str, &str); 6] = [
-    (
-        "libglib-2.0.so.0",
-        "libglib2.0-0` or, since Debian 13 and Ubuntu 24.04, `libglib2.0-0t64",
-        "glib2",
-    ),
-    (
-        "libgthread-2.0.so.0",
-        "libglib2.0-0` or, since Debian 13 and Ubuntu 24.04, `libglib2.0-0t64",
-        "glib2",
-    ),
+    ("libglib-2.0.so.0", GLIB, "glib2"),
+    ("libgthread-2.0.so.0", GLIB, "glib2"),
     ("libz.so.1", "zlib1g", "zlib-ng-compat"),
     ("libstdc++.so.6", "libstdc++6", "libstdc++"),
     ("libgcc_s.so.1", "libgcc-s1", "libgcc"),
@@ -56,10 +50,7 @@ pub(crate) fn load(path: &Path) -> Result<&'static Api, LoadError> {
     Ok(api)
 }
 
-/// Says whether the engine can run on this machine.
-///
-/// # Errors
-/// Not Linux on x86-64, or a processor without AVX.
+/// Says whether the engine can run on this machine: Linux on x86-64 with AVX.
 pub(crate) fn check_machine() -> Result<(), LoadError> {
     if !cfg!(all(target_os = "linux", target_arch = "x86_64")) {
         return Err(LoadError::Machine(format!(
@@ -78,67 +69,62 @@ pub(crate) fn check_machine() -> Result<(), LoadError> {
 }
 
 fn open(path: &Path) -> Result<Api, LoadError> {
-    // SAFETY: running the library's initialisers is what loading means; either `check` compared its hash with
-    // the pinned one just before, or a person has named another build.
+    // SAFETY: running the library's initialisers is what loading means; either its hash was compared with the pinned one when it was
+    // installed, where only this user can change it, or a person has named another build.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) };
     let library = library.map_err(|error| explain(path, &error.to_string()))?;
-    let missing = |error: libloading::Error| LoadError::Other {
-        path: path.to_owned(),
-        reason: error.to_string(),
-    };
     // SAFETY: the types are those of gym3's `libenv.h`, and the version is checked before any other function is called.
-    let (version, api) = unsafe {
-        let version = *library
-            .get::<Version>(b"libenv_version\0")
-            .map_err(missing)?;
-        let api = Api {
-            make: *library.get(b"libenv_make\0").map_err(missing)?,
-            get_tensortypes: *library.get(b"libenv_get_tensortypes\0").map_err(missing)?,
-            set_buffers: *library.get(b"libenv_set_buffers\0").map_err(missing)?,
-            observe: *library.get(b"libenv_observe\0").map_err(missing)?,
-            act: *library.get(b"libenv_act\0").map_err(missing)?,
-            close: *library.get(b"libenv_close\0").map_err(missing)?,
-            get_state: *library.get(b"get_state\0").map_err(missing)?,
-            set_state: *library.get(b"set_state\0").map_err(missing)?,
-        };
-        (version, api)
-    };
+    let found = unsafe { functions(&library) };
+    let (version, api) = found.map_err(|error| LoadError::library(path, error.to_string()))?;
     // Keep it loaded for the rest of the process, so that the function pointers stay valid.
     std::mem::forget(library);
     // SAFETY: `libenv_version` takes nothing and returns a constant.
-    let found = unsafe { version() };
-    if found != LIBENV_VERSION {
-        let reason = format!(
-            "its interface is version {found}, not {}",
-            ffi::LIBENV_VERSION
-        );
-        return Err(LoadError::Other {
-            path: path.to_owned(),
-            reason,
-        });
+    match unsafe { version() } {
+        LIBENV_VERSION => Ok(api),
+        found => Err(LoadError::library(
+            path,
+            format!("its interface is version {found}, not {LIBENV_VERSION}"),
+        )),
     }
-    Ok(api)
+}
+
+/// # Safety
+/// The library's functions have the types of `ffi`, and are called only while it is loaded.
+unsafe fn functions(library: &Library) -> Result<(Version, Api), libloading::Error> {
+    // SAFETY: the caller vouches for the types.
+    unsafe {
+        let api = Api {
+            make: *library.get(b"libenv_make\0")?,
+            get_tensortypes: *library.get(b"libenv_get_tensortypes\0")?,
+            set_buffers: *library.get(b"libenv_set_buffers\0")?,
+            observe: *library.get(b"libenv_observe\0")?,
+            act: *library.get(b"libenv_act\0")?,
+            close: *library.get(b"libenv_close\0")?,
+            get_state: *library.get(b"get_state\0")?,
+            set_state: *library.get(b"set_state\0")?,
+        };
+        Ok((*library.get(b"libenv_version\0")?, api))
+    }
 }
 
 /// Turns what `dlopen` said into what to do about it.
 fn explain(path: &Path, said: &str) -> LoadError {
-    let missing = PACKAGES
-        .iter()
-        .find(|(library, ..)| said.contains(library) && said.contains("cannot open shared"));
-    if let Some(&(library, debian, fedora)) = missing {
-        return LoadError::MissingLibrary {
-            library: library.to_owned(),
-            debian,
-            fedora,
-        };
-    }
-    if said.contains("GLIBC") && said.contains("not found") {
-        return LoadError::TooOld(said.to_owned());
-    }
-    LoadError::Other {
-        path: path.to_owned(),
-        reason: said.to_owned(),
-    }
+    let is_missing = |library: &str| said.contains(library) && said.contains("cannot open shared");
+    let missing = PACKAGES.iter().find(|(library, ..)| is_missing(library));
+    let reason = if let Some((library, debian, fedora)) = missing {
+        format!(
+            "the system library {library} is missing; install it with `apt-get install {debian}` (Debian, Ubuntu) or `dnf install {fedora}` \
+             (Fedora)"
+        )
+    } else if said.contains("GLIBC") && said.contains("not found") {
+        format!(
+            "this system's C or C++ library is too old, it needs glibc 2.17 and libstdc++ of gcc 4.6 or later; use a newer distribution; \
+             the loader said: {said}"
+        )
+    } else {
+        said.to_owned()
+    };
+    LoadError::library(path, reason)
 }
 
 #[cfg(test)]
@@ -148,41 +134,44 @@ mod tests {
 
     #[test]
     fn what_the_loader_says_becomes_what_to_do() {
-        let path = Path::new("/cache/libenv.so");
-        let said = |text: &str| explain(path, text).to_string();
-        let text =
-            said("libgthread-2.0.so.0: cannot open shared object file: No such file or directory");
-        assert!(text.contains("libgthread-2.0.so.0 is missing"), "{text}");
-        assert!(text.contains("`apt-get install libglib2.0-0` or"), "{text}");
-        assert!(text.contains("`libglib2.0-0t64`"), "{text}");
-        let text = said("libz.so.1: cannot open shared object file: No such file or directory");
-        assert!(text.contains("`apt-get install zlib1g`"), "{text}");
-        let text =
-            said("libstdc++.so.6: cannot open shared object file: No such file or directory");
-        assert!(text.contains("libstdc++6"), "{text}");
-        let text = said(
-            "/lib/x86_64-linux-gnu/libc.so.6: version `GLIBC_2.17' not found (required by libenv.so)",
-        );
-        assert!(
-            text.contains("too old") && text.contains("GLIBC_2.17"),
-            "{text}"
-        );
-        let text = said("/cache/libenv.so: file too short");
-        assert!(
-            text.contains("file too short") && text.ends_with(WITHOUT_ENGINE),
-            "{text}"
-        );
+        let missing = "cannot open shared object file: No such file or directory";
+        for (said, texts) in [
+            (
+                format!("libgthread-2.0.so.0: {missing}"),
+                &[
+                    "library libgthread-2.0.so.0 is missing",
+                    "`apt-get install libglib2.0-0` or",
+                    "`libglib2.0-0t64`",
+                ][..],
+            ),
+            (
+                format!("libz.so.1: {missing}"),
+                &["`apt-get install zlib1g`"],
+            ),
+            (format!("libstdc++.so.6: {missing}"), &["libstdc++6"]),
+            (
+                "libc.so.6: version `GLIBC_2.17' not found (required by libenv.so)".to_owned(),
+                &["too old", "GLIBC_2.17"],
+            ),
+            (
+                "/cache/libenv.so: file too short".to_owned(),
+                &["engine from /cache/libenv.so: ", "file too short"],
+            ),
+        ] {
+            let text = explain(Path::new("/cache/libenv.so"), &said).to_string();
+            assert!(text.ends_with(WITHOUT_ENGINE), "{text}");
+            assert!(texts.iter().all(|it| text.contains(it)), "{text}");
+        }
     }
 
     #[test]
-    fn a_file_that_is_no_library_is_an_error_with_the_loaders_words() {
+    fn a_file_that_is_not_a_library_is_an_error_with_the_loaders_words() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), b"not a library").unwrap();
-        let error = load(file.path()).err().unwrap().to_string();
-        assert!(error.contains("loading procgen's engine"), "{error}");
+        let text = load(file.path()).err().unwrap().to_string();
         assert!(
-            error.contains("file too short") || error.contains("invalid ELF"),
-            "{error}"
+            text.contains("file too short") || text.contains("invalid ELF"),
+            "{text}"
         );
         assert!(load(Path::new("/nowhere/libenv.so")).is_err());
     }

@@ -52,17 +52,17 @@ mod tests {
     }
 
     #[test]
-    fn a_nap_is_half_a_fast_step() {
-        assert_eq!(after(&[]), None);
-        assert_eq!(after(&[400]), Some(us(200)));
-        assert_eq!(after(&[400, 4_000]), Some(us(225)));
-        assert_eq!(after(&[400, 4_000, 400]), Some(us(200)));
-    }
-
-    #[test]
-    fn steps_that_are_soon_over_are_waited_for() {
-        assert_eq!(after(&[199]), None);
-        assert_eq!(after(&[400, 150]), None);
+    fn a_nap_is_half_a_fast_step_and_left_out_where_steps_are_short() {
+        for (steps, nap) in [
+            (&[][..], None),
+            (&[400], Some(us(200))),
+            (&[400, 4_000], Some(us(225))),
+            (&[400, 4_000, 400], Some(us(200))),
+            (&[199], None),
+            (&[400, 150], None),
+        ] {
+            assert_eq!(after(steps), nap, "{steps:?}");
+        }
     }
 
     #[test]

@@ -55,87 +55,93 @@ impl Options {
     /// # Errors
     /// Numbers out of range, or a mode that the game does not have.
     pub fn validate(&self) -> Result<(), OptionsError> {
-        let fail = |text: String| Err(OptionsError(text));
-        if self.num_envs == 0 || self.num_envs > NUM_ENVS_MAX {
-            return fail(format!(
-                "{} copies of the game; 1 to {NUM_ENVS_MAX} are possible",
-                self.num_envs
-            ));
-        }
-        if self.num_threads > NUM_THREADS_MAX {
-            return fail(format!(
-                "{} threads; 0 to {NUM_THREADS_MAX} are possible",
-                self.num_threads
-            ));
-        }
-        if self.num_levels < 0 || self.start_level < 0 {
-            return fail(format!(
-                "num_levels = {}, start_level = {}; neither may be negative",
-                self.num_levels, self.start_level
-            ));
-        }
-        if self.start_level.checked_add(self.num_levels).is_none() {
-            return fail(format!(
-                "start_level {} + num_levels {} is past the last level, 2147483647",
-                self.start_level, self.num_levels
-            ));
-        }
-        if self.num_levels == 0 && self.start_level != 0 {
-            return fail(format!(
-                "start_level = {} has no effect with num_levels = 0 (every level); set one of them otherwise",
-                self.start_level
-            ));
-        }
-        if !self.game.has(self.distribution_mode) {
-            let games: Vec<&str> = Game::ALL
-                .iter()
-                .filter(|game| game.has(self.distribution_mode))
-                .map(|game| game.name())
-                .collect();
-            return fail(format!(
-                "{} has no distribution mode \"{}\"; easy and hard work, and these games have that one: {}",
-                self.game,
-                self.distribution_mode,
+        let Options {
+            game,
+            num_envs,
+            num_levels,
+            start_level,
+            num_threads,
+            distribution_mode: mode,
+            ..
+        } = *self;
+        let text = if num_envs == 0 || num_envs > NUM_ENVS_MAX {
+            format!("{num_envs} copies of the game; 1 to {NUM_ENVS_MAX} are possible")
+        } else if num_threads > NUM_THREADS_MAX {
+            format!("{num_threads} threads; 0 to {NUM_THREADS_MAX} are possible")
+        } else if num_levels < 0 || start_level < 0 {
+            format!(
+                "num_levels = {num_levels}, start_level = {start_level}; neither may be negative"
+            )
+        } else if start_level.checked_add(num_levels).is_none() {
+            format!(
+                "start_level {start_level} + num_levels {num_levels} is past the last level, 2147483647"
+            )
+        } else if num_levels == 0 && start_level != 0 {
+            format!(
+                "start_level = {start_level} has no effect with num_levels = 0 (every level); set one of them otherwise"
+            )
+        } else if !game.has(mode) {
+            let games = Game::ALL.into_iter().filter(|game| game.has(mode));
+            let games: Vec<&str> = games.map(Game::name).collect();
+            format!(
+                "{game} has no distribution mode \"{mode}\"; easy and hard work, and these games have that one: {}",
                 games.join(", ")
-            ));
-        }
-        Ok(())
+            )
+        } else {
+            return Ok(());
+        };
+        Err(OptionsError(text))
     }
 }
 
 /// The settings in the engine's layout, with the memory they point to.
 pub(crate) struct RawOptions {
     items: Vec<LibenvOption>,
-    /// Each item's value; an item points into one of these. Boxes, so that the addresses stay when the vector grows.
-    values: Vec<Box<[u8]>>,
+    /// Each item's value; an item points into one of these, which stay where they are when this is moved.
+    values: Vec<Vec<u8>>,
 }
 
 impl RawOptions {
     /// Lays out checked settings. `resource_root` is the folder of the pictures, with a slash at its end.
     pub(crate) fn new(options: &Options, resource_root: &str) -> RawOptions {
-        let mut raw = RawOptions {
-            items: Vec::new(),
-            values: Vec::new(),
-        };
-        let int = |number: usize| i32::try_from(number).expect("validated to be small");
-        raw.string("env_name", options.game.name());
-        raw.string("resource_root", resource_root);
-        raw.int("num_levels", options.num_levels);
-        raw.int("start_level", options.start_level);
-        raw.int("num_actions", int(NUM_ACTIONS));
-        raw.int("rand_seed", options.rand_seed);
-        raw.int("num_threads", int(options.num_threads));
-        raw.int("debug_mode", 0);
-        raw.int("distribution_mode", options.distribution_mode.number());
-        raw.bool("render_human", false);
-        raw.bool("use_generated_assets", false);
-        raw.bool("use_monochrome_assets", false);
-        raw.bool("use_sequential_levels", options.use_sequential_levels);
-        raw.bool("paint_vel_info", options.paint_vel_info);
-        raw.bool("use_backgrounds", options.use_backgrounds);
-        raw.bool("center_agent", options.center_agent);
-        raw.bool("restrict_themes", options.restrict_themes);
-        raw
+        let text = |value: &str| (DTYPE_UINT8, value.len(), value.as_bytes().to_vec());
+        let int = |value: i32| (DTYPE_INT32, 1, value.to_ne_bytes().to_vec());
+        let flag = |value: bool| (DTYPE_UINT8, 1, vec![u8::from(value)]);
+        let i32 = |number: usize| i32::try_from(number).expect("validated to be small");
+        let table = [
+            ("env_name", text(options.game.name())),
+            ("resource_root", text(resource_root)),
+            ("num_levels", int(options.num_levels)),
+            ("start_level", int(options.start_level)),
+            ("num_actions", int(i32(NUM_ACTIONS))),
+            ("rand_seed", int(options.rand_seed)),
+            ("num_threads", int(i32(options.num_threads))),
+            ("debug_mode", int(0)),
+            ("distribution_mode", int(options.distribution_mode.number())),
+            ("render_human", flag(false)),
+            ("use_generated_assets", flag(false)),
+            ("use_monochrome_assets", flag(false)),
+            ("use_sequential_levels", flag(options.use_sequential_levels)),
+            ("paint_vel_info", flag(options.paint_vel_info)),
+            ("use_backgrounds", flag(options.use_backgrounds)),
+            ("center_agent", flag(options.center_agent)),
+            ("restrict_themes", flag(options.restrict_themes)),
+        ];
+        let (items, values) = table
+            .map(|(name, (dtype, count, mut value))| {
+                let data = value.as_mut_ptr().cast::<c_void>();
+                let (name, count) = (ffi::name(name), i32(count));
+                let item = LibenvOption {
+                    name,
+                    dtype,
+                    count,
+                    data,
+                };
+                (item, value)
+            })
+            .into_iter()
+            .unzip();
+        RawOptions { items, values }
     }
 
     /// The struct that `libenv_make` takes by value; it points into `self`, which must outlive the call.
@@ -146,88 +152,58 @@ impl RawOptions {
             count,
         }
     }
-
-    fn string(&mut self, name: &str, value: &str) {
-        self.item(name, DTYPE_UINT8, value.len(), value.as_bytes());
-    }
-
-    fn int(&mut self, name: &str, value: i32) {
-        self.item(name, DTYPE_INT32, 1, &value.to_ne_bytes());
-    }
-
-    fn bool(&mut self, name: &str, value: bool) {
-        self.item(name, DTYPE_UINT8, 1, &[u8::from(value)]);
-    }
-
-    fn item(&mut self, name: &str, dtype: u32, count: usize, bytes: &[u8]) {
-        let mut value: Box<[u8]> = bytes.into();
-        let data = value.as_mut_ptr().cast::<c_void>();
-        let count = i32::try_from(count).expect("an option's value is short");
-        self.items.push(LibenvOption {
-            name: ffi::name(name),
-            dtype,
-            count,
-            data,
-        });
-        self.values.push(value);
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn options() -> Options {
-        Options {
-            game: Game::Coinrun,
-            num_envs: 2,
-            num_levels: 500,
-            start_level: 0,
-            rand_seed: 1,
-            num_threads: 0,
-            distribution_mode: DistributionMode::Easy,
-            use_sequential_levels: true,
-            paint_vel_info: true,
-            use_backgrounds: true,
-            center_agent: true,
-            restrict_themes: false,
-        }
-    }
+    const OPTIONS: Options = Options {
+        game: Game::Coinrun,
+        num_envs: 2,
+        num_levels: 500,
+        start_level: 0,
+        rand_seed: 1,
+        num_threads: 0,
+        distribution_mode: DistributionMode::Easy,
+        use_sequential_levels: true,
+        paint_vel_info: true,
+        use_backgrounds: true,
+        center_agent: true,
+        restrict_themes: false,
+    };
 
     #[test]
-    fn what_would_end_the_process_is_refused_with_the_value() {
-        assert_eq!(options().validate(), Ok(()));
-        let refused = |change: fn(&mut Options), text: &str| {
-            let mut options = options();
+    fn what_would_end_the_process_is_rejected_with_the_value() {
+        assert_eq!(OPTIONS.validate(), Ok(()));
+        let rejected = |change: fn(&mut Options), text: &str| {
+            let mut options = OPTIONS;
             change(&mut options);
             let error = options.validate().unwrap_err().to_string();
             assert!(error.contains(text), "{error}");
         };
-        refused(|o| o.num_envs = 0, "0 copies");
-        refused(|o| o.num_envs = NUM_ENVS_MAX + 1, "4097 copies");
-        refused(|o| o.num_threads = 1000, "1000 threads");
-        refused(|o| o.num_levels = -1, "num_levels = -1");
-        refused(|o| o.start_level = -1, "start_level = -1");
-        refused(|o| o.start_level = i32::MAX, "past the last level");
-        refused(|o| (o.num_levels, o.start_level) = (0, 7), "no effect");
-        refused(
-            |o| o.distribution_mode = DistributionMode::Extreme,
-            "chaser, dodgeball, leaper, starpilot",
-        );
-        refused(
-            |o| o.distribution_mode = DistributionMode::Memory,
-            "caveflyer, dodgeball, heist, jumper, maze, miner",
-        );
+        rejected(|o| o.num_envs = 0, "0 copies");
+        rejected(|o| o.num_envs = NUM_ENVS_MAX + 1, "4097 copies");
+        rejected(|o| o.num_threads = 1000, "1000 threads");
+        rejected(|o| o.num_levels = -1, "num_levels = -1");
+        rejected(|o| o.start_level = -1, "start_level = -1");
+        rejected(|o| o.start_level = i32::MAX, "past the last level");
+        rejected(|o| (o.num_levels, o.start_level) = (0, 7), "no effect");
+        let extreme = "coinrun has no distribution mode \"extreme\"; easy and hard work, and these games have that one: \
+            chaser, dodgeball, leaper, starpilot";
+        rejected(|o| o.distribution_mode = DistributionMode::Extreme, extreme);
+        let memory = "caveflyer, dodgeball, heist, jumper, maze, miner";
+        rejected(|o| o.distribution_mode = DistributionMode::Memory, memory);
     }
 
     #[test]
     fn values_lie_where_the_items_point() {
-        let mut raw = RawOptions::new(&options(), "/somewhere/");
+        let mut raw = RawOptions::new(&OPTIONS, "/somewhere/");
         assert_eq!(raw.as_libenv().count, 17);
         for (item, value) in raw.items.iter().zip(&raw.values) {
             assert_eq!(item.data.cast_const().cast::<u8>(), value.as_ptr());
         }
-        assert_eq!(&*raw.values[0], b"coinrun");
-        assert_eq!(&*raw.values[2], &500_i32.to_ne_bytes());
+        assert_eq!(raw.values[0], b"coinrun");
+        assert_eq!(raw.values[2], 500_i32.to_ne_bytes());
     }
 }

@@ -4,7 +4,7 @@
 use std::ffi::c_void;
 use std::time::Instant;
 
-use crate::error::{InstallError, ProcgenError};
+use crate::error::ProcgenError;
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
 use crate::game::Game;
 use crate::install::Engine;
@@ -57,26 +57,20 @@ impl VecGame {
     /// Settings that the engine does not take, a library that cannot be loaded, or one that is not version 0.10.7.
     pub fn new(engine: &Engine, options: &Options) -> Result<VecGame, ProcgenError> {
         options.validate()?;
-        let api = library::load(&engine.library())?;
+        let api = library::load(engine.library())?;
         let assets = engine.assets();
         // The engine reads files by joining strings and ends the process when one is missing.
-        if !assets.is_dir() {
-            let reason = "the folder of pictures is gone".to_owned();
-            return Err(InstallError::Damaged {
-                root: engine.root().to_owned(),
-                reason,
+        let resource_root = match assets.to_str() {
+            Some(path) if assets.is_dir() => format!("{path}/"),
+            found => {
+                let reason =
+                    found.map_or("is not UTF-8; set DRIML_CACHE to another", |_| "is gone");
+                let folder = assets.display();
+                return Err(ProcgenError::Unexpected(format!(
+                    "its folder of pictures {folder} {reason}"
+                )));
             }
-            .into());
-        }
-        let resource_root = assets
-            .to_str()
-            .map(|path| format!("{path}/"))
-            .ok_or_else(|| {
-                ProcgenError::Unexpected(format!(
-                    "its path {} is not UTF-8; set DRIML_CACHE to another",
-                    assets.display()
-                ))
-            })?;
+        };
         let n = options.num_envs;
         let num_envs = i32::try_from(n).expect("validated to be small");
         let mut raw = RawOptions::new(options, &resource_root);
@@ -118,38 +112,37 @@ impl VecGame {
 
     /// The current frames [N, 64, 64, 3].
     pub fn frames(&self) -> &[u8] {
-        // SAFETY: the engine writes only inside `act` and `set_state`, which take `&mut self`; so for all below.
-        unsafe { self.frames.as_slice() }
+        self.read(&self.frames)
     }
 
     /// What the last actions earned [N]; 0 before the first.
     pub fn rewards(&self) -> &[f32] {
-        // SAFETY: as in `frames`.
-        unsafe { self.rewards.as_slice() }
+        self.read(&self.rewards)
     }
 
     /// 1 where the current frame is the first of an episode [N].
     pub fn first(&self) -> &[u8] {
-        // SAFETY: as in `frames`.
-        unsafe { self.first.as_slice() }
+        self.read(&self.first)
     }
 
     /// The level in which the last actions were taken [N].
     pub fn prev_level_seed(&self) -> &[i32] {
-        // SAFETY: as in `frames`.
-        unsafe { self.prev_level_seed.as_slice() }
+        self.read(&self.prev_level_seed)
     }
 
     /// 1 where the last action completed its level [N].
     pub fn prev_level_complete(&self) -> &[u8] {
-        // SAFETY: as in `frames`.
-        unsafe { self.prev_level_complete.as_slice() }
+        self.read(&self.prev_level_complete)
     }
 
     /// The level that the current frame shows [N].
     pub fn level_seed(&self) -> &[i32] {
-        // SAFETY: as in `frames`.
-        unsafe { self.level_seed.as_slice() }
+        self.read(&self.level_seed)
+    }
+
+    fn read<'a, T: Copy>(&'a self, buffer: &'a Pinned<T>) -> &'a [T] {
+        // SAFETY: the engine writes only inside `act` and `set_state`, which take `&mut self`.
+        unsafe { buffer.as_slice() }
     }
 
     /// Takes one action in every copy, each in `0..15` or `RESET`, and waits for what comes of it.
@@ -157,22 +150,20 @@ impl VecGame {
     /// # Errors
     /// Not N actions, or one out of range; nothing was stepped.
     pub fn act(&mut self, actions: &[i32]) -> Result<(), ProcgenError> {
-        if actions.len() != self.num_envs {
-            let text = format!(
-                "{} actions for {} copies of {}",
-                actions.len(),
-                self.num_envs,
-                self.game
-            );
-            return Err(ProcgenError::Action(text));
+        let (n, game) = (self.num_envs, self.game);
+        let wrong = |text| Err(ProcgenError::Action(text));
+        if actions.len() != n {
+            return wrong(format!(
+                "{} actions for {n} copies of {game}",
+                actions.len()
+            ));
         }
         let valid = RESET..NUM_ACTIONS as i32;
         if let Some(env) = actions.iter().position(|action| !valid.contains(action)) {
-            let text = format!(
-                "action {} for copy {env} of {}; 0 to 14 exist",
-                actions[env], self.game
-            );
-            return Err(ProcgenError::Action(text));
+            let action = actions[env];
+            return wrong(format!(
+                "action {action} for copy {env} of {game}; 0 to 14 exist"
+            ));
         }
         // SAFETY: `act` below is the only call during which the engine reads the actions.
         unsafe { self.actions.as_mut_slice() }.copy_from_slice(actions);
@@ -257,52 +248,40 @@ impl VecGame {
     /// The buffers above are right only for exactly these tensors.
     fn check_types(&self) -> Result<(), ProcgenError> {
         let side = FRAME_SIDE as i32;
-        self.check_space(
-            "observations",
-            ffi::SPACE_OBSERVATION,
-            &[("rgb", DTYPE_UINT8, &[side, side, 3])],
-        )?;
-        self.check_space(
-            "actions",
-            ffi::SPACE_ACTION,
-            &[("action", DTYPE_INT32, &[])],
-        )?;
-        let infos: [(&str, u32, &[i32]); 3] = [
-            ("prev_level_seed", DTYPE_INT32, &[]),
-            ("prev_level_complete", DTYPE_UINT8, &[]),
-            ("level_seed", DTYPE_INT32, &[]),
-        ];
-        self.check_space("infos", ffi::SPACE_INFO, &infos)
-    }
-
-    fn check_space(
-        &self,
-        what: &str,
-        space: u32,
-        expected: &[(&str, u32, &[i32])],
-    ) -> Result<(), ProcgenError> {
-        // SAFETY: the handle is open; with a null pointer the engine only counts.
-        let count = unsafe { (self.api.get_tensortypes)(self.handle, space, std::ptr::null_mut()) };
-        if count != expected.len() as i32 {
-            return Err(ProcgenError::Unexpected(format!(
-                "{count} {what}, not {}",
-                expected.len()
-            )));
+        for (space, expected) in [
+            (
+                ffi::SPACE_OBSERVATION,
+                &[("rgb", DTYPE_UINT8, &[side, side, 3][..])][..],
+            ),
+            (ffi::SPACE_ACTION, &[("action", DTYPE_INT32, &[])]),
+            (
+                ffi::SPACE_INFO,
+                &[
+                    ("prev_level_seed", DTYPE_INT32, &[]),
+                    ("prev_level_complete", DTYPE_UINT8, &[]),
+                    ("level_seed", DTYPE_INT32, &[]),
+                ],
+            ),
+        ] {
+            let null = std::ptr::null_mut();
+            // SAFETY: the handle is open; with a null pointer the engine only counts.
+            let count = unsafe { (self.api.get_tensortypes)(self.handle, space, null) };
+            let mut types = vec![LibenvTensortype::zeroed(); usize::try_from(count).unwrap_or(0)];
+            // SAFETY: the engine writes as many types as it just counted, and there is room for them.
+            unsafe { (self.api.get_tensortypes)(self.handle, space, types.as_mut_ptr()) };
+            let found: Vec<_> = types.iter().map(LibenvTensortype::describe).collect();
+            let expected: Vec<_> = expected
+                .iter()
+                .map(|(name, dtype, shape)| ffi::describe(name, *dtype, shape))
+                .collect();
+            if found != expected {
+                let (found, expected) = (found.join(", "), expected.join(", "));
+                return Err(ProcgenError::Unexpected(format!(
+                    "its buffers are {found}, not {expected}"
+                )));
+            }
         }
-        let mut types = vec![LibenvTensortype::zeroed(); expected.len()];
-        // SAFETY: the engine writes as many types as it just counted, and there is room for them.
-        unsafe { (self.api.get_tensortypes)(self.handle, space, types.as_mut_ptr()) };
-        let agrees = |(found, (name, dtype, shape)): (&LibenvTensortype, &(&str, u32, &[i32]))| {
-            found.name() == *name && found.dtype == *dtype && found.shape() == *shape
-        };
-        if types.iter().zip(expected).all(agrees) {
-            return Ok(());
-        }
-        let found: Vec<String> = types.iter().map(LibenvTensortype::describe).collect();
-        Err(ProcgenError::Unexpected(format!(
-            "its {what} are {}",
-            found.join(", ")
-        )))
+        Ok(())
     }
 
     /// Tells the engine where to read and write, which also does the first reset. Once only.

@@ -17,10 +17,8 @@ pub(crate) fn run(command: &ProcgenCommand) -> anyhow::Result<()> {
     match command {
         ProcgenCommand::Install => {
             let engine = procgen_sys::Engine::install(&mut console::line)?;
-            print(&format!(
-                "procgen's engine is in {}\n",
-                engine.root().display()
-            ))
+            let library = engine.library().display();
+            print(&format!("procgen's engine is {library}\n"))
         }
     }
 }

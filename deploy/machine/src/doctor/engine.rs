@@ -11,32 +11,26 @@ const WHAT: &str = "Procgen";
 pub(super) fn fact() -> Fact {
     match Engine::locate() {
         Ok(engine) => match engine.check_loads() {
-            Ok(()) => Fact::ok(
-                WHAT,
-                format!("the engine is in {} and loads", engine.root().display()),
-            ),
+            Ok(()) => {
+                let library = engine.library().display();
+                Fact::ok(WHAT, format!("the engine is {library} and loads"))
+            }
             Err(why) => Fact::missing(WHAT, why.to_string()),
         },
-        Err(why @ (InstallError::Missing { .. } | InstallError::Damaged { .. })) => {
-            not_there(&why, Engine::source())
-        }
+        Err(InstallError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
         Err(why) => Fact::missing(WHAT, why.to_string()),
     }
 }
 
-/// The fact where the engine is not there whole; `source` is where it would come from.
-fn not_there(why: &InstallError, source: Result<String, InstallError>) -> Fact {
-    let damaged = matches!(why, InstallError::Damaged { .. });
+/// The fact where the engine is not there; `source` is where it would come from.
+fn not_there(reason: &str, source: Result<String, InstallError>) -> Fact {
     match source {
-        Ok(source) => {
-            let state = if damaged { "damaged" } else { "not installed" };
-            Fact::note(
-                WHAT,
-                format!(
-                    "the engine is {state}: `driml procgen install` gets it from {source}, and so does the first run that needs it"
-                ),
-            )
-        }
+        Ok(source) => Fact::note(
+            WHAT,
+            format!(
+                "the engine: {reason}; `driml procgen install` gets it from {source}, and so does the first run that needs it"
+            ),
+        ),
         Err(why) => Fact::missing(WHAT, why.to_string()),
     }
 }
@@ -48,13 +42,11 @@ mod tests {
 
     #[test]
     fn an_engine_that_can_be_fetched_is_a_note_and_one_that_cannot_is_missing() {
-        let missing = InstallError::Missing {
-            root: "/cache/procgen".into(),
-        };
-        let fact = not_there(&missing, Ok("`pip`".into()));
+        let fact = not_there("it is not installed", Ok("`pip`".into()));
         assert_eq!(fact.state, State::Note);
         assert!(fact.text.contains("`driml procgen install`"), "{fact}");
-        let fact = not_there(&missing, Err(InstallError::NoPip));
+        let no_pip = InstallError::Fetch("install python3-pip".into());
+        let fact = not_there("it is not installed", Err(no_pip));
         assert_eq!(fact.state, State::Missing);
         assert!(fact.text.contains("python3-pip"), "{fact}");
     }
