@@ -1,6 +1,6 @@
 //! Why a world could not be made or stepped.
 
-use crate::worlds::exec::error::{ExecError, Fault};
+use crate::worlds::exec::protocol::{ExecError, Fault};
 
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]
@@ -47,7 +47,7 @@ impl EnvError {
     pub fn is_not_saved(&self) -> bool {
         match self {
             Self::NotSaved => true,
-            Self::Exec(error) => matches!(error.fault, Fault::NotSaved { .. }),
+            Self::Exec(error) => matches!(error.fault, Fault::NotSaved(_)),
             _ => false,
         }
     }

@@ -14,9 +14,10 @@ use std::time::{Duration, Instant};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
+use serde::Serialize;
 use tracing::Level;
 
-use super::error::{ExecError, Fault, LastWords};
+use super::protocol::{ExecError, Fault};
 
 const SHELL: &str = "/bin/sh";
 
@@ -65,17 +66,11 @@ pub(super) struct WorldProcess {
 
 impl WorldProcess {
     /// Starts the command; what it writes to stderr is logged at `level`.
-    ///
-    /// # Errors
-    /// The operating system refuses.
     pub(super) fn start(command: &str, level: Level) -> Result<Self, ExecError> {
         Self::try_start(command, level).map_err(|source| ExecError {
             command: command.into(),
-            fault: Fault::System {
-                doing: "starting it",
-                source,
-            },
-            words: LastWords::default(),
+            fault: Fault::Other(format!("cannot be used: starting it: {source}")),
+            words: String::new(),
         })
     }
 
@@ -128,9 +123,6 @@ impl WorldProcess {
     }
 
     /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
-    ///
-    /// # Errors
-    /// The operating system refuses.
     pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), ExecError> {
         let said = match &mut self.to {
             Some(to) => to.write_all(bytes).and_then(|()| to.flush()),
@@ -139,14 +131,24 @@ impl WorldProcess {
         match said {
             Ok(()) => Ok(()),
             Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
-            Err(source) => Err(self.fail(Fault::System { doing, source })),
+            Err(source) => Err(self.system(doing, &source)),
         }
     }
 
+    /// Says a line of JSON to it, after `before`.
+    pub(super) fn say_line(
+        &mut self,
+        before: &[u8],
+        message: &impl Serialize,
+        doing: &'static str,
+    ) -> Result<(), ExecError> {
+        let mut line = before.to_vec();
+        line.extend(serde_json::to_vec(message).expect("plain text and numbers are JSON"));
+        line.push(b'\n');
+        self.say(&line, doing)
+    }
+
     /// Its next line.
-    ///
-    /// # Errors
-    /// It ended, or took too long.
     pub(super) fn line(
         &mut self,
         patience: Patience,
@@ -165,9 +167,6 @@ impl WorldProcess {
     }
 
     /// Its next byte.
-    ///
-    /// # Errors
-    /// It ended, or took too long.
     pub(super) fn byte(
         &mut self,
         patience: Patience,
@@ -189,13 +188,12 @@ impl WorldProcess {
             Err(e) if e.kind() == ErrorKind::TimedOut => {
                 self.kill();
                 let Patience { limit, setting } = patience;
-                Err(self.fail(Fault::Silent {
-                    doing,
-                    limit,
-                    setting,
-                }))
+                Err(self.fail(Fault::Dead(format!(
+                    "has not answered for {} s {doing}, and was killed: if it needs longer, --set {setting}=N",
+                    limit.as_secs_f64()
+                ))))
             }
-            Err(source) => Err(self.fail(Fault::System { doing, source })),
+            Err(source) => Err(self.system(doing, &source)),
         }
     }
 
@@ -218,32 +216,41 @@ impl WorldProcess {
     /// What to say of a process that is not there any more.
     fn ended(&mut self, doing: &'static str) -> ExecError {
         self.to = None;
-        let fault = match self.end_within(END_MAX) {
-            Some(status) => Fault::Ended {
-                doing,
-                how: in_words(status),
-            },
-            None => Fault::Closed { doing },
+        let how = match self.end_within(END_MAX) {
+            Some(status) => format!("ended {doing} ({})", in_words(status)),
+            None => format!("closed its stdout {doing} without ending, and was killed"),
         };
         self.kill();
-        self.fail(fault)
+        self.fail(Fault::Dead(how))
     }
 
     /// What to say of this fault, with the process's last words.
     pub(super) fn fail(&self, fault: Fault) -> ExecError {
-        if matches!(
-            fault,
-            Fault::Ended { .. } | Fault::Closed { .. } | Fault::Silent { .. }
-        ) {
+        if matches!(fault, Fault::Dead(_)) {
             // It is dead; its last words may be still on their way. Nobody sends anything here.
             let _ = self.spoken.recv_timeout(END_MAX);
         }
         let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
+        let words = words.iter().map(|line| format!("\n  {line}"));
+        let words: String = words.collect();
         ExecError {
             command: self.command.clone(),
             fault,
-            words: LastWords(words.iter().cloned().collect()),
+            words: match words.is_empty() {
+                true => words,
+                false => format!(". Its last words:{words}"),
+            },
         }
+    }
+
+    /// What to say of something that it should not do.
+    pub(super) fn other(&self, text: String) -> ExecError {
+        self.fail(Fault::Other(text))
+    }
+
+    /// What to say of an error of the operating system.
+    pub(super) fn system(&self, doing: &str, source: &io::Error) -> ExecError {
+        self.other(format!("cannot be used: {doing}: {source}"))
     }
 
     fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {

@@ -4,7 +4,7 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use super::state::SavedExec;
+use super::protocol::SavedExec;
 use super::*;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
@@ -71,7 +71,7 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
             }
         )
     );
-    let seeds: Vec<u16> = config::seeds(7, COPIES)
+    let seeds: Vec<u16> = seeds(7, COPIES)
         .into_iter()
         .map(|seed| (seed % 65_536) as u16)
         .collect();
@@ -107,9 +107,9 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
 
 #[test]
 fn a_copy_s_seed_does_not_depend_on_how_many_copies_there_are() {
-    let seeds = config::seeds(7, 64);
-    assert_eq!(config::seeds(7, 3), seeds[..3]);
-    assert_ne!(config::seeds(8, 3), seeds[..3]);
+    let seeds = seeds(7, 64);
+    assert_eq!(seeds(7, 3), seeds[..3]);
+    assert_ne!(seeds(8, 3), seeds[..3]);
     assert!(seeds.iter().all(|&seed| seed < 1 << 31));
     let different: std::collections::BTreeSet<_> = seeds.iter().collect();
     assert_eq!(different.len(), 64);

@@ -1,14 +1,13 @@
 //! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
-//! What a saved state holds, and whose it is, is for `state`.
+//! What passes between them is for `protocol`.
 
 use tracing::Level;
 
-use super::block::{Block, StateMemory};
-use super::config::{ExecConfig, in_words, introduce, seeds};
-use super::error::{ExecError, Fault, LastWords};
-use super::messages::{Opening, StatePlace};
 use super::process::{Patience, WorldProcess};
-use super::state::{SavedExec, WORLD_STATE_BYTES_MAX};
+use super::protocol::{
+    Block, ExecError, Fault, Opening, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
+};
+use super::{ExecConfig, in_words, introduce, seeds};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
@@ -60,32 +59,27 @@ impl ExecWorld {
             channels: declared.channels,
         };
         if shape != config.frame_shape() || declared.actions != config.actions {
-            let other = Fault::OtherShape {
-                found: in_words(shape, &declared.actions),
-                promised: config.in_words(),
-            };
-            return Err(process.fail(other).into());
+            let (found, promised) = (in_words(shape, &declared.actions), config.in_words());
+            let other = format!(
+                "declares {found}, but the run's settings say {promised}: start the run anew, or the command as it was"
+            );
+            return Err(process.other(other).into());
         }
-        if declared.copies != num_envs {
-            let other = Fault::OtherCopies {
-                found: declared.copies,
-                asked: num_envs,
-            };
-            return Err(process.fail(other).into());
+        let copies = declared.copies;
+        if copies != num_envs {
+            let other = format!(
+                "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
+            );
+            return Err(process.other(other).into());
         }
-        let block = Block::new(num_envs, shape).map_err(|source| {
-            let doing = "making the memory that it shares";
-            process.fail(Fault::System { doing, source })
-        })?;
-        let path = block.path();
+        let block = Block::new(num_envs, shape)
+            .map_err(|e| process.system("making the memory that it shares", &e))?;
         let opening = Opening {
-            block: &path,
+            block: &block.path(),
             layout: block.layout(),
         };
-        let mut line = serde_json::to_vec(&opening).expect("plain numbers are JSON");
-        line.push(b'\n');
         let doing = "before its first frames";
-        process.say(&line, doing)?;
+        process.say_line(b"", &opening, doing)?;
         let mut world = Self {
             process,
             block,
@@ -100,8 +94,14 @@ impl ExecWorld {
     fn hear_done(&mut self, patience: Patience, doing: &'static str) -> Result<(), ExecError> {
         match self.process.byte(patience, doing)? {
             DONE => Ok(()),
-            byte => Err(self.process.fail(Fault::OtherByte { doing, byte })),
+            byte => Err(self.other_byte(doing, byte)),
         }
+    }
+
+    fn other_byte(&self, doing: &str, byte: u8) -> ExecError {
+        self.process.other(format!(
+            "answered {doing} with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
+        ))
     }
 
     /// Says that a state is to be saved or loaded, and where it lies.
@@ -111,23 +111,18 @@ impl ExecWorld {
         memory: &StateMemory,
         doing: &'static str,
     ) -> Result<(), ExecError> {
-        let path = memory.path();
         let place = StatePlace {
-            state: &path,
+            state: &memory.path(),
             bytes_max: WORLD_STATE_BYTES_MAX,
         };
-        let mut line = vec![what];
-        line.extend(serde_json::to_vec(&place).expect("plain text and numbers are JSON"));
-        line.push(b'\n');
-        self.process.say(&line, doing)
+        self.process.say_line(&[what], &place, doing)
     }
 
     /// The process's own bytes for how its copies stand.
     fn save_process(&mut self) -> Result<Vec<u8>, ExecError> {
         let doing = "in the middle of saving its state";
         let patience = self.config.step_patience();
-        let system = |source| Fault::System { doing, source };
-        let memory = StateMemory::new(&[]).map_err(|e| self.process.fail(system(e)))?;
+        let memory = StateMemory::new(&[]).map_err(|e| self.process.system(doing, &e))?;
         self.say_state(SAVE, &memory, doing)?;
         match self.process.byte(patience, doing)? {
             DONE => {}
@@ -136,30 +131,32 @@ impl ExecWorld {
                 let why = String::from_utf8_lossy(&line).trim().to_owned();
                 // It lives on, and has said all there is to say.
                 return Err(ExecError {
-                    words: LastWords::default(),
-                    ..self.process.fail(Fault::NotSaved { why })
+                    words: String::new(),
+                    ..self.process.fail(Fault::NotSaved(why))
                 });
             }
-            byte => return Err(self.process.fail(Fault::OtherByte { doing, byte })),
+            byte => return Err(self.other_byte(doing, byte)),
         }
-        let bytes = memory.len().map_err(|e| self.process.fail(system(e)))?;
+        let bytes = memory.len().map_err(|e| self.process.system(doing, &e))?;
         if bytes == 0 {
-            return Err(self.process.fail(Fault::NoState));
+            return Err(self.process.other(format!(
+                "wrote no state: where it says `.` {doing}, the bytes have to lie in \"state\""
+            )));
         }
         if bytes > WORLD_STATE_BYTES_MAX {
-            let max = WORLD_STATE_BYTES_MAX;
-            return Err(self.process.fail(Fault::StateTooLarge { bytes, max }));
+            return Err(self.process.other(format!(
+                "wrote a state of {bytes} bytes; {WORLD_STATE_BYTES_MAX} are possible for all its copies together"
+            )));
         }
         let state = memory.read(bytes as usize);
-        state.map_err(|e| self.process.fail(system(e)))
+        state.map_err(|e| self.process.system(doing, &e))
     }
 
     fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), ExecError> {
         let doing = "in the middle of loading its state";
-        let system = |source| Fault::System { doing, source };
-        let memory = StateMemory::new(state).map_err(|e| self.process.fail(system(e)))?;
-        let written = self.block.write_frames(frames);
-        written.map_err(|e| self.process.fail(system(e)))?;
+        let written = StateMemory::new(state)
+            .and_then(|memory| self.block.write_frames(frames).map(|()| memory));
+        let memory = written.map_err(|e| self.process.system(doing, &e))?;
         self.say_state(LOAD, &memory, doing)?;
         // It belongs to a start, and may take as long: a world may have to play an episode again.
         self.hear_done(self.config.start_patience(), doing)
@@ -233,29 +230,35 @@ impl Environment for ExecWorld {
     ) -> Result<(), EnvError> {
         check_step(self.num_envs, self.num_actions(), actions, rewards, ends)?;
         let doing = "in the middle of a step";
-        if let Err(source) = self.block.write_actions(actions) {
-            return Err(self.process.fail(Fault::System { doing, source }).into());
-        }
+        let written = self.block.write_actions(actions);
+        written.map_err(|e| self.process.system(doing, &e))?;
         self.process.say(&[STEP], doing)?;
         self.hear_done(self.config.step_patience(), doing)?;
-        let numbers = match self.block.read_results(rewards) {
-            Ok(numbers) => numbers,
-            Err(source) => return Err(self.process.fail(Fault::System { doing, source }).into()),
-        };
+        let numbers = self.block.read_results(rewards);
+        let numbers = numbers.map_err(|e| self.process.system(doing, &e))?;
+        let mut wrong = None;
         for (copy, (end, &number)) in ends.iter_mut().zip(numbers).enumerate() {
             *end = match number {
                 0 => StepEnd::Running,
                 1 => StepEnd::LevelChange,
                 2 => StepEnd::TimedOut,
                 3 => StepEnd::Terminal,
-                end => return Err(self.process.fail(Fault::End { copy, end }).into()),
+                number => {
+                    wrong = Some(format!(
+                        "ended the step of copy {copy} with {number}; 0 runs on, 1 is the next level, 2 timed out, 3 terminal"
+                    ));
+                    break;
+                }
             };
         }
         if let Some(copy) = rewards.iter().position(|reward| !reward.is_finite()) {
             let reward = rewards[copy];
-            return Err(self.process.fail(Fault::Reward { copy, reward }).into());
+            wrong.get_or_insert_with(|| format!("gave copy {copy} the reward {reward}"));
         }
-        Ok(())
+        match wrong {
+            Some(text) => Err(self.process.other(text).into()),
+            None => Ok(()),
+        }
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {

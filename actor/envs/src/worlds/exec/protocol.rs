@@ -1,0 +1,337 @@
+//! What an actor and a world's process say to each other, where it lies, and what can be wrong with it.
+//! Starting and ending the process is for `process`.
+//!
+//! The process is the command of `--env "exec:COMMAND"`, run by `sh`. What is said to it and what it answers:
+//!
+//! | who | says | by |
+//! | --- | --- | --- |
+//! | actor | `{"driml_env": 1, "copies": 16, "seeds": [..]}` | a line to its stdin |
+//! | world | `{"driml_env": 1, "copies": 16, "height": 84, "width": 84, "channels": 1, "actions": ["no-op", ..]}` | a line to its stdout |
+//! | actor | `{"block": PATH, "bytes": N, "actions": 0, "rewards": 64, "ends": 128, "frames": 192}` | a line to its stdin |
+//! | world | the first frames lie in the block | the byte `.` |
+//! | actor | the actions lie in the block | the byte `s`, for each step |
+//! | world | rewards, ends and the next frames lie there | the byte `.`, for each step |
+//!
+//! A world that declares `"saves": true` besides is also asked for its state, between two steps:
+//!
+//! | who | says | by |
+//! | --- | --- | --- |
+//! | actor | `S` and `{"state": PATH, "bytes_max": M}` | a line to its stdin |
+//! | world | the state of all copies is written into the empty file `PATH` | the byte `.` |
+//! | | or: this world cannot be saved after all | the byte `-` and a line that says why |
+//! | actor | `L` and `{"state": PATH, "bytes_max": M}`: the file holds a state that a world of this command and of as many copies wrote | a line to its stdin |
+//! | world | goes on from that state; the frames lie in the block already | the byte `.` |
+//!
+//! A state is everything that decides what follows, generators included, in at most M bytes of the world's own choice. A state that
+//! the world does not take back is a reason to end, with a word to stderr.
+//!
+//! The end of its stdin tells the process to end. A process that only has to declare itself sees that end after its line: so
+//! the shapes are found before the actors start. There are as many `seeds` as copies, each below 2^31; copy i is seeded with
+//! the i-th. `PATH` is memory that both share; the numbers are where in it the columns begin, by bytes: `actions` [N] u8,
+//! `rewards` [N] f32 of the machine's order, `ends` [N] u8 as [`StepEnd`](crate::StepEnd) numbers them (0 runs on, 1 next
+//! level, 2 timed out, 3 terminal) and `frames` [N, H, W, C] u8. The frame after an end is the first of the next episode.
+//! What the process writes to stderr is the actor's log.
+//!
+//! The memory has no name in the file system, and a shell that waits for the actor's end kills the process: when an actor
+//! is killed, nothing is left. This side reads and writes the memory as a file, which needs no unsafe code.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::FileExt;
+
+use nix::fcntl::{FcntlArg, SealFlag, fcntl};
+use nix::sys::memfd::{MFdFlags, memfd_create};
+use serde::{Deserialize, Serialize};
+
+use super::ExecConfig;
+use crate::environment::FrameShape;
+use crate::error::EnvError;
+use crate::saved;
+
+/// Why a world's process cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("the world `{command}` {fault}{words}")]
+pub struct ExecError {
+    /// The command, as `--env` has it after `exec:`.
+    pub command: String,
+    /// What is wrong.
+    pub fault: Fault,
+    /// The last lines that it wrote to stderr, as the message ends with them; empty if it wrote none.
+    pub words: String,
+}
+
+/// What is wrong with a world's process.
+#[derive(Debug, thiserror::Error)]
+pub enum Fault {
+    /// It ended by itself, or was killed as it did not answer.
+    #[error("{0}")]
+    Dead(String),
+    /// It offers to save its state, and found that it cannot: why, in its own words.
+    #[error("cannot save its state: {0}")]
+    NotSaved(String),
+    /// It is not the world that was asked for, does what no world may, or the operating system reports an error.
+    #[error("{0}")]
+    Other(String),
+}
+
+/// The protocol's version. A process that speaks another is refused.
+pub(super) const VERSION: u64 = 1;
+
+/// Most characters of a line that a message repeats.
+const SHOWN_MAX: usize = 200;
+
+/// What an actor asks for.
+#[derive(Debug, Serialize)]
+pub(super) struct Request {
+    driml_env: u64,
+    copies: usize,
+    seeds: Vec<u32>,
+}
+
+impl Request {
+    pub(super) const fn new(seeds: Vec<u32>) -> Self {
+        Self {
+            driml_env: VERSION,
+            copies: seeds.len(),
+            seeds,
+        }
+    }
+}
+
+/// What a world is, by its own word.
+#[derive(Debug, Deserialize)]
+pub(super) struct Declaration {
+    pub(super) copies: usize,
+    pub(super) height: usize,
+    pub(super) width: usize,
+    pub(super) channels: usize,
+    pub(super) actions: Vec<String>,
+    /// Whether it knows how to save and to load its state. Worlds of before say nothing of it.
+    #[serde(default)]
+    pub(super) saves: bool,
+}
+
+impl Declaration {
+    /// Reads the first line of a process.
+    pub(super) fn parse(line: &[u8]) -> Result<Self, Fault> {
+        let no_world = |why: String| {
+            let line = String::from_utf8_lossy(line);
+            let line: String = line.chars().take(SHOWN_MAX).collect();
+            Fault::Other(format!(
+                "does not declare itself as a world: its first line on stdout is {line:?} and not JSON with \"driml_env\" and the shapes ({why}); \
+                 deploy/python/driml_env.py makes a Gymnasium environment such a world"
+            ))
+        };
+        let value: serde_json::Value =
+            serde_json::from_slice(line).map_err(|e| no_world(e.to_string()))?;
+        let found = value.get("driml_env").and_then(serde_json::Value::as_u64);
+        match found {
+            Some(VERSION) => serde_json::from_value(value).map_err(|e| no_world(e.to_string())),
+            Some(found) => Err(Fault::Other(format!(
+                "speaks version {found} of the protocol, and this driml speaks version {VERSION}: take the driml_env.py that came with it"
+            ))),
+            None => Err(no_world("\"driml_env\" is missing".into())),
+        }
+    }
+}
+
+/// Where the memory is that both sides share.
+#[derive(Debug, Serialize)]
+pub(super) struct Opening<'a> {
+    pub(super) block: &'a str,
+    #[serde(flatten)]
+    pub(super) layout: Layout,
+}
+
+/// Where a state is to be written, or lies.
+#[derive(Debug, Serialize)]
+pub(super) struct StatePlace<'a> {
+    pub(super) state: &'a str,
+    pub(super) bytes_max: u64,
+}
+
+/// Each column begins at a multiple of this, so that no two of them share a line of a processor's cache.
+const ALIGNMENT: usize = 64;
+
+/// Where each column begins, and how long the whole is; bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Layout {
+    bytes: usize,
+    actions: usize,
+    rewards: usize,
+    ends: usize,
+    frames: usize,
+}
+
+impl Layout {
+    pub(super) const fn new(copies: usize, shape: FrameShape) -> Self {
+        let rewards = copies.next_multiple_of(ALIGNMENT);
+        let ends = (rewards + copies * size_of::<f32>()).next_multiple_of(ALIGNMENT);
+        let frames = (ends + copies).next_multiple_of(ALIGNMENT);
+        Self {
+            bytes: frames + copies * shape.bytes(),
+            actions: 0,
+            rewards,
+            ends,
+            frames,
+        }
+    }
+}
+
+/// The memory. It has no name, and goes with the last of the two processes.
+pub(super) struct Block {
+    file: File,
+    layout: Layout,
+    copies: usize,
+    /// Rewards, padding, ends: memory to use again.
+    results: Vec<u8>,
+}
+
+impl Block {
+    /// Makes the memory, whose size nobody can change afterwards.
+    pub(super) fn new(copies: usize, shape: FrameShape) -> io::Result<Self> {
+        let layout = Layout::new(copies, shape);
+        let flags = MFdFlags::MFD_CLOEXEC | MFdFlags::MFD_ALLOW_SEALING;
+        let file = File::from(memfd_create(c"driml-world", flags)?);
+        file.set_len(layout.bytes as u64)?;
+        let seals = SealFlag::F_SEAL_SHRINK | SealFlag::F_SEAL_GROW | SealFlag::F_SEAL_SEAL;
+        fcntl(&file, FcntlArg::F_ADD_SEALS(seals))?;
+        Ok(Self {
+            file,
+            layout,
+            copies,
+            results: vec![0; layout.ends + copies - layout.rewards],
+        })
+    }
+
+    pub(super) const fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    pub(super) fn path(&self) -> String {
+        path(&self.file)
+    }
+
+    /// Puts down the actions [N].
+    pub(super) fn write_actions(&self, actions: &[u8]) -> io::Result<()> {
+        self.file.write_all_at(actions, self.layout.actions as u64)
+    }
+
+    /// Reads rewards [N] and the numbers of ends [N].
+    pub(super) fn read_results(&mut self, rewards: &mut [f32]) -> io::Result<&[u8]> {
+        self.file
+            .read_exact_at(&mut self.results, self.layout.rewards as u64)?;
+        let (numbers, ends) = self
+            .results
+            .split_at(self.layout.ends - self.layout.rewards);
+        for (reward, bytes) in rewards
+            .iter_mut()
+            .zip(numbers.chunks_exact(size_of::<f32>()))
+        {
+            *reward = f32::from_ne_bytes(bytes.try_into().expect("four bytes"));
+        }
+        Ok(&ends[..self.copies])
+    }
+
+    /// Reads the frames [N, H, W, C].
+    pub(super) fn read_frames(&self, frames: &mut [u8]) -> io::Result<()> {
+        self.file.read_exact_at(frames, self.layout.frames as u64)
+    }
+
+    /// Puts down the frames [N, H, W, C], as after a step.
+    pub(super) fn write_frames(&self, frames: &[u8]) -> io::Result<()> {
+        self.file.write_all_at(frames, self.layout.frames as u64)
+    }
+}
+
+/// Memory for a state of a world, whose length is that of the state. It goes when this is dropped.
+pub(super) struct StateMemory {
+    file: File,
+}
+
+impl StateMemory {
+    pub(super) fn new(state: &[u8]) -> io::Result<Self> {
+        let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
+        file.write_all_at(state, 0)?;
+        Ok(Self { file })
+    }
+
+    pub(super) fn path(&self) -> String {
+        path(&self.file)
+    }
+
+    /// How long the state is that lies there, bytes.
+    pub(super) fn len(&self) -> io::Result<u64> {
+        Ok(self.file.metadata()?.len())
+    }
+
+    /// Reads the first `len` bytes.
+    pub(super) fn read(&self, len: usize) -> io::Result<Vec<u8>> {
+        let mut state = vec![0; len];
+        self.file.read_exact_at(&mut state, 0)?;
+        Ok(state)
+    }
+}
+
+/// Under which name another process of the same user opens a file without one, as long as this process lives.
+fn path(file: &File) -> String {
+    format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
+}
+
+/// Longest state that a process may give for all its copies together, bytes.
+pub(super) const WORLD_STATE_BYTES_MAX: u64 = 64 << 20;
+
+/// How a world stands, and which world it is.
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct SavedExec {
+    command: String,
+    copies: usize,
+    /// Rows, columns, bytes a pixel.
+    shape: [usize; 3],
+    actions: Vec<String>,
+    /// Those in which the next actions are taken [N, H, W, C].
+    pub(super) frames: Vec<u8>,
+    /// The process's own bytes.
+    pub(super) state: Vec<u8>,
+}
+
+impl SavedExec {
+    pub(super) fn new(config: &ExecConfig, copies: usize, frames: Vec<u8>, state: Vec<u8>) -> Self {
+        Self {
+            command: config.command.clone(),
+            copies,
+            shape: [config.height, config.width, config.channels],
+            actions: config.actions.clone(),
+            frames,
+            state,
+        }
+    }
+
+    pub(super) fn to_bytes(&self) -> Result<Vec<u8>, EnvError> {
+        saved::encode(self)
+    }
+
+    pub(super) fn from_bytes(
+        bytes: &[u8],
+        config: &ExecConfig,
+        num_envs: usize,
+    ) -> Result<Self, EnvError> {
+        let this: Self = saved::decode_whole(bytes)?;
+        if this.command != config.command {
+            return Err(EnvError::State(format!(
+                "it is of the world `{}`, and this is `{}`: give the command as it was",
+                this.command, config.command
+            )));
+        }
+        saved::check_copies(this.copies, num_envs)?;
+        let shape = [config.height, config.width, config.channels];
+        saved::check(
+            this.shape == shape && this.actions == config.actions,
+            "the shape of its frames or its actions",
+        )?;
+        let frame_bytes = num_envs * config.frame_shape().bytes();
+        saved::check(this.frames.len() == frame_bytes, "the number of its frames")?;
+        Ok(this)
+    }
+}
