@@ -88,14 +88,6 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Whether it listens with certificates, and so is to say whom it refuses.
-    pub(crate) const fn is_guarded(&self) -> bool {
-        match self {
-            Self::ReplayServer(args) => args.tls.is_set(),
-            _ => false,
-        }
-    }
-
     /// What its process is for.
     pub(crate) const fn purpose(&self) -> Purpose {
         match self {

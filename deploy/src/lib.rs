@@ -33,7 +33,7 @@ pub fn main() -> ExitCode {
         }
     };
     let settled = process_env::settle(cli.command.purpose());
-    console::log_to_stderr(cli.command.is_guarded());
+    console::log_to_stderr();
     if let Err(e) = settled {
         tracing::warn!("this process goes on without the environment that makes it fast: {e}");
     }

@@ -60,16 +60,18 @@ pub enum SessionError {
         /// What it says, or that it says nothing.
         what: String,
     },
-    /// Nobody listens where the session was to connect, as far as can be told over UDP.
+    /// No replay server lets this process in over QUIC. Whether none listens or one side rejects the other's certificate is known to
+    /// zenoh alone, whose log has it on the side that rejects.
     #[error(
-        "nobody listens on {}, after {} s: is the replay server running, with --tls-dir, and is the endpoint right? Its port is one of UDP",
-        .connect.join(", "), CONNECT_MAX.as_secs()
+        "no replay server lets this process in on {}: is it running, with --tls-dir, and is the endpoint right (its port is one of UDP)? If \
+         so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay server's log say why",
+        .connect.join(", ")
     )]
-    NobodyListens {
+    NotLetIn {
         /// Endpoints to connect to.
         connect: Vec<String>,
     },
-    /// A certificate, or the other side's, is not good.
+    /// A certificate is not good.
     #[error(transparent)]
     Tls(#[from] TlsError),
     /// Nobody is there who could answer.
@@ -147,7 +149,7 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
 /// peer of this run sends, are dropped while they come in.
 ///
 /// # Errors
-/// As [`open`]; a certificate that either side refuses, and why.
+/// As [`open`]; one side rejects the other's certificate.
 pub fn open_as(
     endpoints: &Endpoints,
     keys: &Keys,
@@ -158,13 +160,6 @@ pub fn open_as(
         return open_with(endpoints, message_bytes_max, &[]);
     };
     credentials.warn_if_it_expires_soon();
-    for endpoint in endpoints.connect.iter().filter(|it| is_quic(it)) {
-        reach::look(endpoint)?;
-        if !tls::check(endpoint, credentials, CONNECT_MAX)? {
-            let connect = vec![endpoint.clone()];
-            return Err(SessionError::NobodyListens { connect });
-        }
-    }
     let mut settings = vec![
         ("transport/link/tls", credentials.zenoh_settings()),
         (
@@ -291,9 +286,13 @@ fn open_with(
         return open("-1").map_err(fail);
     }
     reach::wait_for_any(&endpoints.connect, CONNECT_MAX)?;
-    let not_driml = |what: String| SessionError::NotDriml {
-        connect: endpoints.connect.clone(),
-        what,
+    let connect = || endpoints.connect.clone();
+    let not_driml = |what: String| match endpoints.connect.iter().any(|it| is_quic(it)) {
+        true => SessionError::NotLetIn { connect: connect() },
+        false => SessionError::NotDriml {
+            connect: connect(),
+            what,
+        },
     };
     let milliseconds = |it: Duration| it.as_millis().to_string();
     let why = match open(&milliseconds(UNDERSTOOD_MAX)) {

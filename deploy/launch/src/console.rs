@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::Context as _;
 use console::Term;
-use driml_protocol::{last_warning, tls};
+use driml_protocol::last_warning;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use tracing::{
     Event, Level, Subscriber,
@@ -19,7 +19,6 @@ use tracing::{
 };
 use tracing_subscriber::{
     EnvFilter, Layer,
-    filter::Targets,
     layer::{Context as LayerContext, SubscriberExt},
     util::SubscriberInitExt,
 };
@@ -128,10 +127,10 @@ pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
 /// that no answer is wanted any more. Nor that it does not know a liveliness token any more (`Unknown token`, the only error of that
-/// module) which a part that leaves takes back while its link closes, over QUIC now and then: it is gone, as it should be. Nor what it
-/// says of connections over QUIC that did not come about, and what quinn warns of.
+/// module) which a part that leaves takes back while its link closes, over QUIC now and then: it is gone, as it should be. Nor what quinn
+/// warns of. Connections over QUIC that were rejected are logged with zenoh's own warning: the other side learns only that it failed.
 const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
-                         zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=off,quinn=error";
+                         zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=warn,quinn=error";
 
 /// The usual filter of the log, with driml's own crates at `level`.
 fn usual_filter(level: &str) -> String {
@@ -149,9 +148,7 @@ fn wanted_filter(wanted: &str) -> String {
 }
 
 /// Sends the log to stderr. `DRIML_LOG` says what is logged: a level of driml's own crates, or a filter in the form of `RUST_LOG`.
-///
-/// With `guarded`, what zenoh says of those whom it refuses is heard too: [`tls::overhear`].
-pub fn log_to_stderr(guarded: bool) {
+pub fn log_to_stderr() {
     let usual = || EnvFilter::new(usual_filter("info"));
     let wanted = std::env::var("DRIML_LOG").ok().filter(|it| !it.is_empty());
     let is_debugged = wanted.is_some();
@@ -171,26 +168,10 @@ pub fn log_to_stderr(guarded: bool) {
         // Paths of modules are for those who debug.
         .with_target(is_debugged)
         .with_filter(filter.clone());
-    let refusals = guarded.then(|| {
-        let targets = Targets::new()
-            .with_target(tls::HANDSHAKE_TARGET, Level::WARN)
-            .with_target(tls::ACCESS_TARGET, Level::TRACE);
-        Refusals.with_filter(targets)
-    });
     tracing_subscriber::registry()
         .with(log)
         .with(LastWarning.with_filter(filter))
-        .with(refusals)
         .init();
-}
-
-/// Hands on what zenoh says of those whom it refuses.
-struct Refusals;
-
-impl<S: Subscriber> Layer<S> for Refusals {
-    fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
-        tls::overhear(event.metadata().target(), &text(event));
-    }
 }
 
 /// Keeps the last warning or error of the log for those who ask this process how it is.

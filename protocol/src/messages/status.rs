@@ -105,8 +105,6 @@ pub struct ReplayStatus {
     pub batches_retried: u64,
     /// Messages refused as malformed or foreign, or because their sender's role may not send them.
     pub messages_refused: u64,
-    /// Connections refused, for want of a good certificate.
-    pub connections_refused: u64,
     /// Rows served since the start.
     pub rows_sampled: u64,
     /// Rows served to a learner that died before it saved what it learned from them; they do not count as sampled.
@@ -189,7 +187,6 @@ impl ReplayStatus {
                 chunks_retried,
                 batches_retried,
                 messages_refused,
-                connections_refused,
                 rows_sampled,
                 rows_unlearned,
                 updates,
@@ -231,7 +228,6 @@ impl ReplayStatus {
             sum.chunks_retried = sum.chunks_retried.saturating_add(*chunks_retried);
             sum.batches_retried = sum.batches_retried.saturating_add(*batches_retried);
             sum.messages_refused = sum.messages_refused.saturating_add(*messages_refused);
-            sum.connections_refused = sum.connections_refused.saturating_add(*connections_refused);
             sum.rows_sampled = sum.rows_sampled.saturating_add(*rows_sampled);
             sum.rows_unlearned = sum.rows_unlearned.saturating_add(*rows_unlearned);
             // Each hears of them with its next request.
@@ -364,7 +360,6 @@ mod tests {
             chunks_retried: 6 * n,
             batches_retried: 7 * n,
             messages_refused: 8 * n,
-            connections_refused: 9 * n,
             rows_sampled: 9 * n,
             rows_unlearned: 19 * n,
             updates: 27 * n,

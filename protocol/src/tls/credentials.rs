@@ -1,5 +1,5 @@
 //! The files of one part in a folder of certificates, read and checked before anything is sent.
-//! What the other side shows is for `handshake`.
+//! The other side's files are checked there, before its start.
 
 use std::{
     fs, io,
@@ -45,9 +45,6 @@ pub struct Credentials {
     expires_on: String,
     /// The names and addresses that it is for: a replay server's.
     hosts: Vec<String>,
-    pub(super) roots: RootCertStore,
-    pub(super) chain: Vec<CertificateDer<'static>>,
-    pub(super) secret: PrivateKeyDer<'static>,
 }
 
 impl Credentials {
@@ -116,9 +113,9 @@ impl Credentials {
             certificate: certificate.clone(),
             role,
         };
-        let signer = provider().key_provider.load_private_key(secret.clone_key());
+        let signer = provider().key_provider.load_private_key(secret);
         let signer = signer.map_err(|_| not_pem(&key))?;
-        let pair = CertifiedKey::new(chain.clone(), signer);
+        let pair = CertifiedKey::new(chain, signer);
         pair.keys_match().map_err(|_| other_key())?;
         Ok(Self {
             role,
@@ -128,25 +125,12 @@ impl Credentials {
             expires,
             expires_on,
             hosts,
-            roots,
-            chain,
-            secret,
         })
     }
 
     /// What this part is.
     pub const fn role(&self) -> Role {
         self.role
-    }
-
-    /// The authority's certificate.
-    pub(super) fn authority_path(&self) -> &Path {
-        &self.authority
-    }
-
-    /// The certificate's file.
-    pub fn certificate_path(&self) -> &Path {
-        &self.certificate
     }
 
     /// Until when the certificate is good, for a person.
@@ -207,7 +191,7 @@ impl Credentials {
 }
 
 /// The provider of algorithms that zenoh uses too.
-pub(super) fn provider() -> CryptoProvider {
+fn provider() -> CryptoProvider {
     ring::default_provider()
 }
 

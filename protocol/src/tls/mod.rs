@@ -10,14 +10,10 @@
 
 mod access;
 mod credentials;
-mod handshake;
-mod reports;
 mod role;
 mod sentences;
 
 pub(crate) use access::rules;
 pub use credentials::{Credentials, authority_path};
-pub(crate) use handshake::check;
-pub use reports::{ACCESS_TARGET, HANDSHAKE_TARGET, Report, listen, overhear};
 pub use role::{ACTORS_MAX, Role};
 pub use sentences::TlsError;

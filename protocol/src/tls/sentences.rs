@@ -1,4 +1,4 @@
-//! What is wrong with a certificate, a key or the other side, and what to do: a sentence each.
+//! What is wrong with a certificate or a key, and what to do: a sentence each.
 //! It checks nothing.
 
 use std::path::PathBuf;
@@ -109,24 +109,6 @@ pub enum TlsError {
         /// The authority's.
         authority: PathBuf,
         /// What the check said.
-        why: String,
-    },
-    /// The other side's certificate is not good.
-    #[error("whoever listens on {endpoint} is refused: {why}")]
-    Server {
-        /// The endpoint that was to be reached.
-        endpoint: String,
-        /// What is wrong with it and what to do.
-        why: String,
-    },
-    /// The other side does not take this part's certificate.
-    #[error("the replay server on {endpoint} refuses {}: {why}", .path.display())]
-    Refused {
-        /// The endpoint that was to be reached.
-        endpoint: String,
-        /// This part's certificate.
-        path: PathBuf,
-        /// Why, and what to do.
         why: String,
     },
 }

@@ -15,7 +15,7 @@ use driml_protocol::{
     join_within,
     session::{self, Endpoints},
     shared_memory,
-    tls::{self, Credentials},
+    tls::Credentials,
 };
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
@@ -112,8 +112,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         listen: args.listen.clone(),
         connect: args.connect,
     };
-    // From the first connection on.
-    let reports = args.credentials.is_some().then(tls::listen);
     let session = session::open_as(
         &endpoints,
         &keys,
@@ -171,7 +169,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             chunks: ParkedChunks::default(),
             requests: ParkedRequests::default(),
             timings: Timings::default(),
-            connections_refused: 0,
             said: SeldomEach::default(),
         }),
         changed: Condvar::new(),
@@ -183,9 +180,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
     entrance.open(service.clone());
     threads.extend(service.clone().start_working()?);
-    if let Some(reports) = reports {
-        threads.push(service.clone().start_hearing(reports)?);
-    }
     service.wait_until_over(&args.ending, args.stay);
     // Its threads wait for that.
     shutdown.set();

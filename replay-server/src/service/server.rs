@@ -49,8 +49,6 @@ pub(super) struct State {
     pub(super) chunks: ParkedChunks<Question>,
     pub(super) requests: ParkedRequests<Responder<BatchReply>>,
     pub(super) timings: Timings,
-    /// Connections refused for want of a good certificate.
-    pub(super) connections_refused: u64,
     /// Lines about what was refused, which a stranger could make come at any rate.
     pub(super) said: SeldomEach,
 }

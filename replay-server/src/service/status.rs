@@ -1,12 +1,7 @@
-//! The smaller messages: an actor's goodbye, the learner's affinity, reports, the status, and who was not let in.
+//! The smaller messages: an actor's goodbye, the learner's affinity, reports and the status.
 
 use std::{
     collections::HashSet,
-    sync::{
-        Arc,
-        mpsc::{Receiver, RecvTimeoutError},
-    },
-    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
@@ -20,8 +15,6 @@ use super::{
     server::{Service, State},
 };
 
-/// How often the thread that hears of who was refused looks whether it should end.
-const TICK: Duration = Duration::from_millis(200);
 /// How often it is looked whether somebody is missing.
 const LOOK: Duration = Duration::from_secs(1);
 /// How long a replay server stays for parts that do not leave when the run is over.
@@ -200,44 +193,12 @@ impl Service {
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
-        status.connections_refused = state.connections_refused;
         status.learner_finished = state.accounts.is_over();
         status.actors_acting = state.actors_acting();
         status.actors_waiting = state.chunks.len() as u32;
         state.timings.report(&mut status);
         drop(state);
         responder.reply(&status);
-    }
-
-    /// Starts the thread that hears of those that were not let in at all, by certificate or role; it ends after the shutdown.
-    pub(super) fn start_hearing(
-        self: Arc<Self>,
-        reports: Receiver<tls::Report>,
-    ) -> std::io::Result<JoinHandle<()>> {
-        let thread = std::thread::Builder::new().name("refused".into());
-        thread.spawn(move || {
-            while !self.shutdown.is_set() {
-                fault::point("refused");
-                match reports.recv_timeout(TICK) {
-                    Ok(report) => self.hear(report),
-                    Err(RecvTimeoutError::Timeout) => {}
-                    Err(RecvTimeoutError::Disconnected) => return,
-                }
-            }
-        })
-    }
-
-    fn hear(&self, report: tls::Report) {
-        let mut state = self.state();
-        match report {
-            tls::Report::Connection(why) => {
-                state.connections_refused += 1;
-                state.say(&why, &format!("a connection was refused: {why}"));
-            }
-            tls::Report::Message(why) => {
-                state.refuse(&why, &format!("a message was refused: {why}"));
-            }
-        }
     }
 }
 

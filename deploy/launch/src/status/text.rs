@@ -52,7 +52,6 @@ pub(super) fn describe(snapshot: &Snapshot) -> String {
         ("chunks sent again", replay.chunks_retried),
         ("batches asked again", replay.batches_retried),
         ("messages refused", replay.messages_refused),
-        ("connections refused", replay.connections_refused),
     ];
     let counts: Vec<_> = counts.map(|(what, n)| format!("{what} {n}")).to_vec();
     let _ = writeln!(page, "{}", counts.join("  "));

@@ -117,11 +117,6 @@ impl Page {
                 "Messages refused.",
                 numbers.messages_refused,
             ),
-            (
-                "connections_refused_total",
-                "Connections refused for want of a certificate.",
-                replay.connections_refused,
-            ),
         ] {
             self.counter(name, help, count);
         }
