@@ -3,8 +3,6 @@
 
 #![allow(clippy::unwrap_used, reason = "these are tests")]
 
-mod bad_messages;
-mod bad_weights;
 mod by_hand;
 mod circles;
 mod closed_terminal;
@@ -16,7 +14,6 @@ mod durable;
 mod evaluate;
 mod failures;
 mod leftovers;
-mod lies;
 mod limits;
 mod local;
 mod lockstep;
@@ -30,10 +27,10 @@ mod prioritised;
 mod procgen;
 mod python;
 mod recovering;
+mod refusals;
 mod repo_rules;
 mod resume;
 mod resume_fuzz;
-mod roles;
 mod several_machines;
 mod small_shared_memory;
 mod soak;
@@ -43,7 +40,6 @@ mod tensorboard;
 mod tiny_replay;
 mod tls;
 mod watch;
-mod wrong_place;
 
 use driml_tests::{Process, TestSystem};
 

@@ -1,26 +1,21 @@
 //! What a certificate is good for: its own role and number, and nothing else, whatever its holder sends.
 //! Who is let in at all is in `tls`.
 
-use std::{
-    sync::{
-        Arc,
-        atomic::{AtomicUsize, Ordering},
-    },
-    time::Duration,
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
 };
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Hello,
-    InsertReply, Learned, LearnerJoin, LearnerStatus, ReplayStatus, RequestId, WeightsHeader,
-    WeightsRequest, WeightsUpload, WeightsVersion, codec, session, tls::Role,
+    Learned, LearnerJoin, LearnerStatus, ReplayStatus, RequestId, WeightsHeader, WeightsRequest,
+    WeightsUpload, WeightsVersion, codec, session, tls::Role,
 };
 use driml_tests::{Client, Process, new_learner};
-use zenoh::{Wait, qos::Priority, query::Query, sample::Locality};
+use zenoh::{Wait, query::Query, sample::Locality};
 
+use super::{Row, SILENCE, send};
 use crate::{LONG, tls::TlsSystem};
-
-/// How long an answer is waited for that does not come.
-const NO_ANSWER: Duration = Duration::from_millis(700);
 
 /// A run over TLS, and who watches it.
 struct Guarded {
@@ -52,18 +47,6 @@ impl Guarded {
         self.observer.replay().unwrap().messages_refused
     }
 
-    /// A question at `key` gets no answer.
-    fn denied(&self, who: Role, client: &Client, key: &str, bytes: Vec<u8>) {
-        let asked = session::ask(
-            &client.session,
-            key,
-            bytes.into(),
-            Priority::Data,
-            NO_ANSWER,
-        );
-        assert!(asked.is_err(), "{who} at {key}: {asked:?}");
-    }
-
     /// The run goes on as if nothing had been.
     fn goes_on(&self) {
         let updates = self.observer.learner().unwrap().updates;
@@ -83,22 +66,21 @@ fn an_actor_asks_for_nothing_but_its_own() {
     let Some(run) = Guarded::new("an_actor_asks_for_nothing_but_its_own") else {
         return;
     };
-    let (one, role) = (run.tls.client(Role::Actor(1)), Role::Actor(1));
-    let (keys, hash) = (one.keys.clone(), one.spec.hash());
-    let weights = WeightsHeader::new(1 << 19, 0, b"w");
-    let (other, life) = (0, 9);
+    let one = &run.tls.client(Role::Actor(1));
+    let (keys, hash) = (&one.keys, one.spec.hash());
+    let (other, incarnation) = (0, 9);
     let goodbye = Goodbye {
         actor: other,
-        incarnation: life,
+        incarnation,
         produced: 0,
     };
     let join = ActorJoin {
         actor: other,
-        incarnation: life,
+        incarnation,
     };
     let claim = Claim {
         actor: other,
-        incarnation: life,
+        incarnation,
         sequence: 0,
         leaving: false,
     };
@@ -116,58 +98,35 @@ fn an_actor_asks_for_nothing_but_its_own() {
         num_actions: 3,
         matrix: vec![1.0; 9],
     };
-    let learner = new_learner(1);
     let upload = WeightsUpload {
         learner: 1,
-        weights,
+        weights: WeightsHeader::new(1 << 19, 0, b"w"),
     };
-    let encoded = |bytes: Result<Vec<u8>, driml_protocol::CodecError>| bytes.unwrap();
-    for (key, bytes) in [
-        (
-            keys.of::<BatchRequest>(),
-            encoded(codec::encode(hash, &batch, &[])),
-        ),
-        (
-            keys.of::<AffinityUpdate>(),
-            encoded(codec::encode(hash, &affinity, &[])),
-        ),
-        (
-            keys.of::<LearnerJoin>(),
-            encoded(codec::encode(hash, &learner, &[])),
-        ),
-        (
-            keys.of::<WeightsUpload>(),
-            encoded(codec::encode(hash, &upload, b"w")),
-        ),
-        (
-            keys.of_actor::<ActorJoin>(other),
-            encoded(codec::encode(hash, &join, &[])),
-        ),
-        (
-            keys.of_actor::<Goodbye>(other),
-            encoded(codec::encode(hash, &goodbye, &[])),
-        ),
-        (
-            keys.of_actor::<Claim>(other),
-            encoded(codec::encode(hash, &claim, &[])),
-        ),
-        (keys.of_actor::<ChunkHeader>(other), vec![0; 100]),
-        (
-            keys.of::<Goodbye>(),
-            encoded(codec::encode(hash, &goodbye, &[])),
-        ),
-        (keys.of::<ReplayStatus>(), Vec::new()),
-        (keys.of::<LearnerStatus>(), Vec::new()),
-        ("driml/**".into(), Vec::new()),
-    ] {
-        run.denied(role, &one, &key, bytes);
-    }
+    let upload = codec::encode(hash, &upload, b"w").unwrap();
+    let learner = new_learner(1);
+    send(
+        one,
+        [
+            Row::of(one, keys.of::<BatchRequest>(), &batch, SILENCE),
+            Row::of(one, keys.of::<AffinityUpdate>(), &affinity, SILENCE),
+            Row::of(one, keys.of::<LearnerJoin>(), &learner, SILENCE),
+            Row::new(keys.of::<WeightsUpload>(), upload, SILENCE),
+            Row::of(one, keys.of_actor::<ActorJoin>(other), &join, SILENCE),
+            Row::of(one, keys.of_actor::<Goodbye>(other), &goodbye, SILENCE),
+            Row::of(one, keys.of_actor::<Claim>(other), &claim, SILENCE),
+            Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], SILENCE),
+            Row::of(one, keys.of::<Goodbye>(), &goodbye, SILENCE),
+            Row::new(keys.of::<ReplayStatus>(), [], SILENCE),
+            Row::new(keys.of::<LearnerStatus>(), [], SILENCE),
+            Row::new("driml/**", [], SILENCE),
+        ],
+    );
 
     // At its own keys, messages that speak for another.
     let before = run.refused();
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: other,
-        incarnation: life,
+        incarnation,
         sequence: 0,
         first_transition: 0,
         weights_version: 1,
@@ -177,30 +136,18 @@ fn an_actor_asks_for_nothing_but_its_own() {
         frame_bytes: one.spec.frame_bytes() as u32,
     });
     chunk.set(0, 0, 1.0, driml_protocol::End::Running);
-    let (mut bytes, payload) = chunk.seal(hash).unwrap();
-    bytes.extend_from_slice(payload);
-    let reply = one.insert_bytes(1, bytes);
-    assert!(
-        matches!(&reply, InsertReply::Refused { why } if why.contains("speaks for actor 0 at the key")),
-        "{reply:?}"
+    let (head, payload) = chunk.seal(hash).unwrap();
+    let chunk = [&head, payload].concat();
+    let speaks_for = "speaks for actor 0 at the key";
+    send(
+        one,
+        [
+            Row::new(keys.of_actor::<ChunkHeader>(1), chunk, speaks_for),
+            Row::of(one, keys.of_actor::<Goodbye>(1), &goodbye, SILENCE),
+            Row::of(one, keys.of_actor::<ActorJoin>(1), &join, SILENCE),
+            Row::of(one, keys.of_actor::<Claim>(1), &claim, SILENCE),
+        ],
     );
-    for (key, bytes) in [
-        (
-            keys.of_actor::<Goodbye>(1),
-            codec::encode(hash, &goodbye, &[]).unwrap(),
-        ),
-        (
-            keys.of_actor::<ActorJoin>(1),
-            codec::encode(hash, &join, &[]).unwrap(),
-        ),
-        (
-            keys.of_actor::<Claim>(1),
-            codec::encode(hash, &claim, &[]).unwrap(),
-        ),
-    ] {
-        let asked = session::ask(&one.session, &key, bytes.into(), Priority::Data, NO_ANSWER);
-        assert!(asked.is_err(), "{key}: {asked:?}");
-    }
     assert_eq!(run.refused(), before + 4);
     run.goes_on();
 }
@@ -281,24 +228,22 @@ fn an_observer_only_looks() {
     let Some(run) = Guarded::new("an_observer_only_looks") else {
         return;
     };
-    let observer = run.tls.client(Role::Observer);
+    let observer = &run.tls.client(Role::Observer);
     assert!(observer.replay().is_some() && observer.learner().is_some());
-    let (keys, hash) = (observer.keys.clone(), observer.spec.hash());
-    let request = codec::encode(hash, &WeightsRequest::NewerThan(0), &[]).unwrap();
-    let learner = new_learner(1);
-    let learner = codec::encode(hash, &learner, &[]).unwrap();
+    let keys = &observer.keys;
     let join = ActorJoin {
         actor: 1,
         incarnation: 1,
     };
-    let join = codec::encode(hash, &join, &[]).unwrap();
-    for (key, bytes) in [
-        (keys.of::<WeightsRequest>(), request),
-        (keys.of::<LearnerJoin>(), learner),
-        (keys.of_actor::<ActorJoin>(1), join),
-        (keys.of_actor::<ChunkHeader>(1), vec![0; 100]),
-    ] {
-        run.denied(Role::Observer, &observer, &key, bytes);
-    }
+    let (newer, learner) = (WeightsRequest::NewerThan(0), new_learner(1));
+    send(
+        observer,
+        [
+            Row::of(observer, keys.of::<WeightsRequest>(), &newer, SILENCE),
+            Row::of(observer, keys.of::<LearnerJoin>(), &learner, SILENCE),
+            Row::of(observer, keys.of_actor::<ActorJoin>(1), &join, SILENCE),
+            Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], SILENCE),
+        ],
+    );
     run.goes_on();
 }

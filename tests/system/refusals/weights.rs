@@ -3,12 +3,13 @@
 
 use driml_learner::{Compute, Learner, LearnerConfig};
 use driml_protocol::{
-    Hello, Keys, PROTOCOL_VERSION, WeightsHeader, WeightsUpload, WeightsVersion, codec,
+    Hello, Keys, WeightsHeader, WeightsUpload, WeightsVersion, codec,
     session::{self, Endpoints},
 };
 use driml_tests::Client;
 use zenoh::Wait;
 
+use super::{Row, SILENCE, newer, send};
 use crate::system;
 
 /// The learner that this test plays.
@@ -34,15 +35,15 @@ impl FakeLearner<'_> {
             .unwrap();
     }
 
-    /// Sends bytes that the replay server refuses, and counts as refused.
-    fn refused(&self, bytes: Vec<u8>, why: &str) {
+    /// Sends what the replay server refuses, and counts as refused.
+    fn refused(&self, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
         let counted = || self.client.replay().unwrap().messages_refused;
-        let before = counted();
-        let answer = self
-            .client
-            .ask(&self.client.keys.of::<WeightsUpload>(), bytes);
-        assert!(answer.is_err(), "{why}: {answer:?}");
-        assert_eq!(counted(), before + 1, "{why}");
+        for (name, bytes) in rows {
+            let before = counted();
+            let key = self.client.keys.of::<WeightsUpload>();
+            send(self.client, [Row::new(key, bytes, SILENCE)]);
+            assert_eq!(counted(), before + 1, "{name}");
+        }
     }
 
     /// Says that there are newer weights, as a stranger could.
@@ -75,35 +76,32 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     // Until there are weights that it may use, an actor asks again and steps nothing.
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr("waiting for the learner's first weights");
-    learner.refused(upload(1, &good, hash, LEARNER), "it has not joined");
+    learner.refused([("it has not joined", upload(1, &good, hash, LEARNER))]);
     client.join_as_learner(LEARNER);
-    learner.refused(upload(1, &good, hash ^ 1, LEARNER), "of another run");
+    learner.refused([("of another run", upload(1, &good, hash ^ 1, LEARNER))]);
     assert_eq!(client.replay().unwrap().transitions_inserted, 0);
     learner.send(1, &good);
     client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
 
     // Then it keeps them, whatever comes.
-    let mut newer_protocol = upload(2, &good, hash, LEARNER);
-    newer_protocol[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
-    let mut damaged = upload(2, &good, hash, LEARNER);
+    let of = |version, weights: &[u8], from| upload(version, weights, hash, from);
+    let mut damaged = of(2, &good, LEARNER);
     *damaged.last_mut().unwrap() ^= 1;
-    for (bytes, why) in [
-        (newer_protocol, "of another protocol"),
-        (damaged, "damaged"),
-        (b"not weights".to_vec(), "no message"),
-        (upload(2, &good, hash, LEARNER ^ 1), "of a stranger"),
+    learner.refused([
+        ("of another protocol", newer(of(2, &good, LEARNER))),
+        ("damaged", damaged),
+        ("not a message", b"not weights".to_vec()),
+        ("of a stranger", of(2, &good, LEARNER ^ 1)),
         (
-            upload(1, &good[..40], hash, LEARNER),
             "other weights of the same version",
+            of(1, &good[..40], LEARNER),
         ),
         (
-            upload(1 << 60, &good, hash, LEARNER),
-            "no count of a learner's",
+            "a count that no learner reaches",
+            of(1 << 60, &good, LEARNER),
         ),
-        (upload(0, &good, hash, LEARNER), "older"),
-    ] {
-        learner.refused(bytes, why);
-    }
+        ("older", of(0, &good, LEARNER)),
+    ]);
     learner.announce(4, hash ^ 1);
     actor
         .wait_for_stderr("an announcement of weights was dropped: the message belongs to run spec");
@@ -139,15 +137,14 @@ fn parts_of_another_protocol_version_do_not_join() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let mut newer = codec::encode(0, &hello, &[]).unwrap();
-    newer[4..6].copy_from_slice(&(PROTOCOL_VERSION + 1).to_le_bytes());
+    let whole = codec::encode(0, &hello, &[]).unwrap();
     let greetings = [
-        (newer, "run the same build of driml everywhere"),
-        (b"hello?".to_vec(), "it was cut off or padded"),
         (
-            codec::encode(0, &hello, &[]).unwrap(),
-            "the settings that the replay server sent",
+            newer(whole.clone()),
+            "run the same build of driml everywhere",
         ),
+        (b"hello?".to_vec(), "it was cut off or padded"),
+        (whole, "the settings that the replay server sent"),
     ];
     let key = Keys::new("driml").unwrap().of::<Hello>();
     for (bytes, reason) in greetings {

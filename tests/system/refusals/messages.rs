@@ -1,0 +1,258 @@
+//! Messages that a live replay server must refuse: of other runs and versions, damaged, cut off, not ours at all.
+//! Each is counted once and stores nothing, and the server continues to store.
+
+use driml_protocol::{
+    AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply, Learned,
+    RequestId, codec,
+};
+use driml_tests::{Client, Process, TestSystem};
+
+use super::{Row, SILENCE, newer, send};
+use crate::{LONG, system};
+
+/// A replay server and a client of it.
+struct Served {
+    client: Client,
+    _server: Process,
+    system: TestSystem,
+}
+
+/// The life of actor 0 that sends chunks here, and the learner.
+const INCARNATION: u64 = 9;
+const LEARNER: u64 = 5;
+
+fn served() -> Served {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let client = system.connect();
+    client.join_as_actor(0, INCARNATION);
+    client.join_as_learner(LEARNER);
+    Served {
+        client,
+        _server: server,
+        system,
+    }
+}
+
+fn stored(inserted_total: u64) -> InsertReply {
+    InsertReply::Stored {
+        inserted_total,
+        actors: 0,
+        waited: false,
+    }
+}
+
+impl Served {
+    /// The next chunk of actor 0: two streams of three steps, the last one ending an episode.
+    fn chunk(&self, sequence: u64) -> Chunk {
+        let spec = &self.client.spec;
+        let header = ChunkHeader {
+            actor: 0,
+            incarnation: INCARNATION,
+            sequence,
+            first_transition: 6 * sequence,
+            weights_version: 1,
+            leaving: false,
+            streams: 2,
+            steps: 3,
+            frame_bytes: spec.frame_bytes() as u32,
+        };
+        let mut chunk = Chunk::zeroed(header);
+        for row in 0..6 {
+            let end = if row % 3 == 2 {
+                End::Terminal
+            } else {
+                End::Running
+            };
+            chunk.set(row, (row % 3) as u8, 0.5, end);
+        }
+        chunk
+    }
+
+    fn sealed(&self, chunk: &Chunk) -> Vec<u8> {
+        let (head, payload) = chunk.seal(self.client.spec.hash()).unwrap();
+        [&head, payload].concat()
+    }
+
+    /// Sends what is refused: each row is counted, and stores nothing.
+    fn refuses(&self, rows: impl IntoIterator<Item = Row>) {
+        for row in rows {
+            let before = self.client.replay().unwrap();
+            let why = format!("{}: {}", row.key, row.expected);
+            send(&self.client, [row]);
+            let after = self.client.replay().unwrap();
+            let refused = after.messages_refused - before.messages_refused;
+            let stored = after.transitions_inserted - before.transitions_inserted;
+            assert_eq!((refused, stored), (1, 0), "{why}");
+        }
+    }
+
+    /// Bytes that are refused in the place of chunks, for the reason.
+    fn refuses_chunks(&self, rows: impl IntoIterator<Item = (Vec<u8>, &'static str)>) {
+        let key = self.client.keys.of_actor::<ChunkHeader>(0);
+        self.refuses(
+            rows.into_iter()
+                .map(|(bytes, why)| Row::new(&key, bytes, why)),
+        );
+    }
+
+    /// The server still stores: chunk `sequence` arrives, once.
+    fn stores(&self, sequence: u64) {
+        let inserted_total = 6 * (sequence + 1);
+        let retried = self.client.replay().unwrap().chunks_retried;
+        for _ in 0..2 {
+            let reply = self.client.insert(&self.chunk(sequence));
+            assert_eq!(reply, stored(inserted_total));
+        }
+        let status = self.client.replay().unwrap();
+        assert_eq!(status.transitions_inserted, inserted_total);
+        assert_eq!(status.chunks_retried, retried + 1, "the second was known");
+        assert_eq!(
+            (status.transitions_lost, status.transitions_duplicated),
+            (0, 0)
+        );
+    }
+}
+
+#[test]
+fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
+    let served = served();
+    let hash = served.client.spec.hash();
+    let whole = served.sealed(&served.chunk(0));
+    let (head, payload) = served
+        .chunk(0)
+        .seal(hash ^ 1)
+        .map(|(a, b)| (a, b.to_vec()))
+        .unwrap();
+    let goodbye = Goodbye {
+        actor: 0,
+        incarnation: INCARNATION,
+        produced: 0,
+    };
+    let mut huge = whole.clone();
+    huge[20..28].copy_from_slice(&u64::MAX.to_le_bytes());
+    let web = b"GET / HTTP/1.1\r\nHost: replay\r\nAccept: */*\r\n\r\n";
+    served.refuses_chunks([
+        (
+            [head, payload].concat(),
+            "start every part with the same settings",
+        ),
+        (
+            newer(whole.clone()),
+            "run the same build of driml everywhere",
+        ),
+        (
+            codec::encode(hash, &goodbye, &[]).unwrap(),
+            "a message of kind 8 came where kind 1 is expected",
+        ),
+        (web.to_vec(), "does not start with DRML"),
+        (huge, "more than the"),
+        ([&whole[..], &[0]].concat(), "cut off or padded"),
+    ]);
+    let half = whole.len() / 2;
+    served.refuses_chunks(
+        [0, 1, 31, 32, 40, half, whole.len() - 1]
+            .map(|length| (whole[..length].to_vec(), "cut off or padded")),
+    );
+    served.refuses_chunks([8, 28, 33, half, whole.len() - 1].map(|at| {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x10;
+        (damaged, "checksum is wrong")
+    }));
+    served.stores(0);
+}
+
+#[test]
+fn chunks_that_make_no_sense_in_this_run() {
+    let served = served();
+    let row = |why, change: &dyn Fn(&mut Chunk)| {
+        let mut chunk = served.chunk(0);
+        change(&mut chunk);
+        (served.sealed(&chunk), why)
+    };
+    let smaller = ChunkHeader {
+        frame_bytes: 1,
+        ..served.chunk(0).header
+    };
+    served.refuses_chunks([
+        row("action 3 of 3", &|it| it.set(4, 3, 0.0, End::Running)),
+        row("the reward of row 5 is not finite", &|it| {
+            it.set(5, 0, f32::NAN, End::Running)
+        }),
+        row("do not fill", &|it| it.header.steps = 4),
+        row("do not fill", &|it| it.header.streams = u32::MAX),
+        row("do not fill", &|it| it.header.frame_bytes = 1),
+        row("frames of 1 bytes; this run has 144", &|it| {
+            *it = Chunk::zeroed(smaller)
+        }),
+        row("counts that no run reaches", &|it| {
+            it.header.sequence = u64::MAX
+        }),
+    ]);
+
+    // Not refused, but not stored either: what comes before it is missing.
+    let out_of_order = |sequence, expected| {
+        let reply = served.client.insert(&served.chunk(sequence));
+        assert_eq!(reply, InsertReply::OutOfOrder { expected });
+    };
+    out_of_order(1, 0);
+    served.stores(0);
+    served.stores(1);
+    out_of_order(3, 2);
+    // Another life of the actor, and then a late message of the first.
+    let mut second_life = served.chunk(0);
+    second_life.header.incarnation = 10;
+    let unknown = served.sealed(&second_life);
+    served.refuses_chunks([(unknown, "does not know this life of actor 0")]);
+    served.client.join_as_actor(0, 10);
+    assert_eq!(served.client.insert(&second_life), stored(18));
+    let late = served.sealed(&served.chunk(2));
+    served.refuses_chunks([(late, "give each actor a number of its own")]);
+}
+
+#[test]
+fn everything_else_that_a_replay_server_takes() {
+    let served = served();
+    let (client, hash) = (&served.client, served.client.spec.hash());
+    let garbage = b"DRML and then nothing that makes sense".to_vec();
+    let batch = |rows| BatchRequest {
+        learner: LEARNER,
+        id: RequestId::first(7),
+        rows,
+        shared_memory: false,
+        learned: Learned::default(),
+        other_shards: None,
+    };
+    let goodbye = Goodbye {
+        actor: 0,
+        incarnation: INCARNATION,
+        produced: 1000,
+    };
+    let affinity = AffinityUpdate {
+        learner: LEARNER,
+        version: 1,
+        num_actions: 2,
+        matrix: vec![0.5; 4],
+    };
+    let batches = client.keys.of::<BatchRequest>();
+    let goodbyes = client.keys.of_actor::<Goodbye>(0);
+    let affinities = client.keys.of::<AffinityUpdate>();
+    let foreign_batch = codec::encode(hash ^ 1, &batch(16), &[]).unwrap();
+    let foreign_goodbye = codec::encode(hash ^ 1, &goodbye, &[]).unwrap();
+    served.refuses([
+        // Requests are answered with the reason.
+        Row::new(&batches, garbage.clone(), "Refused {"),
+        Row::new(&batches, foreign_batch, "Refused {"),
+        Row::of(client, &batches, &batch(0), "a batch of"),
+        Row::of(client, &batches, &batch(u32::MAX), "a batch of"),
+        // What needs no answer gets none.
+        Row::new(&goodbyes, garbage.clone(), SILENCE),
+        Row::new(&goodbyes, foreign_goodbye, SILENCE),
+        Row::new(&affinities, garbage, SILENCE),
+        Row::of(client, &affinities, &affinity, SILENCE),
+    ]);
+    let status = client.replay().unwrap();
+    assert_eq!((status.affinity_version, status.transitions_lost), (0, 0));
+    served.stores(0);
+    assert_eq!(served.system.survivors().len(), 1, "the server");
+}
