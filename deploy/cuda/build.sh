@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Builds driml-cuda, the flavour of the program that can use an NVIDIA GPU, and puts it beside the usual one.
-# It needs neither a GPU nor a CUDA toolkit: the compiler and the libraries come from the Python package index, pinned in
+# Builds driml with the feature `cuda`, as `cargo build --release --features cuda` does where a CUDA toolkit is installed.
+# This one needs neither a GPU nor a toolkit: the compiler and the libraries come from the Python package index, pinned in
 # requirements.txt, into the cache folder. It installs no driver and writes to nothing but cache and target folder.
 
 set -euo pipefail
@@ -100,12 +100,12 @@ if [ "$system_toolkit" = yes ]; then
     [ -x "$CUDA_HOME/bin/nvcc" ] || fail "--system-toolkit: there is no $CUDA_HOME/bin/nvcc"
     CUDA_HOME=$(realpath "$CUDA_HOME")
     # The toolkit brings its own stub of the driver's library.
-    links=$CUDA_HOME/lib64/stubs
+    links=$CUDA_HOME/lib64/stubs libraries=$CUDA_HOME/lib64
 else
     folder=$(realpath -m "${DRIML_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/driml}/cuda-13.0")
     cmp -s "$here/requirements.txt" "$folder/fetched.txt" || fetch_toolkit "$folder"
     CUDA_HOME=$folder/nvidia/cu13
-    links=$folder/links
+    links=$folder/links libraries=$CUDA_HOME/lib
     [ -f "$links/libcuda.so" ] || make_links "$CUDA_HOME" "$links"
     export CUDARC_CUDA_VERSION=13000
 fi
@@ -120,12 +120,13 @@ target=$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")
 version=$("$CUDA_HOME/bin/nvcc" --version | sed -n 's/.*release \([0-9.]*\),.*/\1/p')
 [ -n "$version" ] || fail "$CUDA_HOME/bin/nvcc does not say its version"
 built=$target/cuda-$version
-options=(--release --locked --features cuda -p driml --target-dir "$built")
+options=(--release --locked --features cuda -p driml --bin driml --target-dir "$built")
 [ "$offline" = no ] || options+=(--offline)
-say "building driml-cuda for compute capability $compute_cap with CUDA $version in $CUDA_HOME; candle's kernels take several minutes"
-(cd "$root" && cargo build "${options[@]}")
+say "building driml for compute capability $compute_cap with CUDA $version in $CUDA_HOME; candle's kernels take several minutes"
+# The program notes where CUDA's libraries are, for itself and for those that they load in turn.
+(cd "$root" && cargo rustc "${options[@]}" -- -C "link-args=-Wl,--disable-new-dtags -Wl,-rpath,$libraries")
 mkdir -p "$target/release"
 # Renamed into place, so that one that runs is not written over.
-cp "$built/release/driml" "$target/release/.driml-cuda.$$"
-mv -f "$target/release/.driml-cuda.$$" "$target/release/driml-cuda"
-say "$target/release/driml-cuda is ready after $SECONDS s; \`driml doctor\` says what is missing to run it"
+cp "$built/release/driml" "$target/release/.driml.$$"
+mv -f "$target/release/.driml.$$" "$target/release/driml"
+say "$target/release/driml is ready after $SECONDS s; \`driml doctor --cuda\` names its GPUs"

@@ -20,7 +20,7 @@ Usage: deploy/cuda/measure.sh [--out DIR] [--minutes N] [--seed S] [--device cud
   --device cuda:N  the device [default: cuda]
   --python PYTHON  a Python with PyTorch for CUDA: its update is measured on the same device, eager and compiled
 
-It needs `target/release/driml` (cargo build --release) and `target/release/driml-cuda` (deploy/cuda/build.sh).
+It needs a `target/release/driml` with CUDA: cargo build --release --features cuda, or deploy/cuda/build.sh.
 TEXT
 }
 
@@ -46,8 +46,8 @@ compgen -G '/proc/driver/nvidia/gpus/*/information' >/dev/null || [ -e /dev/nvid
     fail "there is no NVIDIA GPU here (neither /proc/driver/nvidia/gpus nor /dev/nvidiactl): nothing to measure.
   In a container, give it the GPU (docker run --gpus all)."
 driml=$(realpath -m "${CARGO_TARGET_DIR:-$root/target}")/release/driml
-[ -x "$driml" ] || fail "there is no $driml: cargo build --release"
-[ -x "${DRIML_CUDA_PROGRAM:-$driml-cuda}" ] || fail "there is no $driml-cuda: deploy/cuda/build.sh --compute-cap N, with the GPU's compute capability"
+[ -x "$driml" ] || fail "there is no $driml: cargo build --release --features cuda, or without a CUDA toolkit
+  deploy/cuda/build.sh --compute-cap N, with the GPU's compute capability"
 
 mkdir -p "$out"
 out=$(cd "$out" && pwd)
@@ -56,7 +56,7 @@ exec 9>"$out/.lock"
 flock -n 9 || fail "another measurement writes to $out"
 
 # Results of other settings or another program are not mixed with these.
-made_with="device $device, $minutes min a run, seed $seed, driml-cuda $(sha256sum "${DRIML_CUDA_PROGRAM:-$driml-cuda}" | cut -c1-16)"
+made_with="device $device, $minutes min a run, seed $seed, driml $(sha256sum "$driml" | cut -c1-16)"
 [ -f "$out/made-with.txt" ] || printf '%s\n' "$made_with" >"$out/made-with.txt"
 [ "$(cat "$out/made-with.txt")" = "$made_with" ] || fail "$out has results of: $(cat "$out/made-with.txt")
   This call would make: $made_with. Choose another --out."
@@ -105,7 +105,6 @@ trap 'say "interrupted; the same call goes on from here"; exit 130' INT
 # First, and each time, as the machine may have changed.
 "$driml" doctor --cuda --run-dir "$out" | tee "$out/doctor.txt" || fail "driml doctor says above what is missing"
 
-# The usual program hands these over to driml-cuda, with the folder of CUDA's libraries.
 step parity "$driml" parity "$root"/tests/parity/*.safetensors --device "$device"
 step learner "$driml" bench learner --device "$device" --json "$out/learner.json"
 if [ -n "$python" ]; then

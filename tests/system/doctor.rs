@@ -14,8 +14,7 @@ fn the_doctor_names_what_the_machine_has_and_ends_as_it_says() {
         "locked memory",
         "disk",
         "Procgen",
-        "CUDA driver",
-        "driml-cuda",
+        "cuda",
     ] {
         let states = ["ok", "note", "missing"].map(|state| format!("{state:<8} {what}"));
         assert!(

@@ -1,8 +1,10 @@
 //! Which device a command computes on, and whether this program can compute there.
-//! A program without CUDA goes on as `driml-cuda`.
+//! It computes nothing.
 
 use clap::Args;
 use driml_model::DeviceName;
+
+use crate::{doctor::cuda, error::Usage};
 
 /// What the learner computes on.
 #[derive(Clone, Copy, Debug, Args)]
@@ -12,16 +14,21 @@ pub struct DeviceFlag {
     pub device: DeviceName,
 }
 
-/// Makes sure that this program can compute on `device`: without CUDA in it, it goes on as `driml-cuda`.
+/// Makes sure that this program can compute on `device`.
 ///
 /// # Errors
-/// There is no such flavour, it cannot start here, or there is no such device.
-pub fn ready_for(device: DeviceName) -> anyhow::Result<()> {
+/// A program without the feature `cuda`, or a device that is not there.
+pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
     match device {
         DeviceName::Cpu => Ok(()),
-        #[cfg(not(feature = "cuda"))]
-        DeviceName::Cuda(_) => Err(crate::driml_cuda::hand_over()),
-        #[cfg(feature = "cuda")]
-        DeviceName::Cuda(ordinal) => Ok(crate::doctor::cuda::check(ordinal)?),
+        DeviceName::Cuda(ordinal) => cuda::check(ordinal),
+    }
+}
+
+/// A GPU's name, compute capability and memory; none if the CPU computes.
+pub fn gpu(device: DeviceName) -> Option<String> {
+    match device {
+        DeviceName::Cpu => None,
+        DeviceName::Cuda(ordinal) => cuda::describe(ordinal).ok(),
     }
 }

@@ -1,4 +1,4 @@
-//! What this machine offers and lacks: cores, memory, devices, and the CUDA flavour of the program.
+//! What this machine offers and lacks: cores, memory, devices.
 //!
 //! Start with [`resources::Machine`] for what sizes a run, with [`doctor::examine`] for what is missing, and with
 //! [`device::ready_for`] before anything is computed on a device. It starts no run and knows no setting. The errors that the
@@ -15,8 +15,6 @@
 
 pub mod device;
 pub mod doctor;
-#[cfg(not(feature = "cuda"))]
-mod driml_cuda;
 pub mod error;
 pub mod limits;
 pub mod process_env;

@@ -33,10 +33,21 @@ pub fn settle(purpose: Purpose) -> io::Result<()> {
     if missing.is_empty() {
         return Ok(());
     }
+    start_again_with(missing)
+}
+
+/// Starts this program again, in the same process and with the same arguments, with these variables too. It returns only if that
+/// fails.
+///
+/// # Errors
+/// The program cannot be started again.
+pub fn start_again_with<'a>(
+    variables: impl IntoIterator<Item = (&'a str, &'a str)>,
+) -> io::Result<()> {
     let mut args = env::args_os();
     let name = args.next().unwrap_or_else(|| OsString::from("driml"));
     let mut again = Command::new(env::current_exe()?);
-    Err(again.arg0(name).args(args).envs(missing).exec())
+    Err(again.arg0(name).args(args).envs(variables).exec())
 }
 
 /// The variables that a process for `purpose` lacks, with their values.

@@ -3,6 +3,8 @@
 
 use std::fs;
 
+use serde::{Deserialize, Serialize};
+
 /// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
 const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
@@ -87,6 +89,37 @@ impl Machine {
     }
 }
 
+/// The machine that measured, as far as figures depend on it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MachineNote {
+    /// The processor's name.
+    pub processor: String,
+    /// Cores that this process may use.
+    pub cores: u32,
+    /// Mean number of tasks that wanted a core in the minute before.
+    pub load: f64,
+    /// The GPU that computed, with its memory; none if the processor did.
+    #[serde(default)]
+    pub gpu: Option<String>,
+}
+
+impl MachineNote {
+    /// What this machine is and how busy it is now; `gpu` computes, or the processor.
+    pub fn this(gpu: Option<String>) -> Self {
+        Self {
+            processor: processor(),
+            cores: Machine::this().cores,
+            load: load(&fs::read_to_string("/proc/loadavg").unwrap_or_default()).unwrap_or(0.0),
+            gpu,
+        }
+    }
+}
+
+/// The mean over the last minute in the kernel's table.
+fn load(loadavg: &str) -> Option<f64> {
+    loadavg.split_whitespace().next()?.parse().ok()
+}
+
 /// The processor's name; "unknown" where the kernel does not say it.
 pub fn processor() -> String {
     let cpuinfo = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -130,6 +163,7 @@ mod tests {
             "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
         assert_eq!(meminfo_available(text), Some(2000 * 1024));
         assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
+        assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Times and sizes in human-readable form.
+//! Times, sizes and other numbers in human-readable form.
 
 use std::time::Duration;
 
@@ -29,6 +29,16 @@ pub fn gib(bytes: u64) -> String {
     format!("{:.1} GiB", bytes as f64 / f64::from(1 << 30))
 }
 
+/// A number with three digits that matter, and all those before the point.
+pub fn number(value: f64) -> String {
+    match value.abs() {
+        size if size >= 100.0 => format!("{value:.0}"),
+        size if size >= 10.0 => format!("{value:.1}"),
+        size if size >= 1.0 || size == 0.0 => format!("{value:.2}"),
+        _ => format!("{value:.3}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -43,6 +53,12 @@ mod tests {
     fn rough_times_have_one() {
         let texts = [3.2, 99.0, 100.0, 3_600.0, 9_000.0].map(rough_duration);
         assert_eq!(texts, ["3 s", "99 s", "2 min", "60 min", "2.5 h"]);
+    }
+
+    #[test]
+    fn numbers_have_the_digits_that_matter() {
+        let texts = [0.0, 0.12345, 1.2345, 12.345, 123.45, 61_234.5].map(number);
+        assert_eq!(texts, ["0.00", "0.123", "1.23", "12.3", "123", "61234"]);
     }
 
     #[test]

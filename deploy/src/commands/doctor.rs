@@ -20,9 +20,6 @@ pub(crate) struct DoctorArgs {
     /// Print the facts as JSON
     #[arg(long)]
     pub(crate) json: bool,
-    /// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour
-    #[arg(long, hide = true)]
-    pub(crate) devices: bool,
 }
 
 /// Prints the facts.
@@ -30,9 +27,6 @@ pub(crate) struct DoctorArgs {
 /// # Errors
 /// Something is missing that training on the CPU needs; with `--tls-dir`, a certificate is not good; with `--cuda`, also what training on a GPU needs.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
-    if args.devices {
-        return print(&doctor::devices_json()?);
-    }
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
     if args.json {
         print(&report.json()?)?;

@@ -2,7 +2,7 @@
 //! It changes nothing, fetches nothing and measures no speed.
 
 mod certificates;
-pub mod cuda;
+pub(crate) mod cuda;
 mod engine;
 mod fact;
 mod host;
@@ -34,14 +34,6 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     }
 }
 
-/// Only the CUDA devices, as JSON: so the usual program asks its CUDA flavour.
-///
-/// # Errors
-/// None that is known.
-pub fn devices_json() -> anyhow::Result<String> {
-    json(&cuda::devices())
-}
-
 impl Report {
     /// A line a fact, and what can be trained on.
     pub fn describe(&self) -> String {
@@ -53,7 +45,7 @@ impl Report {
     /// # Errors
     /// None that is known.
     pub fn json(&self) -> anyhow::Result<String> {
-        json(&self.all())
+        Ok(serde_json::to_string_pretty(&self.all())? + "\n")
     }
 
     fn all(&self) -> Vec<Fact> {
@@ -90,10 +82,6 @@ fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
     names.join(", ")
 }
 
-fn json(facts: &[Fact]) -> anyhow::Result<String> {
-    Ok(serde_json::to_string_pretty(facts)? + "\n")
-}
-
 fn describe(facts: &[Fact], verdict: &str) -> String {
     let mut text = String::new();
     for fact in facts {
@@ -122,20 +110,20 @@ mod tests {
         let cpu = |state| vec![Fact::ok("cores", ""), Fact::new(state, "disk", "")];
         let cuda = |state| {
             vec![
-                Fact::note("CUDA driver", "old"),
-                Fact::new(state, "cuda:0", ""),
+                Fact::missing("cuda:0", "not for this one"),
+                Fact::new(state, "cuda:1", ""),
             ]
         };
         let says = |state, device| verdict(&cpu(state), &cuda(device));
         assert!(says(State::Note, State::Ok).contains("CPU and with"));
         assert!(says(State::Ok, State::Missing).contains("not with"));
-        assert!(verdict(&cpu(State::Ok), &[Fact::ok("CUDA driver", "")]).contains("not with"));
+        assert!(verdict(&cpu(State::Ok), &[Fact::note("cuda", "none")]).contains("not with"));
         assert!(says(State::Missing, State::Ok).contains("cannot"));
     }
 
     #[test]
     fn every_fact_is_a_line_and_the_verdict_stands_apart() {
-        let facts = [Fact::ok("cores", "2"), Fact::note("CUDA driver", "none")];
+        let facts = [Fact::ok("cores", "2"), Fact::note("cuda", "none")];
         let text = describe(&facts, "Done.");
         assert_eq!(text.lines().count(), 4, "{text}");
         assert!(text.ends_with("\n\nDone.\n"), "{text}");
