@@ -18,7 +18,7 @@ use crate::run_folder::{ResumePoint, RunFolder};
 /// Arithmetic that a core sustains over a whole run, learner and actors together, in GFLOP/s.
 ///
 /// Measured on 2 cores of an AMD EPYC with AVX-512: an update of `driml-ada` on bigfish alone, 16 GFLOP, takes 54 ms, which is
-/// 150 a core (`cargo bench --workspace --bench update`); actors and replay server share the cores with it, and other machines
+/// 150 a core (`driml bench learner`); actors and replay server share the cores with it, and other machines
 /// have narrower registers, so this is half of it.
 const GFLOPS_PER_CORE: f64 = 75.0;
 

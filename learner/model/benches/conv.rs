@@ -1,5 +1,5 @@
 //! The convolution, forward and backward, against candle's own, for the network's first layers at batch 256.
-//! The whole network is measured in `network`.
+//! Whole networks are measured by `driml bench learner` and `driml bench policy`.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 use candle_core::{DType, Device, Result, Tensor, Var};
