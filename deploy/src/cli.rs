@@ -1,7 +1,7 @@
 //! The list of commands. Each has its flags and its code in a file of `commands`, or in the crate that it is named for.
 
 use clap::{CommandFactory, Parser, Subcommand};
-use driml_bench::flags::BenchCommand;
+use driml_bench::flags::BenchArgs;
 use driml_experiments::{
     flags::{ExperimentCommand, GridArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
@@ -72,8 +72,7 @@ pub(crate) enum Command {
     /// Measure what each setting that buys speed costs in accuracy: benches, short trainings, a page
     Tradeoff(TradeoffArgs),
     /// Measure how fast the parts are, alone and beside what others use
-    #[command(subcommand)]
-    Bench(BenchCommand),
+    Bench(BenchArgs),
     /// List presets, agents and what differs by game; or print the settings of one game and agent with their sources
     Presets(PresetsArgs),
     /// What this machine can do and what it lacks, for training on the CPU and on a GPU
@@ -112,7 +111,7 @@ impl Command {
             Self::Grid(args) => driml_experiments::grid(&args),
             Self::Experiment(command) => driml_experiments::run(&command),
             Self::Tradeoff(args) => driml_experiments::tradeoff(&args),
-            Self::Bench(command) => driml_bench::run(&command),
+            Self::Bench(args) => driml_bench::run(&args),
             Self::Presets(args) => presets::run(&args),
             Self::Doctor(args) => doctor::run(&args),
             Self::Procgen(command) => procgen::run(&command),

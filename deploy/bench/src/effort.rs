@@ -1,9 +1,12 @@
-//! How long something is measured, and how its speed is taken.
+//! The one measuring loop: how long something is measured, and how its speed is taken.
 //! It keeps no figure and judges none.
 
 use std::time::{Duration, Instant};
 
 use crate::flags::BenchFlags;
+
+/// What is measured; a call is what is timed.
+pub(super) type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
 
 /// How long each thing is measured.
 #[derive(Clone, Copy, Debug)]
@@ -31,63 +34,43 @@ impl Effort {
     }
 
     /// Calls of `work` a second, by the median of their durations: for calls that all do the same.
-    ///
-    /// # Errors
-    /// The first of `work`'s.
-    pub(super) fn rate_by_median<E>(
+    pub(super) fn rate_by_median<'a>(
         &self,
-        mut work: impl FnMut() -> Result<(), E>,
-    ) -> Result<f64, E> {
-        Ok(1.0 / median(&self.durations(&mut work)?))
+        work: impl FnMut() -> anyhow::Result<()> + 'a,
+    ) -> anyhow::Result<f64> {
+        Ok(self.rates_in_turn(&mut [Box::new(work)])?[0])
     }
 
     /// Calls of `work` a second over all of them: for calls of which a few do much more than the others.
-    ///
-    /// # Errors
-    /// The first of `work`'s.
-    pub(super) fn rate_overall<E>(
+    pub(super) fn rate_overall<'a>(
         &self,
-        mut work: impl FnMut() -> Result<(), E>,
-    ) -> Result<f64, E> {
-        let durations = self.durations(&mut work)?;
+        work: impl FnMut() -> anyhow::Result<()> + 'a,
+    ) -> anyhow::Result<f64> {
+        let durations = &self.durations(&mut [Box::new(work)])?[0];
         Ok(durations.len() as f64 / durations.iter().sum::<f64>())
     }
 
-    /// Seconds of each call.
-    fn durations<E>(&self, work: &mut impl FnMut() -> Result<(), E>) -> Result<Vec<f64>, E> {
-        for _ in 0..self.warmup_calls {
-            work()?;
-        }
-        let (first, mut durations) = (Instant::now(), Vec::new());
-        while durations.len() < self.calls_min || first.elapsed() < self.time_min {
-            let started = Instant::now();
-            work()?;
-            durations.push(started.elapsed().as_secs_f64());
-        }
-        Ok(durations)
+    /// Calls a second of each of `works`, by the median. They take turns, so that a load of the machine affects them alike.
+    pub(super) fn rates_in_turn(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<f64>> {
+        let durations = self.durations(works)?;
+        Ok(durations.iter().map(|it| 1.0 / median(it)).collect())
     }
 
-    /// Calls a second of each of `works`, by the median. They take turns, so that a load of the machine meets them alike; each is told
-    /// how many calls it had.
-    ///
-    /// # Errors
-    /// The first of a call's.
-    pub(super) fn rates_in_turn<E>(
-        &self,
-        works: &mut [&mut dyn FnMut(usize) -> Result<(), E>],
-    ) -> Result<Vec<f64>, E> {
-        let mut seconds = vec![Vec::new(); works.len()];
-        let (first, mut calls, warmup) = (Instant::now(), 0, self.warmup_calls as usize);
-        while calls < warmup + self.calls_min || first.elapsed() < self.time_min {
+    /// Seconds of each call of each work, in turn, after the warm-up.
+    fn durations(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<Vec<f64>>> {
+        for _ in 0..self.warmup_calls {
+            works.iter_mut().try_for_each(|work| work())?;
+        }
+        let (first, mut calls, mut seconds) = (Instant::now(), 0, vec![Vec::new(); works.len()]);
+        while calls < self.calls_min || !self.is_spent(first) {
             for (work, seconds) in works.iter_mut().zip(&mut seconds) {
                 let started = Instant::now();
-                work(calls)?;
+                work()?;
                 seconds.push(started.elapsed().as_secs_f64());
             }
             calls += 1;
         }
-        let rate = |seconds: &Vec<f64>| 1.0 / median(&seconds[warmup..]);
-        Ok(seconds.iter().map(rate).collect())
+        Ok(seconds)
     }
 
     /// Whether something that began at `started` has been measured for long enough.
@@ -109,7 +92,7 @@ pub(super) fn median(values: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use std::convert::Infallible;
+    use std::cell::RefCell;
 
     use super::*;
 
@@ -122,19 +105,24 @@ mod tests {
     }
 
     #[test]
-    fn calls_are_counted_after_the_warm_up() {
+    fn works_take_turns_and_calls_are_counted_after_the_warm_up() {
         let effort = Effort {
             warmup_calls: 2,
             calls_min: 3,
             time_min: Duration::ZERO,
         };
-        let mut calls = 0;
-        let mut work = || {
-            calls += 1;
-            Ok::<_, Infallible>(())
+        let calls = RefCell::new(String::new());
+        let work = |name: char| -> Work<'_> {
+            let calls = &calls;
+            Box::new(move || {
+                calls.borrow_mut().push(name);
+                Ok(())
+            })
         };
-        let Ok(durations) = effort.durations(&mut work);
-        assert_eq!((durations.len(), calls), (3, 5));
-        assert_eq!(effort.rate_by_median(|| Err("broken")), Err("broken"));
+        let durations = effort.durations(&mut [work('a'), work('b')]).unwrap();
+        let counts: Vec<_> = durations.iter().map(Vec::len).collect();
+        assert_eq!(counts, [3, 3]);
+        assert_eq!(*calls.borrow(), "ababababab");
+        assert!(effort.rate_by_median(|| anyhow::bail!("broken")).is_err());
     }
 }

@@ -6,48 +6,38 @@ use driml_launch::console;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, measurements::Measurement, settings};
+use crate::{effort::Effort, report::Measurement, settings};
 
-const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
+pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
 /// Copies of the game.
 const ENVS: usize = 32;
 /// The engine's own threads; with 0 the caller's steps every copy.
-const ENGINE_THREADS: [usize; 2] = [0, 2];
+pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];
 /// Steps of which a call that is timed consists.
 const STEPS: usize = 64;
 
-/// Steps a second, each copy's counted.
-///
-/// # Errors
-/// An engine that cannot be had or fails.
-pub(super) fn measure(effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
-    procgen_sys::Engine::install(&mut console::line)?;
-    let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut figures = Vec::new();
-    for game in GAMES {
-        for threads in ENGINE_THREADS {
-            let world = format!("procgen:{game}");
-            let rate = rate(&world, threads, effort, &mut rng)?;
-            let name = format!("{game}, {ENVS} copies, {threads} engine threads");
-            figures.push(Measurement::found(name, rate, "steps/s"));
-        }
-    }
-    Ok(figures)
+/// The name of the figure of one of Procgen's games.
+pub(super) fn name(game: &str, threads: usize) -> String {
+    format!("{game}, {ENVS} copies, {threads} engine threads")
 }
 
-/// Steps a second of some worlds, each copy's counted.
-///
-/// # Errors
-/// A world that cannot be had or fails.
-pub(super) fn measure_worlds(
-    effort: &Effort,
-    worlds: &[String],
-) -> anyhow::Result<Vec<Measurement>> {
+/// Steps a second of some worlds, Procgen's if none is named, each copy's counted.
+pub(super) fn measure(worlds: &[String], effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+    let mut cases = Vec::new();
+    for world in worlds {
+        cases.push((format!("{world}, {ENVS} copies"), world.clone(), 0));
+    }
+    if worlds.is_empty() {
+        procgen_sys::Engine::install(&mut console::line)?;
+        for game in GAMES {
+            let of_game = |threads| (name(game, threads), format!("procgen:{game}"), threads);
+            cases.extend(ENGINE_THREADS.map(of_game));
+        }
+    }
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut figures = Vec::new();
-    for world in worlds {
-        let rate = rate(world, 0, effort, &mut rng)?;
-        let name = format!("{world}, {ENVS} copies");
+    for (name, world, threads) in cases {
+        let rate = rate(&world, threads, effort, &mut rng)?;
         figures.push(Measurement::found(name, rate, "steps/s"));
     }
     Ok(figures)
@@ -64,11 +54,11 @@ fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> a
     let (mut rewards, mut ends) = ([0.0; ENVS], [StepEnd::Running; ENVS]);
     // A step that starts episodes takes longer than others, so the mean counts.
     let calls = effort.rate_overall(|| {
-        actions.iter().try_for_each(|actions| {
+        for actions in &actions {
             world.step(actions, &mut rewards, &mut ends)?;
             world.observe(&mut frames);
-            Ok::<_, driml_envs::EnvError>(())
-        })
+        }
+        Ok(())
     })?;
     Ok(calls * (STEPS * ENVS) as f64)
 }

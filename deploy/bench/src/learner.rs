@@ -1,133 +1,221 @@
-//! Updates of the learner at the paper's sizes, and one of them by candle's stock operations.
-//! Batches are made up: nothing but the arithmetic is measured.
+//! Updates of the learner: at the paper's sizes, as sizes grow, and on batches that worlds give.
+//! Nothing but the update is timed; batches of sizes are made up.
 
-use driml_learner::{Agent, Batch, Compute, DeviceName, EqualStates, Precision, UpdateError};
+use driml_envs::WorldName;
+use driml_launch::inspect::Inspection;
+use driml_learner::{
+    Agent, Batch, Compute, DeviceName, Kernels, Learner, LearnerConfig, Precision,
+    cost::{UpdateCost, UpdateShape},
+};
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    candle_baseline::CandleBaseline,
-    effort::Effort,
-    measurements::{Measurement, named},
-    settings,
+    effort::{Effort, Work},
+    flags::{BenchFlags, BenchLearnerArgs},
+    report::{Measurement, named},
+    settings::{self, AGENT, WORLD},
 };
 
 /// What is measured: its name, agent, preset and further settings.
 const CASES: [(&str, &str, &str, &[&str]); 4] = [
     ("C51, 64x64x3", "c51", "paper", &[]),
-    (GLOBAL_DIM, "driml-ada", "paper", &[]),
+    (GLOBAL_DIM, AGENT, "paper", &[]),
     (
         "C51 + local-local + global-global DIM, 64x64x3",
-        "driml-ada",
+        AGENT,
         "paper",
         &["learner.update.lambda.3t3=1"],
     ),
     (
         "C51 + global-global DIM, 104x80x3",
-        "driml-ada",
+        AGENT,
         "paper-observation",
         &[],
     ),
 ];
-/// The update that candle's stock operations do too.
-const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
-/// That update where this share of s_t and s_{t+k}, and of s_{t+n}, repeats another state; what is done with them.
-const REPEATS: [(f64, EqualStates, &str); 6] = [
-    (0.0, EqualStates::Each, "no states repeat, each computed"),
-    (0.0, EqualStates::Once, "no states repeat, equal ones once"),
-    (
-        0.04,
-        EqualStates::Each,
-        "4% of states repeat, each computed",
-    ),
-    (
-        0.04,
-        EqualStates::Once,
-        "4% of states repeat, equal ones once",
-    ),
-    (
-        0.38,
-        EqualStates::Each,
-        "38% of states repeat, each computed",
-    ),
-    (
-        0.38,
-        EqualStates::Once,
-        "38% of states repeat, equal ones once",
-    ),
+/// The update that is also computed with candle's own operations, as on a GPU, in place of our kernels.
+pub(super) const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
+/// What that figure's name ends with.
+pub(super) const CANDLE: &str = "candle's own operations";
+/// Shares of s_t and s_{t+k}, and of s_{t+n}, that repeat another state.
+const REPEATED: [(f64, &str); 3] = [
+    (0.0, "no states repeat"),
+    (0.04, "4% of states repeat"),
+    (0.38, "38% of states repeat"),
+];
+/// What is done with equal states.
+const EQUAL_STATES: [(&str, &str); 2] = [
+    ("learner.equal_states=each", "each computed"),
+    ("learner.equal_states=once", "equal ones once"),
+];
+/// What grows, and the settings over those of the paper: C51 + global DIM, 256 rows of 64x64x3, 51 atoms, vectors of 512.
+const SIZES: [(&str, &[&str]); 13] = [
+    ("32 rows", &["learner.batch_size=32"]),
+    ("64 rows", &["learner.batch_size=64"]),
+    ("128 rows", &["learner.batch_size=128"]),
+    ("256 rows of 64x64, 51 atoms, vectors of 512", &[]),
+    ("512 rows", &["learner.batch_size=512"]),
+    ("48x48", &["input.height=48", "input.width=48"]),
+    ("84x84", &["input.height=84", "input.width=84"]),
+    ("104x80", &["input.height=104", "input.width=80"]),
+    ("11 atoms", &["model.atoms=11"]),
+    ("201 atoms", &["model.atoms=201"]),
+    ("vectors of 64", &["model.rkhs=64"]),
+    ("vectors of 256", &["model.rkhs=256"]),
+    ("vectors of 1024", &["model.rkhs=1024"]),
+];
+/// A replay of 20,000 frames that random actions gave, as `driml inspect --worlds --play` has it.
+const PLAYED_SETS: [&str; 4] = [
+    "replay.transitions_max=21000",
+    "replay.warmup_transitions=20000",
+    "actor.epsilon_start=1",
+    "actor.epsilon_end=1",
+];
+/// Batches that updates take in turn.
+const PLAYED_BATCHES: usize = 4;
+/// What is measured on played batches: its name, whether frames are whole, and what is done with equal states.
+const PLAYED: [(&str, bool, &str); 3] = [
+    ("whole frames, each state", true, EQUAL_STATES[0].0),
+    ("each state", false, EQUAL_STATES[0].0),
+    ("equal states once", false, EQUAL_STATES[1].0),
 ];
 
-/// Updates a second on a device; candle's stock operations beside it on the CPU alone.
-///
-/// # Errors
-/// An update that failed.
+/// Updates a second on a device, in each precision; on the CPU also with candle's own operations.
 pub(super) fn measure(
+    args: &BenchLearnerArgs,
+    flags: &BenchFlags,
     effort: &Effort,
-    device: DeviceName,
-    precision: Precision,
 ) -> anyhow::Result<Vec<Measurement>> {
-    let compute = device.open(precision)?;
+    let device = args.on.device;
     let mut figures = Vec::new();
-    for (name, agent, preset, sets) in CASES {
-        let config = settings::of_run(settings::WORLD, agent, preset, sets)?.with_whole_frames()?;
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let rows = SyntheticBatch::draw(&config, &mut rng);
-        let batch = rows.batch();
-        let (model, update) = (config.model.clone(), config.learner.update.clone());
-        let mut learner = Agent::new(model, update, &compute, &mut rng)?
-            .with_equal_states(config.learner.equal_states);
-        let rate = effort.rate_by_median(|| learner.update(&batch).map(drop))?;
-        figures.push(Measurement::found(
-            named(name, precision),
-            rate,
-            "updates/s",
-        ));
-        if name == GLOBAL_DIM && device == DeviceName::Cpu && precision == Precision::F32 {
-            let mut stock = CandleBaseline::new(&learner)?;
-            let rate = effort.rate_by_median(|| stock.update(&batch).map(drop))?;
-            let name = format!("{name}, candle's stock operations");
-            figures.push(Measurement::found(name, rate, "updates/s"));
-        }
-    }
-    if device == DeviceName::Cpu {
-        figures.extend(repeats(effort, precision)?);
-    }
-    Ok(figures)
-}
-
-/// Updates a second where states of a batch repeat, in turn.
-fn repeats(effort: &Effort, precision: Precision) -> anyhow::Result<Vec<Measurement>> {
-    let config = settings::of_run(settings::WORLD, "driml-ada", "paper", &[])?;
-    let compute = Compute::cpu(precision);
-    let mut updates = Vec::new();
-    for (share, equal_states, _) in REPEATS {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut rows = SyntheticBatch::draw(&config, &mut rng);
-        rows.repeat(share);
-        let (model, update) = (config.model.clone(), config.learner.update.clone());
-        let mut learner =
-            Agent::new(model, update, &compute, &mut rng)?.with_equal_states(equal_states);
-        updates.push(move |_: usize| learner.update(&rows.batch()).map(drop));
-    }
-    let mut works: Vec<&mut dyn FnMut(usize) -> Result<(), UpdateError>> = Vec::new();
-    for update in &mut updates {
-        works.push(update);
-    }
-    let rates = effort.rates_in_turn(&mut works)?;
-    let mut figures = Vec::new();
-    for ((_, _, what), rate) in REPEATS.into_iter().zip(rates) {
-        let name = named(
-            format!("C51 + global-global DIM, 60x60x3, {what}"),
+    for precision in flags.precisions(device) {
+        let mut bench = Bench {
+            effort,
             precision,
-        );
-        figures.push(Measurement::found(name, rate, "updates/s"));
+            compute: device.open(precision)?,
+            figures,
+        };
+        match (args.growth, &args.played[..]) {
+            (true, _) => bench.growth()?,
+            (_, []) => bench.paper(device == DeviceName::Cpu)?,
+            (_, worlds) => worlds.iter().try_for_each(|world| bench.played(world))?,
+        }
+        figures = bench.figures;
     }
     Ok(figures)
 }
 
-/// A batch that no world gave.
-pub(super) struct SyntheticBatch {
+/// What measures on one device in one precision, and what it has found.
+struct Bench<'a> {
+    effort: &'a Effort,
+    precision: Precision,
+    compute: Compute,
+    figures: Vec<Measurement>,
+}
+
+impl Bench<'_> {
+    fn found(&mut self, what: &str, value: f64, unit: &str) {
+        let what = named(what, self.precision);
+        self.figures.push(Measurement::found(what, value, unit));
+    }
+
+    /// Updates at the paper's sizes; on a CPU with candle's own operations too, and where states of a batch repeat.
+    fn paper(&mut self, on_cpu: bool) -> anyhow::Result<()> {
+        for (name, agent, preset, sets) in CASES {
+            let config = settings::of_run(WORLD, agent, preset, sets)?.with_whole_frames()?;
+            let work = updates(&config, &self.compute, 0.0)?;
+            self.found(name, self.effort.rate_by_median(work)?, "updates/s");
+            if name == GLOBAL_DIM && on_cpu && self.precision == Precision::F32 {
+                let mut stock = self.compute.clone();
+                stock.kernels = Kernels::Candle;
+                let rate = self.effort.rate_by_median(updates(&config, &stock, 0.0)?)?;
+                self.found(&format!("{name}, {CANDLE}"), rate, "updates/s");
+            }
+        }
+        if !on_cpu {
+            return Ok(());
+        }
+        let (mut names, mut works) = (Vec::new(), Vec::new());
+        for (share, repeated) in REPEATED {
+            for (set, equal_states) in EQUAL_STATES {
+                let config = settings::of_run(WORLD, AGENT, "paper", &[set])?;
+                works.push(updates(&config, &self.compute, share)?);
+                names.push(format!(
+                    "C51 + global-global DIM, 60x60x3, {repeated}, {equal_states}"
+                ));
+            }
+        }
+        for (name, rate) in names.iter().zip(self.effort.rates_in_turn(&mut works)?) {
+            self.found(name, rate, "updates/s");
+        }
+        Ok(())
+    }
+
+    /// For each size updates a second, and the arithmetic that this is: the products that `driml inspect` counts.
+    fn growth(&mut self) -> anyhow::Result<()> {
+        for (name, sets) in SIZES {
+            let sets = [sets, &["learner.equal_states=each"]].concat();
+            let config = settings::of_run(WORLD, AGENT, "paper", &sets)?.with_whole_frames()?;
+            let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
+            let gflop = UpdateCost::of(&config.model, &shape).total() as f64 / 1e9;
+            let work = updates(&config, &self.compute, 0.0)?;
+            let (rate, name) = (
+                self.effort.rate_by_median(work)?,
+                format!("{name}: {gflop:.2} GFLOP"),
+            );
+            self.found(&name, rate, "updates/s");
+            self.found(&format!("{name}, arithmetic"), rate * gflop, "GFLOP/s");
+        }
+        Ok(())
+    }
+
+    /// Updates of `driml-ada` on batches that random play gave in a world, with what a scene does not need left out and without.
+    /// The weights are not trained: an agent that has learned sees other states.
+    fn played(&mut self, world: &WorldName) -> anyhow::Result<()> {
+        let mut works: Vec<Work<'_>> = Vec::new();
+        for (_, whole, set) in PLAYED {
+            let sets = [&PLAYED_SETS[..], &[set]].concat();
+            let mut config = settings::of_run(&world.to_string(), AGENT, "paper", &sets)?;
+            if whole {
+                config = config.with_whole_frames()?;
+            }
+            config.world.install(&mut |_: &str| {})?;
+            let (batches, mut calls) = (Inspection::batches(&config, PLAYED_BATCHES)?, 0);
+            let config = LearnerConfig::from_toml(&config.to_toml())?;
+            let mut learner = Learner::new(config, &self.compute)?;
+            works.push(Box::new(move || {
+                calls += 1;
+                learner.update(&batches[calls % PLAYED_BATCHES])?;
+                Ok(())
+            }));
+        }
+        let rates = self.effort.rates_in_turn(&mut works)?;
+        for ((name, ..), rate) in PLAYED.into_iter().zip(rates) {
+            self.found(&format!("{world}: {name}"), rate, "updates/s");
+        }
+        Ok(())
+    }
+}
+
+/// Updates of an agent of these settings on a batch that no world gave, of whose states this share repeats another one.
+fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Result<Work<'static>> {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut rows = SyntheticBatch::draw(config, &mut rng);
+    rows.repeat(repeated);
+    let (model, update) = (config.model.clone(), config.learner.update.clone());
+    let agent = Agent::new(model, update, compute, &mut rng)?;
+    let mut agent = agent.with_equal_states(config.learner.equal_states);
+    Ok(Box::new(move || {
+        agent.update(&rows.batch())?;
+        Ok(())
+    }))
+}
+
+/// A batch that no world gave: random bytes, actions and returns.
+struct SyntheticBatch {
+    /// s_t, s_{t+k} and s_{t+n}.
     frames: [Vec<u8>; 3],
     action: Vec<u8>,
     next_action: Vec<u8>,
@@ -137,15 +225,14 @@ pub(super) struct SyntheticBatch {
 }
 
 impl SyntheticBatch {
-    /// Random bytes, actions and returns, of the sizes that `config` has.
-    pub(super) fn draw(config: &RunConfig, rng: &mut ChaCha8Rng) -> Self {
+    /// As many rows, bytes and actions as `config` has.
+    fn draw(config: &RunConfig, rng: &mut ChaCha8Rng) -> Self {
         let rows = config.learner.batch_size as usize;
-        let mut frames = || {
+        let frames = std::array::from_fn(|_| {
             let mut frames = vec![0; rows * config.model.frame_len()];
             rng.fill_bytes(&mut frames);
             frames
-        };
-        let frames = [frames(), frames(), frames()];
+        });
         let mut actions = || {
             let draw = |_| rng.random_range(0..config.model.num_actions) as u8;
             (0..rows).map(draw).collect::<Vec<_>>()
@@ -177,7 +264,8 @@ impl SyntheticBatch {
         }
     }
 
-    pub(super) fn batch(&self) -> Batch<'_> {
+    /// The rows as a learner takes them.
+    fn batch(&self) -> Batch<'_> {
         let [states_t, states_k, states_n] = &self.frames;
         Batch {
             rows: self.action.len(),

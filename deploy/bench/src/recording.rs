@@ -10,12 +10,41 @@ use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{settings, taking_part::INCARNATION};
+use crate::settings;
 
+/// The life of the actor whose chunks are made of it.
+pub(super) const INCARNATION: u64 = 1;
 /// Copies of the game, each a stream of transitions.
-pub(super) const STREAMS: usize = 8;
+const STREAMS: usize = 8;
 /// Steps of each copy; then the recording begins again.
-pub(super) const STEPS: usize = 256;
+const STEPS: usize = 256;
+
+/// Chunks that are measured. An actor of 16 copies sends the last.
+pub(super) const CHUNKS: [ChunkShape; 4] = [
+    ChunkShape::new(4, 1),
+    ChunkShape::new(8, 4),
+    ChunkShape::new(8, 16),
+    ChunkShape::new(8, 32),
+];
+
+/// Streams and steps of a chunk.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ChunkShape {
+    streams: u32,
+    steps: u32,
+}
+
+impl ChunkShape {
+    /// The first `streams` of [`STREAMS`].
+    pub(super) const fn new(streams: u32, steps: u32) -> Self {
+        assert!(streams as usize <= STREAMS);
+        Self { streams, steps }
+    }
+
+    pub(super) const fn transitions(self) -> u32 {
+        self.streams * self.steps
+    }
+}
 
 /// Transitions of [`STREAMS`] copies of bigfish under a random policy, for [`STEPS`] steps.
 pub(super) struct Recording {
@@ -28,9 +57,6 @@ pub(super) struct Recording {
 
 impl Recording {
     /// Plays.
-    ///
-    /// # Errors
-    /// An engine that cannot be had or fails.
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
@@ -62,9 +88,6 @@ impl Recording {
     }
 
     /// Writes the frames, raw, for a process that is not ours.
-    ///
-    /// # Errors
-    /// A file that cannot be written.
     pub(super) fn write_frames(&self, path: &Path) -> anyhow::Result<()> {
         std::fs::write(path, &self.frames).with_context(|| format!("writing {}", path.display()))
     }
@@ -74,18 +97,9 @@ impl Recording {
         self.frame_bytes
     }
 
-    /// Chunk after chunk of one actor, `steps` steps of the first `streams` streams each, in memory of `pool`; the recording
-    /// plays round and round.
-    pub(super) fn chunks(
-        &self,
-        actor: u32,
-        (streams, steps): (u32, u32),
-        pool: BufferPool,
-    ) -> Chunks<'_> {
-        assert!(
-            streams as usize <= STREAMS,
-            "{streams} of {STREAMS} streams"
-        );
+    /// Chunk after chunk of one actor, each of `shape` and in memory of `pool`; the recording plays round and round.
+    pub(super) fn chunks(&self, actor: u32, shape: ChunkShape, pool: BufferPool) -> Chunks<'_> {
+        let ChunkShape { streams, steps } = shape;
         Chunks {
             recording: self,
             pool,
@@ -117,14 +131,7 @@ impl Chunks<'_> {
         self.next.first_transition
     }
 
-    /// Chunks say from now on that weights of `version` acted.
-    pub(super) const fn act_with(&mut self, version: u64) {
-        self.next.weights_version = version;
-    }
-
-    /// The next chunk, of `steps` steps.
-    pub(super) fn next_of(&mut self, steps: u32) -> Chunk {
-        self.next.steps = steps;
+    pub(super) fn next_chunk(&mut self) -> Chunk {
         let Recording {
             frame_bytes,
             frames,
@@ -133,7 +140,7 @@ impl Chunks<'_> {
         let bytes = self.next.payload_bytes();
         let bytes = bytes.expect("a chunk of a bench is far below the address space");
         let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
-        let (streams, steps) = (self.next.streams as usize, steps as usize);
+        let (streams, steps) = (self.next.streams as usize, self.next.steps as usize);
         let first_step = self.next.first_transition as usize / streams;
         for row in 0..streams * steps {
             let step = first_step + row % steps;
@@ -149,14 +156,6 @@ impl Chunks<'_> {
     }
 }
 
-impl Iterator for Chunks<'_> {
-    type Item = Chunk;
-
-    fn next(&mut self) -> Option<Chunk> {
-        Some(self.next_of(self.next.steps))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -169,8 +168,8 @@ mod tests {
             frames: (0..STEPS * STREAMS).flat_map(place).collect(),
             steps: vec![(1, 0.5, End::Running); STEPS * STREAMS],
         };
-        let mut chunks = recording.chunks(3, (2, 3), BufferPool::new(1));
-        let (first, second) = (chunks.next().unwrap(), chunks.next().unwrap());
+        let mut chunks = recording.chunks(3, ChunkShape::new(2, 3), BufferPool::new(1));
+        let (first, second) = (chunks.next_chunk(), chunks.next_chunk());
         assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);
         assert_eq!(second.frames(), [3, 0, 4, 0, 5, 0, 3, 1, 4, 1, 5, 1]);
         let numbers = [first, second].map(|it| (it.header.sequence, it.header.first_transition));

@@ -26,9 +26,6 @@ pub(super) const CAPACITY: u64 = 20_000;
 pub(super) const AGENT: &str = "driml-ada";
 
 /// A run's settings: world, agent and preset, and single settings over them.
-///
-/// # Errors
-/// Settings that cannot work.
 pub(super) fn of_run(
     world: &str,
     agent: &str,

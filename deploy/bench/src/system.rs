@@ -1,94 +1,290 @@
-//! A short run of `driml local` with its real processes, watched from outside as any client could.
-//! It changes nothing about the run, and says nothing about how well it learns.
+//! Whole runs of `driml local` with their real processes, watched from outside as any client could: one to its end, or more and
+//! more actors, each number for some seconds. It changes nothing about a run but its end, and does not judge how well it learns.
 
-use std::time::Duration;
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
 
-use anyhow::bail;
-use driml_launch::console;
+use anyhow::{bail, ensure};
+use driml_launch::{
+    console,
+    endpoint::NAMESPACE,
+    managed_process::ManagedProcess,
+    run_folder::{RunFolder, Summary},
+    status_client::Statuses,
+};
+use driml_machine::units::number;
+use driml_protocol::{Keys, LearnerStatus, ReplayStatus, session};
+use tempfile::TempDir;
 
 use crate::{
-    flags::BenchSystemArgs,
-    launched::{Launched, Moment},
-    measurements::Measurement,
-    settings,
+    flags::{BenchFlags, BenchScaleArgs, BenchSystemArgs},
+    report::{Measurement, aligned},
+    settings::{self, AGENT, WORLD},
+    subprocess::{connect, reach, start},
 };
 
 /// Frames of the run, and of a quick one.
 const FRAMES: (u64, u64) = (12_000, 2_500);
 /// Updates before the first that counts: by then all threads run and all memory is taken.
 const WARMUP_UPDATES: u64 = 10;
-/// How often the run is looked at.
+/// How often a run is looked at.
 const POLL: Duration = Duration::from_millis(100);
-const AGENT: &str = "driml-ada";
+/// How long what is waited for may take, a run's end too.
+const WAIT_MAX: Duration = Duration::from_secs(300);
+/// Exit code of a run that was interrupted.
+const INTERRUPTED: i32 = 130;
+/// Actor processes that are measured.
+const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
+/// Replay ratios, and how far either side may run ahead at each, in transitions: at the first the actors wait for the learner, at
+/// the second they are what limits.
+const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 
-/// Updates and frames a second, the share of time in which the learner computes, and the highest memory of each process.
-///
-/// # Errors
-/// A run that failed, or was over before it could be looked at.
-pub(super) fn measure(args: &BenchSystemArgs) -> anyhow::Result<Vec<Measurement>> {
+/// Updates and frames a second of a run, the share of time in which the learner computes, and the highest memory of each process.
+pub(super) fn measure(
+    args: &BenchSystemArgs,
+    flags: &BenchFlags,
+) -> anyhow::Result<Vec<Measurement>> {
     procgen_sys::Engine::install(&mut console::line)?;
-    let config = settings::of_run(settings::WORLD, AGENT, "paper", &[])?;
-    let frames = args.frames.unwrap_or(match args.flags.quick {
+    let frames = args.frames.unwrap_or(match flags.quick {
         true => FRAMES.1,
         false => FRAMES.0,
     });
-    let (frames, threads) = (
-        frames.to_string(),
-        format!("local.learner_threads={}", args.flags.threads),
-    );
-    let flags = [
-        "--env",
-        settings::WORLD,
-        "--agent",
-        AGENT,
-        "--frames",
-        &frames,
-        "--set",
-        &threads,
-    ];
-    let mut run = Launched::start(&flags, &config)?;
-    let [first, last] = watch(&mut run)?;
-    let summary = run.finish()?;
-
-    let seconds = (last.at - first.at).as_secs_f64();
-    let rate = |first: u64, last: u64| (last - first) as f64 / seconds;
-    let computing = last.learner.computing_s - first.learner.computing_s;
-    let waiting = last.learner.waiting_s - first.learner.waiting_s;
-    let updates = rate(first.learner.updates, last.learner.updates);
-    let stored = |moment: &Moment| moment.replay.transitions_inserted;
+    let threads = format!("local.learner_threads={}", flags.threads);
+    let mut run = Run::start(&["--frames", &frames.to_string()], &[&threads])?;
+    let [first, last] = run.watch_to_end()?;
+    let watched = Watched {
+        all_act_after_s: 0.0,
+        first,
+        last,
+        summary: run.finish(0)?,
+    };
+    let [before, after] = [&watched.first.learner, &watched.last.learner];
+    let computing = after.computing_s - before.computing_s;
+    let waiting = after.waiting_s - before.waiting_s;
+    let share = 100.0 * computing / (computing + waiting);
+    let computes = "share of its time in which the learner computes";
     let mut figures = vec![
-        Measurement::found("updates", updates, "updates/s"),
-        Measurement::found("frames", rate(stored(&first), stored(&last)), "frames/s"),
-        Measurement::found(
-            "share of its time in which the learner computes",
-            100.0 * computing / (computing + waiting),
-            "%",
-        ),
+        Measurement::found("updates", watched.rate(Moment::updates), "updates/s"),
+        Measurement::found("frames", watched.rate(Moment::frames), "frames/s"),
+        Measurement::found(computes, share, "%"),
     ];
-    figures.extend(summary.rss_mib_max.iter().filter_map(|(process, mib)| {
+    for (process, mib) in &watched.summary.rss_mib_max {
         let what = format!("memory of {process}");
-        Some(Measurement::found(what, mib.as_f64()?, "MiB"))
-    }));
+        figures.extend(mib.as_f64().map(|mib| Measurement::found(what, mib, "MiB")));
+    }
     Ok(figures)
 }
 
-/// The first moment after the learner's warm-up, and the last one at which both sides were still at work.
-fn watch(run: &mut Launched) -> anyhow::Result<[Moment; 2]> {
-    let (mut first, mut last) = (None, None);
-    // The run ends by itself; then it can no longer be looked at.
-    while let Ok(moment) = run.look() {
-        std::thread::sleep(POLL);
-        let Some(moment) = moment else { continue };
-        if moment.replay.finished || moment.learner.finished {
-            break;
-        }
-        if moment.learner.updates >= WARMUP_UPDATES {
-            last = Some(moment);
-            first = first.or_else(|| last.take());
+/// Runs at both ratios with more and more actors, as figures and as a table.
+pub(super) fn scale(
+    args: &BenchScaleArgs,
+    flags: &BenchFlags,
+) -> anyhow::Result<(Vec<Measurement>, String)> {
+    procgen_sys::Engine::install(&mut console::line)?;
+    let actors = match (args.actors.as_slice(), flags.quick) {
+        ([], true) => &ACTORS[..2],
+        ([], false) => &ACTORS,
+        (asked, _) => asked,
+    };
+    let seconds = args.seconds.unwrap_or(if flags.quick { 2 } else { 5 });
+    let (mut figures, mut rows) = (Vec::new(), Vec::new());
+    for (ratio, slack) in RATIOS {
+        for &actors in actors {
+            let mut heads = ["ratio", "actors"].map(String::from).to_vec();
+            let mut row = vec![ratio.to_string(), actors.to_string()];
+            for (column, value) in Watched::new(actors, ratio, slack, seconds)?.columns() {
+                row.push(value.map_or("-".into(), number));
+                let what = format!("ratio {ratio}, {actors} actors: {column}");
+                figures.extend(value.map(|value| Measurement::found(what, value, &column)));
+                heads.push(column);
+            }
+            if rows.is_empty() {
+                rows.push(heads);
+            }
+            rows.push(row);
         }
     }
-    match (first, last) {
-        (Some(first), Some(last)) => Ok([first, last]),
-        _ => bail!("the run was over within {WARMUP_UPDATES} updates: give it more --frames"),
+    let columns: Vec<_> = (0..rows[0].len()).collect();
+    Ok((figures, aligned(&rows, &columns)))
+}
+
+/// What was seen of a run.
+struct Watched {
+    /// From the launcher's start to the last actor's first frame.
+    all_act_after_s: f64,
+    first: Moment,
+    last: Moment,
+    summary: Summary,
+}
+
+impl Watched {
+    /// A run with so many actors, from its start until it has been watched for `seconds`.
+    fn new(actors: u32, ratio: f64, slack: u64, seconds: u32) -> anyhow::Result<Self> {
+        let ratio = format!("replay.replay_ratio={ratio}");
+        let slack = format!("replay.slack_transitions={slack}");
+        let sets = [
+            &*ratio,
+            &*slack,
+            "replay.capacity_transitions=20000",
+            "replay.transitions_max=1000000000000",
+        ];
+        let started = Instant::now();
+        let mut run = Run::start(&["--actors", &actors.to_string()], &sets)?;
+        let acting = run.wait_until(|now| now.replay.actors_acting >= actors)?;
+        let first = run.wait_until(|now| now.learner.updates > 2)?;
+        let until = first.at + Duration::from_secs(seconds.into());
+        thread::sleep(until.saturating_duration_since(Instant::now()));
+        let last = run.wait_until(|_| true)?;
+        run.launcher.ask_to_stop();
+        Ok(Self {
+            all_act_after_s: (acting.at - started).as_secs_f64(),
+            first,
+            last,
+            summary: run.finish(INTERRUPTED)?,
+        })
+    }
+
+    /// A row of the table of actors.
+    fn columns(&self) -> Vec<(String, Option<f64>)> {
+        let mut columns = vec![
+            ("frames/s".to_owned(), Some(self.rate(Moment::frames))),
+            ("updates/s".to_owned(), Some(self.rate(Moment::updates))),
+            ("all act after s".to_owned(), Some(self.all_act_after_s)),
+        ];
+        let replay = &self.last.replay;
+        for (name, unit, quantiles) in [
+            ("answer", "ms", replay.answer_ms),
+            ("insert", "ms", replay.insert_ms),
+            ("weights behind", "s", replay.weights_behind_s),
+            ("weights behind", "updates", replay.weights_behind_updates),
+        ] {
+            columns.push((format!("{name} p50 {unit}"), quantiles.map(|it| it.p50)));
+            columns.push((format!("{name} p99 {unit}"), quantiles.map(|it| it.p99)));
+        }
+        let memory = self.summary.rss_mib_max.values();
+        let memory = memory.filter_map(|mib| mib.as_f64()).sum();
+        columns.push(("MiB of all".to_owned(), Some(memory)));
+        let (retried, lost) = (self.summary.chunks_retried, self.summary.transitions_lost);
+        columns.push(("retried".to_owned(), Some(retried as f64)));
+        columns.push(("lost".to_owned(), Some(lost as f64)));
+        columns
+    }
+
+    /// What `count` counts, a second.
+    fn rate(&self, count: fn(&Moment) -> u64) -> f64 {
+        let seconds = (self.last.at - self.first.at).as_secs_f64();
+        (count(&self.last) - count(&self.first)) as f64 / seconds
+    }
+}
+
+/// What the processes report, and when.
+#[derive(Clone)]
+struct Moment {
+    at: Instant,
+    replay: ReplayStatus,
+    learner: LearnerStatus,
+}
+
+impl Moment {
+    fn frames(&self) -> u64 {
+        self.replay.transitions_inserted
+    }
+
+    fn updates(&self) -> u64 {
+        self.learner.updates
+    }
+}
+
+/// A run of bigfish with driml-ada, which ends when this is dropped.
+struct Run {
+    launcher: ManagedProcess,
+    statuses: Statuses,
+    folder: TempDir,
+}
+
+impl Run {
+    /// Starts `driml local` with these flags and settings, and waits until it listens.
+    fn start(flags: &[&str], sets: &[&str]) -> anyhow::Result<Self> {
+        let config = settings::of_run(WORLD, AGENT, "paper", sets)?;
+        let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
+        let endpoint = format!("unixsock-stream/{}", folder.path().join("s").display());
+        let run_dir = folder.path().join("run").display().to_string();
+        let listen = ["local", "--listen", &endpoint, "--run-dir", &run_dir];
+        let args = [&listen[..], flags].concat();
+        let mut launcher = start("launcher", &args, sets, folder.path())?;
+        let endpoints = connect(&endpoint);
+        let session = reach(&mut launcher, || session::open(&endpoints))?;
+        let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
+        Ok(Self {
+            statuses: Statuses::new(vec![session], keys, config.run.hash()),
+            launcher,
+            folder,
+        })
+    }
+
+    /// What the processes report now; none while they do not answer, as they start after the replay server and end before it.
+    fn look(&mut self) -> anyhow::Result<Option<Moment>> {
+        if self.launcher.end().is_some() {
+            bail!("{}", self.launcher.exit_report());
+        }
+        let answers = self.statuses.ask_replay();
+        if answers.and_then(|()| self.statuses.ask_learner()).is_err() {
+            return Ok(None);
+        }
+        Ok(Some(Moment {
+            at: Instant::now(),
+            replay: self.statuses.replay.clone(),
+            learner: self.statuses.learner.clone(),
+        }))
+    }
+
+    /// The first moment that is as `wanted`.
+    fn wait_until(&mut self, wanted: impl Fn(&Moment) -> bool) -> anyhow::Result<Moment> {
+        let started = Instant::now();
+        loop {
+            if let Some(moment) = self.look()?.filter(&wanted) {
+                return Ok(moment);
+            }
+            ensure!(
+                started.elapsed() < WAIT_MAX,
+                "the run has not come as far as is to be measured within {} s",
+                WAIT_MAX.as_secs()
+            );
+            thread::sleep(POLL / 2);
+        }
+    }
+
+    /// The first moment after the learner's warm-up, and the last one at which both sides were still at work.
+    fn watch_to_end(&mut self) -> anyhow::Result<[Moment; 2]> {
+        let (mut first, mut last) = (None, None);
+        // The run ends by itself; then it can no longer be looked at.
+        while let Ok(moment) = self.look() {
+            thread::sleep(POLL);
+            let Some(moment) = moment else { continue };
+            if moment.replay.finished || moment.learner.finished {
+                break;
+            }
+            if moment.learner.updates >= WARMUP_UPDATES {
+                last = Some(moment);
+                first = first.or_else(|| last.take());
+            }
+        }
+        match (first, last) {
+            (Some(first), Some(last)) => Ok([first, last]),
+            _ => bail!("the run was over within {WARMUP_UPDATES} updates: give it more --frames"),
+        }
+    }
+
+    /// Waits for the run's end, with this exit code, and gives its summary.
+    fn finish(mut self, code: i32) -> anyhow::Result<Summary> {
+        self.statuses.close();
+        let end = self
+            .launcher
+            .wait_until(Instant::now() + WAIT_MAX, || false);
+        let code_of_end = end.and_then(|end| end.code());
+        ensure!(code_of_end == Some(code), "{}", self.launcher.exit_report());
+        Summary::read(&RunFolder::new(self.folder.path().join("run")))
     }
 }

@@ -43,9 +43,12 @@ pub struct Surroundings<'a> {
     pub meeting: Option<&'a Meeting>,
 }
 
+/// The variable that says how many threads a process has for arithmetic.
+pub const THREADS: &str = "RAYON_NUM_THREADS";
+
 /// Gives a process `threads` threads for arithmetic. Everything else that it needs of its environment it has from this one.
 pub fn set_thread_env(command: &mut Command, threads: u32) {
-    command.env("RAYON_NUM_THREADS", threads.to_string());
+    command.env(THREADS, threads.to_string());
 }
 
 /// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks

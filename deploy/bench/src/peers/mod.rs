@@ -1,27 +1,29 @@
 //! `driml bench peers`: ours and theirs in turn, round after round, and the ratio of each pair beside its goal.
-//! What is compared with what is in `pairs`; a goal that is missed is shown and is no error.
+//! What is compared with what is in `pairs`; a goal that is missed is shown and is not an error.
 
 mod pairs;
 mod script;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fs,
+};
 
 use anyhow::Context;
+use clap::ValueEnum;
 use driml_launch::console;
-use driml_learner::DeviceName;
+use driml_machine::{resources::MachineNote, units::number};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    alone,
     effort::median,
-    flags::{BenchPeersArgs, Component},
-    measurements::{self, MachineNote, Measurement},
+    flags::{BenchFlags, BenchPeersArgs, Component},
     peers::{
-        pairs::{PAIRS, Pair, Theirs},
-        script::{Absent, Script},
+        pairs::{Pair, Theirs, pairs},
+        script::Script,
     },
     recording::Recording,
-    table,
+    report::{self, Measurement, Samples, aligned},
 };
 
 /// The load above which something else is running, which slows the two sides unequally.
@@ -29,15 +31,11 @@ const LOAD_MAX: f64 = 0.5;
 /// Rounds, and those of a quick comparison.
 const ROUNDS: (u32, u32) = (5, 1);
 
-/// What one side found in every round, by what was measured.
-type Samples = BTreeMap<String, Vec<f64>>;
-
 /// A component's figures, and its peer's or why there are none.
 #[derive(Debug, Default)]
 struct Sides {
     ours: Samples,
     theirs: Samples,
-    units: BTreeMap<String, String>,
     peer: String,
     absent: Option<String>,
 }
@@ -76,111 +74,97 @@ struct Comparison {
     rows: Vec<Row>,
 }
 
-/// Measures, and reports.
-///
-/// # Errors
-/// A component of ours that failed, or a file that cannot be written. A peer that is missing or fails is reported as skipped.
-pub(super) fn run(args: &BenchPeersArgs) -> anyhow::Result<()> {
-    let rounds = args.rounds.unwrap_or(match args.flags.quick {
+/// Measures, and reports. A peer that is missing or fails is reported as skipped.
+pub(super) fn run(
+    args: &BenchPeersArgs,
+    flags: &BenchFlags,
+    machine: MachineNote,
+) -> anyhow::Result<()> {
+    let rounds = args.rounds.unwrap_or(match flags.quick {
         true => ROUNDS.1,
         false => ROUNDS.0,
     });
     let components: BTreeSet<_> = match args.only.as_slice() {
-        [] => PAIRS.iter().map(|pair| pair.component).collect(),
+        [] => Component::value_variants().iter().copied().collect(),
         only => only.iter().copied().collect(),
     };
-    let machine = MachineNote::this();
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
-    script::write_all(folder.path())?;
+    for (name, text) in script::FILES {
+        fs::write(folder.path().join(name), text).with_context(|| format!("writing {name}"))?;
+    }
     let frames = folder.path().join("frames");
     if components.contains(&Component::Replay) {
         Recording::play()?.write_frames(&frames)?;
     }
     let mut sides = BTreeMap::new();
-    for &component in &components {
-        let script = Script::new(component, args, folder.path(), &frames);
+    for component in components {
+        let script = Script::new(component, args, flags, &frames);
         let mut found = Sides {
-            peer: script.peer().name().to_owned(),
+            peer: script.peer.to_owned(),
             ..Sides::default()
         };
-        if let Err(absent) = script.check() {
-            found.skip(absent);
+        if let Err(why) = script.check() {
+            found.skip(why);
         }
         sides.insert(component, (script, found));
     }
     for round in 1..=rounds {
         for (component, (script, sides)) in &mut sides {
-            console::line(&format!(
-                "round {round} of {rounds}: {} of ours",
-                component.name()
-            ));
-            sides.add_ours(alone::figures(
-                *component,
-                &[],
-                &args.flags,
-                DeviceName::Cpu,
-            )?);
+            let name = component.name();
+            console::line(&format!("round {round} of {rounds}: {name} of ours"));
+            sides.ours.add(script::ours(*component, flags)?);
             if sides.absent.is_none() {
                 console::line(&format!("round {round} of {rounds}: {}", sides.peer));
-                match script.run() {
+                match script.run(folder.path()) {
                     Ok((peer, figures)) => sides.add_theirs(peer, figures),
-                    Err(absent) => sides.skip(absent),
+                    Err(why) => sides.skip(format!("{why:#}")),
                 }
             }
         }
     }
-    let precisions = args.flags.precisions(DeviceName::Cpu);
-    let is_measured =
-        |pair: &&Pair| sides.contains_key(&pair.component) && pair.is_asked(&precisions);
-    let rows = PAIRS.iter().filter(is_measured).map(|pair| {
-        let (_, sides) = &sides[&pair.component];
-        row(pair, sides).with_context(|| format!("comparing {:?}", pair.ours))
+    let rows = pairs().into_iter().filter_map(|pair| {
+        let (_, sides) = sides.get(&pair.component)?;
+        row(&pair, sides)
     });
     let comparison = Comparison {
         rounds,
-        quick: args.flags.quick,
-        threads: args.flags.threads,
+        quick: flags.quick,
+        threads: flags.threads,
         machine,
-        rows: rows.collect::<anyhow::Result<_>>()?,
+        rows: rows.collect(),
     };
-    measurements::publish(
-        &comparison,
-        &describe(&comparison),
-        args.flags.json.as_deref(),
-    )
+    let table = describe(&comparison);
+    report::publish(&comparison, &table, flags.json.as_deref())
 }
 
 impl Sides {
-    fn add_ours(&mut self, figures: Vec<Measurement>) {
-        for Measurement { what, value, unit } in figures {
-            self.units.insert(what.clone(), unit);
-            self.ours.entry(what).or_default().push(value);
-        }
-    }
-
     fn add_theirs(&mut self, peer: String, figures: BTreeMap<String, f64>) {
         self.peer = peer;
-        for (what, value) in figures {
-            self.theirs.entry(what).or_default().push(value);
-        }
+        self.theirs
+            .add(figures.into_iter().map(|(what, value)| Measurement {
+                what,
+                value,
+                unit: String::new(),
+            }));
     }
 
-    /// Goes on without the peer.
-    fn skip(&mut self, Absent(why): Absent) {
+    /// Measures on without the peer.
+    fn skip(&mut self, why: String) {
         console::line(&format!("skipped: {why}"));
         self.absent = Some(why);
     }
 }
 
-/// Medians and ratio of one pair; none if ours was not measured.
+/// Medians and ratio of one pair; none if ours was not measured, as in a precision that was not asked for.
 fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
-    let ours = sides.ours.get(pair.ours)?;
-    let (peer, theirs) = match pair.theirs {
-        Theirs::Peers(what) if what == pair.ours => (sides.peer.clone(), sides.theirs.get(what)),
-        Theirs::Peers(what) => (format!("{}: {what}", sides.peer), sides.theirs.get(what)),
-        Theirs::Ours(what, name) => (name.to_owned(), sides.ours.get(what)),
+    let (ours, unit) = sides.ours.of(&pair.ours)?;
+    let (peer, theirs) = match &pair.theirs {
+        Theirs::Peers(what) if *what == pair.ours => (sides.peer.clone(), sides.theirs.of(what)),
+        Theirs::Peers(what) => (format!("{}: {what}", sides.peer), sides.theirs.of(what)),
+        Theirs::Ours(what, name) => ((*name).to_owned(), sides.ours.of(what)),
     };
-    let rounds = ours.iter().zip(theirs.into_iter().flatten());
+    let theirs = theirs.map(|(values, _)| values);
+    let rounds = ours.iter().zip(theirs.unwrap_or_default());
     let ratios: Vec<_> = rounds.map(|(ours, theirs)| ours / theirs).collect();
     let absent = || match &sides.absent {
         Some(why) => why.clone(),
@@ -188,10 +172,10 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     };
     Some(Row {
         component: pair.component.name().into(),
-        what: pair.ours.into(),
-        unit: sides.units.get(pair.ours)?.clone(),
+        what: pair.ours.clone(),
+        unit: unit.into(),
         ours: median(ours),
-        theirs: theirs.map(|theirs| median(theirs)),
+        theirs: theirs.map(median),
         ratio: theirs.map(|_| median(&ratios)),
         ratios,
         goal: pair.goal,
@@ -202,14 +186,11 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
 
 /// The table, and below it why rows were skipped.
 fn describe(comparison: &Comparison) -> String {
-    let mut cells = vec![
-        ["what", "ours", "theirs", "", "", "ratio", "goal", ""]
-            .map(String::from)
-            .to_vec(),
-    ];
+    let heads = ["what", "ours", "theirs", "", "", "ratio", "goal", ""];
+    let mut cells = vec![heads.map(String::from).to_vec()];
     let mut skipped = BTreeSet::new();
     for row in &comparison.rows {
-        let number = |value: Option<f64>| value.map_or("-".into(), table::number);
+        let number = |value: Option<f64>| value.map_or("-".into(), number);
         let verdict = match (row.ratio, row.goal) {
             (None, _) => "skipped",
             (_, None) => "",
@@ -228,22 +209,22 @@ fn describe(comparison: &Comparison) -> String {
         ]);
         skipped.extend(row.skipped.iter().map(|why| format!("skipped: {why}\n")));
     }
-    let Comparison {
-        rounds,
-        threads,
-        machine,
-        ..
-    } = comparison;
-    let mut text = table::aligned(&cells, &[1, 2, 5, 6]);
+    let mut text = aligned(&cells, &[1, 2, 5, 6]);
     text.extend(skipped);
+    let (rounds, threads) = (comparison.rounds, comparison.threads);
+    let MachineNote {
+        processor,
+        cores,
+        load,
+        ..
+    } = &comparison.machine;
     text.push_str(&format!(
-        "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {}, {} cores.\n",
-        machine.processor, machine.cores
+        "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {processor}, {cores} cores.\n"
     ));
-    if machine.load > LOAD_MAX {
+    if *load > LOAD_MAX {
         text.push_str(&format!(
             "The machine was not idle before: {} tasks wanted a core. These are no figures to go by.\n",
-            table::number(machine.load)
+            number(*load)
         ));
     }
     if comparison.quick {

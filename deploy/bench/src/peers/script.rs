@@ -1,4 +1,4 @@
-//! Runs the peers: Python scripts that do the same work and print one line of JSON.
+//! Both sides of a comparison as processes: this program's bench, and Python scripts that do the same work.
 //! It installs nothing, and says what is missing.
 
 use std::{
@@ -7,13 +7,16 @@ use std::{
     process::{Command, Stdio},
 };
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use serde::Deserialize;
 
-use crate::flags::{BenchPeersArgs, Component};
+use crate::{
+    flags::{BenchFlags, BenchPeersArgs, Component},
+    report::{Measurement, Report},
+};
 
 /// The scripts, which this program carries, so that it can be started anywhere.
-const FILES: [(&str, &str); 6] = [
+pub(super) const FILES: [(&str, &str); 6] = [
     ("measure.py", include_str!("../../peers/measure.py")),
     (
         "torch_network.py",
@@ -34,60 +37,16 @@ const FILES: [(&str, &str); 6] = [
     ("gym3_steps.py", include_str!("../../peers/gym3_steps.py")),
 ];
 
-/// Puts the scripts into a folder.
-///
-/// # Errors
-/// A file that cannot be written.
-pub(super) fn write_all(folder: &Path) -> anyhow::Result<()> {
-    for (name, text) in FILES {
-        std::fs::write(folder.join(name), text).with_context(|| format!("writing {name}"))?;
-    }
-    Ok(())
-}
-
-/// The scripts' texts.
-#[cfg(test)]
-pub(super) fn texts() -> [&'static str; 6] {
-    FILES.map(|(_, text)| text)
-}
-
-/// What others use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Peer {
-    Torch,
-    Reverb,
-    Gym3,
-}
-
-impl Peer {
-    /// Its name in tables and messages.
-    pub(super) const fn name(self) -> &'static str {
-        match self {
-            Self::Torch => "PyTorch",
-            Self::Reverb => "Reverb",
-            Self::Gym3 => "gym3",
-        }
-    }
-
-    /// The modules that it takes, the file that lists their packages, and the flag that names its interpreter.
-    const fn needs(self) -> (&'static str, &'static str, &'static str) {
-        match self {
-            Self::Torch => ("torch", "requirements-torch.txt", "--torch-python"),
-            Self::Reverb => ("reverb", "requirements-reverb.txt", "--reverb-python"),
-            Self::Gym3 => ("procgen", "requirements-gym3.txt", "--gym3-python"),
-        }
-    }
-}
-
-/// Why a peer has no figures, as the table says it.
-#[derive(Debug)]
-pub(super) struct Absent(pub(super) String);
-
-/// One peer's script and how it is called.
+/// A component's peer: its script and how it is called.
 pub(super) struct Script {
-    peer: Peer,
+    /// The peer's name in tables and messages.
+    pub(super) peer: &'static str,
+    /// The Python module that it takes.
+    module: &'static str,
+    /// Its name in that of its requirements and of the flag for its interpreter.
+    short: &'static str,
     python: PathBuf,
-    path: PathBuf,
+    file: &'static str,
     args: Vec<String>,
 }
 
@@ -102,79 +61,94 @@ struct Answer {
 }
 
 impl Script {
-    /// The script that does a component's work, in `folder`; `frames` is the file that Reverb's frames come from.
+    /// The script that does a component's work; `frames` is the file that Reverb's frames come from.
     pub(super) fn new(
         component: Component,
         args: &BenchPeersArgs,
-        folder: &Path,
+        flags: &BenchFlags,
         frames: &Path,
     ) -> Self {
-        let (peer, name, own) = match component {
-            Component::Learner => (Peer::Torch, "torch_update.py", &args.torch_python),
-            Component::Policy => (Peer::Torch, "torch_policy.py", &args.torch_python),
-            Component::Replay => (Peer::Reverb, "reverb_replay.py", &args.reverb_python),
-            Component::Env => (Peer::Gym3, "gym3_steps.py", &args.gym3_python),
+        let (peer, module, file) = match component {
+            Component::Learner => ("PyTorch", "torch", "torch_update.py"),
+            Component::Policy => ("PyTorch", "torch", "torch_policy.py"),
+            Component::Replay => ("Reverb", "reverb", "reverb_replay.py"),
+            Component::Env => ("gym3", "procgen", "gym3_steps.py"),
         };
-        let mut words = vec!["--threads".to_owned(), args.flags.threads.to_string()];
-        words.extend(args.flags.quick.then(|| "--quick".to_owned()));
+        let (short, own) = match component {
+            Component::Learner | Component::Policy => ("torch", &args.torch_python),
+            Component::Replay => ("reverb", &args.reverb_python),
+            Component::Env => ("gym3", &args.gym3_python),
+        };
+        let mut words = vec!["--threads".to_owned(), flags.threads.to_string()];
+        words.extend(flags.quick.then(|| "--quick".to_owned()));
         if component == Component::Replay {
             words.extend(["--frames".to_owned(), frames.display().to_string()]);
         }
         Self {
             peer,
+            module,
+            short,
             python: own.as_ref().unwrap_or(&args.python).clone(),
-            path: folder.join(name),
+            file,
             args: words,
         }
     }
 
-    /// Whose script it is.
-    pub(super) const fn peer(&self) -> Peer {
-        self.peer
-    }
-
-    /// Whether the interpreter is there and finds the peer's module.
-    pub(super) fn check(&self) -> Result<(), Absent> {
-        let (module, requirements, flag) = self.peer.needs();
+    /// Whether the interpreter is there and finds the peer's module; else why there are no figures, as the table says it.
+    pub(super) fn check(&self) -> Result<(), String> {
         let find =
             "import importlib.util, sys; sys.exit(importlib.util.find_spec(sys.argv[1]) is None)";
         let found = Command::new(&self.python)
-            .args(["-c", find, module])
+            .args(["-c", find, self.module])
             .stdin(Stdio::null())
             .stderr(Stdio::null())
             .status();
-        let (python, name) = (self.python.display(), self.peer.name());
+        let (python, peer, short) = (self.python.display(), self.peer, self.short);
         match found {
             Ok(status) if status.success() => Ok(()),
-            Ok(_) => Err(Absent(format!(
-                "{python} has no {name}: {python} -m pip install -r deploy/bench/peers/{requirements}, or name one that has it with {flag}"
-            ))),
-            Err(e) => Err(Absent(format!(
-                "{python} cannot be started ({e}): name a Python that has {name} with {flag}"
-            ))),
+            Ok(_) => Err(format!(
+                "{python} has no {peer}: {python} -m pip install -r deploy/bench/peers/requirements-{short}.txt, or name one that has it with --{short}-python"
+            )),
+            Err(e) => Err(format!(
+                "{python} cannot be started ({e}): name a Python that has {peer} with --{short}-python"
+            )),
         }
     }
 
-    /// Runs the script and gives its peer's name with version, and its figures. Its progress goes to stderr.
-    pub(super) fn run(&self) -> Result<(String, BTreeMap<String, f64>), Absent> {
-        let name = self.peer.name();
-        let output = Command::new(&self.python)
-            .arg(&self.path)
-            .args(&self.args)
-            .stdin(Stdio::null())
-            .stderr(Stdio::inherit())
-            .output()
-            .map_err(|e| Absent(format!("the script of {name} could not be started: {e}")))?;
-        if !output.status.success() {
-            let how = output.status;
-            return Err(Absent(format!(
-                "the script of {name} failed ({how}); what it said is above"
-            )));
-        }
-        let text = String::from_utf8_lossy(&output.stdout);
+    /// Runs the script in `folder` and gives its peer's name with version, and its figures. Its progress goes to stderr.
+    pub(super) fn run(&self, folder: &Path) -> anyhow::Result<(String, BTreeMap<String, f64>)> {
+        let mut command = Command::new(&self.python);
+        command.arg(folder.join(self.file)).args(&self.args);
+        let text = output(command, &format!("the script of {}", self.peer))?;
         let line = text.lines().last().unwrap_or_default();
-        let answer: Answer = serde_json::from_str(line)
-            .map_err(|e| Absent(format!("the script of {name} printed {line:?}: {e}")))?;
-        Ok((answer.peer, answer.figures))
+        match serde_json::from_str::<Answer>(line) {
+            Ok(answer) => Ok((answer.peer, answer.figures)),
+            Err(e) => bail!("the script of {} printed {line:?}: {e}", self.peer),
+        }
     }
+}
+
+/// Runs this program for a component's figures. Its progress goes to stderr.
+pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
+    let program = std::env::current_exe().context("finding this program's own file")?;
+    let mut command = Command::new(program);
+    command.args(["bench", component.name(), "--json", "-"]);
+    command.args(["--threads", &flags.threads.to_string()]);
+    command.args(flags.quick.then_some("--quick"));
+    for precision in &flags.precision {
+        command.args(["--precision", precision.name()]);
+    }
+    let text = output(command, &format!("the bench of the {}", component.name()))?;
+    let report: Report = serde_json::from_str(&text).context("reading a bench's figures")?;
+    Ok(report.figures)
+}
+
+/// What a process writes to stdout.
+fn output(mut command: Command, what: &str) -> anyhow::Result<String> {
+    command.stdin(Stdio::null()).stderr(Stdio::inherit());
+    let output = command.output();
+    let output = output.with_context(|| format!("{what} could not be started"))?;
+    let how = output.status;
+    ensure!(how.success(), "{what} failed ({how}); its output is above");
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }

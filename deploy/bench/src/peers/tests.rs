@@ -1,24 +1,28 @@
 //! The comparison's arithmetic and its table, without any measurement.
 
-use driml_learner::Precision;
 use expect_test::expect;
 
 use super::*;
 
-fn figure(what: &str, value: f64) -> Measurement {
-    Measurement::found(what, value, "updates/s")
-}
-
-fn samples(of: &[(&str, &[f64])]) -> Samples {
-    of.iter()
-        .map(|(what, values)| (what.to_string(), values.to_vec()))
-        .collect()
+fn sides(ours: &[(&str, &[f64])]) -> Sides {
+    let mut sides = Sides {
+        peer: "PyTorch".into(),
+        ..Sides::default()
+    };
+    for (what, values) in ours {
+        for value in *values {
+            sides
+                .ours
+                .add([Measurement::found(*what, *value, "updates/s")]);
+        }
+    }
+    sides
 }
 
 fn pair(theirs: Theirs, goal: Option<f64>) -> Pair {
     Pair {
         component: Component::Learner,
-        ours: "C51",
+        ours: "C51".into(),
         theirs,
         goal,
     }
@@ -26,34 +30,24 @@ fn pair(theirs: Theirs, goal: Option<f64>) -> Pair {
 
 #[test]
 fn a_ratio_is_the_median_of_the_rounds_ratios() {
-    let mut sides = Sides {
-        ours: samples(&[("C51", &[6.0, 4.0, 9.0]), ("stock", &[0.5, 0.5, 0.5])]),
-        ..Sides::default()
-    };
-    sides.units.insert("C51".into(), "updates/s".into());
+    let mut sides = sides(&[("C51", &[6.0, 4.0, 9.0]), ("stock", &[0.5, 0.5, 0.5])]);
     for value in [3.0, 4.0, 3.0] {
         sides.add_theirs("PyTorch 9".into(), [("C51".into(), value)].into());
     }
-    let found = row(&pair(Theirs::Peers("C51"), Some(1.5)), &sides).unwrap();
+    let found = row(&pair(Theirs::Peers("C51".into()), Some(1.5)), &sides).unwrap();
     assert_eq!(
         (found.ours, found.theirs, found.ratio),
         (6.0, Some(3.0), Some(2.0))
     );
     assert_eq!((found.peer.as_str(), found.skipped), ("PyTorch 9", None));
-    let found = row(&pair(Theirs::Ours("stock", "stock"), None), &sides).unwrap();
-    assert_eq!((found.ratio, found.peer.as_str()), (Some(12.0), "stock"));
+    let found = row(&pair(Theirs::Ours("stock".into(), "candle"), None), &sides).unwrap();
+    assert_eq!((found.ratio, found.peer.as_str()), (Some(12.0), "candle"));
 }
 
 #[test]
 fn a_peer_that_is_missing_is_shown_as_skipped() {
-    let mut sides = Sides {
-        peer: "PyTorch".into(),
-        absent: Some("python3 has no PyTorch".into()),
-        ..Sides::default()
-    };
-    sides.add_ours(vec![figure("C51", 6.0)]);
-    let rows = vec![row(&pair(Theirs::Peers("C51"), Some(1.5)), &sides).unwrap()];
-    assert_eq!((rows[0].ratio, rows[0].theirs), (None, None));
+    let mut sides = sides(&[("C51", &[6.0])]);
+    sides.skip("python3 has no PyTorch".into());
     let comparison = Comparison {
         rounds: 1,
         quick: true,
@@ -64,7 +58,7 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
             load: 6.6,
             gpu: None,
         },
-        rows,
+        rows: vec![row(&pair(Theirs::Peers("C51".into()), Some(1.5)), &sides).unwrap()],
     };
     expect![[r#"
         what  ours  theirs                      ratio  goal
@@ -76,42 +70,22 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
     "#]]
     .assert_eq(&describe(&comparison));
     let text = serde_json::to_string(&comparison).unwrap();
-    assert_eq!(
-        serde_json::from_str::<Comparison>(&text).unwrap(),
-        comparison
-    );
+    let read: Comparison = serde_json::from_str(&text).unwrap();
+    assert_eq!(read, comparison);
 }
 
 #[test]
 fn every_peer_s_figure_is_named_in_its_script() {
-    for Pair {
-        component, theirs, ..
-    } in PAIRS
-    {
-        let Theirs::Peers(name) = theirs else {
+    for pair in pairs() {
+        let Theirs::Peers(name) = pair.theirs else {
             continue;
         };
         // Names that a script puts together are checked by running it; the precision is one it appends.
-        let name = name.strip_suffix(", bf16").unwrap_or(name);
-        if matches!(component, Component::Learner | Component::Replay) {
+        let name = name.strip_suffix(", bf16").unwrap_or(&name);
+        if matches!(pair.component, Component::Learner | Component::Replay) {
             let quoted = format!("\"{name}\"");
-            let scripts = script::texts();
-            assert!(scripts.iter().any(|text| text.contains(&quoted)), "{name}");
+            let named = |(_, text): &(_, &str)| text.contains(&quoted);
+            assert!(script::FILES.iter().any(named), "{name}");
         }
     }
-}
-
-#[test]
-fn rows_of_a_precision_that_was_not_asked_for_are_left_out() {
-    let asked = |precisions: &[Precision]| {
-        let learners = PAIRS.iter().filter(|it| it.component == Component::Learner);
-        let asked = learners.filter(|pair| pair.is_asked(precisions));
-        asked.map(|pair| pair.ours).collect::<Vec<_>>()
-    };
-    let (f32, bf16) = (asked(&[Precision::F32]), asked(&[Precision::Bf16]));
-    assert!(bf16.iter().all(|name| name.ends_with(", bf16")));
-    assert!(!f32.iter().any(|name| name.contains("bf16")));
-    let all = asked(&[Precision::F32, Precision::Bf16]);
-    assert_eq!(f32.len() + bf16.len(), all.len());
-    assert!(!f32.is_empty() && !bf16.is_empty());
 }

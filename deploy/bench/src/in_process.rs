@@ -1,0 +1,186 @@
+//! Batches drawn and put together inside the replay server, without wire and codec.
+//! It starts no process.
+
+use std::hint::black_box;
+
+use anyhow::{anyhow, ensure};
+use driml_protocol::{
+    ActorJoin, Batch, BufferPool, Chunk, ChunkHeader, End, InsertReply, Sampling,
+};
+use driml_replay_server::Replay;
+use driml_settings::config::RunConfig;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{
+    effort::{Effort, Work},
+    recording::{CHUNKS, INCARNATION, Recording},
+    report::Measurement,
+    settings::{self, AGENT, CAPACITY},
+};
+
+/// The names of [`assembling`]'s figures.
+pub(super) const ASSEMBLED: &str = "batch of 3 states, without a wire";
+pub(super) const COPIED: &str = "plain copy of a batch's bytes";
+
+/// Streams and steps of a chunk that holds no world's frames.
+const BLANK_CHUNK: (u32, u32) = (8, 128);
+/// Steps of its episodes.
+const EPISODE: u64 = 500;
+/// Side of its frames: so small that the draw is measured and not the copying of states.
+const SIDE: u32 = 8;
+/// Rainbow's alpha; beta is the learner's.
+const PRIORITISED: Sampling = Sampling::Prioritised {
+    alpha: 0.5,
+    beta_start: 0.4,
+    beta_end: 1.0,
+    beta_updates: 1,
+};
+
+/// Batches of recorded frames a second, and as many bytes merely copied.
+pub(super) fn assembling(
+    recording: &Recording,
+    effort: &Effort,
+) -> anyhow::Result<[Measurement; 2]> {
+    let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
+    let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes());
+    let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
+    let mut filled = Filled::new(&config, CAPACITY, || chunks.next_chunk())?;
+    let sampling = effort.rate_by_median(|| {
+        black_box(filled.draw()?);
+        Ok(())
+    })?;
+    drop(filled);
+
+    let held = vec![1_u8; CAPACITY as usize * frame_bytes];
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let copying = effort.rate_by_median(|| {
+        let mut copy = Vec::with_capacity(3 * rows as usize * frame_bytes);
+        for _ in 0..3 * rows {
+            let from = rng.random_range(0..CAPACITY as usize) * frame_bytes;
+            copy.extend_from_slice(&held[from..from + frame_bytes]);
+        }
+        black_box(copy);
+        Ok(())
+    })?;
+    Ok([
+        Measurement::found(ASSEMBLED, sampling, "batches/s"),
+        Measurement::found(COPIED, copying, "batches/s"),
+    ])
+}
+
+/// Batches a second of a replay that holds `held` transitions: drawn uniformly, by priority, and by priorities that are then set,
+/// in turn.
+pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+    let filled = |sampling| {
+        let mut config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
+        (config.run.frame_height, config.run.frame_width) = (SIDE, SIDE);
+        config.run.frame_channels = 1;
+        config.replay.capacity_transitions = held;
+        config.replay.sampling = sampling;
+        let mut sequence = 0;
+        Filled::new(&config, held, || {
+            sequence += 1;
+            blank_chunk(sequence - 1)
+        })
+    };
+    let mut uniform = filled(Sampling::Uniform)?;
+    let mut prioritised = filled(PRIORITISED)?;
+    let mut learned_from = filled(PRIORITISED)?;
+    let rows = uniform.rows;
+    // Most transitions have a priority of their own, as after a while of learning.
+    for _ in 0..2 * held / u64::from(rows) {
+        prioritised.learn()?;
+        learned_from.learn()?;
+    }
+    let names = [
+        "drawn uniformly",
+        "drawn by priority",
+        "drawn by priority, and priorities set",
+    ];
+    let mut works: [Work<'_>; 3] = [
+        Box::new(|| uniform.draw().map(|batch| drop(black_box(batch)))),
+        Box::new(|| prioritised.draw().map(|batch| drop(black_box(batch)))),
+        Box::new(|| learned_from.learn()),
+    ];
+    let figures = names.into_iter().zip(effort.rates_in_turn(&mut works)?);
+    let name = |what| format!("{rows} rows of {held} transitions {what}");
+    Ok(figures
+        .map(|(what, rate)| Measurement::found(name(what), rate, "batches/s"))
+        .collect())
+}
+
+/// A chunk of black frames whose episodes have [`EPISODE`] steps.
+fn blank_chunk(sequence: u64) -> Chunk {
+    let (streams, steps) = BLANK_CHUNK;
+    let mut chunk = Chunk::zeroed(ChunkHeader {
+        actor: 0,
+        incarnation: INCARNATION,
+        sequence,
+        first_transition: sequence * u64::from(streams * steps),
+        weights_version: 0,
+        leaving: false,
+        streams,
+        steps,
+        frame_bytes: SIDE * SIDE,
+    });
+    for row in 0..streams * steps {
+        let step = sequence * u64::from(steps) + u64::from(row % steps);
+        let ends = (step + 1).is_multiple_of(EPISODE);
+        let end = if ends { End::Terminal } else { End::Running };
+        chunk.set(row as usize, 0, 0.0, end);
+    }
+    chunk
+}
+
+/// A replay that is full, and what its learner finds.
+struct Filled {
+    replay: Replay,
+    rows: u32,
+    updates: u64,
+    rng: ChaCha8Rng,
+}
+
+impl Filled {
+    /// A replay with the chunks of one actor, until it has stored more than `held` transitions.
+    fn new(
+        config: &RunConfig,
+        held: u64,
+        mut next_chunk: impl FnMut() -> Chunk,
+    ) -> anyhow::Result<Self> {
+        let rows = config.learner.batch_size;
+        let mut replay = Replay::new(&config.run, &config.replay, rows)?;
+        let join = ActorJoin {
+            actor: 0,
+            incarnation: INCARNATION,
+        };
+        replay.join_actor(join).map_err(anyhow::Error::msg)?;
+        while replay.inserted_total() <= held {
+            let reply = replay.insert(&next_chunk());
+            ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+        }
+        Ok(Self {
+            replay,
+            rows,
+            updates: 0,
+            rng: ChaCha8Rng::seed_from_u64(1),
+        })
+    }
+
+    fn draw(&mut self) -> anyhow::Result<Batch> {
+        let batch = self.replay.sample(self.rows);
+        batch.map_err(|why| anyhow!("no batch: {why:?}"))
+    }
+
+    /// Draws a batch and sets its rows' priorities.
+    fn learn(&mut self) -> anyhow::Result<()> {
+        let batch = self.draw()?;
+        let found: Vec<f32> = (0..self.rows).map(|_| self.rng.random()).collect();
+        self.updates += 1;
+        if let Some(update) = batch.priority_update(1, self.updates, &found) {
+            let set = self.replay.set_priorities(&update);
+            set.map_err(anyhow::Error::msg)?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,173 @@
+//! What a bench found, as a table and as JSON, and the machine that it was measured on.
+//! It measures nothing and compares nothing.
+
+use std::{fs, path::Path};
+
+use anyhow::Context;
+use driml_launch::console::{self, print};
+use driml_learner::Precision;
+use driml_machine::{resources::MachineNote, units::number};
+use serde::{Deserialize, Serialize};
+
+use crate::effort::median;
+
+/// One thing that was measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Measurement {
+    /// What, unique in its bench.
+    pub(super) what: String,
+    /// How much of the unit.
+    pub(super) value: f64,
+    /// The unit, such as `updates/s`.
+    pub(super) unit: String,
+}
+
+impl Measurement {
+    /// A figure, which is printed to stderr at once.
+    pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
+        let (what, unit) = (what.into(), unit.to_owned());
+        console::line(&format!("  {what}: {} {unit}", number(value)));
+        Self { what, value, unit }
+    }
+}
+
+/// What was found in every round, each figure with its values in the order of the rounds.
+#[derive(Debug, Default)]
+pub(super) struct Samples(Vec<(Measurement, Vec<f64>)>);
+
+impl Samples {
+    /// Adds the figures of a round.
+    pub(super) fn add(&mut self, figures: impl IntoIterator<Item = Measurement>) {
+        for figure in figures {
+            match self.0.iter_mut().find(|(it, _)| it.what == figure.what) {
+                Some((_, values)) => values.push(figure.value),
+                None => self.0.push((figure.clone(), vec![figure.value])),
+            }
+        }
+    }
+
+    /// A figure's values and its unit.
+    pub(super) fn of(&self, what: &str) -> Option<(&[f64], &str)> {
+        let (figure, values) = self.0.iter().find(|(it, _)| it.what == what)?;
+        Some((&values[..], figure.unit.as_str()))
+    }
+
+    /// Each figure's median.
+    pub(super) fn medians(self) -> Vec<Measurement> {
+        let of_rounds = self.0.into_iter();
+        of_rounds
+            .map(|(figure, values)| Measurement {
+                value: median(&values),
+                ..figure
+            })
+            .collect()
+    }
+}
+
+/// What is computed, and in which precision if it is not f32.
+pub(super) fn named(what: &str, precision: Precision) -> String {
+    match precision {
+        Precision::F32 => what.to_owned(),
+        other => format!("{what}, {other}"),
+    }
+}
+
+/// A bench's figures as JSON has them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Report {
+    /// The name of the bench that measured.
+    pub(super) bench: String,
+    /// Whether it took a few iterations only.
+    pub(super) quick: bool,
+    /// Threads for arithmetic.
+    pub(super) threads: u32,
+    /// Where, as it was before the first measurement.
+    pub(super) machine: MachineNote,
+    /// What was found.
+    pub(super) figures: Vec<Measurement>,
+}
+
+impl Report {
+    /// The figures as rows of three fields, which blanks part: value, unit, and all the rest of the line what was measured.
+    pub(super) fn rows(&self) -> String {
+        let row = |it: &Measurement| vec![number(it.value), it.unit.clone(), it.what.clone()];
+        aligned(&self.figures.iter().map(row).collect::<Vec<_>>(), &[0])
+    }
+}
+
+/// Prints `table` and writes `report` to `json`; to stdout, alone, if that is `-`.
+pub(super) fn publish(
+    report: &impl Serialize,
+    table: &str,
+    json: Option<&Path>,
+) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(report).context("writing the figures as JSON")?;
+    text.push('\n');
+    match json {
+        Some(path) if path == Path::new("-") => print(&text),
+        Some(path) => {
+            fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
+            print(table)
+        }
+        None => print(table),
+    }
+}
+
+/// Rows as lines whose columns are aligned: to the left, or to the right for the columns in `right`.
+pub(super) fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width_of = |column: usize| {
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+    };
+    let widths: Vec<_> = (0..columns).map(width_of).collect();
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().enumerate().map(|(column, cell)| {
+            let width = widths[column];
+            match right.contains(&column) {
+                true => format!("{cell:>width$}"),
+                false => format!("{cell:<width$}"),
+            }
+        });
+        let line = cells.collect::<Vec<_>>().join("  ");
+        format!("{}\n", line.trim_end())
+    };
+    rows.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use expect_test::expect;
+
+    use super::*;
+
+    #[test]
+    fn a_report_is_a_table_and_reads_back_as_it_was_written() {
+        let mut samples = Samples::default();
+        for value in [5.25, 1.0, 9.0] {
+            samples.add([Measurement::found("C51 + DIM", value, "updates/s")]);
+        }
+        samples.add([Measurement::found(
+            "32 rows: 1.20 GFLOP",
+            61_234.5,
+            "GFLOP/s",
+        )]);
+        let report = Report {
+            bench: "learner".into(),
+            quick: true,
+            threads: 2,
+            machine: MachineNote::this(None),
+            figures: samples.medians(),
+        };
+        expect![[r#"
+             5.25  updates/s  C51 + DIM
+            61234  GFLOP/s    32 rows: 1.20 GFLOP
+        "#]]
+        .assert_eq(&report.rows());
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("figures.json");
+        publish(&report, "", Some(&file)).unwrap();
+        let read: Report = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+        assert_eq!(read, report);
+    }
+}

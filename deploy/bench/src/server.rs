@@ -1,0 +1,250 @@
+//! A replay server in a process of its own, with real clients over the real wire.
+//! The clients are the actor's delivery and the learner's batch source, so what is measured is what runs in production.
+
+use std::{
+    hint::black_box,
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail, ensure};
+use driml_actor::{ActorSettings, Delivery, DeliveryLimits};
+use driml_launch::{endpoint::NAMESPACE, managed_process::ManagedProcess};
+use driml_learner::{
+    LearnerConfig,
+    remote::batch_source::{BatchSource, Counters, Next, Requests},
+};
+use driml_protocol::{
+    ActorJoin, Alive, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
+    session::{self, MESSAGE_BYTES_MAX},
+    tls::{Credentials, Role},
+};
+use zenoh::{Session, Wait, liveliness::LivelinessToken};
+
+use crate::{
+    effort::Effort,
+    recording::{ChunkShape, INCARNATION, Recording},
+    settings,
+    subprocess::{connect, reach, start},
+};
+
+/// The number of a bench's learner.
+const LEARNER: u64 = 1;
+/// How long a batch or an insert may take to come, and the server to end.
+const ANSWER_MAX: Duration = Duration::from_secs(30);
+
+/// The flag for certificates.
+pub(super) const TLS_DIR: &str = "--tls-dir";
+/// The flag for a replay on disk.
+pub(super) const REPLAY_DIR: &str = "--replay-dir";
+
+/// A server, and how clients reach it.
+#[derive(Clone, Debug)]
+pub(super) struct Wire {
+    /// Its name in figures.
+    pub(super) name: &'static str,
+    pub(super) endpoint: String,
+    pub(super) shared_memory: bool,
+    /// Transitions that the server holds.
+    pub(super) held: u64,
+    /// A folder that it has, and the flag for it: certificates of all roles, or a replay on disk.
+    pub(super) folder: Option<(&'static str, String)>,
+}
+
+/// A replay server and its clients.
+pub(super) struct Server {
+    process: ManagedProcess,
+    pub(super) wire: Wire,
+    keys: Keys,
+    /// The first may do anything where nothing is guarded, else only look; then each role has one of its own.
+    sessions: Vec<Session>,
+    actor: ActorSettings,
+    learner: LearnerConfig,
+    /// Actors so far; each delivery is another one.
+    actors: u32,
+}
+
+impl Server {
+    /// Starts a server with its log in `folder`, and waits until it answers.
+    pub(super) fn start(wire: &Wire, folder: &Path) -> anyhow::Result<Self> {
+        let shared_memory = format!("transport.shared_memory={}", wire.shared_memory);
+        let held = format!("replay.capacity_transitions={}", wire.held);
+        let sets = [&settings::REPLAY[..], &[&*shared_memory, &*held]].concat();
+        let mut args = vec!["replay-server", "--stay", "--listen", &wire.endpoint];
+        args.extend(
+            wire.folder
+                .iter()
+                .flat_map(|(flag, dir)| [*flag, dir.as_str()]),
+        );
+        let mut process = start("replay-server", &args, &sets, folder)?;
+        let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
+        let credentials = wire.credentials(Role::Observer)?;
+        let session = reach(&mut process, || {
+            let (endpoints, credentials) = (connect(&wire.endpoint), credentials.as_ref());
+            session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)
+        })?;
+        let hello = join::hello(&session, &keys, &Shutdown::default())?
+            .context("this client was not told to stop")?;
+        Ok(Self {
+            process,
+            wire: wire.clone(),
+            keys,
+            sessions: vec![session],
+            actor: ActorSettings::from_toml(&hello.config_toml)?,
+            learner: LearnerConfig::from_toml(&hello.config_toml)?,
+            actors: 0,
+        })
+    }
+
+    /// Delivers chunks until `is_enough` of what was sent and since when, and gives transitions stored a second, from the
+    /// first chunk's making to the last one's acknowledgement.
+    pub(super) fn deliver(
+        &mut self,
+        recording: &Recording,
+        shape: ChunkShape,
+        is_enough: impl Fn(u64, Instant) -> bool,
+    ) -> anyhow::Result<f64> {
+        self.actors += 1;
+        let (actor, pool) = (self.actors, self.actor.chunk_memory());
+        let client = self.client(Role::Actor(actor), self.actor.spec.hash())?;
+        let alive = join_as_actor(&client, actor)?;
+        let limits = DeliveryLimits::of(&self.actor.actor);
+        let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
+        let mut chunks = recording.chunks(actor, shape, pool);
+        let started = Instant::now();
+        while !is_enough(chunks.transitions(), started) {
+            if !delivery.send(chunks.next_chunk()) {
+                break;
+            }
+        }
+        let unwanted = delivery.finish()?;
+        drop(alive);
+        let seconds = started.elapsed().as_secs_f64();
+        ensure!(unwanted == 0, "{unwanted} transitions were not wanted");
+        Ok(chunks.transitions() as f64 / seconds)
+    }
+
+    /// Batches a second, each read as a learner would.
+    pub(super) fn fetch(&mut self, effort: &Effort) -> anyhow::Result<f64> {
+        let shutdown = Shutdown::default();
+        let client = self.client(Role::Learner, self.learner.spec.hash())?;
+        let LearnerConfig {
+            learner, transport, ..
+        } = &self.learner;
+        let _alive = join_as_learner(&client)?;
+        let requests = Requests {
+            learner: LEARNER,
+            rows: learner.batch_size,
+            in_flight: learner.batches_in_flight,
+            shared_memory: transport.shared_memory,
+            unreachable_max: ANSWER_MAX,
+        };
+        let clients = std::slice::from_ref(&client);
+        let mut source = BatchSource::start(clients, requests, &Counters::at_start(1), &shutdown)?;
+        let rate = effort.rate_overall(|| match source.next(ANSWER_MAX)? {
+            Next::Batch(served) => {
+                // One byte of each cache line, so that all of the states have come.
+                let batch = &served.batch;
+                let states = [batch.states_t(), batch.states_k(), batch.states_n()];
+                black_box(states.map(|plane| {
+                    plane
+                        .iter()
+                        .step_by(64)
+                        .map(|&byte| u64::from(byte))
+                        .sum::<u64>()
+                }));
+                Ok(())
+            }
+            Next::NotYet(waiting) => {
+                bail!("no batch came within {} s: {waiting}", ANSWER_MAX.as_secs())
+            }
+            Next::Finished => bail!("the replay server reports that the run is over"),
+        });
+        // A request that is on its way wants its answer before the session is closed.
+        shutdown.set();
+        while !matches!(source.next(ANSWER_MAX)?, Next::Finished) {}
+        rate
+    }
+
+    fn client(&mut self, role: Role, spec_hash: u64) -> anyhow::Result<RunClient> {
+        let session = match self.wire.credentials(role)? {
+            None => self.sessions[0].clone(),
+            own => {
+                let endpoints = connect(&self.wire.endpoint);
+                let session =
+                    session::open_as(&endpoints, &self.keys, own.as_ref(), MESSAGE_BYTES_MAX)?;
+                self.sessions.push(session.clone());
+                session
+            }
+        };
+        Ok(RunClient::new(session, self.keys.clone(), spec_hash))
+    }
+
+    /// Asks the server to end, and waits for it.
+    pub(super) fn end(mut self) {
+        self.close();
+        self.process.ask_to_stop();
+        self.process
+            .wait_until(Instant::now() + ANSWER_MAX, || false);
+    }
+
+    /// Ends the server at once, as when its process dies; another one can take its place.
+    pub(super) fn kill(mut self) -> Wire {
+        self.close();
+        self.process.kill();
+        self.process
+            .wait_until(Instant::now() + ANSWER_MAX, || false);
+        self.wire
+    }
+
+    fn close(&self) {
+        for session in &self.sessions {
+            if let Err(e) = session.close().wait() {
+                tracing::debug!("closing a session: {e}");
+            }
+        }
+    }
+}
+
+impl Wire {
+    /// What a role needs where the server is guarded.
+    fn credentials(&self, role: Role) -> anyhow::Result<Option<Credentials>> {
+        Ok(match &self.folder {
+            Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),
+            _ => None,
+        })
+    }
+}
+
+/// Joins as an actor, which counts as connected until the result is dropped.
+fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessToken> {
+    let alive = alive(client, Alive::actor(actor, INCARNATION))?;
+    let join = ActorJoin {
+        actor,
+        incarnation: INCARNATION,
+    };
+    join::as_actor(client, join, &Shutdown::default())?
+        .context("this client was not told to stop")?;
+    Ok(alive)
+}
+
+/// Joins as the learner, which has learned from nothing and counts as connected until the result is dropped.
+fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
+    let alive = alive(client, Alive::learner(LEARNER))?;
+    let join = LearnerJoin {
+        learner: LEARNER,
+        run: LEARNER,
+        updates: 0,
+        tally: Tally::default(),
+        other_shards: Tally::default(),
+        restart: false,
+    };
+    join::as_learner(client, join, &Shutdown::default())?
+        .context("this client was not told to stop")?;
+    Ok(alive)
+}
+
+fn alive(client: &RunClient, who: Alive) -> anyhow::Result<LivelinessToken> {
+    let token = client.declare_alive(who);
+    token.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))
+}

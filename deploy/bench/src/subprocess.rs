@@ -1,0 +1,76 @@
+//! This program as another process: a replay server, a whole run, or itself with other threads.
+//! What is asked of a process that runs is for `server` and `system`.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, bail};
+use driml_launch::{
+    console::Screen,
+    managed_process::{ManagedProcess, Surroundings, THREADS},
+};
+use driml_machine::process_env;
+use driml_protocol::session::{Endpoints, SessionError};
+use zenoh::Session;
+
+use crate::settings;
+
+/// How long a process may take to listen.
+const LISTEN_MAX: Duration = Duration::from_secs(60);
+
+/// Makes sure that this process has `threads` threads for arithmetic, as the launcher gives those of a run: with others it starts
+/// again in the same process, with the same arguments.
+pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
+    let threads = threads.to_string();
+    if std::env::var(THREADS).is_ok_and(|it| it == threads) {
+        return Ok(());
+    }
+    let again = process_env::start_again_with([(THREADS, threads.as_str())]);
+    again.context("starting this program again with other threads")
+}
+
+/// Starts this program with other arguments, for driml-ada on bigfish with the settings `sets`, and its log in `folder`. It ends
+/// when the result is dropped.
+pub(super) fn start(
+    name: &str,
+    args: &[&str],
+    sets: &[&str],
+    folder: &Path,
+) -> anyhow::Result<ManagedProcess> {
+    let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
+    let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
+    let args = [args, &run, &sets].concat();
+    let surroundings = Surroundings {
+        logs: folder,
+        screen: &Screen::plain(),
+        meeting: None,
+    };
+    let args: Vec<_> = args.into_iter().map(String::from).collect();
+    ManagedProcess::start(name, &args, 1, surroundings)
+}
+
+/// Where a client connects that does not listen.
+pub(super) fn connect(endpoint: &str) -> Endpoints {
+    Endpoints {
+        listen: Vec::new(),
+        connect: vec![endpoint.to_owned()],
+    }
+}
+
+/// A session to a process as soon as it listens.
+pub(super) fn reach(
+    process: &mut ManagedProcess,
+    open: impl Fn() -> Result<Session, SessionError>,
+) -> anyhow::Result<Session> {
+    let deadline = Instant::now() + LISTEN_MAX;
+    loop {
+        match open() {
+            Ok(session) => return Ok(session),
+            Err(e) if Instant::now() > deadline => return Err(e.into()),
+            Err(_) if process.end().is_some() => bail!("{}", process.exit_report()),
+            Err(e) => tracing::debug!("{} does not listen yet: {e}", process.name),
+        }
+    }
+}
