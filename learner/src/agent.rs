@@ -228,20 +228,17 @@ impl Agent {
         self.average.as_ref()
     }
 
-    /// The same agent with the averaged weights in its online network, to play with; none without an averaged network.
+    /// Puts the averaged weights, if there are any, into torso and head of the online network, to play with. Says whether there were.
     ///
     /// # Errors
     /// A tensor that cannot be copied on its device.
-    pub fn into_average(self) -> Result<Option<Self>, UpdateError> {
-        let Some(average) = &self.average else {
-            return Ok(None);
-        };
-        for (name, var) in average.iter() {
+    pub fn take_average(&mut self) -> Result<bool, UpdateError> {
+        for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online.get(name) {
                 online.set(var)?;
             }
         }
-        Ok(Some(self))
+        Ok(self.average.is_some())
     }
 
     /// What actors need, torso and head, as safetensors bytes.

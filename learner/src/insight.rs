@@ -2,17 +2,18 @@
 //! It learns nothing and chooses no action.
 
 use candle_core::Tensor;
-use driml_model::{Compute, Features, ModelConfig, Network};
+use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
 
 use crate::{
     agent::Agent,
     auxiliary::dim::{DIM, Dim, Vectors, dots_of},
     error::UpdateError,
     losses::c51::softmax,
+    settings::LearnerSettings,
     tensors::{flat, states},
 };
 
-/// An agent's online network, to be asked.
+/// A learned network, to be asked.
 #[derive(Debug)]
 pub struct Insight {
     model: ModelConfig,
@@ -38,11 +39,26 @@ impl Insight {
     /// # Errors
     /// Kernels that the device does not have.
     pub fn of(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
-        let settings = agent.settings();
-        let is_local = settings.objective.name() == DIM.name && settings.lambda.wanted()[0];
+        Self::new(agent.model(), agent.settings(), agent.online(), compute)
+    }
+
+    /// The network with these parameters, learned with these settings; without DIM's heads it compares no features.
+    ///
+    /// # Errors
+    /// As [`Insight::of`], and parameters that do not fit the model.
+    pub fn new(
+        model: &ModelConfig,
+        settings: &LearnerSettings,
+        parameters: &Parameters,
+        compute: Compute,
+    ) -> Result<Self, UpdateError> {
+        let is_local = settings.objective.name() == DIM.name
+            && settings.lambda.wanted()[0]
+            && model.dim.psi3
+            && model.dim.phi3;
         Ok(Self {
-            model: agent.model().clone(),
-            network: Network::with_kernels(agent.model(), agent.online(), compute.kernels)?,
+            model: model.clone(),
+            network: Network::with_kernels(model, parameters, compute.kernels)?,
             compute,
             local_dim: is_local.then(|| Dim::new(&settings.auxiliary_settings())),
         })
@@ -125,7 +141,7 @@ mod tests {
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
-    use crate::{Lambda, LearnerSettings};
+    use crate::Lambda;
 
     const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
         lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\

@@ -29,7 +29,7 @@ fn it_prints_the_agent_beside_a_random_policy() {
     assert_eq!(lines.len(), 3, "{lines:?}");
     assert_eq!(
         lines[0],
-        "chain as trained on, 7 episodes each, f32 weights after 540 updates played in f32, seed 2"
+        "chain as trained on, 7 episodes each, online f32 weights after 540 updates played in f32, seed 2"
     );
     for (line, policy) in lines[1..].iter().zip(["driml-fix", "random"]) {
         assert!(
@@ -106,6 +106,44 @@ fn it_plays_any_checkpoint_that_is_there() {
         .run("evaluate run --checkpoint 7")
         .expect_code(64)
         .expect_said("no checkpoint after 7 updates; it has those after");
+}
+
+/// A run with averaged weights in `run`.
+fn with_averages() -> TestSystem {
+    let system = system();
+    system
+        .run(&format!(
+            "local --lockstep --agent driml-fix {SHORT} --set learner.update.average_tau=0.01 --run-dir run"
+        ))
+        .expect_code(0);
+    system
+}
+
+#[test]
+fn it_plays_averaged_weights_where_a_run_has_them() {
+    let system = with_averages();
+    system
+        .run("evaluate run --keep --episodes 2")
+        .expect_code(0);
+    for (flags, weights) in [
+        ("", "averaged"),
+        ("--checkpoint newest", "averaged"),
+        ("--checkpoint best", "averaged"),
+        ("--weights average", "averaged"),
+        ("--weights online", "online"),
+    ] {
+        let ended = system.run(&format!("evaluate run --episodes 2 {flags}"));
+        let words = format!("{weights} f32 weights after 540 updates");
+        let said = ended.expect_code(0).stdout;
+        assert!(said.lines().next().unwrap().contains(&words), "{said}");
+        let ended = system.run(&format!("evaluate run --episodes 2 --json {flags}"));
+        let told: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
+        assert_eq!(told["averaged"], weights == "averaged");
+    }
+    system
+        .run("evaluate run --checkpoint average")
+        .expect_code(64)
+        .expect_said("leave it out");
 }
 
 /// Checkpoints of a run of processes, and of one in lockstep, are played as it goes on; the best is kept.

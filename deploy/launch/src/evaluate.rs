@@ -1,4 +1,4 @@
-//! Whole episodes with a run's newest checkpoint, and a random policy's beside them.
+//! Whole episodes with a run's weights, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
 use std::{
@@ -11,14 +11,14 @@ use clap::ValueEnum;
 use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Watch, episode_returns};
 use driml_envs::{CutFrames, FewerActions, WorldConfig};
 use driml_learner::{
-    Agent, Compute, UpdateError, checkpoint,
+    Compute, UpdateError, checkpoint,
     insight::{Insight, Seen},
 };
 use driml_machine::{
     error::{Usage, usage},
     whole_number,
 };
-use driml_model::{Enlarge, Precision, StoredAs};
+use driml_model::{Enlarge, Parameters, Precision, StoredAs};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -46,16 +46,25 @@ pub enum Levels {
 }
 
 /// Which checkpoint of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Which {
     /// The one with the most updates behind it.
+    #[default]
     Newest,
     /// The one after so many updates.
     After(u64),
     /// The one that earned most when checkpoints were played.
     Best,
-    /// The averaged weights of the newest one.
+}
+
+/// Which weights of a checkpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Weights {
+    /// The averaged ones where the run has them (learner.update.average_tau), else the online ones
+    #[default]
     Average,
+    /// Those of the last update
+    Online,
 }
 
 impl FromStr for Which {
@@ -65,13 +74,13 @@ impl FromStr for Which {
         match text {
             "best" => Ok(Self::Best),
             "newest" => Ok(Self::Newest),
-            "average" => Ok(Self::Average),
+            "average" => {
+                Err("averaged weights are played wherever a run has them: leave it out".into())
+            }
             _ => whole_number::within(1..=u64::MAX)(text)
                 .map(Self::After)
                 .map_err(|e| {
-                    format!(
-                        "{e}: give the updates of a checkpoint, \"best\", \"newest\" or \"average\""
-                    )
+                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
                 }),
         }
     }
@@ -86,72 +95,69 @@ pub enum Who {
     Random,
 }
 
-/// A run's newest weights and its world, ready to play.
+/// A run's weights and its world, ready to play.
 pub struct Player {
     /// The settings of the run that trained them.
     pub config: RunConfig,
     /// The network's parameters as it plays with them, a safetensors file.
-    weights: Vec<u8>,
-    agent: Agent,
+    pub(crate) weights: Vec<u8>,
+    /// The same as they were learned, with DIM's heads if they are known.
+    pub(crate) network: Parameters,
     /// Updates behind its weights.
     pub updates: u64,
+    /// They are an average over updates.
+    pub is_averaged: bool,
 }
 
 impl Player {
-    /// Reads the newest checkpoint of a run's folder.
+    /// Reads what a user wants to play of a run's folder: the averaged weights of the newest checkpoint if there are some, else its
+    /// online ones.
     ///
     /// # Errors
-    /// A folder that is no run's or has no checkpoint, a damaged checkpoint.
+    /// As [`Player::load_at`].
     pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::load_at(folder, Which::Newest)
+        Self::load_at(folder, Which::default(), Weights::default())
     }
 
     /// Reads one of the checkpoints in a run's folder.
     ///
     /// # Errors
     /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
-    pub fn load_at(folder: &RunFolder, which: Which) -> anyhow::Result<Self> {
-        let config = config_of(folder)?;
-        let player = Self::read(config, &checkpoint_at(folder, which)?)?;
-        match which {
-            Which::Average => player.averaged(folder),
-            _ => Ok(player),
-        }
+    pub fn load_at(folder: &RunFolder, which: Which, weights: Weights) -> anyhow::Result<Self> {
+        Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
     }
 
-    /// Its weights as the learner published them: an actor of the run plays no others.
-    pub(crate) fn read(config: RunConfig, checkpoint: &Path) -> anyhow::Result<Self> {
-        let restored = checkpoint::load(
+    /// Its weights as the learner publishes such.
+    pub(crate) fn read(
+        config: RunConfig,
+        checkpoint: &Path,
+        weights: Weights,
+    ) -> anyhow::Result<Self> {
+        let mut agent = checkpoint::load(
             checkpoint,
             &config.model,
             &config.learner.update,
             &Compute::CPU,
             config.run.hash(),
-        )?;
-        let weights = restored.agent.weights_as(config.learner.publish_as)?;
-        let updates = restored.agent.updates();
+        )?
+        .agent;
+        let is_averaged = weights == Weights::Average && agent.take_average()?;
         Ok(Self {
+            weights: agent.weights_as(config.learner.publish_as)?,
+            network: agent.online().clone(),
+            updates: agent.updates(),
+            is_averaged,
             config,
-            weights,
-            updates,
-            agent: restored.agent,
         })
     }
 
-    /// The same with the averaged weights of its checkpoint.
-    fn averaged(self, folder: &RunFolder) -> anyhow::Result<Self> {
-        let agent = self.agent.into_average()?.ok_or_else(|| {
-            usage!(
-                "the checkpoints in {} have no averaged weights: train with --set learner.update.average_tau=0.001, or leave out \
-                 --checkpoint average",
-                folder.display()
-            )
-        })?;
-        Ok(Self {
-            weights: agent.weights_as(self.config.learner.publish_as)?,
-            agent,
-            ..self
-        })
+    /// What its weights are: "averaged" or "online".
+    pub const fn weights_name(&self) -> &'static str {
+        if self.is_averaged {
+            "averaged"
+        } else {
+            "online"
+        }
     }
 
     /// The same with f32 weights and arithmetic, whatever the actors of the run have.
@@ -159,7 +165,7 @@ impl Player {
     /// # Errors
     /// A weight that is not finite.
     pub fn exact(mut self) -> anyhow::Result<Self> {
-        self.weights = self.agent.weights()?;
+        self.weights = self.network.without_dim()?.to_safetensors(|_| true)?;
         self.config.learner.publish_as = StoredAs::F32;
         self.config.actor.precision = Precision::F32;
         Ok(self)
@@ -230,8 +236,17 @@ impl Player {
     /// # Errors
     /// Settings that do not fit each other.
     pub fn viewer(&self) -> anyhow::Result<Viewer> {
+        let mut model = self.config.model.clone();
+        if self.network.len() < model.parameter_shapes().len() {
+            model = model.without_dim();
+        }
         Ok(Viewer {
-            insight: Insight::of(&self.agent, Compute::cpu(self.config.actor.precision))?,
+            insight: Insight::new(
+                &model,
+                &self.config.learner.update,
+                &self.network,
+                Compute::cpu(self.config.actor.precision),
+            )?,
             enlarge: self.enlarge()?,
             enlarged: Vec::new(),
         })
@@ -303,7 +318,7 @@ pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
 /// The folder of a checkpoint.
 pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
     let updates = match which {
-        Which::Newest | Which::Average => None,
+        Which::Newest => None,
         Which::After(updates) => Some(updates),
         Which::Best => {
             let mut best = checkpoint::list(&folder.best())?;

@@ -637,8 +637,9 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     let restored = load(&settings);
     assert_eq!(values(restored.average().unwrap()), average);
     assert_eq!(values(restored.online()), values(run.agent.online()));
-    let played = restored.into_average().unwrap().unwrap();
+    let mut played = restored;
+    assert!(played.take_average().unwrap());
     assert_eq!(values(played.online()), average);
     settings.average_tau = None;
-    assert!(load(&settings).into_average().unwrap().is_none());
+    assert!(!load(&settings).take_average().unwrap());
 }

@@ -1,4 +1,4 @@
-//! `driml evaluate`: whole episodes with a run's newest checkpoint, and a random policy's beside them; a film of them on request.
+//! `driml evaluate`: whole episodes with a run's weights, and a random policy's beside them; a film of them on request.
 
 mod progress;
 mod recording;
@@ -13,7 +13,7 @@ use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
     console::print,
-    evaluate::{Levels, Player, Which, Who, levels, mean_and_deviation},
+    evaluate::{Levels, Player, Weights, Which, Who, levels, mean_and_deviation},
     keep::{Judged, keep},
     run_folder::{RunFolder, sweep},
 };
@@ -42,12 +42,14 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
-    /// Play the checkpoint after so many updates, the "best" of those that were played and kept, or the "average": the newest
-    /// one's averaged weights (learner.update.average_tau)
-    #[arg(long, value_name = "UPDATES", default_value = "newest")]
-    pub(crate) checkpoint: Which,
+    /// Play the checkpoint after so many updates, or the "best" of those that were played and kept [default: newest]
+    #[arg(long, value_name = "UPDATES")]
+    pub(crate) checkpoint: Option<Which>,
+    /// Which of the checkpoint's weights to play [default: average]
+    #[arg(long, value_enum)]
+    pub(crate) weights: Option<Weights>,
     /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
-    #[arg(long, conflicts_with_all = ["levels", "seed", "exact", "returns", "json", "record"])]
+    #[arg(long, conflicts_with_all = ["levels", "seed", "weights", "exact", "returns", "json", "record"])]
     pub(crate) keep: bool,
     /// Play with f32 weights and arithmetic, also where the run's actors played with bf16 or f16
     #[arg(long)]
@@ -76,16 +78,17 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
     let folder = RunFolder::new(folder);
+    let which = args.checkpoint.unwrap_or_default();
     if args.keep {
         end_when_asked(folder.clone(), args.exit_with_parent)?;
-        let judged = keep(&folder, args.checkpoint, args.episodes)?;
+        let judged = keep(&folder, which, args.episodes)?;
         return print(&format!(
             "{}{}\n",
             judged.earned.describe(),
             verdict(&judged)
         ));
     }
-    let mut player = Player::load_at(&folder, args.checkpoint)?;
+    let mut player = Player::load_at(&folder, which, args.weights.unwrap_or_default())?;
     if args.exact {
         player = player.exact()?;
     }
@@ -95,16 +98,17 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let world = levels(&player.config.world, args.levels)?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
-    let which = match args.levels {
+    let on = match args.levels {
         Levels::Train => "as trained on",
         Levels::TrainSingle => "on the levels trained on, one an episode",
         Levels::Unseen => "on unseen levels",
     };
     let said = |text: &str| if args.json { Ok(()) } else { print(text) };
     said(&format!(
-        "{} {which}, {} episodes each, {} weights after {} updates played in {}, seed {}\n",
+        "{} {on}, {} episodes each, {} {} weights after {} updates played in {}, seed {}\n",
         spec.world,
         args.episodes,
+        player.weights_name(),
         player.config.learner.publish_as,
         player.updates,
         player.config.actor.precision,

@@ -82,6 +82,7 @@ pub(super) fn json(
         "agent": spec.agent,
         "updates": player.updates,
         "weights": player.config.learner.publish_as,
+        "averaged": player.is_averaged,
         "arithmetic": player.config.actor.precision,
         "levels": levels.map(|it| it.get_name().to_owned()),
         "seed": seed,
