@@ -1,6 +1,8 @@
 //! How well a policy plays: whole episodes, undiscounted returns.
 //! It stores and sends nothing.
 
+use std::ops::ControlFlow;
+
 use driml_envs::{Environment, StepEnd};
 use rand_chacha::ChaCha8Rng;
 
@@ -23,10 +25,11 @@ pub struct Evaluation {
     pub steps_max: u64,
 }
 
-/// Is shown every step and the returns so far, and changes nothing.
-pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]);
+/// Is shown every step and the returns so far; says whether to play on.
+pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
 
-/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone.
+/// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone. They are fewer
+/// where `watch` breaks.
 ///
 /// Each copy contributes the same number of episodes (the last round's surplus is dropped by copy order), so that short
 /// episodes are not favoured by being over first.
@@ -67,7 +70,9 @@ pub fn episode_returns(
                 running[copy] = 0.0;
             }
         }
-        watch(&step, &returns);
+        if watch(&step, &returns).is_break() {
+            return Ok(returns);
+        }
     }
     if returns.len() < episodes {
         return Err(ActError::EndlessEpisodes {
@@ -163,6 +168,7 @@ mod tests {
         let returns = episode_returns(world, &mut policy, evaluation, rng, &mut |_, returns| {
             seen += 1;
             shown = returns.to_vec();
+            ControlFlow::Continue(())
         });
         assert_eq!(seen, policy.0.len(), "every step is shown");
         assert!(returns.as_ref().is_ok_and(|it| *it == shown) || returns.is_err());
@@ -196,6 +202,27 @@ mod tests {
         assert_eq!(play(&[SHORT, LONG], 3, 100).unwrap(), [1.0, 1.0, 100.0]);
         assert_eq!(play(&[LONG, SHORT], 3, 100).unwrap(), [1.0, 100.0, 100.0]);
         assert_eq!(play(&[SHORT, LONG], 1, 100).unwrap(), [1.0]);
+    }
+
+    #[test]
+    fn a_watch_that_breaks_ends_the_play() {
+        let world = Box::new(Scripted {
+            scripts: vec![SHORT.to_vec()],
+            step: 0,
+        });
+        let evaluation = Evaluation {
+            frame_stack: 1,
+            epsilon: 0.0,
+            episodes: 9,
+            steps_max: 100,
+        };
+        let rng = ChaCha8Rng::seed_from_u64(1);
+        let watch = &mut |_: &Step<'_>, returns: &[f64]| match returns.len() {
+            3 => ControlFlow::Break(()),
+            _ => ControlFlow::Continue(()),
+        };
+        let returns = episode_returns(world, &mut Tape::default(), evaluation, rng, watch);
+        assert_eq!(returns.unwrap(), [1.0; 3]);
     }
 
     #[test]

@@ -52,7 +52,7 @@ def main():
         for seed in range(1, given.seeds + 1):
             run = given.out / f"trial{trial.number}-seed{seed}"
             world = ["--env", given.env, "--agent", given.agent, "--frames", given.frames]
-            output_of([given.driml, "local", *world, "--seed", str(seed), "--run-dir", str(run), *sets])
+            output_of([given.driml, "local", "--no-play", *world, "--seed", str(seed), "--run-dir", str(run), *sets])
             told = json.loads(output_of([given.driml, "evaluate", str(run), "--episodes", "50", "--json"]))
             returns.append(told["policies"][given.agent]["mean_return"])
         return sum(returns) / len(returns)

@@ -146,6 +146,31 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
         .expect_said("leave it out");
 }
 
+#[test]
+fn a_finished_run_says_what_its_weights_earn() {
+    let system = system();
+    for (flags, is_played) in [("--set local.play=true", true), ("--no-play", false)] {
+        let name = if is_played { "played" } else { "left-out" };
+        let ended = system
+            .run(&format!(
+                "local --agent c51 {SHORT} {flags} --run-dir {name}"
+            ))
+            .expect_code(0);
+        let line = "Greedy return (online weights): ";
+        assert_eq!(ended.stdout.contains(line), is_played, "{}", ended.stdout);
+        let text = fs::read_to_string(system.path(name).join("summary.json")).unwrap();
+        let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let played = &summary["played"];
+        assert_eq!(played.is_object(), is_played);
+        if is_played {
+            let number = |name: &str| played[name].as_f64().unwrap();
+            assert!(number("low") <= number("mean") && number("mean") <= number("high"));
+            let episodes = played["episodes"].as_u64().unwrap();
+            assert!((20..=100).contains(&episodes), "{episodes}");
+        }
+    }
+}
+
 /// Checkpoints of a run of processes, and of one in lockstep, are played as it goes on; the best is kept.
 #[test]
 fn it_plays_checkpoints_while_the_run_goes_on() {

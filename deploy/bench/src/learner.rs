@@ -1,10 +1,8 @@
-//! Updates of the learner: at the paper's sizes, as sizes grow, and on batches that worlds give.
+//! Updates of the learner: at the paper's sizes, and as sizes grow.
 //! Nothing but the update is timed; batches of sizes are made up.
 
-use driml_envs::WorldName;
-use driml_launch::inspect::Inspection;
 use driml_learner::{
-    Agent, Batch, Compute, DeviceName, Kernels, Learner, LearnerConfig, Precision,
+    Agent, Batch, Compute, DeviceName, Kernels, Precision,
     cost::{UpdateCost, UpdateShape},
 };
 use driml_settings::config::RunConfig;
@@ -66,22 +64,6 @@ const SIZES: [(&str, &[&str]); 13] = [
     ("vectors of 256", &["model.rkhs=256"]),
     ("vectors of 1024", &["model.rkhs=1024"]),
 ];
-/// A replay of 20,000 frames that random actions gave, as `driml inspect --worlds --play` has it.
-const PLAYED_SETS: [&str; 4] = [
-    "replay.transitions_max=21000",
-    "replay.warmup_transitions=20000",
-    "actor.epsilon_start=1",
-    "actor.epsilon_end=1",
-];
-/// Batches that updates take in turn.
-const PLAYED_BATCHES: usize = 4;
-/// What is measured on played batches: its name, whether frames are whole, and what is done with equal states.
-const PLAYED: [(&str, bool, &str); 3] = [
-    ("whole frames, each state", true, EQUAL_STATES[0].0),
-    ("each state", false, EQUAL_STATES[0].0),
-    ("equal states once", false, EQUAL_STATES[1].0),
-];
-
 /// Updates a second on a device, in each precision; on the CPU also with candle's own operations.
 pub(super) fn measure(
     args: &BenchLearnerArgs,
@@ -97,10 +79,9 @@ pub(super) fn measure(
             compute: device.open(precision)?,
             figures,
         };
-        match (args.growth, &args.played[..]) {
-            (true, _) => bench.growth()?,
-            (_, []) => bench.paper(device == DeviceName::Cpu)?,
-            (_, worlds) => worlds.iter().try_for_each(|world| bench.played(world))?,
+        match args.growth {
+            true => bench.growth()?,
+            false => bench.paper(device == DeviceName::Cpu)?,
         }
         figures = bench.figures;
     }
@@ -167,33 +148,6 @@ impl Bench<'_> {
             );
             self.found(&name, rate, "updates/s");
             self.found(&format!("{name}, arithmetic"), rate * gflop, "GFLOP/s");
-        }
-        Ok(())
-    }
-
-    /// Updates of `driml-ada` on batches that random play gave in a world, with what a scene does not need left out and without.
-    /// The weights are not trained: an agent that has learned sees other states.
-    fn played(&mut self, world: &WorldName) -> anyhow::Result<()> {
-        let mut works: Vec<Work<'_>> = Vec::new();
-        for (_, whole, set) in PLAYED {
-            let sets = [&PLAYED_SETS[..], &[set]].concat();
-            let mut config = settings::of_run(&world.to_string(), AGENT, "paper", &sets)?;
-            if whole {
-                config = config.with_whole_frames()?;
-            }
-            config.world.install(&mut |_: &str| {})?;
-            let (batches, mut calls) = (Inspection::batches(&config, PLAYED_BATCHES)?, 0);
-            let config = LearnerConfig::from_toml(&config.to_toml())?;
-            let mut learner = Learner::new(config, &self.compute)?;
-            works.push(Box::new(move || {
-                calls += 1;
-                learner.update(&batches[calls % PLAYED_BATCHES])?;
-                Ok(())
-            }));
-        }
-        let rates = self.effort.rates_in_turn(&mut works)?;
-        for ((name, ..), rate) in PLAYED.into_iter().zip(rates) {
-            self.found(&format!("{world}: {name}"), rate, "updates/s");
         }
         Ok(())
     }

@@ -224,7 +224,9 @@ impl Queue {
         self.runs.write_call(&plan)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
-        command.arg("local").args(exit_with_this_process());
+        command
+            .args(["local", "--no-play"])
+            .args(exit_with_this_process());
         if resumed {
             command.arg("--resume").arg(&folder);
         } else {

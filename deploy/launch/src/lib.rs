@@ -29,6 +29,7 @@ mod evaluator;
 pub mod inspect;
 pub mod interrupts;
 pub mod keep;
+mod last_play;
 pub mod launcher;
 pub mod live_view;
 pub mod lockstep;

@@ -33,6 +33,9 @@ pub struct LocalConfig {
     /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tensorboard: bool,
+    /// Whether the weights of a finished run are played, beside a random policy; in lockstep never.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub play: bool,
     /// When checkpoints are played while the run goes on; none if they are not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation: Option<EvaluationConfig>,

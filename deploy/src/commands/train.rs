@@ -68,6 +68,9 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every", allow_negative_numbers = true,
           value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) evaluate_episodes: u32,
+    /// Do not play the weights of the finished run beside a random policy, which takes about 30 s at most
+    #[arg(long)]
+    pub(crate) no_play: bool,
     /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
@@ -101,6 +104,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     if args.tensorboard {
         args.run.over.sets.push("local.tensorboard=true".into());
+    }
+    if args.no_play {
+        args.run.over.sets.push("local.play=false".into());
     }
     if let Some(every) = args.evaluate_every {
         let (sets, episodes) = (&mut args.run.over.sets, args.evaluate_episodes);

@@ -24,6 +24,7 @@ use crate::{
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
+    last_play,
     live_view::{Display, TEMPLATE, recovery, silence},
     meeting::Meeting,
     open_files,
@@ -141,7 +142,7 @@ pub fn run(
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
-    let (summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
+    let (mut summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
     // An interrupted or failed run does not wait for it.
     if let Some(mut evaluator) = launch.evaluator.take()
         && outcome == Outcome::Finished
@@ -178,6 +179,9 @@ pub fn run(
         resume::say_how(&config.world, run_dir);
         Err(Interrupted.into())
     } else {
+        last_play::play(&mut summary, config, run_dir, &|| {
+            launch.interrupts.count() > 0
+        });
         print(&summary.next_steps(run_dir))
     }
 }

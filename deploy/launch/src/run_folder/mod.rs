@@ -20,7 +20,7 @@ pub use self::{
     metrics::{Progress, progress},
     recorder::{Recorded, RunRecorder},
     resume_point::ResumePoint,
-    summary::{Outcome, Summary},
+    summary::{Earned, LastPlay, Outcome, Summary},
 };
 pub(crate) use self::{
     evaluations::Candidate,

@@ -4,6 +4,7 @@ use driml_protocol::{EndedEpisode, Horizon, Played, Returns, RunSpec, TimeoutRul
 use expect_test::expect;
 
 use super::*;
+use crate::run_folder::{Earned, LastPlay};
 
 fn spec() -> RunSpec {
     RunSpec {
@@ -279,17 +280,29 @@ fn next_steps_stand_in_columns() {
         transitions_inserted: 1_280,
         ..ReplayStatus::default()
     };
-    // `expect!` takes the indent away.
+    let played = LastPlay {
+        weights: "averaged".into(),
+        episodes: 100,
+        agent: Earned {
+            mean: 45.123,
+            low: 41.8,
+            high: 48.4,
+        },
+        random: Earned {
+            mean: 3.9,
+            low: 3.1,
+            high: 4.7,
+        },
+    };
+    let mut summary = summary(&replay);
+    summary.played = Some(played);
     expect![[r#"
+        Greedy return (averaged weights): 45.12, 95% interval 41.80 to 48.40, 100 episodes; a random policy earns 3.90 (3.10 to 4.70).
+          driml evaluate runs/x --record play.gif     films it, and plays a random policy beside it
           driml plot runs/x --out plot.png            return, losses, k and speed
-          driml evaluate runs/x                       beside a random policy
           driml train --resume runs/x --frames 2560   trains on
     "#]]
-    .assert_eq(
-        &summary(&replay)
-            .next_steps(&RunFolder::new("runs/x"))
-            .replace("  driml", "driml"),
-    );
+    .assert_eq(&summary.next_steps(&RunFolder::new("runs/x")));
 }
 
 #[test]

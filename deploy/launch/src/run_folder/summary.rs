@@ -22,6 +22,49 @@ pub enum Outcome {
     Failed,
 }
 
+/// The mean undiscounted return of whole episodes, and the 95% interval in which it lies.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Earned {
+    /// The mean.
+    pub mean: f64,
+    /// Where the interval begins.
+    pub low: f64,
+    /// Where it ends.
+    pub high: f64,
+}
+
+/// What a finished run's weights earned, and a random policy over as many episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LastPlay {
+    /// Which weights: "averaged" or "online".
+    pub weights: String,
+    /// Episodes of each.
+    pub episodes: u64,
+    /// What the weights earned.
+    #[serde(flatten)]
+    pub agent: Earned,
+    /// What the random policy did.
+    pub random: Earned,
+}
+
+impl LastPlay {
+    /// A line about it.
+    fn describe(&self) -> String {
+        let Self { agent, random, .. } = self;
+        format!(
+            "Greedy return ({} weights): {:.2}, 95% interval {:.2} to {:.2}, {} episodes; a random policy earns {:.2} ({:.2} to {:.2}).\n",
+            self.weights,
+            agent.mean,
+            agent.low,
+            agent.high,
+            self.episodes,
+            random.mean,
+            random.low,
+            random.high
+        )
+    }
+}
+
 /// The contents of `summary.json`: how a run ended and what it counted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -112,6 +155,9 @@ pub struct Summary {
     pub weights_behind_updates: Option<Quantiles>,
     /// Highest resident memory of each process, MiB.
     pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
+    /// What its weights earn; none where they were not played.
+    #[serde(default)]
+    pub played: Option<LastPlay>,
 }
 
 impl Summary {
@@ -162,6 +208,7 @@ impl Summary {
             weights_behind_s: replay.weights_behind_s,
             weights_behind_updates: replay.weights_behind_updates,
             rss_mib_max: serde_json::Map::new(),
+            played: None,
         }
     }
 
@@ -207,20 +254,36 @@ impl Summary {
         Self::read(folder).is_ok_and(|it| it.outcome == Outcome::Finished)
     }
 
-    /// What a person may do with a finished run, a command a line.
+    /// What the weights of a finished run earn, and what a person may do with them, a command a line.
     pub fn next_steps(&self, run_dir: &RunFolder) -> String {
         let run = run_dir.display();
         let more = self.frames.saturating_mul(2);
-        commands(&[
+        let commands = commands(&[
+            (
+                format!("evaluate {run} --record play.gif"),
+                "films it, and plays a random policy beside it",
+            ),
             plot(run_dir),
-            (format!("evaluate {run}"), "beside a random policy"),
             (format!("train --resume {run} --frames {more}"), "trains on"),
-        ])
+        ]);
+        self.earned() + &commands
     }
 
-    /// What is printed at the end.
+    /// How it ended and what its weights earn.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
-        format!("{}\n{}\n", self.counts(), run_dir.display())
+        format!(
+            "{}\n{}{}\n",
+            self.counts(),
+            self.earned(),
+            run_dir.display()
+        )
+    }
+
+    /// The line about what was played; empty if nothing was.
+    fn earned(&self) -> String {
+        self.played
+            .as_ref()
+            .map_or(String::new(), LastPlay::describe)
     }
 
     /// How the run ended and what it counted, in one line.

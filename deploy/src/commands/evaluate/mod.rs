@@ -5,7 +5,7 @@ mod recording;
 mod report;
 mod tile;
 
-use std::path::PathBuf;
+use std::{ops::ControlFlow, path::PathBuf};
 
 use anyhow::Context;
 use clap::Args;
@@ -126,6 +126,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
             if let Some(film) = &mut film {
                 film.see(step);
             }
+            ControlFlow::Continue(())
         },
     );
     drop(progress);
@@ -144,7 +145,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     };
     said(&describe(&spec.agent, &returns))?;
     let mut progress = Progress::new("random", episodes);
-    let see = &mut |_: &Step<'_>, returns: &[f64]| progress.see(returns);
+    let see = &mut |_: &Step<'_>, returns: &[f64]| {
+        progress.see(returns);
+        ControlFlow::Continue(())
+    };
     let random = player.play_watched(Who::Random, &world, episodes, args.seed, see)?;
     drop(progress);
     said(&describe("random", &random))?;

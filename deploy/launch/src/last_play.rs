@@ -1,0 +1,118 @@
+//! What a finished run's weights earn, played greedily beside a random policy: the number that the run was for.
+//! It fails no run: what goes wrong is a line on stderr.
+
+use std::{
+    ops::ControlFlow,
+    time::{Duration, Instant},
+};
+
+use anyhow::ensure;
+use driml_actor::Step;
+use driml_settings::config::RunConfig;
+
+use crate::{
+    console,
+    evaluate::{Levels, Player, Who, interval, levels},
+    run_folder::{LastPlay, RunFolder, Summary},
+};
+
+/// Episodes that are played at once, one in each copy of the world. They count together, so that long ones are not left out.
+const BATCH: usize = 20;
+/// Batches that are played if there is time.
+const BATCHES_MAX: u32 = 5;
+/// How long all of it may take; the first batch may take longer.
+const PLAY_MAX: Duration = Duration::from_secs(30);
+/// How long the first batch may.
+const FIRST_BATCH_MAX: Duration = Duration::from_secs(120);
+
+/// Plays the weights of a finished run and adds what they earned to its summary, if its settings ask for that and until it `is_stopped`.
+pub(crate) fn play(
+    summary: &mut Summary,
+    config: &RunConfig,
+    folder: &RunFolder,
+    is_stopped: &dyn Fn() -> bool,
+) {
+    if !config.local.play {
+        return;
+    }
+    console::line(
+        "playing the weights beside a random policy, for about 30 s at most (Ctrl-C leaves that out, --no-play too)",
+    );
+    let noted = played(folder, is_stopped).and_then(|played| {
+        summary.played = played;
+        summary.write(folder)
+    });
+    if let Err(e) = noted {
+        console::line(&format!(
+            "the run is finished, but what its weights earn is not known: {}; `driml evaluate {}` tries again",
+            console::describe(&e),
+            folder.display()
+        ));
+    }
+}
+
+/// What the weights in `folder` earn; none if it was stopped before there was anything to say.
+fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
+    let started = Instant::now();
+    let player = Player::load(folder)?;
+    let world = levels(&player.config.world, Levels::Train)?;
+    let watch =
+        &mut |_: &Step<'_>, _: &[f64]| match is_stopped() || started.elapsed() > FIRST_BATCH_MAX {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        };
+    let (mut agent, mut random) = (Vec::new(), Vec::new());
+    for batch in 0..BATCHES_MAX {
+        // It takes about as long as each before it.
+        if batch > 0 && started.elapsed() * (batch + 1) > PLAY_MAX * batch {
+            break;
+        }
+        let mut of = |who| player.play_watched(who, &world, BATCH, batch.into(), watch);
+        let both = [of(Who::Agent)?, of(Who::Random)?];
+        if both.iter().any(|returns| returns.len() < BATCH) {
+            break;
+        }
+        let [of_agent, of_random] = both;
+        agent.extend(of_agent);
+        random.extend(of_random);
+    }
+    if agent.is_empty() {
+        let max = FIRST_BATCH_MAX.as_secs();
+        ensure!(is_stopped(), "{BATCH} episodes take longer than {max} s");
+        return Ok(None);
+    }
+    Ok(Some(LastPlay {
+        weights: player.weights_name().into(),
+        episodes: agent.len() as u64,
+        agent: interval(&agent),
+        random: interval(&random),
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_machine::resources::Machine;
+    use driml_protocol::{LearnerStatus, ReplayStatus};
+    use driml_settings::{
+        presets::preset,
+        resolve::{Flags, Source, resolve},
+    };
+
+    use super::*;
+    use crate::run_folder::{Episodes, Outcome};
+
+    #[test]
+    fn what_cannot_be_played_fails_no_run() {
+        let source = Source::Layers(preset("smoke").unwrap(), "chain".parse().unwrap(), "c51");
+        let mut config = resolve(&source, &Flags::default(), &Machine::this()).unwrap();
+        assert!(!config.local.play, "a run that tests parts is not played");
+        config.local.play = true;
+        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+        let (none, outcome) = (Episodes::default(), Outcome::Finished);
+        let mut summary = Summary::of(outcome, &config.run, &replay, &learner, none, 2.0);
+        let before = summary.clone();
+        let folder = RunFolder::new("no-such-run");
+        play(&mut summary, &config, &folder, &|| false);
+        assert_eq!(summary, before);
+    }
+}
