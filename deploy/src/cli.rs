@@ -56,7 +56,7 @@ pub(crate) enum Command {
     Status(StatusArgs),
     /// Show how a run goes, wherever its parts are and whoever started them, and record it in a folder
     Watch(WatchArgs),
-    /// Play whole episodes with a run's newest weights, beside a random policy
+    /// Play whole episodes with the weights of a run or of a pretrained network, beside a random policy
     Evaluate(EvaluateArgs),
     /// What a world and an agent build, compute and send, what it would be if everything were on, and why
     Inspect(InspectArgs),

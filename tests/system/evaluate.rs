@@ -147,6 +147,47 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
 }
 
 #[test]
+fn an_exported_network_is_played_without_its_run() {
+    let system = with_averages();
+    let said = system
+        .run("evaluate run --export net.safetensors")
+        .expect_code(0);
+    assert!(
+        said.stdout
+            .starts_with("averaged weights after 540 updates as f16"),
+        "{}",
+        said.stdout
+    );
+    let run = system
+        .run("evaluate run --episodes 3 --exact")
+        .expect_code(0);
+    fs::rename(system.path("run"), system.path("moved")).unwrap();
+    let net = system
+        .run("evaluate net.safetensors --episodes 3 --record play.gif --overlay")
+        .expect_code(0);
+    let lines: Vec<_> = net.stdout.lines().collect();
+    assert!(
+        lines[0].contains("averaged f16 weights after 540 updates"),
+        "{lines:?}"
+    );
+    assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
+    let online = system.run_folder("moved").checkpoints().pop().unwrap();
+    let online = online.join("online.safetensors").display().to_string();
+    for (args, said) in [
+        ("net.safetensors --keep", "is a single network"),
+        ("net.safetensors --weights online", "is a single network"),
+        ("net.safetensors --checkpoint best", "is a single network"),
+        ("none.safetensors", "reading none.safetensors: No such file"),
+        (&online, "is not an exported network"),
+        ("pretrained:pong", "no pretrained weights of \"pong\""),
+        ("moved --export net", "ends in .safetensors"),
+    ] {
+        let ended = system.run(&format!("evaluate {args}")).expect_code(64);
+        ended.expect_said(said);
+    }
+}
+
+#[test]
 fn a_finished_run_says_what_its_weights_earn() {
     let system = system();
     for (flags, is_played) in [("--set local.play=true", true), ("--no-play", false)] {

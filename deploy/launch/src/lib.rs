@@ -38,6 +38,7 @@ pub mod meeting;
 pub mod open_files;
 pub mod panics;
 pub mod plan;
+pub mod pretrained;
 pub mod process_log;
 mod processes;
 mod rates;

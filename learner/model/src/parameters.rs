@@ -134,10 +134,15 @@ impl Parameters {
     /// network. One entry, as more would be written in an order of their own each time.
     ///
     /// # Errors
-    /// As [`Parameters::to_safetensors`].
-    pub fn to_described_safetensors(&self, key: &str, value: &str) -> Result<Vec<u8>> {
+    /// As [`Parameters::to_safetensors_as`].
+    pub fn to_described_safetensors(
+        &self,
+        stored: StoredAs,
+        key: &str,
+        value: &str,
+    ) -> Result<Vec<u8>> {
         let entry = HashMap::from([(key.to_owned(), value.to_owned())]);
-        self.serialized(StoredAs::F32, |_| true, Some(entry))
+        self.serialized(stored, |_| true, Some(entry))
     }
 
     fn serialized(

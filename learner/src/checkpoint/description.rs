@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 /// The metadata's one key.
-pub(super) const KEY: &str = "driml";
+pub const KEY: &str = "driml";
 /// 1: the tables of the settings that a reader needs, under their names there.
 const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/python/weights.md`.
@@ -54,12 +54,10 @@ pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String
     serde_json::to_string(&description).expect("plain values are JSON")
 }
 
-/// Sizes of the network in a safetensors file, as its description says; none if it has none.
-pub(super) fn model_in(safetensors: &[u8]) -> Option<Value> {
+/// The description in a safetensors file; none if it has none.
+pub fn described(safetensors: &[u8]) -> Option<Value> {
     let (_, header) = safetensors::SafeTensors::read_metadata(safetensors).ok()?;
-    let text = header.metadata().as_ref()?.get(KEY)?;
-    let description: Value = serde_json::from_str(text).ok()?;
-    description.get("model").cloned()
+    serde_json::from_str(header.metadata().as_ref()?.get(KEY)?).ok()
 }
 
 /// The path of the first value that differs, under `name`, and both values.

@@ -114,11 +114,12 @@ pub fn load(
 
 /// Checks that a checkpoint's network has the sizes of `model`, as far as its description says.
 fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> {
-    let Some(saved) = description::model_in(&read(&path.join(ONLINE))?) else {
+    let described = description::described(&read(&path.join(ONLINE))?);
+    let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
     let ours = serde_json::to_value(model).unwrap_or_default();
-    match description::difference("model", &saved, &ours) {
+    match description::difference("model", saved, &ours) {
         None => Ok(()),
         Some((key, found, expected)) => Err(CheckpointError::OtherModel {
             folder: path.to_owned(),

@@ -9,7 +9,7 @@ mod load;
 mod save;
 
 pub use contents::check_state;
-pub use description::describe;
+pub use description::{KEY as DESCRIPTION, describe, described};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
 pub use load::{Restored, companion, load, load_latest, progress};

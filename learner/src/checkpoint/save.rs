@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_model::Parameters;
+use driml_model::{Parameters, StoredAs};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
@@ -114,7 +114,7 @@ fn tensor_files(
     description: &str,
 ) -> Result<Vec<(&'static str, Vec<u8>)>, UpdateError> {
     let everything = |parameters: &Parameters| {
-        parameters.to_described_safetensors(description::KEY, description)
+        parameters.to_described_safetensors(StoredAs::F32, description::KEY, description)
     };
     let moments = agent.adam.to_tensors()?;
     let moments = safetensors::serialize(&moments, None).map_err(candle_core::Error::from)?;

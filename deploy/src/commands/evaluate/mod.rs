@@ -1,21 +1,26 @@
-//! `driml evaluate`: whole episodes with a run's weights, and a random policy's beside them; a film of them on request.
+//! `driml evaluate`: whole episodes with a run's weights or an exported network's, and a random policy's beside them; a film of them on
+//! request.
 
 mod progress;
 mod recording;
 mod report;
 mod tile;
 
-use std::{ops::ControlFlow, path::PathBuf};
+use std::{
+    ops::ControlFlow,
+    path::{Path, PathBuf},
+};
 
 use anyhow::Context;
 use clap::Args;
 use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
-    console::print,
+    console::{self, print},
     evaluate::{Levels, Player, Weights, Which, Who, levels, mean_and_deviation},
     keep::{Judged, keep},
-    run_folder::{RunFolder, sweep},
+    pretrained,
+    run_folder::{RunFolder, sweep, write_whole},
 };
 use driml_machine::error::{EXIT_INTERRUPTED, usage};
 use driml_protocol::Shutdown;
@@ -27,7 +32,7 @@ use self::{
 
 #[derive(Debug, Args)]
 pub(crate) struct EvaluateArgs {
-    /// Folder of the run
+    /// Folder of the run, a file that --export wrote, or pretrained:GAME for a network that is built in
     #[arg(value_name = "RUN", required_unless_present = "run")]
     pub(crate) folder: Option<PathBuf>,
     /// The same
@@ -48,6 +53,9 @@ pub(crate) struct EvaluateArgs {
     /// Which of the checkpoint's weights to play [default: average]
     #[arg(long, value_enum)]
     pub(crate) weights: Option<Weights>,
+    /// Write the weights that would be played into this file, as f16 with the run's settings, and play nothing
+    #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["keep", "exact", "returns", "json", "record"])]
+    pub(crate) export: Option<PathBuf>,
     /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
     #[arg(long, conflicts_with_all = ["levels", "seed", "weights", "exact", "returns", "json", "record"])]
     pub(crate) keep: bool,
@@ -77,8 +85,16 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     let folder = args.folder.as_ref().or(args.run.as_ref());
     let folder = folder.expect("clap asks for one of the two");
+    let pretrained = pretrained::find(folder)?;
     let folder = RunFolder::new(folder);
     let which = args.checkpoint.unwrap_or_default();
+    if pretrained.is_some() && (args.checkpoint.is_some() || args.weights.is_some() || args.keep) {
+        return Err(usage!(
+            "{} is a single network: --checkpoint, --weights and --keep are for the folder of a run",
+            folder.display()
+        )
+        .into());
+    }
     if args.keep {
         end_when_asked(folder.clone(), args.exit_with_parent)?;
         let judged = keep(&folder, which, args.episodes)?;
@@ -88,10 +104,17 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
             verdict(&judged)
         ));
     }
-    let mut player = Player::load_at(&folder, which, args.weights.unwrap_or_default())?;
+    let mut player = match pretrained {
+        Some(player) => player,
+        None => Player::load_at(&folder, which, args.weights.unwrap_or_default())?,
+    };
+    if let Some(path) = &args.export {
+        return export(&player, path);
+    }
     if args.exact {
         player = player.exact()?;
     }
+    player.config.world.install(&mut console::line)?;
     // Before an hour of playing.
     let table = args.returns.as_deref().map(report::Table::begin);
     let mut table = table.transpose()?;
@@ -160,6 +183,23 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         print(&report::json(&player, args.levels, args.seed, &played)?)?;
     }
     Ok(())
+}
+
+/// Writes the network that plays into a file of its own.
+fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
+    if path.extension().is_none_or(|it| it != "safetensors") {
+        let name = path.display();
+        return Err(usage!("--export {name}: the file's name ends in .safetensors").into());
+    }
+    let bytes = pretrained::export(player)?;
+    write_whole(path, &bytes)?;
+    print(&format!(
+        "{} weights after {} updates as f16, {} kB; `driml evaluate {}` plays them\n",
+        player.weights_name(),
+        player.updates,
+        bytes.len() / 1000,
+        path.display()
+    ))
 }
 
 /// Ends this process when it is asked to or nobody waits for it any more, and leaves nothing half.

@@ -1,0 +1,243 @@
+//! Networks that are played without a run: each one file, f16 weights with the run's settings in the metadata. Some are built in.
+//! It trains none, and such a file cannot be trained on: it has neither auxiliary heads nor an optimiser's state.
+
+use std::{fs, path::Path};
+
+use anyhow::{Context, bail};
+use driml_learner::{
+    Compute,
+    checkpoint::{DESCRIPTION, describe, described},
+};
+use driml_machine::error::{nearest, usage};
+use driml_model::{Parameters, Precision, StoredAs, is_bf16_fast};
+use driml_settings::config::RunConfig;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::evaluate::Player;
+
+/// What stands before the name of a built-in network.
+const PREFIX: &str = "pretrained:";
+/// What the name of a file that is no run's folder ends with.
+const EXTENSION: &str = "safetensors";
+/// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and the line
+/// `("GAME", include_bytes!("../../pretrained/GAME.safetensors")),`.
+const BUILT_IN: &[(&str, &[u8])] = &[];
+
+/// The key of [`Exported`] in the file's description.
+const EXPORTED: &str = "exported";
+
+/// What the description of an exported network has beside that of a checkpoint's.
+#[derive(Serialize, Deserialize)]
+struct Exported {
+    /// The run's resolved settings, TOML.
+    settings: String,
+    updates: u64,
+    is_averaged: bool,
+}
+
+/// The network that `name` names, built in or in a file; none if it is the name of a run's folder.
+///
+/// # Errors
+/// A name that no built-in network has, a file that cannot be read or holds something else.
+pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
+    let shown = name.display().to_string();
+    if let Some(game) = shown.strip_prefix(PREFIX) {
+        return built_in(BUILT_IN, game).map(Some);
+    }
+    if name.extension().is_none_or(|it| it != EXTENSION) || name.is_dir() {
+        return Ok(None);
+    }
+    let bytes = fs::read(name).map_err(|e| usage!("reading {shown}: {e}"))?;
+    read(&shown, bytes).map(Some)
+}
+
+/// The network of `game` among `all`.
+fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
+    let games: Vec<_> = all.iter().map(|(game, _)| *game).collect();
+    let Some((_, bytes)) = all.iter().find(|(known, _)| *known == game) else {
+        let near = nearest(game, games.iter().copied());
+        let known = match games.len() {
+            0 => "this program has none".into(),
+            _ => format!("there are {PREFIX}{}", games.join(&format!(", {PREFIX}"))),
+        };
+        return Err(usage!("there are no pretrained weights of {game:?}{near}; {known}").into());
+    };
+    let player = read(&format!("{PREFIX}{game}"), bytes.to_vec())?;
+    let world = &player.config.run.world;
+    if world.rsplit(':').next() != Some(game) {
+        bail!("{PREFIX}{game} holds weights of {world}");
+    }
+    Ok(player)
+}
+
+/// The network in a file's bytes.
+fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
+    let exported = described(&bytes).and_then(|it| it.get(EXPORTED).cloned());
+    let exported: Exported = exported
+        .and_then(|it| serde_json::from_value(it).ok())
+        .with_context(|| {
+            usage!(
+                "{name} is not an exported network: its metadata has no settings; `driml evaluate RUN --export FILE.{EXTENSION}` writes one"
+            )
+        })?;
+    let settings = format!("the settings in {name}");
+    let mut config = RunConfig::parse(&settings, &exported.settings)?;
+    config.learner.publish_as = StoredAs::F16;
+    // It was chosen for the machine that trained.
+    if !is_bf16_fast() {
+        config.actor.precision = Precision::F32;
+    }
+    let model = config.model.without_dim();
+    let network = Parameters::load_safetensors(&model, &bytes, &Compute::CPU.device)
+        .with_context(|| format!("{name} does not have the weights of its settings"))?;
+    Ok(Player {
+        config,
+        weights: bytes,
+        network,
+        updates: exported.updates,
+        is_averaged: exported.is_averaged,
+    })
+}
+
+/// The network that plays, without DIM's heads, as the bytes of a file that [`find`] reads.
+///
+/// # Errors
+/// A weight that f16 cannot hold.
+pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
+    let config = &player.config;
+    let exported = Exported {
+        settings: config.to_toml(),
+        updates: player.updates,
+        is_averaged: player.is_averaged,
+    };
+    let model = config.model.without_dim();
+    let mut description: Value =
+        serde_json::from_str(&describe(&config.run, &model, &config.input))?;
+    description[EXPORTED] = serde_json::to_value(exported)?;
+    let network = player.network.without_dim()?;
+    Ok(network.to_described_safetensors(StoredAs::F16, DESCRIPTION, &description.to_string())?)
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_machine::resources::Machine;
+    use driml_settings::{
+        presets::preset,
+        resolve::{Flags, Source, resolve},
+    };
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::evaluate::{Levels, Who};
+
+    /// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
+    fn untrained(world: &str, agent: &'static str) -> Player {
+        let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
+        let config = resolve(&source, &Flags::default(), &Machine::this()).unwrap();
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
+        let weights = network.without_dim().unwrap();
+        Player {
+            weights: weights.to_safetensors(|_| true).unwrap(),
+            network,
+            config,
+            updates: 7,
+            is_averaged: true,
+        }
+    }
+
+    fn said(all: &[(&str, &[u8])], game: &str) -> String {
+        format!("{:#}", built_in(all, game).map(drop).unwrap_err())
+    }
+
+    fn played(player: &Player) -> Vec<f64> {
+        let returns = player.returns(Who::Agent, Levels::Train, 4, 3).unwrap();
+        returns.unwrap()
+    }
+
+    #[test]
+    fn every_built_in_network_can_be_read() {
+        for (game, _) in BUILT_IN {
+            built_in(BUILT_IN, game).unwrap();
+        }
+    }
+
+    #[test]
+    fn an_exported_network_is_read_and_plays() {
+        let player = untrained("chain", "driml-ada");
+        let bytes = export(&player).unwrap();
+        assert_eq!(bytes, export(&player).unwrap());
+        let read = built_in(&[("chain", &bytes[..])], "chain").unwrap();
+        assert_eq!((read.updates, read.weights_name()), (7, "averaged"));
+        assert_eq!(read.config.run, player.config.run);
+        for (name, var) in read.network.iter() {
+            let both = [var, player.network.get(name).unwrap()];
+            let both = both.map(|it| it.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+            for (rounded, exact) in both[0].iter().zip(&both[1]) {
+                let size = exact.abs().max(StoredAs::F16.least_normal());
+                let error = StoredAs::F16.error() as f32 * size;
+                assert!(
+                    (rounded - exact).abs() <= error,
+                    "{name}: {rounded}, {exact}"
+                );
+            }
+        }
+        assert_eq!(played(&read).len(), 4);
+        // Of what is read nothing is rounded again.
+        let again = export(&read).unwrap();
+        let again = built_in(&[("chain", &again[..])], "chain").unwrap();
+        assert_eq!(played(&read), played(&again));
+        assert_eq!(played(&read), played(&read.exact().unwrap()));
+    }
+
+    #[test]
+    fn what_does_not_fit_names_both_sides() {
+        let bytes = export(&untrained("chain", "c51")).unwrap();
+        let other = export(&untrained("mspacman", "c51")).unwrap();
+        let all: &[(&str, &[u8])] = &[("chain", &bytes[..]), ("ising", &other[..])];
+        assert_eq!(
+            said(all, "chian"),
+            "there are no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising"
+        );
+        assert_eq!(
+            said(&[], "chain"),
+            "there are no pretrained weights of \"chain\"; this program has none"
+        );
+        assert_eq!(
+            said(all, "ising"),
+            "pretrained:ising holds weights of mspacman"
+        );
+        assert!(said(&[("chain", &bytes[..99])], "chain").contains("is not an exported network"));
+
+        // Weights of one network beside the settings of another.
+        let mut mixed = untrained("chain", "c51");
+        for (from, to, why) in [
+            ("hidden = 32", "hidden = 16", "has shape"),
+            (
+                "num_actions = 3",
+                "num_actions = 5",
+                "num_actions = 5, but it",
+            ),
+        ] {
+            let text = mixed.config.to_toml().replace(from, to);
+            let description = serde_json::json!({
+                EXPORTED: Exported { settings: text, updates: 1, is_averaged: false }
+            });
+            let network = &mixed.network;
+            let bytes = network
+                .to_described_safetensors(StoredAs::F16, DESCRIPTION, &description.to_string())
+                .unwrap();
+            let text = said(&[("chain", &bytes[..])], "chain");
+            assert!(
+                text.contains(why) && text.contains("pretrained:chain"),
+                "{text}"
+            );
+        }
+        mixed.network = untrained("mspacman", "c51").network;
+        let bytes = export(&mixed).unwrap();
+        let why = said(&[("chain", &bytes[..])], "chain");
+        assert!(why.contains("has shape") && why.contains("wanted"), "{why}");
+    }
+}
