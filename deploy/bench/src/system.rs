@@ -211,7 +211,14 @@ impl Run {
         let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
         let endpoint = format!("unixsock-stream/{}", folder.path().join("s").display());
         let run_dir = folder.path().join("run").display().to_string();
-        let listen = ["local", "--no-play", "--listen", &endpoint, "--run-dir", &run_dir];
+        let listen = [
+            "local",
+            "--no-play",
+            "--listen",
+            &endpoint,
+            "--run-dir",
+            &run_dir,
+        ];
         let args = [&listen[..], flags].concat();
         let mut launcher = start("launcher", &args, sets, folder.path())?;
         let endpoints = connect(&endpoint);
