@@ -3,7 +3,7 @@
     python optuna_search.py [--trials 20] [--env chain] [--agent driml-ada] [--frames 12000] [--seeds 2] [--out search]
 
 Change `suggest` to what you search. Runs stay in OUT, and so does the study: called again, it goes on. A search over few seeds finds settings
-that suit these seeds: judge the best anew with others, `driml grid --seeds`.
+that suit these seeds: judge the best anew with others, `driml sweep --seeds`.
 """
 
 import argparse

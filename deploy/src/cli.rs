@@ -3,7 +3,7 @@
 use clap::{CommandFactory, Parser, Subcommand};
 use driml_bench::flags::BenchArgs;
 use driml_experiments::{
-    flags::{ExperimentCommand, GridArgs, TradeoffArgs},
+    flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
 use driml_machine::process_env::Purpose;
@@ -33,9 +33,12 @@ Examples:
 
 `driml presets --game starpilot --agent c51` prints what a preset sets: every setting with its source.";
 
+/// The version, and the commit that the program was built from.
+const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("DRIML_COMMIT"), ")");
+
 /// Deep Reinforcement and InfoMax Learning: actors, a replay server and a learner.
 #[derive(Debug, Parser)]
-#[command(name = "driml", version, max_term_width = 100)]
+#[command(name = "driml", version = VERSION, max_term_width = 100)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     pub(crate) command: Command,
@@ -65,7 +68,8 @@ pub(crate) enum Command {
     /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
     Plot(PlotArgs),
     /// Train with every combination of settings, several seeds each: a table and a plot
-    Grid(GridArgs),
+    #[command(visible_alias = "grid")]
+    Sweep(SweepArgs),
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
@@ -108,7 +112,7 @@ impl Command {
             Self::Inspect(args) => inspect::run(&args),
             Self::Parity(args) => parity::run(&args),
             Self::Plot(args) => plot::run(&args),
-            Self::Grid(args) => driml_experiments::grid(&args),
+            Self::Sweep(args) => driml_experiments::sweep(&args),
             Self::Experiment(command) => driml_experiments::run(&command),
             Self::Tradeoff(args) => driml_experiments::tradeoff(&args),
             Self::Bench(args) => driml_bench::run(&args),

@@ -1,5 +1,5 @@
-//! An experiment's folder: finished pieces of its grid, its data and its figures.
-//! It knows no experiment; what a piece is and what follows from all of them is theirs.
+//! The cache of an experiment: its folder with finished pieces of work, from which it resumes, its data and its figures.
+//! It knows no experiment; what a piece is and what follows from all of them is theirs. Whole runs are kept by `sweep::runs`.
 
 use std::{
     fs,
@@ -22,13 +22,15 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use crate::{
     flags::ExperimentFlags,
-    page::{self, Page},
+    page::{self, Page, Table},
     progress::Progress,
 };
 
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
 const PIECES: &str = "pieces";
 const SETTINGS: &str = "settings.json";
+/// Where the runs of a sweep lie. Git does not keep them.
+pub(crate) const RUNS: &str = "runs";
 
 /// A finished piece as it is kept.
 #[derive(Serialize, Deserialize)]
@@ -42,7 +44,7 @@ struct Kept<T> {
 
 /// An experiment under way.
 #[derive(Debug)]
-pub(super) struct Session {
+pub(crate) struct Session {
     folder: PathBuf,
     progress: Progress,
     seconds: f64,
@@ -55,7 +57,7 @@ impl Session {
     ///
     /// # Errors
     /// A folder whose pieces were made with other settings, a file system that refuses.
-    pub(super) fn open(
+    pub(crate) fn open(
         name: &str,
         flags: &ExperimentFlags,
         settings: &impl Serialize,
@@ -87,11 +89,11 @@ impl Session {
         })
     }
 
-    /// [`Session::open`] of an experiment that is a queue of runs. For a report alone it makes no folder.
+    /// [`Session::open`] of a sweep. For a report alone it makes no folder; runs that lie in one with their calls are enough.
     ///
     /// # Errors
     /// A report where nothing was made yet; as for [`Session::open`].
-    pub(super) fn open_queue(
+    pub(crate) fn open_queue(
         name: &str,
         flags: &ExperimentFlags,
         settings: &impl Serialize,
@@ -99,7 +101,8 @@ impl Session {
         report_only: bool,
     ) -> anyhow::Result<Self> {
         let folder = folder(name, flags);
-        if report_only && !folder.join(PIECES).join(SETTINGS).is_file() {
+        let has = |what| folder.join(what).is_dir();
+        if report_only && !has(PIECES) && !has(RUNS) {
             return Err(usage!(
                 "nothing was made in {} yet: there is nothing to report",
                 folder.display()
@@ -110,7 +113,7 @@ impl Session {
     }
 
     /// The piece of this name if it is there, whatever it was made of.
-    pub(super) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
+    pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         let text = fs::read(self.piece_path(key)).ok()?;
         let kept: Kept<T> = serde_json::from_slice(&text).ok()?;
         Some(kept.result)
@@ -120,7 +123,7 @@ impl Session {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub(super) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
+    pub(crate) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
         let kept = Kept {
             of: String::new(),
             seconds: 0.0,
@@ -135,17 +138,17 @@ impl Session {
     }
 
     /// Where everything goes.
-    pub(super) fn folder(&self) -> &Path {
+    pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
 
     /// The folder, and the progress of work that keeps itself there.
-    pub(super) fn work(&mut self) -> (&Path, &mut Progress) {
+    pub(crate) fn work(&mut self) -> (&Path, &mut Progress) {
         (&self.folder, &mut self.progress)
     }
 
     /// Counts the time that such work took, added up over runs that are made `at_once` at a time.
-    pub(super) fn spend(&mut self, seconds: f64, at_once: u32) {
+    pub(crate) fn spend(&mut self, seconds: f64, at_once: u32) {
         self.seconds += seconds;
         self.at_once = at_once;
     }
@@ -154,7 +157,7 @@ impl Session {
     ///
     /// # Errors
     /// What `make` says; an interrupt; a file system that refuses.
-    pub(super) fn piece<T: Serialize + DeserializeOwned>(
+    pub(crate) fn piece<T: Serialize + DeserializeOwned>(
         &mut self,
         key: &str,
         units: u64,
@@ -167,7 +170,7 @@ impl Session {
     ///
     /// # Errors
     /// As for [`Session::piece`].
-    pub(super) fn piece_of<T: Serialize + DeserializeOwned>(
+    pub(crate) fn piece_of<T: Serialize + DeserializeOwned>(
         &mut self,
         of: &str,
         key: &str,
@@ -188,7 +191,7 @@ impl Session {
         let started = Instant::now();
         let result = make(&mut self.progress).inspect_err(|e| {
             if e.is::<Interrupted>() {
-                console::line("stopped; the same command goes on from the last whole piece");
+                console::line("stopped; the same command resumes after the last whole piece");
             }
         })?;
         let kept = Kept {
@@ -204,22 +207,17 @@ impl Session {
         Ok(kept.result)
     }
 
-    /// Writes rows of data as `name.csv`.
+    /// Writes a table as `name.csv`.
     ///
     /// # Errors
-    /// A file system that refuses.
-    pub(super) fn csv(
-        &self,
-        name: &str,
-        header: &[&str],
-        rows: impl IntoIterator<Item = Vec<String>>,
-    ) -> anyhow::Result<()> {
+    /// The file system refuses.
+    pub(crate) fn csv(&self, name: &str, table: &Table) -> anyhow::Result<()> {
         let path = self.folder.join(format!("{name}.csv"));
         let doing = || format!("writing {}", path.display());
         let mut file = csv::Writer::from_path(&path).with_context(doing)?;
-        file.write_record(header).with_context(doing)?;
-        for row in rows {
-            file.write_record(&row).with_context(doing)?;
+        file.write_record(&table.header).with_context(doing)?;
+        for row in &table.rows {
+            file.write_record(row).with_context(doing)?;
         }
         file.flush().with_context(doing)
     }
@@ -228,7 +226,7 @@ impl Session {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub(super) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
+    pub(crate) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
         Ok(figure.save_both(&self.folder, stem)?)
     }
 
@@ -236,7 +234,7 @@ impl Session {
     ///
     /// # Errors
     /// A file system that refuses.
-    pub(super) fn finish(self, page: &Page) -> anyhow::Result<()> {
+    pub(crate) fn finish(self, page: &Page) -> anyhow::Result<()> {
         self.progress.clear();
         let text = page.text(self.seconds, self.at_once);
         write_whole(&self.folder.join("README.md"), text.as_bytes())?;
@@ -249,7 +247,7 @@ impl Session {
 }
 
 /// The settings that the experiment's pieces were made with; none if there are none yet, or they cannot be read.
-pub(super) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
+pub(crate) fn settings_of<T: DeserializeOwned>(name: &str, flags: &ExperimentFlags) -> Option<T> {
     let text = fs::read_to_string(folder(name, flags).join(PIECES).join(SETTINGS)).ok()?;
     serde_json::from_str(&text).ok()
 }
@@ -264,7 +262,7 @@ fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
 ///
 /// # Errors
 /// A file that cannot be looked at.
-pub(super) fn program() -> anyhow::Result<String> {
+pub(crate) fn program() -> anyhow::Result<String> {
     let file = std::env::current_exe().context("finding this program's own file")?;
     let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
     let written = about.modified().ok();

@@ -1,7 +1,7 @@
 //! The command line of `driml experiment`.
 //! What a value means is for the experiment that takes it; the settings of its full or smoke length are chosen here.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use driml_machine::whole_number;
@@ -75,24 +75,21 @@ pub struct ProcgenArgs {
     pub(crate) flags: ExperimentFlags,
     #[command(flatten)]
     pub(crate) queue: QueueFlags,
-    /// Games, such as bigfish,starpilot; or all [default: as the experiment's settings say]
+    /// Games, such as bigfish,starpilot; or all [default: all]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) games: Vec<String>,
-    /// Agents, driml-fix and driml-noact also with a k, as in driml-noact-k5; or all [default: c51,driml-fix,driml-ada]
+    /// Agents, driml-fix and driml-noact also with a k, as in driml-noact-k5; or all [default: c51,driml-ada]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
-    /// Frames of each run; the paper's are 50000000
+    /// Frames of each run; the paper's are 50000000 [default: 1000000]
     #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
-    /// Episodes played with each run's weights on each kind of levels
+    /// Episodes played with each of a run's last three checkpoints, or three times as many with its averaged weights [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
-    /// Named settings of every run; `driml presets` lists them
+    /// Named settings of every run; `driml presets` lists them [default: tuned]
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
-    /// Instead: short runs of c51 on every game, to see on which it learns soonest
-    #[arg(long)]
-    pub(crate) screen: bool,
 }
 
 /// What `driml tradeoff` takes.
@@ -122,9 +119,9 @@ pub struct TradeoffArgs {
     pub(crate) queue: QueueFlags,
 }
 
-/// What `driml grid` takes.
+/// What `driml sweep` takes.
 #[derive(Clone, Debug, Args)]
-pub struct GridArgs {
+pub struct SweepArgs {
     /// Worlds, such as coinrun,maze or mspacman [default: as `driml train`]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) env: Vec<String>,
@@ -150,12 +147,12 @@ pub struct GridArgs {
     /// Start nothing: table and plot of the runs that are finished
     #[arg(long)]
     pub(crate) report: bool,
-    /// Where runs, table and plot go; a grid that was stopped goes on there [default: experiments/grid]
+    /// Where runs, table and plot go; a sweep that was stopped resumes there [default: experiments/grid]
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
 }
 
-impl GridArgs {
+impl SweepArgs {
     /// Where it works, as experiments say it.
     pub(crate) fn folder(&self) -> ExperimentFlags {
         ExperimentFlags {
@@ -207,17 +204,30 @@ pub(crate) fn settings<T: DeserializeOwned>(
     })
 }
 
-/// The command that repeats an experiment, for its page.
-pub(crate) fn command_line(name: &str, flags: &ExperimentFlags, out: &Path) -> String {
-    let mut words = format!("driml experiment {name}");
-    if flags.smoke {
-        words += " --smoke";
+/// The table `full` or `smoke` of a sweep's settings, which are built in.
+pub(crate) fn sweep_settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
+    let length = if smoke { "smoke" } else { "full" };
+    let read = || -> Result<T, toml::de::Error> {
+        let mut file: toml::Table = text.parse()?;
+        let table = file.remove(length).unwrap_or(toml::Table::new().into());
+        table.try_into()
+    };
+    read().unwrap_or_else(|e| panic!("sweeps/{name}.toml is built in, and a test reads it: {e}"))
+}
+
+/// The command that this process was called with, for a page: without where it writes, and without asking for a report alone.
+pub(crate) fn this_command() -> String {
+    let mut words = vec!["driml".to_owned()];
+    let args = std::env::args_os().skip(1);
+    let mut args = args.map(|word| word.to_string_lossy().into_owned());
+    while let Some(word) = args.next() {
+        if word == "--out" {
+            args.next();
+        } else if word != "--report" && !word.starts_with("--out=") {
+            let plain = |c: char| c.is_ascii_alphanumeric() || "-_.,=:/".contains(c);
+            let is_plain = word.chars().all(plain);
+            words.push(if is_plain { word } else { format!("'{word}'") });
+        }
     }
-    if let Some(seeds) = flags.seeds {
-        words += &format!(" --seeds {seeds}");
-    }
-    if flags.out.is_some() {
-        words += &format!(" --out {}", out.display());
-    }
-    words
+    words.join(" ")
 }

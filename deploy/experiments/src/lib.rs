@@ -1,11 +1,14 @@
-//! `driml experiment` and `driml plot`: the paper's experiments, each a folder here, each leaving figures, data and a page.
+//! `driml experiment`, `driml sweep`, `driml tradeoff` and `driml plot`: whatever is made of runs or of small trainings, and leaves
+//! figures, data and a page.
 //!
-//! An experiment is a grid of pieces (a setting and a seed, say). `session::Session` keeps each finished piece, so that one
-//! that was stopped goes on where it was; pieces that are whole runs are made by `queue`. What it leaves is written by
-//! `page::Page` from the template `page.md` beside its settings.
+//! * `sweep` is the engine for runs: it makes, resumes and keeps those of every combination of settings and seed. `sweeps` are the
+//!   experiments that consist of runs, each a TOML file, a page template and what is special about it.
+//! * `studies` are the experiments that train something of their own; `stability` measures numeric routines.
+//! * `cache` keeps finished pieces of work in an experiment's folder, `stats` has the statistics, `page` fills in templates and renders
+//!   tables, `plot` draws what runs recorded.
 //!
-//! A new one is a folder with `run(args)`, a variant of [`flags::ExperimentCommand`], and beside its code `config.toml`,
-//! `smoke.toml` (the same in seconds) and `page.md`. Results that are kept are in `deploy/experiments/results/`.
+//! A new experiment of runs is three files in `sweeps` and a variant of [`flags::ExperimentCommand`]. Results that are kept are in
+//! `deploy/experiments/results/`.
 //!
 //! Start with [`run`]; what it takes comes from a command line, here the one of Fig. 1 in its short form:
 //!
@@ -26,27 +29,22 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-mod aggregate;
+mod cache;
 pub mod flags;
-mod grid;
-mod ising;
-#[cfg(test)]
-mod made_up;
-mod pacman;
 mod page;
 pub mod plot;
-mod procgen;
 mod progress;
-mod queue;
-mod random_walk;
-mod runs;
-mod session;
 mod stability;
-mod statistics;
-mod template;
-mod tradeoff;
+mod stats;
+mod studies;
+mod sweep;
+mod sweeps;
 
-use crate::flags::{ExperimentCommand, GridArgs, TradeoffArgs};
+use crate::{
+    flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
+    studies::{ising, random_walk},
+    sweeps::{pacman, procgen},
+};
 
 /// Runs the experiment that the command names.
 ///
@@ -67,13 +65,13 @@ pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
 /// # Errors
 /// As [`run`].
 pub fn tradeoff(args: &TradeoffArgs) -> anyhow::Result<()> {
-    tradeoff::run(args)
+    sweeps::tradeoff::run(args)
 }
 
 /// Makes a run for each combination of settings and each seed.
 ///
 /// # Errors
 /// As [`run`].
-pub fn grid(args: &GridArgs) -> anyhow::Result<()> {
-    grid::run(args)
+pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
+    sweep::command::run(args)
 }

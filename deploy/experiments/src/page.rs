@@ -1,20 +1,44 @@
 //! The page that an experiment leaves: claim, command, time, expected, got, differences.
-//! Its text is a template beside the experiment; its numbers come from results alone, so that none can be stale.
+//! Its text is a minijinja template beside the experiment; its numbers come from results alone, so that none can be stale.
 
-use std::fmt;
+use std::{collections::BTreeMap, fmt};
 
 use driml_machine::units::rough_duration;
-
-use crate::template::{self, Values};
+use minijinja::{Environment, UndefinedBehavior, Value};
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// Numbers in rows and columns, as Markdown.
-#[derive(Debug, Default)]
-pub(super) struct Table {
-    pub(super) header: Vec<String>,
-    pub(super) rows: Vec<Vec<String>>,
+/// Numbers in rows and columns: as Markdown with `{}`, in columns of text with [`Table::text`].
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Table {
+    pub(crate) header: Vec<String>,
+    pub(crate) rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// A table of these rows.
+    pub(crate) fn new(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Self {
+        Self {
+            header: header.iter().map(|&it| it.to_owned()).collect(),
+            rows: rows.into_iter().collect(),
+        }
+    }
+
+    /// Columns that stand below each other, for a terminal.
+    pub(crate) fn text(&self) -> String {
+        let lines = || std::iter::once(&self.header).chain(&self.rows);
+        let width = |column: usize| lines().map(|line| line[column].chars().count()).max();
+        let widths: Vec<_> = (0..self.header.len()).map(width).collect();
+        let mut text = String::new();
+        for line in lines() {
+            let cells = line.iter().zip(&widths);
+            let padded = cells.map(|(cell, width)| format!("{cell:0$}", width.unwrap_or(0)));
+            text += padded.collect::<Vec<_>>().join("  ").trim_end();
+            text.push('\n');
+        }
+        text
+    }
 }
 
 impl fmt::Display for Table {
@@ -28,16 +52,50 @@ impl fmt::Display for Table {
     }
 }
 
+/// The cell of a number; empty in data where there is none.
+pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
+    value.map_or(String::new(), |value| format!("{value:.decimals$}"))
+}
+
+/// A cell of a page; a dash where there is nothing.
+pub(crate) fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
+    value.map_or_else(|| "-".into(), text)
+}
+
+/// What the names in a template stand for.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Values(BTreeMap<&'static str, Value>);
+
+impl Values {
+    /// A number or words, or a whole block.
+    pub(crate) fn set(&mut self, name: &'static str, value: impl fmt::Display) -> &mut Self {
+        self.0.insert(name, value.to_string().into());
+        self
+    }
+
+    /// Entries of a list.
+    pub(crate) fn items(&mut self, name: &'static str, items: Vec<String>) -> &mut Self {
+        self.0.insert(name, items.into());
+        self
+    }
+
+    /// Whether what hangs on it is on the page.
+    pub(crate) fn when(&mut self, name: &'static str, truth: bool) -> &mut Self {
+        self.0.insert(name, truth.into());
+        self
+    }
+}
+
 /// A page, filled in but for the time that it took.
 #[derive(Debug)]
-pub(super) struct Page {
+pub(crate) struct Page {
     template: &'static str,
     values: Values,
 }
 
 impl Page {
     /// The page of this template; `command` repeats the experiment, which was of the smoke length or not.
-    pub(super) fn new(
+    pub(crate) fn new(
         template: &'static str,
         mut values: Values,
         command: &str,
@@ -49,7 +107,7 @@ impl Page {
     }
 
     /// As Markdown. `seconds` is the time that all pieces took together, made `at_once` at a time.
-    pub(super) fn text(&self, seconds: f64, at_once: u32) -> String {
+    pub(crate) fn text(&self, seconds: f64, at_once: u32) -> String {
         let at_once = match at_once {
             1 => String::new(),
             jobs => format!(" of runs, {jobs} at once,"),
@@ -61,14 +119,39 @@ impl Page {
             "time",
             format!("{time}{at_once} on a machine with {cores} cores."),
         );
-        template::fill(self.template, &values)
+        fill(self.template, &values)
     }
 }
 
 /// What came out, for the terminal: the list below "Got".
-pub(super) fn summary(page: &str) -> String {
+pub(crate) fn summary(page: &str) -> String {
     let list = page.split("**Got.**\n\n").nth(1).unwrap_or_default();
     list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
+}
+
+/// The Markdown that `template` becomes. Blocks of which nothing is left are left out.
+///
+/// # Panics
+/// The template, which is built in, is not one, or names a value that its experiment does not give.
+fn fill(template: &str, values: &Values) -> String {
+    let mut environment = Environment::new();
+    environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.set_trim_blocks(true);
+    environment.set_lstrip_blocks(true);
+    environment.add_function("figure", figure);
+    let text = environment
+        .render_str(template, &values.0)
+        .unwrap_or_else(|e| {
+            panic!("the template of the page is built in, and a test fills it: {e:#}")
+        });
+    let blocks = text.split("\n\n").map(str::trim);
+    let blocks: Vec<_> = blocks.filter(|block| !block.is_empty()).collect();
+    blocks.join("\n\n") + "\n"
+}
+
+/// A picture with its caption below it, and a link to the SVG.
+fn figure(stem: &str, caption: &str) -> String {
+    format!("![{caption}]({stem}.png)\n\n{caption} ([SVG]({stem}.svg))")
 }
 
 #[cfg(test)]
@@ -77,13 +160,14 @@ mod tests {
 
     #[test]
     fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
-        let table = Table {
-            header: vec!["a".into(), "b".into()],
-            rows: vec![vec!["1".into(), "2".into()]],
-        };
-        let template = "# T\n\n{smoke}\n\n**Command.** `{command}`\n\n**Time.** {time}\n\n**Got.**\n\n* {got}\n\nNumbers:\n\n{table}\n";
+        let table = Table::new(&["a", "b"], [vec!["1".into(), "2".into()]]);
+        assert_eq!(table.text(), "a  b\n1  2\n");
+        let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
+                        * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ table }}\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let mut values = Values::default();
         values.set("got", 0.5).set("table", table);
+        values.items("more", vec!["1".into(), "2".into()]);
+        values.when("no", false);
         let page = |smoke| Page::new(template, values.clone(), "driml experiment t", smoke);
         let text = page(true).text(130.0, 1);
         for part in [
@@ -91,17 +175,23 @@ mod tests {
             "smoke length",
             "**Command.** `driml experiment t`",
             "**Time.** 2 min on",
-            "**Got.**\n\n* 0.5\n",
-            "Numbers:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n",
+            "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n",
+            "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
-        assert_eq!(summary(&text), "* 0.5\n");
+        assert_eq!(summary(&text), "* 0.5\n* 1\n* 2\n");
         assert!(
             page(true)
                 .text(130.0, 2)
                 .contains("**Time.** 2 min of runs, 2 at once, on")
         );
         assert!(!page(false).text(1.0, 1).contains("smoke length"));
+    }
+
+    #[test]
+    #[should_panic(expected = "undefined")]
+    fn a_name_without_a_value_is_a_mistake() {
+        fill("{{ nothing }}", &Values::default());
     }
 }

@@ -14,7 +14,7 @@ const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
 
 /// Counts units of work, such as updates.
 #[derive(Debug)]
-pub(super) struct Progress {
+pub(crate) struct Progress {
     total: u64,
     done: u64,
     /// Done before this start: known, so no measure of speed.
@@ -28,7 +28,7 @@ pub(super) struct Progress {
 
 impl Progress {
     /// Of `total` units; listens for interrupts from now on.
-    pub(super) fn new(total: u64, interrupts: Interrupts) -> Self {
+    pub(crate) fn new(total: u64, interrupts: Interrupts) -> Self {
         Self {
             total,
             done: 0,
@@ -42,18 +42,18 @@ impl Progress {
     }
 
     /// Says what is being done.
-    pub(super) fn begin(&mut self, what: &str) {
+    pub(crate) fn begin(&mut self, what: &str) {
         self.what = what.to_owned();
     }
 
     /// Counts work that an earlier start did.
-    pub(super) fn find(&mut self, units: u64) {
+    pub(crate) fn find(&mut self, units: u64) {
         self.done += units;
         self.found += units;
     }
 
     /// Counts work that was done in vain and has to be done again.
-    pub(super) fn again(&mut self, units: u64) {
+    pub(crate) fn again(&mut self, units: u64) {
         self.total += units;
         if let Some(bar) = self.screen.bar() {
             bar.set_length(self.total);
@@ -64,7 +64,7 @@ impl Progress {
     ///
     /// # Errors
     /// [`Interrupted`] after a Ctrl-C or a signal to stop.
-    pub(super) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
+    pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.done += units;
         let period = if self.screen.bar().is_some() {
             BAR_PERIOD
@@ -83,17 +83,17 @@ impl Progress {
     }
 
     /// Writes a line above the bar.
-    pub(super) fn line(&self, line: &str) {
+    pub(crate) fn line(&self, line: &str) {
         self.screen.line(line);
     }
 
     /// How many times Ctrl-C or a signal has asked to stop.
-    pub(super) fn interrupts(&self) -> u32 {
+    pub(crate) fn interrupts(&self) -> u32 {
         self.interrupts.count()
     }
 
     /// Takes the bar away.
-    pub(super) fn clear(&self) {
+    pub(crate) fn clear(&self) {
         self.screen.clear();
     }
 

@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{
     plot::flags::Band,
-    statistics::{Spread, interval},
+    stats::{Spread, interval},
 };
 
 /// Points of a curve over several runs.
@@ -87,18 +87,9 @@ impl Group<'_> {
             if let Some(window) = way.smooth {
                 values = smoothed(&values, window as f64);
             }
-            if !values.is_empty() {
-                each.push(values);
-            }
+            each.push(values);
         }
-        Ok(match &each[..] {
-            [] => Curve::default(),
-            [only] => Curve {
-                points: thinned(only),
-                band: Vec::new(),
-            },
-            many => together(many, way.band),
-        })
+        Ok(one_curve(&each, way.band))
     }
 }
 
@@ -112,6 +103,10 @@ pub(super) struct Way {
 
 /// One or several curves as one, with a band of their range if there are several.
 pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
+    one_curve(each, Band::Range)
+}
+
+fn one_curve(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).cloned().collect();
     match &each[..] {
         [] => Curve::default(),
@@ -119,7 +114,7 @@ pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
             points: thinned(only),
             band: Vec::new(),
         },
-        many => together(many, Band::Range),
+        many => together(many, band),
     }
 }
 

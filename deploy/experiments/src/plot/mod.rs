@@ -20,7 +20,6 @@ use driml_launch::{
 use driml_machine::error::usage;
 
 pub(crate) use self::{
-    affinity::figure as affinities,
     groups::{Curve, over_seeds, smoothed},
     runs::{Over, Run},
 };

@@ -173,7 +173,7 @@ impl Run {
     ///
     /// # Errors
     /// They are not there or do not hold.
-    pub(super) fn config(&self) -> anyhow::Result<RunConfig> {
+    pub(crate) fn config(&self) -> anyhow::Result<RunConfig> {
         let path = self.folder.config();
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("reading {}", path.display()))?;

@@ -21,10 +21,9 @@ use self::{
     settings::Settings,
 };
 use crate::{
-    flags::{self, ExperimentFlags, command_line},
-    page::{Page, Table},
-    session::{self, Session},
-    template::Values,
+    cache::{self, Session},
+    flags::{self, ExperimentFlags, this_command},
+    page::{Page, Table, Values},
 };
 
 const NAME: &str = "stability";
@@ -85,7 +84,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let units = each * u64::from(settings.seeds) + 1;
     let mut session = Session::open(NAME, args, &settings, units)?;
     // What another build of the routines kept says nothing of these.
-    let program = session::program()?;
+    let program = cache::program()?;
     let mut rows: Vec<Row> = Vec::new();
     for (at, (family, units, check)) in MENU.into_iter().enumerate() {
         let mut of_family: Vec<Row> = Vec::new();
@@ -124,7 +123,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &results)?;
     let cases = thousands(results.cases());
     session.figure("worst", &figure::figure(&results.rows, &cases))?;
-    let command = command_line(NAME, args, session.folder());
+    let command = this_command();
     let page = session.folder().join("README.md");
     session.finish(&page_of(&results, &command, args.smoke))?;
     let verdict = verdict(&results);
@@ -150,13 +149,13 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
             row.input.clone(),
         ]
     });
-    session.csv("promises", &header, rows)?;
+    session.csv("promises", &Table::new(&header, rows))?;
     let header = ["value", "refused_by_name", "message"];
     let rows = results.refusals.iter().map(|it| {
         let said = it.said.clone().unwrap_or_default();
         vec![it.value.clone(), yes(it.is_by_name()).to_owned(), said]
     });
-    session.csv("refused", &header, rows)
+    session.csv("refused", &Table::new(&header, rows))
 }
 
 const fn yes(truth: bool) -> &'static str {

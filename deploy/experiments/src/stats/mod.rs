@@ -1,6 +1,8 @@
 //! Small statistics over seeds and pairs: mean and spread, 95% intervals, when two means are apart, rank correlation, area under the
 //! ROC curve. Every interval of seeds that is printed or drawn is made here. It normalises nothing.
 
+pub(crate) mod over_games;
+
 use std::fmt;
 
 use rand::{Rng, SeedableRng};
@@ -8,18 +10,18 @@ use rand_chacha::ChaCha8Rng;
 
 /// Mean and standard deviation (n - 1) over seeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Spread {
-    pub(super) mean: f64,
+pub(crate) struct Spread {
+    pub(crate) mean: f64,
     /// 0 for a single value.
-    pub(super) sd: f64,
-    pub(super) min: f64,
-    pub(super) max: f64,
-    pub(super) count: usize,
+    pub(crate) sd: f64,
+    pub(crate) min: f64,
+    pub(crate) max: f64,
+    pub(crate) count: usize,
 }
 
 impl Spread {
     /// Of these values; none of no value.
-    pub(super) fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+    pub(crate) fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let values: Vec<f64> = values.into_iter().collect();
         let n = values.len() as f64;
         if values.is_empty() {
@@ -71,15 +73,15 @@ fn quantile(freedom: usize) -> f64 {
 
 /// A mean and the interval in which it lies with 95% confidence if values are normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Interval {
-    pub(super) mean: f64,
+pub(crate) struct Interval {
+    pub(crate) mean: f64,
     /// Both none for a single value: it does not tell how far others would spread.
-    pub(super) ends: Option<(f64, f64)>,
+    pub(crate) ends: Option<(f64, f64)>,
 }
 
 impl Interval {
     /// Mean, low and high end as a file of data has them; empty where there is none.
-    pub(super) fn cells(&self) -> [String; 3] {
+    pub(crate) fn cells(&self) -> [String; 3] {
         let ends = self.ends;
         let numbers = [Some(self.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
         numbers.map(|it| it.map_or(String::new(), |it| format!("{it:.4}")))
@@ -89,7 +91,7 @@ impl Interval {
 /// Student's interval of the mean; none of no value.
 ///
 /// A bootstrap of so few values as there are seeds is too narrow: of three, its 95% interval has the mean in 75% of cases.
-pub(super) fn interval(values: &[f64]) -> Option<Interval> {
+pub(crate) fn interval(values: &[f64]) -> Option<Interval> {
     let Spread {
         mean, sd, count, ..
     } = Spread::of(values.iter().copied())?;
@@ -102,16 +104,16 @@ pub(super) fn interval(values: &[f64]) -> Option<Interval> {
 
 /// The mean of some values minus that of others which have nothing in common with them.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Difference {
+pub(crate) struct Difference {
     /// Welch's interval, with his degrees of freedom rounded down. No ends where either side has a single value.
-    pub(super) interval: Interval,
+    pub(crate) interval: Interval,
     /// Whether 0 is outside of the interval, and the exact permutation test finds a chance of at most 5%: few values may coincide, and
     /// their interval is then too narrow. Of more than 20 values the interval alone decides.
-    pub(super) is_apart: bool,
+    pub(crate) is_apart: bool,
 }
 
 /// The mean of `to` minus that of `from`; none where either is empty.
-pub(super) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
+pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
     let interval = welch(from, to)?;
     let excludes_zero = |(low, high)| low > 0.0 || high < 0.0;
     let is_apart = interval.ends.is_some_and(excludes_zero)
@@ -147,7 +149,7 @@ fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
 const SAMPLES: usize = 2_000;
 
 /// How often [`difference`] calls two samples of these sizes apart that are of one normal law.
-pub(super) fn apart_by_chance(from: usize, to: usize) -> f64 {
+pub(crate) fn apart_by_chance(from: usize, to: usize) -> f64 {
     // One fixed seed: the same sizes give the same page.
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut sample = |count: usize| -> Vec<f64> { (0..count).map(|_| normal(&mut rng)).collect() };
@@ -228,7 +230,7 @@ fn ranks(values: &[f64]) -> Vec<f64> {
 }
 
 /// Spearman's rank correlation, in -1..=1; none of fewer than three pairs or where one side does not vary.
-pub(super) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
+pub(crate) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
     let x = ranks(&pairs.iter().map(|pair| pair.0).collect::<Vec<_>>());
     let y = ranks(&pairs.iter().map(|pair| pair.1).collect::<Vec<_>>());
     let mean = (pairs.len() as f64 + 1.0) / 2.0;
@@ -243,7 +245,7 @@ pub(super) fn rank_correlation(pairs: &[(f64, f64)]) -> Option<f64> {
 /// Probability that a score of `yes` is above one of `no`, ties counting half: the area under the ROC curve.
 ///
 /// 0.5 for scores that tell nothing; none if either is empty. Scores must be finite.
-pub(super) fn auc(yes: &[f64], no: &[f64]) -> Option<f64> {
+pub(crate) fn auc(yes: &[f64], no: &[f64]) -> Option<f64> {
     if yes.is_empty() || no.is_empty() {
         return None;
     }

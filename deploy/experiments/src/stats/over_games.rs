@@ -1,21 +1,21 @@
 //! Scores over games and seeds as the field reports them: interquartile mean and probability of improvement. Source: Agarwal et al.
 //! 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Their bootstrap intervals are for more seeds than
-//! runs of days allow; these are Student's. It normalises nothing. Besides, the score by which the paper sums up its table 1.
+//! runs of days allow; these are Student's. It normalises nothing.
 
-use crate::statistics::{Interval, interval};
+use crate::stats::{Interval, interval};
 
 /// Scores by game and seed: `scores[game][seed]`, each game with at least one seed.
-pub(super) type Scores = Vec<Vec<f64>>;
+pub(crate) type Scores = Vec<Vec<f64>>;
 
 /// Mean of the middle half of all scores, and its interval; none of no score.
-pub(super) fn iqm(scores: &Scores) -> Option<Interval> {
+pub(crate) fn iqm(scores: &Scores) -> Option<Interval> {
     estimate(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
 }
 
 /// Probability that a run of `x` does better than one of `y` in a game drawn at random, and its interval; none of no game.
 ///
 /// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games; both have the same games.
-pub(super) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
+pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     assert_eq!(x.len(), y.len(), "the same games");
     let found = estimate(&[x, y], |it| {
         let games = it[0].iter().zip(&it[1]);
@@ -23,28 +23,6 @@ pub(super) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     })?;
     let ends = found.ends.map(|(low, high)| (low.max(0.0), high.min(1.0)));
     Some(Interval { ends, ..found })
-}
-
-/// Mean over games of each agent's place between the game's worst agent, 0, and its best, 1, divided by the place of the
-/// agent `baseline`: `games[game][agent]`, the same agents in each game. None if no agents differ in any game, or if the
-/// baseline is the worst in all.
-///
-/// The paper does not define its "Norm.score"; this formula gives the last row of table 1 from its other rows. It depends on
-/// which agents are compared.
-pub(super) fn norm_scores(games: &[Vec<f64>], baseline: usize) -> Option<Vec<f64>> {
-    let agents = games.first()?.len();
-    let mut places = vec![0.0; agents];
-    for scores in games {
-        let worst = scores.iter().copied().fold(f64::INFINITY, f64::min);
-        let best = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        if best > worst {
-            for (place, score) in places.iter_mut().zip(scores) {
-                *place += (score - worst) / (best - worst);
-            }
-        }
-    }
-    let unit = places[baseline];
-    (unit > 0.0).then(|| places.iter().map(|place| place / unit).collect())
 }
 
 /// Mean without the lowest and the highest quarter, each rounded down to whole scores.
@@ -158,17 +136,6 @@ mod tests {
         };
         let pairs = numbers(found).into_iter().zip(numbers(expected));
         pairs.for_each(|(found, expected)| assert!((found - expected).abs() < 1e-12));
-    }
-
-    #[test]
-    fn the_norm_score_is_relative_to_worst_best_and_baseline() {
-        // Places: 1/2, 0, 1 and 1/2, 1, 0; the third game, where all are equal, says nothing.
-        let games = [vec![2.0, 1.0, 3.0], vec![0.0, 5.0, -5.0], vec![4.0; 3]];
-        assert_eq!(norm_scores(&games, 0), Some(vec![1.0, 1.0, 1.0]));
-        assert_eq!(norm_scores(&games[..1], 0), Some(vec![1.0, 0.0, 2.0]));
-        assert_eq!(norm_scores(&games[..1], 1), None);
-        assert_eq!(norm_scores(&games[2..], 0), None);
-        assert_eq!(norm_scores(&[], 0), None);
     }
 
     #[test]

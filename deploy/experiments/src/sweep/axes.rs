@@ -1,4 +1,4 @@
-//! The axes of a grid and its cells: every combination of the values that a command line names.
+//! The axes of a sweep and its cells: every combination of the values that a command line names.
 //! What a setting means is for `driml local`, which takes each of them as it stands here.
 
 use driml_machine::error::{Usage, usage};
@@ -8,18 +8,18 @@ const RUNS_MAX: usize = 10_000;
 
 /// What is varied, or fixed if it has one value alone.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Axis {
+pub(crate) struct Axis {
     /// As a column is headed: `env`, `agent`, or a setting's dotted path.
-    pub(super) name: String,
-    pub(super) values: Vec<String>,
+    pub(crate) name: String,
+    pub(crate) values: Vec<String>,
 }
 
 /// One combination: a value of each axis, in their order.
-pub(super) type Cell = Vec<String>;
+pub(crate) type Cell = Vec<String>;
 
 impl Axis {
     /// Values of a flag of `driml local`.
-    pub(super) fn of_flag(name: &str, values: &[String]) -> Self {
+    pub(crate) fn of_flag(name: &str, values: &[String]) -> Self {
         Self {
             name: name.into(),
             values: values.to_vec(),
@@ -30,7 +30,7 @@ impl Axis {
     ///
     /// # Errors
     /// No `=`, an empty or a repeated value.
-    pub(super) fn parse(text: &str) -> Result<Self, Usage> {
+    pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form =
             "--set takes table.key=value,value,.., such as learner.update.adam.lr=1e-4,2.5e-4";
         let (name, values) = text
@@ -50,7 +50,7 @@ impl Axis {
 
     /// # Errors
     /// An empty or a repeated value: a run that nobody meant, or the same one twice.
-    pub(super) fn check(&self, form: &str) -> Result<(), Usage> {
+    pub(crate) fn check(&self, form: &str) -> Result<(), Usage> {
         for (at, value) in self.values.iter().enumerate() {
             if value.is_empty() {
                 return Err(usage!("{} has an empty value; {form}", self.name));
@@ -89,12 +89,12 @@ fn split(text: &str) -> Vec<&str> {
 ///
 /// # Errors
 /// More runs than anybody means, with so many seeds.
-pub(super) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
+pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
     let counts = axes.iter().map(|axis| axis.values.len());
     let runs = counts.fold(seeds as usize, usize::saturating_mul);
     if runs > RUNS_MAX {
         return Err(usage!(
-            "{runs} runs: a grid has at most {RUNS_MAX}; vary fewer settings at a time"
+            "{runs} runs: a sweep has at most {RUNS_MAX}; vary fewer settings at a time"
         ));
     }
     let mut cells = vec![Cell::new()];

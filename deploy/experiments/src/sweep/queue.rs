@@ -1,4 +1,4 @@
-//! Whole runs as pieces of an experiment: `driml local` as child processes, a few at once, each in a folder of its own.
+//! Makes the runs of a sweep: `driml train` as child processes, a few at once, each in a folder.
 //! A finished run is not run again; an unfinished one is resumed, or moved aside and started anew if it cannot be. It knows no
 //! experiment.
 
@@ -12,6 +12,7 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{
+    console,
     managed_process::exit_with_this_process,
     resume::{self, Found},
     run_folder::{Progress as RunProgress, progress as how_far},
@@ -27,11 +28,11 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::{
-    progress::Progress,
-    runs::{FinishedRun, PlannedRun, Runs, move_aside},
-    session::Session,
+use super::{
+    plan::{Call, Made, Planned, PlannedRun, Swept},
+    runs::{Runs, move_aside},
 };
+use crate::{cache::Session, progress::Progress};
 
 /// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
 const TRIES: u32 = 2;
@@ -40,25 +41,29 @@ const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. The result has a place for each
-/// plan: none where the run is missing or failed.
+/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. All settings are resolved, and what their worlds
+/// need is installed, before anything starts.
 ///
 /// # Errors
-/// An interrupt, after the running ones were stopped; settings that cannot work; a file system that refuses.
-pub(super) fn run_all(
+/// An interrupt, after the running ones were stopped; settings that cannot work; the file system refuses.
+pub(crate) fn make<P>(
     session: &mut Session,
-    plans: &[PlannedRun],
+    plans: Vec<Planned<P>>,
     jobs: u32,
     report: bool,
-) -> anyhow::Result<Vec<Option<FinishedRun>>> {
+) -> anyhow::Result<Swept<P>> {
+    if !report {
+        install(&plans)?;
+    }
     let (folder, progress) = session.work();
     let mut queue = Queue {
         runs: Runs::open(folder)?,
         jobs,
+        commit: commit()?,
         waiting: VecDeque::new(),
         running: Vec::new(),
     };
-    for plan in plans {
+    for (_, plan) in &plans {
         if queue.runs.finished(plan).is_some() {
             progress.find(plan.units);
         } else if !report {
@@ -70,17 +75,62 @@ pub(super) fn run_all(
         queue.stop(progress);
     }
     made?;
-    let ran: Vec<_> = plans.iter().map(|plan| queue.runs.finished(plan)).collect();
-    let seconds = ran.iter().flatten().map(|it| it.summary.wall_seconds);
+    let mut swept = Swept {
+        made: Vec::new(),
+        missing: Vec::new(),
+    };
+    for (point, plan) in plans {
+        match queue.runs.finished(&plan) {
+            Some(run) => swept.made.push(Made { point, plan, run }),
+            None => swept.missing.push(plan.name),
+        }
+    }
+    let seconds = swept.made.iter().map(|it| it.run.summary.wall_seconds);
     session.spend(seconds.sum(), jobs);
-    Ok(ran)
+    Ok(swept)
+}
+
+/// Resolves the settings of each call once, whatever its seed, and installs what its world needs.
+fn install<P>(plans: &[Planned<P>]) -> anyhow::Result<()> {
+    let mut known: Vec<Call> = Vec::new();
+    for (_, plan) in plans {
+        let call = Call {
+            seed: 1,
+            ..plan.call.clone()
+        };
+        if !known.contains(&call) {
+            let config = call
+                .config()
+                .map_err(|e| usage!("the run {}: {e}", plan.name))?;
+            config.world.install(&mut console::line)?;
+            known.push(call);
+        }
+    }
+    Ok(())
+}
+
+/// The commit that this program was built from, as its `--version` says in brackets.
+fn commit() -> anyhow::Result<String> {
+    let program = std::env::current_exe().context("finding this program's own file")?;
+    let output = Command::new(program).arg("--version").output();
+    let text = String::from_utf8_lossy(
+        &output
+            .context("asking this program for its version")?
+            .stdout,
+    )
+    .into_owned();
+    let commit = text
+        .trim()
+        .strip_suffix(')')
+        .and_then(|it| it.rsplit_once('('));
+    Ok(commit.map_or_else(String::new, |it| it.1.to_owned()))
 }
 
 /// Makes sure that no run is missing, unless a report of what there is was asked for.
 ///
 /// # Errors
 /// The names of those that are.
-pub(super) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
+pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
     anyhow::ensure!(
         missing.is_empty() || report_only,
         "these runs failed and are in no number of the page; the same command tries them again: {}",
@@ -93,6 +143,8 @@ struct Queue {
     runs: Runs,
     /// Runs at once.
     jobs: u32,
+    /// Of this program.
+    commit: String,
     /// How often each was tried, and its plan.
     waiting: VecDeque<(u32, PlannedRun)>,
     running: Vec<Running>,
@@ -221,17 +273,17 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(&plan)?;
+        self.runs.write_call(&plan, &self.commit)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command
-            .args(["local", "--no-play"])
+            .args(["train", "--no-play"])
             .args(exit_with_this_process());
         if resumed {
             command.arg("--resume").arg(&folder);
         } else {
             command.arg("--run-dir").arg(&folder);
-            command.args(self.threads()).args(&plan.args);
+            command.args(self.threads()).args(plan.call.args());
         }
         command
             .stdin(Stdio::null())
@@ -250,7 +302,7 @@ impl Queue {
         })
     }
 
-    /// Whether what lies in the plan's folder goes on: at the first try alone, as its checkpoint may be what fails.
+    /// Whether what lies in the plan's folder can be resumed: at the first try alone, as its checkpoint may be what fails.
     fn is_resumable(
         &self,
         plan: &PlannedRun,
@@ -268,11 +320,11 @@ impl Queue {
                 Ok(false)
             }
             Ok(Found::Resumed(_)) => {
-                progress.line(&format!("{} goes on from its checkpoint", folder.display()));
+                progress.line(&format!("{} resumes from its checkpoint", folder.display()));
                 Ok(true)
             }
             Err(e) => {
-                progress.line(&format!("{} cannot go on: {e:#}", folder.display()));
+                progress.line(&format!("{} cannot be resumed: {e:#}", folder.display()));
                 Ok(false)
             }
         }
@@ -292,8 +344,7 @@ impl Queue {
         if self.running.is_empty() {
             return;
         }
-        progress
-            .line("stopping the runs; the same command goes on with those that are not finished");
+        progress.line("stopping the runs; the same command resumes those that are not finished");
         for running in &self.running {
             signal(&running.child, Signal::SIGTERM);
         }

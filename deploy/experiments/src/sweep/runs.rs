@@ -1,4 +1,4 @@
-//! The runs of an experiment as they lie on the disk: each with the call that made it and what its process said.
+//! The runs of a sweep as they lie on the disk: each with the call that made it and what its process printed.
 //! It starts none.
 
 use std::{
@@ -10,51 +10,30 @@ use std::{
 use anyhow::Context;
 use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far, write_whole};
 
-/// Where the runs lie in an experiment's folder. Git does not keep them.
-const RUNS: &str = "runs";
+use super::plan::{FinishedRun, PlannedRun};
+use crate::cache::RUNS;
+
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: u64 = 1200;
 
-/// A run to be made.
-#[derive(Clone, Debug)]
-pub(super) struct PlannedRun {
-    /// Its folder's name.
-    pub(super) name: String,
-    /// What follows `driml local`.
-    pub(super) args: Vec<String>,
-    /// Its length in frames.
-    pub(super) frames: u64,
-    /// Episodes after which it is long enough, if that comes first.
-    pub(super) episodes: Option<u64>,
-    /// Its share of the experiment's work.
-    pub(super) units: u64,
-}
-
-/// A finished run.
-#[derive(Clone, Debug)]
-pub(super) struct FinishedRun {
-    pub(super) folder: RunFolder,
-    pub(super) summary: Summary,
-}
-
-/// The folder of an experiment's runs.
-pub(super) struct Runs {
+/// The folder of a sweep's runs.
+pub(crate) struct Runs {
     root: PathBuf,
 }
 
 impl Runs {
-    /// Opens the folder in the experiment's `folder`, or makes it.
+    /// Opens the folder in the sweep's `folder`, or makes it.
     ///
     /// # Errors
-    /// A file system that refuses.
-    pub(super) fn open(folder: &Path) -> anyhow::Result<Self> {
+    /// The file system refuses.
+    pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let root = folder.join(RUNS);
         fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
         Ok(Self { root })
     }
 
     /// The plan's run, if it is there, was made by this plan, and is whole and long enough.
-    pub(super) fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
+    pub(crate) fn finished(&self, plan: &PlannedRun) -> Option<FinishedRun> {
         if !self.is_made_by(plan) {
             return None;
         }
@@ -67,26 +46,32 @@ impl Runs {
             Outcome::Interrupted => enough,
             Outcome::Failed => false,
         };
-        good.then_some(FinishedRun { folder, summary })
+        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
+        good.then(|| FinishedRun {
+            folder,
+            summary,
+            commit: commit.trim().to_owned(),
+        })
     }
 
     /// Whether what lies in the plan's folder was begun by this very plan.
     pub(super) fn is_made_by(&self, plan: &PlannedRun) -> bool {
-        let call = fs::read_to_string(self.call(plan)).ok();
+        let call = fs::read_to_string(self.beside(plan, "call.json")).ok();
         let call = call.and_then(|text| serde_json::from_str::<Vec<String>>(&text).ok());
-        call.is_some_and(|args| args == plan.args)
+        call.is_some_and(|args| args == plan.call.args())
     }
 
-    /// Notes that the plan's run is made by this plan.
+    /// Notes that the plan's run is made by this plan, and by a program of this commit.
     ///
     /// # Errors
-    /// A file system that refuses.
-    pub(super) fn write_call(&self, plan: &PlannedRun) -> anyhow::Result<()> {
-        let call = serde_json::to_vec(&plan.args).context("writing down a call")?;
-        write_whole(&self.call(plan), &call)
+    /// The file system refuses.
+    pub(super) fn write_call(&self, plan: &PlannedRun, commit: &str) -> anyhow::Result<()> {
+        let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
+        write_whole(&self.beside(plan, "call.json"), &call)?;
+        write_whole(&self.beside(plan, "commit"), commit.as_bytes())
     }
 
-    /// The end of what the run's process said.
+    /// The end of what the run's process printed.
     pub(super) fn last_words(&self, plan: &PlannedRun) -> String {
         tail(&self.log(plan), LAST_WORDS_BYTES).unwrap_or_default()
     }
@@ -96,14 +81,13 @@ impl Runs {
         RunFolder::new(self.root.join(&plan.name))
     }
 
-    /// Where the arguments are that a run was made with.
-    fn call(&self, plan: &PlannedRun) -> PathBuf {
-        self.root.join(format!("{}.call.json", plan.name))
+    /// What the run's process printed.
+    pub(super) fn log(&self, plan: &PlannedRun) -> PathBuf {
+        self.beside(plan, "log")
     }
 
-    /// What the run's process said.
-    pub(super) fn log(&self, plan: &PlannedRun) -> PathBuf {
-        self.root.join(format!("{}.log", plan.name))
+    fn beside(&self, plan: &PlannedRun, what: &str) -> PathBuf {
+        self.root.join(format!("{}.{what}", plan.name))
     }
 }
 
@@ -136,11 +120,28 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::{LearnerStatus, ReplayStatus};
+    use driml_launch::run_folder::{Recorded, RunRecorder};
+    use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
 
     use super::*;
-    use crate::made_up;
-    use driml_launch::run_folder::{Recorded, RunRecorder};
+    use crate::sweep::plan::Call;
+
+    fn spec() -> RunSpec {
+        RunSpec {
+            world: "chain".into(),
+            agent: "driml-ada".into(),
+            seed: 3,
+            frame_height: 12,
+            frame_width: 12,
+            frame_channels: 1,
+            frame_stack: 1,
+            num_actions: 3,
+            n_step: 7,
+            gamma: 0.99,
+            horizon: Horizon::Nhg { k_max: 5 },
+            timeout: TimeoutRule::Terminal,
+        }
+    }
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -150,7 +151,10 @@ mod tests {
         };
         let plan = |frames: u64| PlannedRun {
             name: "run".into(),
-            args: vec!["--frames".into(), frames.to_string()],
+            call: Call {
+                frames: Some(frames),
+                ..Call::default()
+            },
             frames,
             episodes: None,
             units: frames,
@@ -159,12 +163,14 @@ mod tests {
         let folder = RunFolder::new(runs.root.join("run"));
         let mut recorder = RunRecorder::create(&folder, Recorded::default()).unwrap();
         recorder.record(std::slice::from_ref(&replay), &learner, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &made_up::spec(), &replay, &learner);
+        let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
         summary.write(&folder).unwrap();
-        assert!(runs.finished(&plan(10)).is_none(), "nobody knows its call");
-        runs.write_call(&plan(10)).unwrap();
-        assert!(runs.finished(&plan(10)).is_some());
+        assert!(runs.finished(&plan(10)).is_none(), "it has no call");
+        runs.write_call(&plan(10), "abc").unwrap();
+        assert_eq!(runs.finished(&plan(10)).unwrap().commit, "abc");
         assert!(runs.finished(&plan(20)).is_none());
+        fs::remove_file(runs.beside(&plan(10), "commit")).unwrap();
+        assert_eq!(runs.finished(&plan(10)).unwrap().commit, "");
         fs::write(folder.metrics(), "seconds,frames\n").unwrap();
         assert!(runs.finished(&plan(10)).is_none(), "its metrics are gone");
     }

@@ -5,12 +5,12 @@ use std::f64::consts::PI;
 use rand::Rng;
 
 use crate::{
-    random_walk::chain::{Chain, GAP_ERROR, LAW_ERROR, MUTUAL_INFORMATION_ERROR},
     stability::{
         check::{Context, Routine, Row},
         edges::exact_sum,
         routines::losses::worse,
     },
+    studies::random_walk::chain::{Chain, GAP_ERROR, LAW_ERROR, MUTUAL_INFORMATION_ERROR},
 };
 
 const WALK: Routine = Routine {

@@ -17,11 +17,10 @@ use self::{
     training::{Episodes, Measured, Task, Trained, View, train},
 };
 use crate::{
-    flags::{self, ExperimentFlags, command_line},
-    page::Page,
-    session::Session,
-    statistics::Spread,
-    template::Values,
+    cache::Session,
+    flags::{self, ExperimentFlags, this_command},
+    page::{Page, Table, Values},
+    stats::Spread,
 };
 
 const NAME: &str = "ising";
@@ -58,7 +57,7 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 ///
 /// # Errors
 /// A folder of other settings, an interrupt, a file system that refuses.
-pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
+pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,
         include_str!("config.toml"),
@@ -79,7 +78,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &trained)?;
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
-    let command = command_line(NAME, args, session.folder());
+    let command = this_command();
     session.finish(&page(&task, &trained, &command, args.smoke))
 }
 
@@ -108,7 +107,7 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
         "auc_pairs",
         "loss_nats",
     ];
-    session.csv("auc", &header, checks)?;
+    session.csv("auc", &Table::new(&header, checks))?;
     let losses = seeds().flat_map(|(seed, one)| {
         smoothed(&one.loss).map(move |(update, loss)| {
             vec![
@@ -118,7 +117,10 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
             ]
         })
     });
-    session.csv("loss", &["seed", "updates", "loss_nats"], losses)?;
+    session.csv(
+        "loss",
+        &Table::new(&["seed", "updates", "loss_nats"], losses),
+    )?;
     let maps = trained[0].maps.iter().enumerate();
     let maps = maps.flat_map(|(episode, map)| {
         map.iter().enumerate().map(move |(location, score)| {
@@ -129,7 +131,10 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
             ]
         })
     });
-    session.csv("maps", &["episode", "location", "score_nats"], maps)
+    session.csv(
+        "maps",
+        &Table::new(&["episode", "location", "score_nats"], maps),
+    )
 }
 
 /// Means of `LOSS_WINDOW` updates each, at their end.

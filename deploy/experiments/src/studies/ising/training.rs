@@ -16,7 +16,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::{progress::Progress, statistics::auc};
+use crate::{progress::Progress, stats::auc};
 
 /// What one training depends on.
 #[derive(Clone, Debug, PartialEq, Serialize)]

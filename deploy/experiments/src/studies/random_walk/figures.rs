@@ -8,7 +8,7 @@ use super::{
     results::{Measure, Results, Trained},
     training::Sampling,
 };
-use crate::statistics::Spread;
+use crate::stats::Spread;
 
 /// The paper's four panels.
 pub(super) fn fig1(results: &Results) -> Figure {

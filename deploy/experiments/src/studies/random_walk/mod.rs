@@ -14,11 +14,10 @@ use self::{
     training::{Sampling, train},
 };
 use crate::{
-    flags::{self, ExperimentFlags, command_line},
-    page::Page,
-    session::Session,
-    statistics::Spread,
-    template::Values,
+    cache::Session,
+    flags::{self, ExperimentFlags, this_command},
+    page::{Page, Table, Values},
+    stats::Spread,
 };
 
 const NAME: &str = "random-walk";
@@ -27,7 +26,7 @@ const NAME: &str = "random-walk";
 ///
 /// # Errors
 /// A folder of other settings, an interrupt, a file system that refuses.
-pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
+pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,
         include_str!("config.toml"),
@@ -64,7 +63,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &results)?;
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
-    let command = command_line(NAME, args, session.folder());
+    let command = this_command();
     session.finish(&page(&results, &command, args.smoke))
 }
 
@@ -91,17 +90,19 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     });
     session.csv(
         "alpha",
-        &[
-            "alpha",
-            "mi_nats",
-            "mi_numerical_nats",
-            "mi_learnt_nats",
-            "mi_ring_nats",
-            "mi_as_printed_nats",
-            "gap",
-            "gap_numerical",
-        ],
-        laws,
+        &Table::new(
+            &[
+                "alpha",
+                "mi_nats",
+                "mi_numerical_nats",
+                "mi_learnt_nats",
+                "mi_ring_nats",
+                "mi_as_printed_nats",
+                "gap",
+                "gap_numerical",
+            ],
+            laws,
+        ),
     )?;
 
     let alpha = results.settings.figure_alpha;
@@ -116,7 +117,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         states.into_iter().chain(numbers).collect()
     });
     let header = ["state", "next", "true_ratio", "learnt_mean", "learnt_sd"];
-    session.csv("ratio", &header, entries)?;
+    session.csv("ratio", &Table::new(&header, entries))?;
 
     let times = results.trained.iter().map(|one| {
         let time = |measure| {
@@ -144,7 +145,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         "final_tv",
         "final_excess_nats",
     ];
-    session.csv("convergence", &header, times)?;
+    session.csv("convergence", &Table::new(&header, times))?;
 
     let curves = figures::shown(results).into_iter().flat_map(|alpha| {
         let points = figures::tv_curve(results, alpha);
@@ -156,7 +157,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
         })
     });
     let header = ["alpha", "updates", "tv_mean", "tv_min", "tv_max"];
-    session.csv("curves", &header, curves)
+    session.csv("curves", &Table::new(&header, curves))
 }
 
 fn page(results: &Results, command: &str, smoke: bool) -> Page {

@@ -5,7 +5,7 @@ use super::{
     settings::Settings,
     training::{Learnt, Sampling},
 };
-use crate::statistics::{Spread, rank_correlation};
+use crate::stats::{Spread, rank_correlation};
 
 /// One piece of the grid.
 pub(super) struct Trained {

@@ -4,37 +4,33 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_protocol::RETURNS_OF;
 
 use super::{
-    results::{LOSSES, Results, Trace, loss_of},
+    results::{LOSSES, Results, Trace},
     settings::Continual,
 };
 use crate::{
     plot::{over_seeds, smoothed},
-    statistics::Spread,
+    stats::Spread,
 };
 
 /// Share of a run over which the drawn loss is averaged.
 const SMOOTH: f64 = 0.1;
 
 /// The DIM losses by epsilon, and the returns under one lethal ghost after another.
-pub(super) fn figure(
-    results: &Results,
-    ghosts: &[Trace],
-    noise: &[Trace],
-) -> anyhow::Result<Figure> {
+pub(super) fn figure(results: &Results) -> Figure {
     let settings = &results.settings;
     let mut panels = Vec::new();
     for (column, what) in LOSSES {
         let mut series = Vec::new();
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
-            let mut each = Vec::new();
-            for (_, points) in loss_of(results, epsilon, column)? {
-                let mut points = smoothed(&points, window);
+            let here = results.losses(column).filter(|it| it.epsilon == epsilon);
+            let each = here.map(|it| {
+                let mut points = smoothed(&it.points, window);
                 // While the learner catches up at the end, several rows have the same frames.
                 points.dedup_by_key(|point| point.0);
-                each.push(points);
-            }
-            let curve = over_seeds(&each);
+                points
+            });
+            let curve = over_seeds(&each.collect::<Vec<_>>());
             series.push(
                 Series::line(&format!("epsilon {epsilon}"), index, curve.points).banded(curve.band),
             );
@@ -50,12 +46,12 @@ pub(super) fn figure(
         (
             "(b) One lethal ghost after another",
             &settings.continual,
-            ghosts,
+            &results.ghosts,
         ),
         (
             "(c) The same with Ising noise in the walls",
             &settings.noise,
-            noise,
+            &results.noise,
         ),
     ] {
         panels.push(Panel::Chart(Chart::new(
@@ -65,7 +61,7 @@ pub(super) fn figure(
             task_series(results, continual, traces),
         )));
     }
-    Ok(Figure {
+    Figure {
         title: "Ms. PacMan: what DIM finds, and what it is good for".into(),
         notes: vec![format!(
             "(a) Mean over a tenth of the run; mean and range over seeds. (b, c) Training return, mean of the last {RETURNS_OF} \
@@ -76,7 +72,7 @@ pub(super) fn figure(
         columns: 2,
         panel_size: (430.0, 320.0),
         panels,
-    })
+    }
 }
 
 fn task_series(results: &Results, continual: &Continual, traces: &[Trace]) -> Vec<Series> {

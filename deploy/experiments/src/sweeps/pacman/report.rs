@@ -5,110 +5,56 @@ use driml_protocol::RETURNS_OF;
 
 use super::{
     figure::figure,
-    plans::{EPISODE_FRAMES_MAX, RunKind},
-    results::{LOSSES, Points, Results, Trace, loss_of, traces},
-    settings::Continual,
+    results::{LOSSES, Loss, Points, Results, Trace},
+    settings::{Continual, EPISODE_FRAMES_MAX},
 };
 use crate::{
-    page::{Page, Table},
-    session::Session,
-    statistics::{Spread, interval, rank_correlation},
-    template::Values,
+    cache::Session,
+    page::{Page, Table, Values, cell, number},
+    stats::{Spread, interval, rank_correlation},
 };
 
-/// Share of a run, at its end, whose mean is the final loss.
-const FINAL: f64 = 0.2;
 /// Names of ghosts 0 to 3.
 const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 
-/// Final loss of a run of (a).
-struct Loss {
-    epsilon: f64,
-    seed: u32,
-    column: &'static str,
-    last: f64,
-    whole: f64,
-}
-
 /// Writes the tables, figure 3 and the page of what was run.
-pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
-    let losses = losses(results)?;
-    let ghosts = traces(results, false)?;
-    let noise = traces(results, true)?;
-    session.figure("fig3", &figure(results, &ghosts, &noise)?)?;
-    write_losses(&session, results, &losses)?;
-    let (continual, with_noise) = (&results.settings.continual, &results.settings.noise);
-    write_traces(&session, "ghosts", &ghosts)?;
-    write_traces(&session, "noise", &noise)?;
-    let mut tables = Values::default();
-    tables
-        .set("losses", loss_table(results, &losses))
-        .set("ghosts", task_table(continual, results, &ghosts))
-        .set("noise", task_table(with_noise, results, &noise));
-    let mut got = got_losses(&losses);
-    got.extend(got_tasks("(b)", continual, results, &ghosts));
-    got.extend(got_tasks("(c)", with_noise, results, &noise));
-    session.finish(&page(results, &losses, got, tables))
+pub(super) fn report(
+    session: Session,
+    results: &Results,
+    command: &str,
+    smoke: bool,
+) -> anyhow::Result<()> {
+    session.figure("fig3", &figure(results))?;
+    write_losses(&session, results)?;
+    write_traces(&session, "ghosts", &results.ghosts)?;
+    write_traces(&session, "noise", &results.noise)?;
+    let values = values(results);
+    let template = include_str!("../pacman.md");
+    session.finish(&Page::new(template, values, command, smoke))
 }
 
-fn losses(results: &Results) -> anyhow::Result<Vec<Loss>> {
-    let mut losses = Vec::new();
-    let settings = &results.settings.predictability;
-    let from = settings.frames as f64 * (1.0 - FINAL);
-    for &epsilon in &settings.epsilons {
-        for (column, _) in LOSSES {
-            for (seed, values) in loss_of(results, epsilon, column)? {
-                let mean = |from: f64| {
-                    let late = values.iter().filter(|(frames, _)| *frames >= from);
-                    Spread::of(late.map(|point| point.1)).map(|spread| spread.mean)
-                };
-                if let (Some(last), Some(whole)) = (mean(from), mean(0.0)) {
-                    losses.push(Loss {
-                        epsilon,
-                        seed,
-                        column,
-                        last,
-                        whole,
-                    });
-                }
-            }
-        }
-    }
-    Ok(losses)
-}
-
-fn write_losses(session: &Session, results: &Results, losses: &[Loss]) -> anyhow::Result<()> {
-    let mut rows = Vec::new();
-    for &epsilon in &results.settings.predictability.epsilons {
-        for (column, _) in LOSSES {
-            for (seed, values) in loss_of(results, epsilon, column)? {
-                rows.extend(values.into_iter().map(|(frames, loss)| {
-                    vec![
-                        epsilon.to_string(),
-                        seed.to_string(),
-                        column.to_owned(),
-                        format!("{frames:.0}"),
-                        format!("{loss:.4}"),
-                    ]
-                }));
-            }
-        }
-    }
-    session.csv("loss", &["epsilon", "seed", "loss", "frames", "nats"], rows)?;
-    let rows = losses.iter().map(|it| {
+fn write_losses(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let head = |it: &Loss| {
         vec![
             it.epsilon.to_string(),
             it.seed.to_string(),
             it.column.to_owned(),
-            format!("{:.4}", it.last),
-            format!("{:.4}", it.whole),
         ]
+    };
+    let rows = results.losses.iter().flat_map(|it| {
+        let points = it.points.iter();
+        points.map(move |(frames, loss)| {
+            [head(it), vec![format!("{frames:.0}"), format!("{loss:.4}")]].concat()
+        })
     });
-    session.csv(
-        "final_loss",
-        &["epsilon", "seed", "loss", "last_fifth_nats", "whole_nats"],
-        rows,
-    )
+    let header = ["epsilon", "seed", "loss", "frames", "nats"];
+    session.csv("loss", &Table::new(&header, rows))?;
+    let rows = results
+        .losses
+        .iter()
+        .map(|it| [head(it), vec![number(it.last, 4), number(it.whole, 4)]].concat());
+    let header = ["epsilon", "seed", "loss", "last_fifth_nats", "whole_nats"];
+    session.csv("final_loss", &Table::new(&header, rows))
 }
 
 fn write_traces(session: &Session, name: &str, traces: &[Trace]) -> anyhow::Result<()> {
@@ -122,35 +68,26 @@ fn write_traces(session: &Session, name: &str, traces: &[Trace]) -> anyhow::Resu
             ]
         })
     });
-    session.csv(name, &["agent", "seed", "episodes", "mean_return"], rows)
+    let header = ["agent", "seed", "episodes", "mean_return"];
+    session.csv(name, &Table::new(&header, rows))
 }
 
-fn loss_table(results: &Results, losses: &[Loss]) -> Table {
-    let rows = results
-        .settings
-        .predictability
-        .epsilons
-        .iter()
-        .map(|&epsilon| {
-            let kind = RunKind::Epsilon(epsilon);
-            let here = results.runs.iter().filter(|(of, ..)| *of == kind);
-            let episodes = here.map(|(.., ran)| ran.summary.episodes as f64);
-            let mut row = vec![
-                epsilon.to_string(),
-                Spread::of(episodes).map_or("-".into(), |it| format!("{:.0}", it.mean)),
-            ];
-            for (column, _) in LOSSES {
-                let of = |value: &dyn Fn(&Loss) -> f64| {
-                    let here = losses
-                        .iter()
-                        .filter(|it| it.epsilon == epsilon && it.column == column);
-                    plus_minus(here.map(value))
-                };
-                row.push(of(&|it| it.last));
-                row.push(of(&|it| it.whole));
-            }
-            row
-        });
+fn loss_table(results: &Results) -> Table {
+    let epsilons = results.settings.predictability.epsilons.iter();
+    let rows = epsilons.map(|&epsilon| {
+        let episodes = results.episodes.iter().filter(|it| it.0 == epsilon);
+        let episodes = Spread::of(episodes.map(|it| it.1));
+        let mut row = vec![
+            epsilon.to_string(),
+            cell(episodes, |it| format!("{:.0}", it.mean)),
+        ];
+        for (column, _) in LOSSES {
+            let here = || results.losses(column).filter(|it| it.epsilon == epsilon);
+            row.push(plus_minus(here().filter_map(|it| it.last)));
+            row.push(plus_minus(here().filter_map(|it| it.whole)));
+        }
+        row
+    });
     let header = [
         "epsilon",
         "episodes",
@@ -159,10 +96,7 @@ fn loss_table(results: &Results, losses: &[Loss]) -> Table {
         "global, last fifth",
         "global, whole run",
     ];
-    Table {
-        header: header.map(String::from).to_vec(),
-        rows: rows.collect(),
-    }
+    Table::new(&header, rows)
 }
 
 fn plus_minus(values: impl Iterator<Item = f64>) -> String {
@@ -201,24 +135,20 @@ fn task_table(continual: &Continual, results: &Results, traces: &[Trace]) -> Tab
     }
 }
 
-/// Epsilon and the final loss of each run.
-fn final_losses(losses: &[Loss], column: &str) -> Points {
-    let of = losses.iter().filter(|it| it.column == column);
-    of.map(|it| (it.epsilon, it.last)).collect()
+/// Rank correlation of epsilon and a final loss, and of how many runs it is.
+fn order_of_epsilon(results: &Results, column: &str) -> Option<(f64, usize)> {
+    let pairs = results.losses(column);
+    let pairs: Points = pairs
+        .filter_map(|it| Some((it.epsilon, it.last?)))
+        .collect();
+    Some((rank_correlation(&pairs)?, pairs.len()))
 }
 
-/// Rank correlation of epsilon and the final global loss.
-fn order_of_epsilon(losses: &[Loss]) -> Option<f64> {
-    rank_correlation(&final_losses(losses, LOSSES[1].0))
-}
-
-fn got_losses(losses: &[Loss]) -> Vec<String> {
+fn got_losses(results: &Results) -> Vec<String> {
     let lines = LOSSES.iter().filter_map(|(column, what)| {
-        let pairs = final_losses(losses, column);
-        let rank = rank_correlation(&pairs)?;
+        let (rank, runs) = order_of_epsilon(results, column)?;
         Some(format!(
-            "(a) Rank correlation of epsilon and the final {what} loss over {} runs: {rank:.2} (1 where each more random ghost costs more).",
-            pairs.len()
+            "(a) Rank correlation of epsilon and the final {what} loss over {runs} runs: {rank:.2} (1 where each more random ghost costs more)."
         ))
     });
     lines.collect()
@@ -275,9 +205,18 @@ fn got_tasks(
     lines
 }
 
-fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values) -> Page {
+/// What the page says.
+fn values(results: &Results) -> Values {
     let settings = &results.settings;
     let (ghosts, noise) = (&settings.continual, &settings.noise);
+    let mut got = got_losses(results);
+    got.extend(got_tasks("(b)", ghosts, results, &results.ghosts));
+    got.extend(got_tasks("(c)", noise, results, &results.noise));
+    let mut values = Values::default();
+    values
+        .set("losses", loss_table(results))
+        .set("ghosts", task_table(ghosts, results, &results.ghosts))
+        .set("noise", task_table(noise, results, &results.noise));
     let missing = &results.missing;
     values
         .when("some_missing", !missing.is_empty())
@@ -294,7 +233,7 @@ fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values
     values
         .when(
             "out_of_order",
-            order_of_epsilon(losses).is_some_and(|rank| rank <= 0.0),
+            order_of_epsilon(results, LOSSES[1].0).is_some_and(|(rank, _)| rank <= 0.0),
         )
         .when("smaller_replay", capacity.is_some())
         .set("capacity", capacity.unwrap_or_default())
@@ -317,6 +256,5 @@ fn page(results: &Results, losses: &[Loss], got: Vec<String>, mut values: Values
         .set("preset", &settings.preset)
         .when("has_sets", !settings.sets.is_empty())
         .set("sets", settings.sets.join(", "));
-    let template = include_str!("page.md");
-    Page::new(template, values, &results.command, results.smoke)
+    values
 }

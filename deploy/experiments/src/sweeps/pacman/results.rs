@@ -1,13 +1,16 @@
 //! What the runs of Fig. 3 left: their losses over frames, and their returns over episodes.
 
-use super::{
-    plans::RunKind,
-    settings::{Continual, Settings},
+use super::settings::{Continual, Point, Settings};
+use crate::{
+    plot::Run,
+    stats::Spread,
+    sweep::plan::{Made, Swept},
 };
-use crate::{plot::Run, runs::FinishedRun, statistics::Spread};
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
 pub(super) const LOSSES: [(&str, &str); 2] = [("dim_3t3", "local"), ("dim_4t4", "global")];
+/// Share of a run, at its end, whose mean is the final loss.
+const FINAL: f64 = 0.2;
 
 /// (x, y) in the order of x.
 pub(super) type Points = Vec<(f64, f64)>;
@@ -15,12 +18,27 @@ pub(super) type Points = Vec<(f64, f64)>;
 /// All there is to report.
 pub(super) struct Results {
     pub(super) settings: Settings,
-    /// Part and seed of each finished run.
-    pub(super) runs: Vec<(RunKind, u32, FinishedRun)>,
+    /// (a)
+    pub(super) losses: Vec<Loss>,
+    /// (b)
+    pub(super) ghosts: Vec<Trace>,
+    /// (c)
+    pub(super) noise: Vec<Trace>,
+    /// Of each epsilon the episodes of its runs.
+    pub(super) episodes: Vec<(f64, f64)>,
     /// Runs that are missing.
     pub(super) missing: Vec<String>,
-    pub(super) command: String,
-    pub(super) smoke: bool,
+}
+
+/// A loss over frames, of a run of (a).
+pub(super) struct Loss {
+    pub(super) epsilon: f64,
+    pub(super) seed: u32,
+    pub(super) column: &'static str,
+    pub(super) points: Points,
+    /// Means of the last fifth and of the whole run; none if it has no value there.
+    pub(super) last: Option<f64>,
+    pub(super) whole: Option<f64>,
 }
 
 /// Training return over episodes.
@@ -28,6 +46,86 @@ pub(super) struct Trace {
     pub(super) agent: String,
     pub(super) seed: u32,
     pub(super) points: Points,
+}
+
+impl Results {
+    /// Reads the metrics of the finished runs.
+    ///
+    /// # Errors
+    /// Metrics that cannot be read.
+    pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
+        let mut results = Self {
+            settings,
+            losses: Vec::new(),
+            ghosts: Vec::new(),
+            noise: Vec::new(),
+            episodes: Vec::new(),
+            missing: swept.missing,
+        };
+        for Made { point, plan, run } in swept.made {
+            let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
+            let settings = &results.settings;
+            match point {
+                Point::Epsilon(epsilon) => {
+                    results
+                        .episodes
+                        .push((epsilon, run.summary.episodes as f64));
+                    let frames = settings.predictability.frames as f64;
+                    for (column, _) in LOSSES {
+                        let points = metrics.values(column)?;
+                        results.losses.push(Loss {
+                            epsilon,
+                            seed,
+                            column,
+                            last: mean_from(&points, frames * (1.0 - FINAL)),
+                            whole: mean_from(&points, 0.0),
+                            points,
+                        });
+                    }
+                }
+                Point::Ghosts(agent) => {
+                    let points = trace(&metrics, &settings.continual)?;
+                    results.ghosts.push(Trace {
+                        agent,
+                        seed,
+                        points,
+                    });
+                }
+                Point::Noise(agent) => {
+                    let points = trace(&metrics, &settings.noise)?;
+                    results.noise.push(Trace {
+                        agent,
+                        seed,
+                        points,
+                    });
+                }
+            }
+        }
+        Ok(results)
+    }
+
+    /// The losses of one column.
+    pub(super) fn losses(&self, column: &str) -> impl Iterator<Item = &Loss> {
+        let column = column.to_owned();
+        self.losses.iter().filter(move |it| it.column == column)
+    }
+}
+
+fn mean_from(points: &Points, frames: f64) -> Option<f64> {
+    let late = points.iter().filter(|point| point.0 >= frames);
+    Spread::of(late.map(|point| point.1)).map(|it| it.mean)
+}
+
+/// Mean return of the last 100 episodes over episodes, up to the end of the last task.
+fn trace(run: &Run, continual: &Continual) -> anyhow::Result<Points> {
+    let (returns, episodes) = (run.values("mean_return")?, run.values("episodes")?);
+    // Once known, the return is in every row: the last rows of both belong together.
+    let rows = returns.iter().rev().zip(episodes.iter().rev());
+    let mut points: Vec<_> = rows.map(|(mean, episodes)| (episodes.1, mean.1)).collect();
+    points.reverse();
+    points.dedup_by_key(|point| point.0);
+    points.retain(|point| point.0 <= continual.episodes() as f64);
+    Ok(points)
 }
 
 impl Trace {
@@ -39,52 +137,6 @@ impl Trace {
         let values: Vec<f64> = inside.map(|point| point.1).collect();
         Some((*values.last()?, Spread::of(values.iter().copied())?.mean))
     }
-}
-
-/// Values of a loss in all runs with this epsilon.
-pub(super) fn loss_of(
-    results: &Results,
-    epsilon: f64,
-    column: &str,
-) -> anyhow::Result<Vec<(u32, Points)>> {
-    let runs = results
-        .runs
-        .iter()
-        .filter(|(kind, ..)| *kind == RunKind::Epsilon(epsilon));
-    runs.map(|(_, seed, ran)| Ok((*seed, Run::read(&ran.folder)?.values(column)?)))
-        .collect()
-}
-
-/// Mean return of the last 100 episodes over episodes, up to the end of the last task.
-pub(super) fn traces(results: &Results, noise: bool) -> anyhow::Result<Vec<Trace>> {
-    let settings = &results.settings;
-    let continual = if noise {
-        &settings.noise
-    } else {
-        &settings.continual
-    };
-    let mut traces = Vec::new();
-    for (kind, seed, ran) in &results.runs {
-        let agent = match kind {
-            RunKind::Ghosts(agent) if !noise => agent,
-            RunKind::Noise(agent) if noise => agent,
-            _ => continue,
-        };
-        let run = Run::read(&ran.folder)?;
-        let (returns, episodes) = (run.values("mean_return")?, run.values("episodes")?);
-        // Once known, the return is in every row: the last rows of both belong together.
-        let rows = returns.iter().rev().zip(episodes.iter().rev());
-        let mut points: Vec<_> = rows.map(|(mean, episodes)| (episodes.1, mean.1)).collect();
-        points.reverse();
-        points.dedup_by_key(|point| point.0);
-        points.retain(|point| point.0 <= continual.episodes() as f64);
-        traces.push(Trace {
-            agent: agent.clone(),
-            seed: *seed,
-            points,
-        });
-    }
-    Ok(traces)
 }
 
 #[cfg(test)]

@@ -1,14 +1,22 @@
-//! What Fig. 3 can be told, and what the command line replaces of it.
+//! What Fig. 3 can be told, what the command line replaces of it, and the runs that follow.
 
 use driml_machine::error::{Usage, usage};
 use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
-use crate::flags::{self, PacmanArgs};
+use crate::{
+    flags::{PacmanArgs, sweep_settings},
+    sweep::plan::{Call, PlannedRun},
+};
 
 pub(super) const NAME: &str = "pacman";
 
-/// `deploy/experiments/src/pacman/*.toml`. A folder holds the runs of one such choice; agents and seeds can be added.
+/// Frames of an episode, about; only the estimate of the time left depends on it.
+const EPISODE_FRAMES: u64 = 190;
+/// Most frames of an episode: the world's step limit. A run of that many frames has all its episodes.
+pub(super) const EPISODE_FRAMES_MAX: u64 = 500;
+
+/// A table of `pacman.toml`. A folder holds the runs of one such choice; agents and seeds can be added.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
@@ -63,14 +71,91 @@ impl Continual {
     }
 }
 
+/// What a run is for.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Point {
+    /// (a): ghosts that move at random with this probability.
+    Epsilon(f64),
+    /// (b), of this agent.
+    Ghosts(String),
+    /// (c), of this agent.
+    Noise(String),
+}
+
+impl Settings {
+    /// What there are runs for, with each seed.
+    pub(super) fn points(&self) -> Vec<Point> {
+        let epsilons = self.predictability.epsilons.iter();
+        let epsilons = epsilons.map(|&epsilon| Point::Epsilon(epsilon));
+        let agents = || self.agents.iter().cloned();
+        let continual = agents()
+            .map(Point::Ghosts)
+            .chain(agents().map(Point::Noise));
+        epsilons.chain(continual).collect()
+    }
+
+    /// The run of a seed.
+    pub(super) fn plan(&self, point: &Point, seed: u32) -> PlannedRun {
+        match point {
+            Point::Epsilon(epsilon) => {
+                let Predictability { agent, frames, .. } = &self.predictability;
+                let sets = [format!("world.epsilon={epsilon}")];
+                PlannedRun {
+                    name: format!("epsilon{epsilon}-seed{seed}"),
+                    call: self.call(agent, seed, *frames, &sets),
+                    frames: *frames,
+                    episodes: None,
+                    units: *frames,
+                }
+            }
+            Point::Ghosts(agent) => self.continual_plan("ghosts", &self.continual, agent, seed),
+            Point::Noise(agent) => self.continual_plan("noise", &self.noise, agent, seed),
+        }
+    }
+
+    fn continual_plan(
+        &self,
+        name: &str,
+        continual: &Continual,
+        agent: &str,
+        seed: u32,
+    ) -> PlannedRun {
+        let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
+        let mut sets = continual.sets.clone();
+        sets.push(format!(
+            "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",
+            continual.episodes_per_task / continual.envs,
+            order.join(",")
+        ));
+        sets.push("local.actors=1".into());
+        sets.push(format!("actor.envs={}", continual.envs));
+        let episodes = continual.episodes();
+        let frames = episodes * EPISODE_FRAMES_MAX;
+        PlannedRun {
+            name: format!("{name}-{agent}-seed{seed}"),
+            call: self.call(agent, seed, frames, &sets),
+            frames,
+            episodes: Some(episodes),
+            units: episodes * EPISODE_FRAMES,
+        }
+    }
+
+    fn call(&self, agent: &str, seed: u32, frames: u64, sets: &[String]) -> Call {
+        Call {
+            env: Some("mspacman".into()),
+            agent: Some(agent.into()),
+            preset: Some(self.preset.clone()),
+            seed,
+            frames: Some(frames),
+            sets: self.sets.iter().chain(sets).cloned().collect(),
+        }
+    }
+}
+
 /// The settings of the length asked for, with what the flags replace.
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
-    let mut settings: Settings = flags::settings(
-        NAME,
-        include_str!("config.toml"),
-        include_str!("smoke.toml"),
-        &args.flags,
-    );
+    let text = include_str!("../pacman.toml");
+    let mut settings: Settings = sweep_settings(NAME, text, args.flags.smoke);
     if !args.agents.is_empty() {
         let known = args.agents.iter().map(|name| presets::agent(name));
         let names = known.map(|agent| agent.map(|agent| agent.name.to_owned()));
@@ -87,7 +172,7 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
             .unwrap_or(continual.episodes_per_task);
         if !episodes.is_multiple_of(continual.envs) {
             return Err(usage!(
-                "--episodes-per-task {episodes} is no multiple of the {} copies of the world, each of which changes its ghost \
+                "--episodes-per-task {episodes} is not a multiple of the {} copies of the world, each of which changes its ghost \
                  by itself",
                 continual.envs
             ));

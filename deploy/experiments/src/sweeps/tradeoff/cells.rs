@@ -1,9 +1,6 @@
-//! Cells of the tables of a trade-off: numbers as a page and a file of data have them.
+//! Differences as the page of a trade-off says them.
 
-use crate::{
-    page::Table,
-    statistics::{Difference, Interval},
-};
+use crate::stats::{Difference, Interval};
 
 /// A difference, with its sign.
 pub(super) fn signed(it: &Difference) -> String {
@@ -23,23 +20,10 @@ pub(super) fn verdict(difference: &Difference) -> &'static str {
     }
 }
 
-/// A cell of a page, a dash if there is nothing.
-pub(super) fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
-    value.map_or_else(|| "-".into(), text)
-}
-
-/// A table of these rows.
-pub(super) fn table(header: &[&str], rows: Vec<Vec<String>>) -> Table {
-    Table {
-        header: header.iter().map(|&it| it.to_owned()).collect(),
-        rows,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::statistics::difference;
+    use crate::stats::difference;
 
     #[test]
     fn a_difference_is_put_into_words() {

@@ -1,12 +1,11 @@
 //! The dials: what can be turned, its levels as settings, what each is expected to buy and to cost.
-//! It measures nothing; the menu itself is `dials.toml`, the settings that all levels share in a world `worlds.toml`.
+//! It measures nothing; the menu itself, and what all levels share in a world, is `tradeoff.toml`.
 
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
 use serde::Deserialize;
 
-const DIALS: &str = include_str!("dials.toml");
-const WORLDS: &str = include_str!("worlds.toml");
+const FILE: &str = include_str!("../tradeoff.toml");
 /// The agent of a dial that names none.
 const AGENT: &str = "c51";
 
@@ -95,10 +94,40 @@ fn slug(name: &str) -> String {
     parts.collect::<Vec<_>>().join("-")
 }
 
+/// The file of settings.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Menu {
+struct File {
+    full: Length,
+    smoke: Length,
+    world: Vec<WorldBase>,
     dial: Vec<Dial>,
+}
+
+/// What every world's runs have at a length.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Length {
+    pub(super) preset: String,
+    /// Of each level.
+    pub(super) seeds: u32,
+    /// Played with each run's weights.
+    pub(super) episodes: u32,
+    /// Of a run; as its world says if this says nothing.
+    pub(super) frames: Option<u64>,
+    /// After those of the world, in the form of `--set`.
+    pub(super) sets: Vec<String>,
+}
+
+fn file() -> File {
+    toml::from_str(FILE)
+        .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"))
+}
+
+/// The full or the smoke length.
+pub(super) fn length(smoke: bool) -> Length {
+    let file = file();
+    if smoke { file.smoke } else { file.full }
 }
 
 /// What all runs in the worlds of one kind have, or in one game of it.
@@ -114,19 +143,11 @@ pub(super) struct WorldBase {
     pub(super) sets: Vec<String>,
 }
 
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Worlds {
-    world: Vec<WorldBase>,
-}
-
 /// The dials that a world has, in the order in which they are tried.
 pub(super) fn dials(world: WorldName) -> Vec<Dial> {
-    let menu: Menu = toml::from_str(DIALS)
-        .unwrap_or_else(|e| panic!("dials.toml is built in, and a test reads it: {e}"));
     let has =
         |dial: &Dial| dial.worlds.is_empty() || dial.worlds.iter().any(|kind| kind == world.kind());
-    menu.dial.into_iter().filter(has).collect()
+    file().dial.into_iter().filter(has).collect()
 }
 
 /// What all runs in a world have.
@@ -134,13 +155,8 @@ pub(super) fn dials(world: WorldName) -> Vec<Dial> {
 /// # Errors
 /// A world that nobody has found settings for with which C51 learns.
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
-    let worlds: Worlds = toml::from_str(WORLDS)
-        .unwrap_or_else(|e| panic!("worlds.toml is built in, and a test reads it: {e}"));
-    let mut of_kind: Vec<_> = worlds
-        .world
-        .iter()
-        .filter(|it| it.kind == world.kind())
-        .collect();
+    let worlds = file().world;
+    let mut of_kind: Vec<_> = worlds.iter().filter(|it| it.kind == world.kind()).collect();
     // A game's own before that of all.
     of_kind.sort_by_key(|it| it.game.is_none());
     let is_for = |it: &WorldBase| {
@@ -148,7 +164,7 @@ pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
         game.is_none_or(|game| format!("{}:{game}", it.kind) == world.to_string())
     };
     of_kind.into_iter().find(|it| is_for(it)).cloned().ok_or_else(|| {
-        let mut kinds: Vec<_> = worlds.world.iter().map(|it| it.kind.as_str()).collect();
+        let mut kinds: Vec<_> = worlds.iter().map(|it| it.kind.as_str()).collect();
         kinds.dedup();
         usage!(
             "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",

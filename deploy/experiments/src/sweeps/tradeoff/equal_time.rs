@@ -2,12 +2,13 @@
 //! Runs that ended alone are compared; the time is that at which those of the faster agent were done.
 
 use super::{
-    cells::{cell, signed, table, verdict},
+    cells::{signed, verdict},
     results::{PointResult, Results},
 };
 use crate::{
+    page::{Table, cell},
     plot::{Over, Run},
-    statistics::{difference, interval},
+    stats::{difference, interval},
 };
 
 /// C51 beside an agent with DIM in training return, as the data has it.
@@ -126,11 +127,11 @@ pub(super) fn dim_table(all: &[EqualTime]) -> String {
         "minus C51 at equal time",
     ];
     let names: Vec<&str> = all.iter().map(|it| it.agent.as_str()).collect();
-    let rows = all.iter().map(|it| it.row.clone()).collect();
+    let rows = all.iter().map(|it| it.row.clone());
     format!(
         "C51 beside {} in training return, at equal frames and at equal wall-clock time.\n\n{}",
         names.join(" and "),
-        table(&header, rows)
+        Table::new(&header, rows)
     )
 }
 

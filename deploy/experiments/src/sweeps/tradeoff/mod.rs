@@ -19,7 +19,7 @@ use std::{collections::BTreeMap, time::Instant};
 
 use driml_launch::{
     console::{self, print},
-    evaluate::{Levels, Player, Who},
+    evaluate::Levels,
 };
 use driml_machine::{error::usage, units::rough_duration};
 
@@ -31,17 +31,19 @@ use self::{
     speed::{Effort, Speed},
 };
 use crate::{
-    flags::TradeoffArgs,
-    queue,
-    runs::{FinishedRun, PlannedRun, Runs},
-    session::{self, Session},
-    statistics::Spread,
+    cache::{self, Session},
+    flags::{TradeoffArgs, this_command},
+    stats::Spread,
+    sweep::{
+        plan::{Made, Planned as PlannedAt, Swept},
+        queue,
+        results::Played,
+        runs::Runs,
+    },
 };
 
 /// The piece that lists the calls.
 const CALLS: &str = "calls";
-/// Seed of the played episodes: the same for every level.
-const PLAY_SEED: u64 = 1;
 /// Seeds up to which finished runs are looked for.
 const SEEDS_FOUND_MAX: u32 = 64;
 /// A piece of measuring as a share of a run's work; only the estimate of the time left depends on it.
@@ -62,13 +64,14 @@ struct Planned {
 ///
 /// # Errors
 /// Names that nothing has, a folder of other settings, an interrupt, a file system that refuses.
-pub(super) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
+pub(crate) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let name = folder_name(args)?;
-    let found: Option<Common> = session::settings_of(&name, &args.flags);
+    let found: Option<Common> = cache::settings_of(&name, &args.flags);
     let mut settings = settings::of(args, found)?;
     let report_only = args.queue.report;
-    if !report_only && settings.common.env.starts_with("procgen:") {
-        procgen_sys::Engine::install(&mut console::line)?;
+    if !report_only {
+        let base = settings.common.config(&settings.dials[0].base_point())?;
+        base.world.install(&mut console::line)?;
     }
     let effort = Effort::of(args.flags.smoke);
     let started = Instant::now();
@@ -152,7 +155,7 @@ fn speeds(
 ) -> anyhow::Result<BTreeMap<String, Speed>> {
     let mut speeds = BTreeMap::new();
     let units = settings.common.frames / PIECE_SHARE;
-    let program = session::program()?;
+    let program = cache::program()?;
     for dial in all_dials(settings)? {
         let base = dial.base_point();
         let asked = settings.dials.iter().any(|it| it.name == dial.name);
@@ -329,22 +332,28 @@ fn made(
         }
     }
     let runs = Runs::open(session.folder())?;
-    let mut wanted: Vec<(usize, u32, PlannedRun)> = Vec::new();
+    let mut wanted: Vec<PlannedAt<Point>> = Vec::new();
     // Seed by seed, so that what was stopped has one seed of everything before it has two of anything. Further seeds that another call
     // made are on the page too.
     for seed in 1..=settings.seeds_of(true).max(SEEDS_FOUND_MAX) {
-        for (at, (point, seeds)) in points.iter().enumerate() {
+        for (point, seeds) in &points {
             let run = settings.common.run(point, seed);
             if seed <= *seeds || runs.finished(&run).is_some() {
-                wanted.push((at, seed, run));
+                wanted.push((point.clone(), run));
             }
         }
     }
-    let plans: Vec<PlannedRun> = wanted.iter().map(|(_, _, run)| run.clone()).collect();
     let units = settings.common.frames / PIECE_SHARE;
-    let work: u64 = plans.iter().map(|plan| plan.units + units).sum();
+    let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
     session.work().1.again(work);
-    let ran = queue::run_all(session, &plans, settings.common.jobs, args.queue.report)?;
+    let play = Played {
+        levels: Levels::Train,
+        checkpoints: 1,
+        episodes: settings.common.episodes,
+        units,
+    };
+    let swept = queue::make(session, wanted, settings.common.jobs, args.queue.report)?;
+    let Swept { made, missing } = swept;
     let mut results = Results {
         commands: commands(args, session)?,
         smoke: args.flags.smoke,
@@ -356,39 +365,25 @@ fn made(
             .filter(|it| !it.chosen)
             .map(|it| it.of.name())
             .collect(),
-        missing: Vec::new(),
+        missing,
         settings,
     };
-    for ((at, seed, plan), ran) in wanted.into_iter().zip(ran) {
-        let Some(ran) = ran else {
-            results.missing.push(plan.name);
-            continue;
-        };
-        let episodes = results.settings.common.episodes;
-        let mut play = |key: &str, of: &str, who| {
-            session.piece_of(of, key, units, |progress| {
-                let played = played(&ran, who, episodes)?;
-                progress.advance(units)?;
-                Ok(played)
-            })
-        };
-        // A run may have been made anew since it was played.
-        let of = ran.summary.weights_sha256.clone();
-        let greedy = play(&format!("{}-played", plan.name), &of, Who::Agent)?;
+    for Made { point, plan, run } in made {
+        let greedy = play.greedy(session, &format!("{}-played", plan.name), &run)?;
         if results.random.is_empty() {
-            results.random = play("random", "", Who::Random)?;
+            results.random = play.random(session, "random", &run)?;
         }
-        let (point, _) = &points[at];
         // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
         let exactness = match results.points.contains_key(&point.key) {
             true => None,
             false => {
-                let config = results.settings.common.config(point)?;
+                let config = results.settings.common.config(&point)?;
                 session.work().1.again(units);
                 let key = format!("exactness-{}", point.key);
-                let of = format!("{of}, {}", exactness::Sizes::of(&config));
+                let sizes = exactness::Sizes::of(&config);
+                let of = format!("{}, {sizes}", run.summary.weights_sha256);
                 let made = session.piece_of(&of, &key, units, |progress| {
-                    let made = exactness::measure(&config, &ran.folder)?;
+                    let made = exactness::measure(&config, &run.folder)?;
                     progress.advance(units)?;
                     Ok(made)
                 })?;
@@ -401,7 +396,11 @@ fn made(
             exactness,
             seeds: Vec::new(),
         });
-        entry.seeds.push(SeedResult { seed, ran, greedy });
+        entry.seeds.push(SeedResult {
+            seed: plan.call.seed,
+            ran: run,
+            greedy: greedy.unwrap_or_default(),
+        });
     }
     let done = |of: &LevelOf| {
         results.points.contains_key(&of.point.key) && results.points.contains_key(&of.base.key)
@@ -417,46 +416,13 @@ fn made(
     Ok(results)
 }
 
-fn played(ran: &FinishedRun, who: Who, episodes: u32) -> anyhow::Result<Vec<f64>> {
-    let player = Player::load(&ran.folder)?;
-    let returns = player.returns(who, Levels::Train, episodes, PLAY_SEED)?;
-    Ok(returns.unwrap_or_default())
-}
-
 /// The calls that made the folder's runs, this one last unless it makes none.
 fn commands(args: &TradeoffArgs, session: &Session) -> anyhow::Result<Vec<String>> {
     let mut all: Vec<String> = session.kept_piece(CALLS).unwrap_or_default();
-    let this = command(args, session);
+    let this = this_command();
     if !all.contains(&this) && !args.queue.report {
         all.push(this);
         session.keep(CALLS, &all)?;
     }
     Ok(all)
-}
-
-fn command(args: &TradeoffArgs, session: &Session) -> String {
-    let mut words = format!("driml tradeoff --env {} --budget {}", args.env, args.budget);
-    if args.flags.smoke {
-        words += " --smoke";
-    }
-    for (flag, number) in [
-        ("--seeds", args.flags.seeds.map(u64::from)),
-        ("--frames", args.frames),
-        ("--episodes", args.episodes.map(u64::from)),
-        ("--jobs", args.queue.jobs.map(u64::from)),
-    ] {
-        if let Some(number) = number {
-            words += &format!(" {flag} {number}");
-        }
-    }
-    if !args.dials.is_empty() {
-        words += &format!(" --dials '{}'", args.dials.join(","));
-    }
-    if args.flags.out.is_some() {
-        words += &format!(" --out {}", session.folder().display());
-    }
-    for set in &args.queue.sets {
-        words += &format!(" --set '{set}'");
-    }
-    words
 }

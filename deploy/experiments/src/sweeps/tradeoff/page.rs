@@ -6,15 +6,14 @@ use anyhow::Context;
 use driml_machine::units::rough_duration;
 
 use super::{
-    cells::{cell, signed, table, verdict},
+    cells::{signed, verdict},
     equal_time::{dim_table, equal_time},
     exactness,
     results::{LevelOf, Measure, PointResult, Results},
 };
 use crate::{
-    page::{Page, Table},
-    statistics::{Interval, Spread, apart_by_chance},
-    template::Values,
+    page::{Page, Table, Values, cell},
+    stats::{Interval, Spread, apart_by_chance},
 };
 
 /// What the bench gives, as the data has it.
@@ -114,14 +113,11 @@ pub(super) fn page(results: &Results) -> anyhow::Result<Page> {
             },
         )
         .when("dim_is_there", !equal.is_empty())
-        .set("pareto", "pareto")
-        .set("pareto_training", "pareto_training")
-        .set("wall", "wall")
         .items("dials", dials(results))
         .when("some_left_out", !results.left_out.is_empty())
         .set("left_out", results.left_out.join("; "));
     Ok(Page::new(
-        include_str!("page.md"),
+        include_str!("../tradeoff.md"),
         values,
         &results.commands.join("`, then `"),
         results.smoke,
@@ -316,7 +312,7 @@ fn gains(results: &Results) -> Table {
         "training return",
         "difference",
     ];
-    table(&header, rows)
+    Table::new(&header, rows)
 }
 
 fn rest(results: &Results) -> Table {
@@ -349,7 +345,7 @@ fn rest(results: &Results) -> Table {
         "weights behind [updates]",
         "[s]",
     ];
-    table(&header, by_level(results, cells, |_, point| cells(point)))
+    Table::new(&header, by_level(results, cells, |_, point| cells(point)))
 }
 
 fn errors(results: &Results) -> Table {
@@ -380,7 +376,7 @@ fn errors(results: &Results) -> Table {
         "Q, actor (rms)",
         "same action, actor",
     ];
-    table(&header, by_level(results, cells, |_, point| cells(point)))
+    Table::new(&header, by_level(results, cells, |_, point| cells(point)))
 }
 
 fn dials(results: &Results) -> Vec<String> {

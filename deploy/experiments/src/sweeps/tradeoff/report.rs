@@ -5,7 +5,7 @@ use super::{
     figures, page,
     results::{LevelOf, Measure, PointResult, Results},
 };
-use crate::session::Session;
+use crate::{cache::Session, page::Table};
 
 const MEASURES: [(&str, Measure); 7] = [
     ("greedy_return", Measure::Greedy),
@@ -64,7 +64,7 @@ fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
             rows.push(row);
         }
     }
-    session.csv("runs", &header, rows)
+    session.csv("runs", &Table::new(&header, rows))
 }
 
 fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -90,7 +90,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         rows.push(row(results, of, false));
     }
     let header: Vec<&str> = header.iter().map(String::as_str).collect();
-    session.csv("levels", &header, rows)
+    session.csv("levels", &Table::new(&header, rows))
 }
 
 /// A level, or the base that it is compared with.
@@ -122,5 +122,5 @@ fn row(results: &Results, of: &LevelOf, is_base: bool) -> Vec<String> {
 
 fn write_equal_time(session: &Session, results: &Results) -> anyhow::Result<()> {
     let rows = equal_time(results)?.into_iter().map(|it| it.cells);
-    session.csv("equal_time", &EQUAL_TIME, rows)
+    session.csv("equal_time", &Table::new(&EQUAL_TIME, rows))
 }

@@ -9,8 +9,8 @@ use super::{
     speed::Speed,
 };
 use crate::{
-    runs::FinishedRun,
-    statistics::{Difference, Interval, Spread, difference, interval},
+    stats::{Difference, Interval, Spread, difference, interval},
+    sweep::plan::FinishedRun,
 };
 
 /// A level of a dial and its base.
@@ -113,7 +113,7 @@ impl PointResult {
 }
 
 impl Results {
-    /// Fewest and most seeds of the bases and of the levels that are none.
+    /// Fewest and most seeds of the bases, and of the other levels.
     pub(super) fn seeds(&self) -> [Option<(usize, usize)>; 2] {
         [true, false].map(|bases| {
             let is_base = |key: &str| self.levels.iter().any(|of| of.base.key == key);

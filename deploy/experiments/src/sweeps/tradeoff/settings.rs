@@ -1,40 +1,18 @@
 //! What a call of `driml tradeoff` asks for, and the runs and settings that follow from it.
 
 use driml_envs::WorldName;
-use driml_machine::{
-    error::{Usage, usage},
-    resources::Machine,
-};
-use driml_settings::{
-    config::RunConfig,
-    flags::{self, RunFlags},
-    presets,
-    resolve::Flags,
-};
+use driml_machine::error::{Usage, usage};
+use driml_settings::{config::RunConfig, presets};
 use serde::{Deserialize, Serialize};
 
 use super::dials::{self, Dial, Point};
-use crate::{flags::TradeoffArgs, runs::PlannedRun};
+use crate::{
+    flags::TradeoffArgs,
+    sweep::plan::{Call, PlannedRun},
+};
 
-/// Seeds of each level unless --seeds says.
-const SEEDS: u32 = 3;
 /// Seeds of a base for each of a level's: all levels are compared with it, so that its luck is in all of their differences.
 const BASE_SEEDS: u32 = 2;
-/// Episodes played with each run's weights.
-const EPISODES: u32 = 100;
-const PRESET: &str = "paper";
-
-/// The smoke length.
-mod smoke {
-    pub(super) const FRAMES: u64 = 1_500;
-    pub(super) const SEEDS: u32 = 1;
-    pub(super) const EPISODES: u32 = 3;
-    pub(super) const PRESET: &str = "smoke";
-    pub(super) const SETS: [&str; 2] = [
-        "learner.batch_size=16",
-        "learner.checkpoint_period_updates=1000",
-    ];
-}
 
 /// What all runs of a folder have in common. Dials, levels and seeds can be added.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -69,28 +47,24 @@ pub(super) struct Settings {
 pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings, Usage> {
     let world: WorldName = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let base = dials::world_base(world)?;
-    let mut sets = base.sets;
-    let (mut preset, mut frames, mut seeds, mut episodes) = (PRESET, base.frames, SEEDS, EPISODES);
-    if args.flags.smoke {
-        sets.extend(smoke::SETS.map(String::from));
-        (preset, frames) = (smoke::PRESET, smoke::FRAMES);
-        (seeds, episodes) = (smoke::SEEDS, smoke::EPISODES);
-    }
-    sets.extend(args.queue.sets.iter().cloned());
+    let length = dials::length(args.flags.smoke);
+    let asked = [length.sets, args.queue.sets.clone()];
+    let sets = base.sets.into_iter().chain(asked.concat()).collect();
+    let frames = length.frames.unwrap_or(base.frames);
     let frames_open = args.frames.is_none() && found.is_none();
     let found_frames = found.as_ref().map(|it| it.frames);
     let found_jobs = found.as_ref().map(|it| it.jobs);
     Ok(Settings {
         common: Common {
             env: world.to_string(),
-            preset: preset.into(),
+            preset: length.preset,
             sets,
             frames: args.frames.or(found_frames).unwrap_or(frames),
-            episodes: args.episodes.unwrap_or(episodes),
+            episodes: args.episodes.unwrap_or(length.episodes),
             jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
         },
         dials: dials::chosen(dials::dials(world), &args.dials)?,
-        seeds: args.flags.seeds.unwrap_or(seeds),
+        seeds: args.flags.seeds.unwrap_or(length.seeds),
         budget_seconds: f64::from(args.budget) * 60.0,
         frames_open,
     })
@@ -113,41 +87,21 @@ impl Common {
     /// # Errors
     /// Settings that cannot work.
     pub(super) fn config(&self, point: &Point) -> Result<RunConfig, Usage> {
-        let flags = RunFlags {
-            env: Some(self.env.clone()),
-            agent: Some(point.agent.clone()),
-            preset: Some(self.preset.clone()),
-            config: None,
-            over: Flags {
-                frames: Some(self.frames),
-                sets: self.sets(point).cloned().collect(),
-                ..Flags::default()
-            },
-        };
-        Ok(flags::resolve(&flags, &Machine::this())?.0)
-    }
-
-    fn sets<'a>(&'a self, point: &'a Point) -> impl Iterator<Item = &'a String> {
-        self.sets.iter().chain(&point.sets)
+        self.run(point, 1).call.config()
     }
 
     /// The run of a seed at `point`.
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
-        let (seed, frames) = (seed.to_string(), self.frames.to_string());
-        let head = [
-            ["--env", &self.env],
-            ["--agent", &point.agent],
-            ["--preset", &self.preset],
-            ["--seed", &seed],
-            ["--frames", &frames],
-        ];
-        let mut args: Vec<String> = head.concat().into_iter().map(String::from).collect();
-        for set in self.sets(point) {
-            args.extend(["--set".into(), set.clone()]);
-        }
         PlannedRun {
             name: format!("{}-seed{seed}", point.key),
-            args,
+            call: Call {
+                env: Some(self.env.clone()),
+                agent: Some(point.agent.clone()),
+                preset: Some(self.preset.clone()),
+                seed,
+                frames: Some(self.frames),
+                sets: self.sets.iter().chain(&point.sets).cloned().collect(),
+            },
             frames: self.frames,
             episodes: None,
             units: self.frames,
@@ -280,11 +234,11 @@ mod tests {
                     ..common.config(point).unwrap()
                 }
             };
-            assert_eq!(of(PRESET, &base), of(&dial.base, &base));
+            assert_eq!(of("paper", &base), of(&dial.base, &base));
             for level in &dial.levels {
                 let point = dial.point(level);
                 let whole = of(&level.name, &base);
-                assert_eq!(of(PRESET, &point), whole, "{}", point.key);
+                assert_eq!(of("paper", &point), whole, "{}", point.key);
             }
         }
     }

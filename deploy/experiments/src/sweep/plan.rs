@@ -1,0 +1,157 @@
+//! What a sweep plans and gets: runs at the points of its axes, and the calls that make them.
+//! It touches no disk and starts nothing.
+
+use driml_launch::run_folder::{RunFolder, Summary};
+use driml_machine::{
+    error::{Usage, usage},
+    resources::Machine,
+};
+use driml_settings::{
+    config::RunConfig,
+    flags::{RunFlags, resolve},
+    resolve::Flags,
+};
+
+/// The flags of `driml train` that make a run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Call {
+    pub(crate) env: Option<String>,
+    pub(crate) agent: Option<String>,
+    pub(crate) preset: Option<String>,
+    pub(crate) seed: u32,
+    pub(crate) frames: Option<u64>,
+    /// In the form of `--set`.
+    pub(crate) sets: Vec<String>,
+}
+
+impl Call {
+    /// As words of a command line.
+    pub(crate) fn args(&self) -> Vec<String> {
+        let named = [
+            ("--env", self.env.clone()),
+            ("--agent", self.agent.clone()),
+            ("--preset", self.preset.clone()),
+            ("--seed", Some(self.seed.to_string())),
+            ("--frames", self.frames.map(|it| it.to_string())),
+        ];
+        let named = named
+            .into_iter()
+            .filter_map(|(flag, value)| Some((flag, value?)));
+        let sets = self.sets.iter().map(|set| ("--set", set.clone()));
+        let pairs = named.chain(sets);
+        pairs
+            .flat_map(|(flag, value)| [flag.to_owned(), value])
+            .collect()
+    }
+
+    /// The settings of the run.
+    ///
+    /// # Errors
+    /// Names that nothing has, settings that cannot work.
+    pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
+        let flags = RunFlags {
+            env: self.env.clone(),
+            agent: self.agent.clone(),
+            preset: self.preset.clone(),
+            config: None,
+            over: Flags {
+                frames: self.frames,
+                seed: Some(self.seed.into()),
+                sets: self.sets.clone(),
+                ..Flags::default()
+            },
+        };
+        Ok(resolve(&flags, &Machine::this())?.0)
+    }
+}
+
+/// A run to be made.
+#[derive(Clone, Debug)]
+pub(crate) struct PlannedRun {
+    /// Its folder's name.
+    pub(crate) name: String,
+    /// What makes it.
+    pub(crate) call: Call,
+    /// Its length in frames.
+    pub(crate) frames: u64,
+    /// Episodes after which it is long enough, if that comes first.
+    pub(crate) episodes: Option<u64>,
+    /// Its share of the sweep's work.
+    pub(crate) units: u64,
+}
+
+/// A finished run.
+#[derive(Clone, Debug)]
+pub(crate) struct FinishedRun {
+    pub(crate) folder: RunFolder,
+    pub(crate) summary: Summary,
+    /// The commit that the program which made it was built from; empty where it was not noted.
+    pub(crate) commit: String,
+}
+
+/// A run that is planned, and what it is for: its place on the axes of its sweep.
+pub(crate) type Planned<P> = (P, PlannedRun);
+
+/// A finished run at its place in the sweep.
+pub(crate) struct Made<P> {
+    pub(crate) point: P,
+    pub(crate) plan: PlannedRun,
+    pub(crate) run: FinishedRun,
+}
+
+/// What a sweep gave.
+pub(crate) struct Swept<P> {
+    /// The finished runs, in the order of their plans.
+    pub(crate) made: Vec<Made<P>>,
+    /// The names of those that are missing.
+    pub(crate) missing: Vec<String>,
+}
+
+impl<P> Swept<P> {
+    /// Makes sure that there is something to report.
+    ///
+    /// # Errors
+    /// No run is finished.
+    pub(crate) fn check_any(&self) -> Result<(), Usage> {
+        if self.made.is_empty() {
+            return Err(usage!("no run is finished yet: there is nothing to report"));
+        }
+        Ok(())
+    }
+}
+
+/// Plans of every point with every seed. Seed by seed, so that a sweep that was stopped has one seed of everything before it has two of
+/// anything.
+pub(crate) fn seed_by_seed<P: Clone>(
+    points: &[P],
+    seeds: u32,
+    plan: impl Fn(&P, u32) -> PlannedRun,
+) -> Vec<Planned<P>> {
+    let plan = &plan;
+    let plans = (1..=seeds).flat_map(|seed| {
+        let of_seed = points.iter();
+        of_seed.map(move |point| (point.clone(), plan(point, seed)))
+    });
+    plans.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The form that runs of earlier programs were made with, which are adopted.
+    #[test]
+    fn a_call_is_written_in_one_order() {
+        let call = Call {
+            env: Some("procgen:maze".into()),
+            agent: Some("c51".into()),
+            preset: Some("tuned".into()),
+            seed: 2,
+            frames: Some(1000),
+            sets: vec!["learner.batch_size=64".into()],
+        };
+        let words = "--env procgen:maze --agent c51 --preset tuned --seed 2 --frames 1000 --set learner.batch_size=64";
+        assert_eq!(call.args().join(" "), words);
+        assert_eq!(Call::default().args(), ["--seed", "0"]);
+    }
+}

@@ -1,0 +1,129 @@
+//! What finished runs earn when they are played, each played once: greedy episodes of their newest weights, and a random policy's.
+//! Returns of the training are in their summaries.
+
+use driml_launch::{
+    evaluate::{Levels, Player, Which, Who, random_returns},
+    run_folder::RunFolder,
+};
+use driml_learner::checkpoint;
+
+use super::plan::FinishedRun;
+use crate::{cache::Session, plot::Run, progress::Progress};
+
+/// Seed of the played episodes: the same levels for every run.
+const SEED: u64 = 1;
+/// The file of a checkpoint's averaged weights.
+const AVERAGE: &str = "average.safetensors";
+
+/// What is played of a run.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Played {
+    pub(crate) levels: Levels,
+    /// Checkpoints that share the episodes, the newest ones; the averaged weights alone play where a run has some.
+    pub(crate) checkpoints: usize,
+    pub(crate) episodes: u32,
+    /// Of work, which only the estimate of the time left depends on.
+    pub(crate) units: u64,
+}
+
+impl Played {
+    /// Returns of a run's agent, played greedily; none if its world does not have the levels. Kept under `key` for these weights.
+    ///
+    /// # Errors
+    /// A damaged checkpoint, a world that fails, an interrupt.
+    pub(crate) fn greedy(
+        self,
+        session: &mut Session,
+        key: &str,
+        run: &FinishedRun,
+    ) -> anyhow::Result<Option<Vec<f64>>> {
+        let of = format!("{} {}", run.summary.weights_sha256, self.episodes);
+        self.piece(session, &of, key, || self.returns(&run.folder))
+    }
+
+    /// Returns of a random policy in a run's world, on the levels trained on.
+    ///
+    /// # Errors
+    /// As for [`Played::greedy`].
+    pub(crate) fn random(
+        self,
+        session: &mut Session,
+        key: &str,
+        run: &FinishedRun,
+    ) -> anyhow::Result<Vec<f64>> {
+        self.piece(session, &self.episodes.to_string(), key, || {
+            let config = Run::read(&run.folder)?.config()?;
+            random_returns(&config, self.episodes as usize, SEED)
+        })
+    }
+
+    fn piece<T: serde::Serialize + serde::de::DeserializeOwned>(
+        self,
+        session: &mut Session,
+        of: &str,
+        key: &str,
+        play: impl FnOnce() -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        session.piece_of(of, key, self.units, |progress: &mut Progress| {
+            let played = play()?;
+            progress.advance(self.units)?;
+            Ok(played)
+        })
+    }
+
+    fn returns(self, folder: &RunFolder) -> anyhow::Result<Option<Vec<f64>>> {
+        let mut all = Vec::new();
+        let players = players(folder, self.checkpoints)?;
+        let each = self.episodes.div_ceil(players.len().max(1) as u32);
+        for which in players {
+            let player = Player::load_at(folder, which)?;
+            match player.returns(Who::Agent, self.levels, each, SEED)? {
+                Some(returns) => all.extend(returns),
+                None => return Ok(None),
+            }
+        }
+        Ok(Some(all))
+    }
+}
+
+/// Which weights of a run play.
+fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>> {
+    let all = checkpoint::list(&folder.checkpoints())?;
+    let newest = all.last();
+    if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
+        // Without a checkpoint the player says what is missing.
+        return Ok(vec![newest.map_or(Which::Newest, |_| Which::Average)]);
+    }
+    let newest = all.iter().rev().take(checkpoints);
+    Ok(newest.map(|(updates, _)| Which::After(*updates)).collect())
+}
+
+/// The mean; none of no value.
+pub(crate) fn mean(returns: &[f64]) -> Option<f64> {
+    (!returns.is_empty()).then(|| returns.iter().sum::<f64>() / returns.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn the_average_plays_before_the_newest_checkpoints() {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(folder.path());
+        assert_eq!(players(&folder, 3).unwrap(), [Which::Newest]);
+        for updates in [1, 2, 3, 4] {
+            let path = folder
+                .checkpoints()
+                .join(format!("checkpoint-{updates:012}"));
+            fs::create_dir_all(path).unwrap();
+        }
+        let newest = [4, 3, 2].map(Which::After);
+        assert_eq!(players(&folder, 3).unwrap(), newest);
+        let path = folder.checkpoints().join("checkpoint-000000000004");
+        fs::write(path.join(AVERAGE), "").unwrap();
+        assert_eq!(players(&folder, 3).unwrap(), [Which::Average]);
+    }
+}

@@ -1,0 +1,239 @@
+//! What table 1 can be told, what the command line replaces of it, and the runs that follow.
+
+use driml_envs::WorldName;
+use driml_launch::evaluate::Levels;
+use driml_machine::error::{Usage, usage};
+use driml_settings::presets;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    flags::{ProcgenArgs, sweep_settings},
+    sweep::{
+        plan::{Call, PlannedRun},
+        results::Played,
+    },
+};
+
+pub(super) const NAME: &str = "procgen";
+/// Checkpoints that play.
+pub(super) const CHECKPOINTS: u32 = 3;
+/// Playing a run as a part of making it; only the estimate of the time left depends on it.
+const PLAY_SHARE: u64 = 10;
+/// The paper's agents, in the order of its table 1.
+const AGENTS: [&str; 7] = [
+    "c51",
+    "cpc",
+    "curl",
+    "driml-noact",
+    "driml-randk",
+    "driml-fix",
+    "driml-ada",
+];
+/// Agents that look a fixed k ahead, so that another k can be asked for.
+const OF_FIXED_K: [&str; 2] = ["driml-fix", "driml-noact"];
+
+/// A table of `procgen.toml`, with what the flags replace.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Settings {
+    /// As `--env` takes them, or `all` for Procgen's sixteen. These four can be added to in a folder; what follows cannot.
+    #[serde(skip_serializing)]
+    pub(super) games: Vec<String>,
+    #[serde(skip_serializing)]
+    pub(super) agents: Vec<String>,
+    #[serde(skip_serializing)]
+    pub(super) seeds: u32,
+    #[serde(skip_serializing)]
+    pub(super) jobs: u32,
+    pub(super) preset: String,
+    pub(super) frames: u64,
+    pub(super) sets: Vec<String>,
+    /// Played with each of the last checkpoints.
+    pub(super) episodes: u32,
+}
+
+/// Where in the sweep a run is.
+#[derive(Clone, Debug)]
+pub(super) struct Point {
+    pub(super) world: String,
+    pub(super) agent: String,
+}
+
+impl Settings {
+    /// The settings of the length asked for.
+    ///
+    /// # Errors
+    /// Names that nothing has.
+    pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
+        let mut settings: Self =
+            sweep_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
+        if !args.games.is_empty() {
+            settings.games.clone_from(&args.games);
+        }
+        if !args.agents.is_empty() {
+            settings.agents.clone_from(&args.agents);
+        }
+        settings.games = worlds(&settings.games)?;
+        settings.agents = agents(&settings.agents)?;
+        settings.seeds = args.flags.seeds.unwrap_or(settings.seeds);
+        settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
+        settings.frames = args.frames.unwrap_or(settings.frames);
+        settings.episodes = args.episodes.unwrap_or(settings.episodes);
+        if let Some(preset) = &args.preset {
+            settings.preset = presets::preset(preset)?.name.to_owned();
+        }
+        settings.sets.extend(args.queue.sets.iter().cloned());
+        Ok(settings)
+    }
+
+    /// What there are runs for, with each seed.
+    pub(super) fn points(&self) -> Vec<Point> {
+        let of_game = |world: &String| {
+            let world = world.clone();
+            self.agents.iter().map(move |agent| Point {
+                world: world.clone(),
+                agent: agent.clone(),
+            })
+        };
+        self.games.iter().flat_map(of_game).collect()
+    }
+
+    /// The run of a seed.
+    pub(super) fn plan(&self, point: &Point, seed: u32) -> PlannedRun {
+        let (agent, k) = with_k(&point.agent);
+        let k = k.map(|k| format!("run.horizon.k={k}"));
+        PlannedRun {
+            name: format!("{}-{}-seed{seed}", short(&point.world), point.agent),
+            call: Call {
+                env: Some(point.world.clone()),
+                agent: Some(agent.to_owned()),
+                preset: Some(self.preset.clone()),
+                seed,
+                frames: Some(self.frames),
+                sets: self.sets.iter().cloned().chain(k).collect(),
+            },
+            frames: self.frames,
+            episodes: None,
+            units: self.frames,
+        }
+    }
+
+    /// How a run is played on these levels.
+    pub(super) fn play(&self, levels: Levels) -> Played {
+        Played {
+            levels,
+            checkpoints: CHECKPOINTS as usize,
+            episodes: CHECKPOINTS * self.episodes,
+            units: (self.frames / PLAY_SHARE).max(1),
+        }
+    }
+}
+
+/// A world's name as files have it.
+pub(super) fn short(world: &str) -> &str {
+    world.strip_prefix("procgen:").unwrap_or(world)
+}
+
+/// Worlds by their names or their games', each once; `all` is every game.
+fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
+    let mut found = Vec::new();
+    for name in names {
+        if name == "all" {
+            let games = WorldName::all().filter(|it| it.kind() == "procgen");
+            found.extend(games.map(|world| world.to_string()));
+        } else {
+            let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
+            found.push(world.to_string());
+        }
+    }
+    Ok(once(found))
+}
+
+/// The agent and the k of a name such as `driml-noact-k5`; other names are the agent's alone.
+fn with_k(name: &str) -> (&str, Option<u32>) {
+    let split = name.rsplit_once("-k");
+    match split.and_then(|(agent, k)| Some((agent, k.parse().ok()?))) {
+        Some((agent, k)) if OF_FIXED_K.contains(&agent) => (agent, Some(k)),
+        _ => (name, None),
+    }
+}
+
+/// Agents by name, each once; `all` is every one of the paper's, and a name with a k one that looks so far ahead.
+fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
+    let mut found = Vec::new();
+    for name in names {
+        if name == "all" {
+            found.extend(AGENTS.map(String::from));
+        } else {
+            let (agent, k) = with_k(name);
+            let agent = presets::agent(agent)?.name;
+            found.push(k.map_or_else(|| agent.to_owned(), |k| format!("{agent}-k{k}")));
+        }
+    }
+    Ok(once(found))
+}
+
+fn once(names: Vec<String>) -> Vec<String> {
+    let mut kept: Vec<String> = Vec::new();
+    for name in names {
+        if !kept.contains(&name) {
+            kept.push(name);
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(list: &[&str]) -> Vec<String> {
+        list.iter().map(|&it| it.to_owned()).collect()
+    }
+
+    fn smoke() -> Settings {
+        sweep_settings(NAME, include_str!("../procgen.toml"), true)
+    }
+
+    #[test]
+    fn the_full_length_is_sixteen_games_of_two_agents() {
+        let full: Settings = sweep_settings(NAME, include_str!("../procgen.toml"), false);
+        assert_eq!(worlds(&full.games).unwrap().len(), 16);
+        assert_eq!(agents(&full.agents).unwrap(), ["c51", "driml-ada"]);
+        for settings in [full, smoke()] {
+            assert!(presets::preset(&settings.preset).is_ok());
+        }
+    }
+
+    #[test]
+    fn games_and_agents_go_by_short_names() {
+        assert_eq!(
+            worlds(&names(&["chain", "bigfish", "chain"])).unwrap(),
+            ["chain", "procgen:bigfish"]
+        );
+        let said = worlds(&names(&["bigfihs"])).unwrap_err().to_string();
+        assert!(said.contains("did you mean"), "{said}");
+        assert_eq!(agents(&names(&["all"])).unwrap().len(), 7);
+        let both = ["driml-noact-k1", "driml-noact-k5"];
+        assert_eq!(agents(&names(&both)).unwrap(), both);
+        for wrong in ["driml-ada-k5", "driml-noact-kx"] {
+            assert!(agents(&names(&[wrong])).is_err(), "{wrong}");
+        }
+    }
+
+    /// The layout of runs that earlier programs made.
+    #[test]
+    fn a_run_is_named_and_called_as_ever() {
+        let point = Point {
+            world: "procgen:heist".into(),
+            agent: "driml-noact-k5".into(),
+        };
+        let plan = smoke().plan(&point, 2);
+        assert_eq!(plan.name, "heist-driml-noact-k5-seed2");
+        assert_eq!(
+            plan.call.args().join(" "),
+            "--env procgen:heist --agent driml-noact --preset smoke --seed 2 --frames 2000 --set learner.checkpoint_period_updates=1000 \
+             --set run.horizon.k=5"
+        );
+    }
+}
