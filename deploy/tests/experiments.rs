@@ -179,7 +179,7 @@ fn procgen_without_the_engine() {
     for line in &lines[1..] {
         assert_eq!(
             [line[2], line[4], line[8]],
-            ["nature", "2000", ""],
+            ["nature", "2016", ""],
             "{line:?}"
         );
         assert!(!line[7].is_empty() && !line[10].is_empty(), "{line:?}");

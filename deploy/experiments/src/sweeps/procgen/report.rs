@@ -197,7 +197,7 @@ fn table(
     }
 }
 
-/// On how many games each agent plays better than at random.
+/// On how many of its games each agent plays better than at random.
 fn above_random(settings: &Settings, games: &BTreeMap<&str, Vec<&Scored>>) -> Vec<String> {
     let line = |agent: &String| {
         let played = games
@@ -205,12 +205,13 @@ fn above_random(settings: &Settings, games: &BTreeMap<&str, Vec<&Scored>>) -> Ve
             .filter(|(_, runs)| of(runs, agent).next().is_some());
         let count = played.clone().count();
         let above = played.filter(|(_, runs)| of(runs, agent).all(Scored::is_above_random));
-        format!(
+        let text = format!(
             "`{agent}` plays better than at random, in every seed by {ERRORS} standard errors, on {} of {count} games.",
             above.count()
-        )
+        );
+        (count > 0).then_some(text)
     };
-    settings.agents.iter().map(line).collect()
+    settings.agents.iter().filter_map(line).collect()
 }
 
 #[cfg(test)]
