@@ -32,7 +32,7 @@ const SETTINGS: &str = "settings.json";
 /// Where the runs of a sweep lie. Git does not keep them.
 pub(crate) const RUNS: &str = "runs";
 
-/// A finished piece as it is kept.
+/// A finished piece on the disk.
 #[derive(Serialize, Deserialize)]
 struct Kept<T> {
     /// Of what it was made, such as the hash of weights; empty if of the settings alone.

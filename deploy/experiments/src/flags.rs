@@ -28,7 +28,7 @@ pub struct ExperimentFlags {
     /// The same in seconds: shows that everything works, and nothing else
     #[arg(long)]
     pub(crate) smoke: bool,
-    /// Where figures, data and page go; an experiment that was stopped goes on there [default: experiments/NAME]
+    /// Where figures, data and page go; an experiment that was stopped resumes there [default: experiments/NAME]
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Seeds 1 to N [default: as the experiment's settings say]

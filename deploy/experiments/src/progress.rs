@@ -1,5 +1,5 @@
 //! How far an experiment is and how long the rest will take: a bar on a terminal, a line now and then elsewhere.
-//! It also hears Ctrl-C, as it is asked after every unit of work.
+//! It also notices Ctrl-C, after every unit of work.
 
 use std::time::{Duration, Instant};
 

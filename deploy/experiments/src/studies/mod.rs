@@ -1,4 +1,4 @@
-//! Experiments that are not made of runs: each trains a small thing of its own, and keeps its pieces in the cache.
+//! Experiments that are not made of runs: each trains a small network by itself, and keeps its pieces in the cache.
 
 pub(crate) mod ising;
 pub(crate) mod random_walk;

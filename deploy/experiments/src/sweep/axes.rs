@@ -49,7 +49,7 @@ impl Axis {
     }
 
     /// # Errors
-    /// An empty or a repeated value: a run that nobody meant, or the same one twice.
+    /// An empty or a repeated value: a run by mistake, or the same one twice.
     pub(crate) fn check(&self, form: &str) -> Result<(), Usage> {
         for (at, value) in self.values.iter().enumerate() {
             if value.is_empty() {

@@ -159,7 +159,7 @@ struct Running {
     child: Child,
     /// Of the plan's units.
     done: u64,
-    /// Asked to stop, as it is long enough.
+    /// Long enough, and asked to stop.
     enough: bool,
 }
 
@@ -248,7 +248,7 @@ impl Queue {
         Ok(())
     }
 
-    /// Starts a run in a process group of its own, so that Ctrl-C reaches it through us alone.
+    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone.
     fn start(
         &self,
         plan: PlannedRun,

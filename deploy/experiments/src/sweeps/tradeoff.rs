@@ -272,7 +272,7 @@ fn planned(
     Ok(planned)
 }
 
-/// The plan as it is printed before anything is run.
+/// What is printed of the plan before anything is run.
 fn describe(settings: &Settings, planned: &[Planned], left: f64) -> String {
     let Common {
         env, frames, sets, ..

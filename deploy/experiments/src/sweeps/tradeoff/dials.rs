@@ -153,7 +153,7 @@ pub(super) fn dials(world: WorldName) -> Vec<Dial> {
 /// What all runs in a world have.
 ///
 /// # Errors
-/// A world that nobody has found settings for with which C51 learns.
+/// A world without known settings with which C51 learns in minutes.
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
     let worlds = file().world;
     let mut of_kind: Vec<_> = worlds.iter().filter(|it| it.kind == world.kind()).collect();

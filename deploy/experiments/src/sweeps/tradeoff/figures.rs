@@ -97,17 +97,16 @@ type Named<'a> = (&'a str, &'a PointResult);
 
 /// The dials that have runs, each with its base and then its levels.
 fn by_dial(results: &Results) -> Vec<(&str, Vec<Named<'_>>)> {
-    let mut dials: Vec<(&str, Vec<Named<'_>>)> = Vec::new();
-    for of in &results.levels {
-        if dials.last().is_none_or(|(name, _)| *name != of.dial.name) {
-            let base = (of.dial.base.as_str(), &results.points[&of.base.key]);
-            dials.push((&of.dial.name, vec![base]));
-        }
-        if let Some((_, named)) = dials.last_mut() {
-            named.push((&of.level, &results.points[&of.point.key]));
-        }
-    }
-    dials
+    let dials = results.by_dial().map(|levels| {
+        let (dial, base) = (&levels[0].dial, &levels[0].base);
+        let base = (dial.base.as_str(), &results.points[&base.key]);
+        let others = levels
+            .iter()
+            .map(|of| (of.level.as_str(), &results.points[&of.point.key]));
+        let named = std::iter::once(base).chain(others);
+        (dial.name.as_str(), named.collect())
+    });
+    dials.collect()
 }
 
 /// Training return over seconds, a panel for each dial with its base.

@@ -238,28 +238,19 @@ fn by_level(
     level: impl Fn(&LevelOf, &PointResult) -> Vec<String>,
 ) -> Vec<Vec<String>> {
     let mut rows: Vec<Vec<String>> = Vec::new();
-    let mut last = "";
-    for of in &results.levels {
-        if of.dial.name != last {
-            last = &of.dial.name;
-            let name = format!("{} (base)", of.dial.base);
-            let head = [of.dial.name.clone(), name, of.base.agent.clone()];
-            rows.push(
-                head.into_iter()
-                    .chain(base(&results.points[&of.base.key]))
-                    .collect(),
-            );
+    for levels in results.by_dial() {
+        let of = &levels[0];
+        let name = format!("{} (base)", of.dial.base);
+        let head = vec![of.dial.name.clone(), name, of.base.agent.clone()];
+        rows.push([head, base(&results.points[&of.base.key])].concat());
+        for of in levels {
+            let head = vec![
+                of.dial.name.clone(),
+                of.level.clone(),
+                of.point.agent.clone(),
+            ];
+            rows.push([head, level(of, &results.points[&of.point.key])].concat());
         }
-        let head = [
-            of.dial.name.clone(),
-            of.level.clone(),
-            of.point.agent.clone(),
-        ];
-        rows.push(
-            head.into_iter()
-                .chain(level(of, &results.points[&of.point.key]))
-                .collect(),
-        );
     }
     rows
 }
@@ -380,17 +371,12 @@ fn errors(results: &Results) -> Table {
 }
 
 fn dials(results: &Results) -> Vec<String> {
-    let mut said = Vec::new();
-    let mut last = "";
-    for of in &results.levels {
-        if of.dial.name != last {
-            last = &of.dial.name;
-            let dial = &of.dial;
-            said.push(format!(
-                "{}, {} as its base: buys {}. Price: {}.",
-                dial.name, dial.base, dial.buys, dial.costs
-            ));
-        }
-    }
-    said
+    let line = |levels: &[LevelOf]| {
+        let dial = &levels[0].dial;
+        format!(
+            "{}, {} as its base: buys {}. Price: {}.",
+            dial.name, dial.base, dial.buys, dial.costs
+        )
+    };
+    results.by_dial().map(line).collect()
 }

@@ -81,13 +81,9 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         );
     }
     let mut rows = Vec::new();
-    let mut last = "";
-    for of in &results.levels {
-        if of.dial.name != last {
-            last = &of.dial.name;
-            rows.push(row(results, of, true));
-        }
-        rows.push(row(results, of, false));
+    for levels in results.by_dial() {
+        rows.push(row(results, &levels[0], true));
+        rows.extend(levels.iter().map(|of| row(results, of, false)));
     }
     let header: Vec<&str> = header.iter().map(String::as_str).collect();
     session.csv("levels", &Table::new(&header, rows))

@@ -113,6 +113,11 @@ impl PointResult {
 }
 
 impl Results {
+    /// The levels of each dial that has runs.
+    pub(super) fn by_dial(&self) -> impl Iterator<Item = &[LevelOf]> {
+        self.levels.chunk_by(|a, b| a.dial.name == b.dial.name)
+    }
+
     /// Fewest and most seeds of the bases, and of the other levels.
     pub(super) fn seeds(&self) -> [Option<(usize, usize)>; 2] {
         [true, false].map(|bases| {
