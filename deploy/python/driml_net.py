@@ -5,10 +5,10 @@
 
     from driml_net import load
     network, run = load("runs/pacman")
-    q = network(states)                        # states u8 [B, H, W, C] as weights.md says; q [B, A]
+    q = network(states)                        # states u8 [B, H, W, C] as deploy/docs/src/reference/weights.md says; q [B, A]
 
 PyTorch is needed, and `onnx` and `onnxscript` for --onnx. Everything it must know is in the checkpoint's own metadata or, for
-checkpoints of earlier versions, in the run's config.toml. Conventions: weights.md beside this file.
+checkpoints of earlier versions, in the run's config.toml. Conventions: deploy/docs/src/reference/weights.md.
 """
 
 import argparse

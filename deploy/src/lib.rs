@@ -5,6 +5,8 @@
 
 mod cli;
 mod commands;
+#[cfg(test)]
+mod reference;
 
 use std::process::ExitCode;
 

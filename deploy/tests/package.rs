@@ -1,5 +1,5 @@
 //! The recipes in `deploy/package`: every call of the program in them has flags that the program knows.
-//! Whether they start where they are for was tried by hand; their README says how.
+//! Whether they start where they are for was tried by hand; deploy/docs/src/how-to/install.md says how.
 
 #![allow(clippy::unwrap_used)]
 

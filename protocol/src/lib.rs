@@ -1,5 +1,5 @@
 //! Everything that crosses a process boundary: the run spec, the messages, their bytes, and where they travel.
-//! It holds no algorithm and no state; `README.md` beside this crate is the table of what is sent where.
+//! It holds no algorithm and no state; `deploy/docs/src/reference/protocol.md` has the table of messages.
 //!
 //! Start at [`RunClient`], which asks, fetches, announces and hears, and at [`QueryWorkers`], which answers. A [`Message`] is a
 //! header and perhaps a payload; [`codec`] turns both into bytes and back, and refuses what is damaged, foreign or of another

@@ -2,7 +2,7 @@
 """Makes the parity cases of what came after the first five files: no_action, cpc*, curl*, dueling, noisy*, weighted_rows.
 
 Needs PyTorch and safetensors; nothing in the project needs either. Everything is float64 and automatic differentiation, and
-written from the formulas in README.md, not from the learner's code.
+written from the formulas in deploy/docs/src/reference/parity.md, not from the learner's code.
 
     python3 make_cases.py            writes the cases beside this file (the same bytes every time)
     python3 make_cases.py --check    recomputes every case beside this file, the first five too, and prints the differences

@@ -4,7 +4,7 @@
 Needs PyTorch and safetensors, as make_cases.py, whose network and losses it takes. Everything but what a row names is float64, so
 that a row is the error of that choice alone. Sums of products are float64 too: f32's share is its own row.
 
-    python3 rounding.py [--rows N] [--steps N]     prints the table of deploy/bench/README.md
+    python3 rounding.py [--rows N] [--steps N]     prints the table of deploy/docs/src/explanation/numerics.md in full
 """
 
 import argparse

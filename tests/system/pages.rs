@@ -1,46 +1,215 @@
-//! The repository's Markdown pages: what they link to is there, and the first one stays short.
-//! It follows no link to another site, and takes templates of pages (in a `src`) for what they are.
+//! The repository's Markdown pages: links lead somewhere, the book lists its pages, and all of it stays short.
+//! It follows no link to another site. Templates of result pages, in a `src` of `deploy/experiments`, count as words alone.
 
-use std::fs;
+use std::{
+    collections::BTreeSet,
+    fs,
+    path::{Path, PathBuf},
+};
 
-use super::repo_rules::files;
+use super::repo_rules::{files, root};
 
-/// Lines of the README, which is to be read on two screens; chapters belong to the folders they are about.
+/// Lines of the README, which is to be read on two screens.
 const README_LINES_MAX: usize = 130;
+const README_WORDS_MAX: usize = 1_250;
+/// Of all Markdown, templates and generated pages included.
+const WORDS_MAX: usize = 25_000;
+/// Of a table's cell, beside links and code.
+const CELL_WORDS_MAX: usize = 12;
+
+const DOCS: &str = "deploy/docs/src";
+const LANGUAGES: [&str; 7] = ["", "sh", "text", "toml", "rust", "python", "ini"];
+
+struct Page {
+    name: String,
+    path: PathBuf,
+    text: String,
+}
+
+fn markdown() -> Vec<Page> {
+    let pages = files()
+        .into_iter()
+        .filter(|(name, _)| name.ends_with(".md"));
+    let page = |(name, path): (String, PathBuf)| Page {
+        text: fs::read_to_string(&path).unwrap(),
+        name,
+        path,
+    };
+    pages.map(page).collect()
+}
+
+/// Those that are read as they are.
+fn pages() -> Vec<Page> {
+    let mut pages = markdown();
+    pages.retain(|page| !page.name.starts_with("deploy/experiments/src/"));
+    assert!(pages.len() > 20, "the walk found {} only", pages.len());
+    pages
+}
+
+fn expect_none(what: &str, wrong: &[String]) {
+    assert!(wrong.is_empty(), "{what}:\n{}", wrong.join("\n"));
+}
+
+/// Tokens with a letter or a digit: a table's bars are not words.
+fn words(text: &str) -> usize {
+    let is_word = |token: &&str| token.chars().any(char::is_alphanumeric);
+    text.split_whitespace().filter(is_word).count()
+}
+
+/// The lines outside code blocks.
+fn prose(text: &str) -> impl Iterator<Item = &str> {
+    let mut in_code = false;
+    text.lines().filter(move |line| {
+        let is_fence = line.trim_start().starts_with("```");
+        in_code ^= is_fence;
+        !in_code && !is_fence
+    })
+}
+
+/// The names that headings have as targets of links.
+fn anchors(text: &str) -> BTreeSet<String> {
+    let headings = prose(text).filter(|line| line.starts_with('#'));
+    let anchor = |line: &str| {
+        let title = line.trim_start_matches('#').trim().to_lowercase();
+        title
+            .chars()
+            .filter(|c| c.is_alphanumeric() || " -_".contains(*c))
+            .map(|c| if c == ' ' { '-' } else { c })
+            .collect()
+    };
+    headings.map(anchor).collect()
+}
 
 #[test]
-fn every_link_leads_to_a_file_of_the_repository() {
+fn every_link_leads_to_a_file_and_heading_of_the_repository() {
     let mut wrong = Vec::new();
-    for (name, path) in files()
-        .into_iter()
-        .filter(|(name, _)| name.ends_with(".md") && !name.contains("/src/"))
-    {
-        let text = fs::read_to_string(&path).unwrap();
-        let folder = path.parent().unwrap();
-        for rest in text.split("](").skip(1) {
+    for page in pages() {
+        for rest in page.text.split("](").skip(1) {
             let Some((link, _)) = rest.split_once(')') else {
                 continue;
             };
-            let file = link.split('#').next().unwrap();
-            let is_ours = !link.contains("://") && !file.is_empty();
-            if is_ours && !folder.join(file).exists() {
-                wrong.push(format!("{name}: {link}"));
+            if link.contains("://") {
+                continue;
+            }
+            let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
+            let target = match file {
+                "" => page.path.clone(),
+                file => page.path.parent().unwrap().join(file),
+            };
+            let leads = target.exists()
+                && (anchor.is_empty()
+                    || fs::read_to_string(&target)
+                        .is_ok_and(|text| anchors(&text).contains(anchor)));
+            if !leads {
+                wrong.push(format!("{}: {link}", page.name));
             }
         }
     }
+    expect_none("links that lead nowhere", &wrong);
+}
+
+#[test]
+fn code_blocks_are_closed_and_of_a_known_language() {
+    let mut wrong = Vec::new();
+    for page in pages() {
+        let fences = page.text.lines().filter_map(|it| it.strip_prefix("```"));
+        let fences: Vec<_> = fences.collect();
+        if fences.len() % 2 != 0 {
+            wrong.push(format!("{}: a block is not closed", page.name));
+        }
+        for pair in fences.chunks(2) {
+            if !LANGUAGES.contains(&pair[0]) {
+                wrong.push(format!("{}: ```{}", page.name, pair[0]));
+            }
+        }
+    }
+    expect_none("code blocks", &wrong);
+}
+
+#[test]
+fn the_book_lists_each_of_its_pages_once() {
+    let summary = fs::read_to_string(root().join(DOCS).join("SUMMARY.md")).unwrap();
+    let mut listed: Vec<_> = summary
+        .split("](")
+        .skip(1)
+        .map(|rest| Path::new(DOCS).join(rest.split(')').next().unwrap()))
+        .collect();
+    listed.sort();
+    let there: Vec<_> = pages()
+        .into_iter()
+        .filter(|page| page.name.starts_with(DOCS) && !page.name.ends_with("SUMMARY.md"))
+        .map(|page| PathBuf::from(page.name))
+        .collect();
+    assert_eq!(listed, there);
+}
+
+#[test]
+fn the_page_of_the_protocol_has_every_key() {
+    let page = root().join(DOCS).join("reference/protocol.md");
+    let page = fs::read_to_string(page).unwrap();
+    let mut keys = 0;
+    for (name, path) in files() {
+        if !name.starts_with("protocol/src/messages/") {
+            continue;
+        }
+        let text = fs::read_to_string(path).unwrap();
+        for rest in text.split("const KEY: &'static str = \"").skip(1) {
+            let key = rest.split('"').next().unwrap();
+            let has = [format!("`{key}`"), format!("`{key}/")];
+            assert!(has.iter().any(|it| page.contains(it)), "{name}: {key}");
+            keys += 1;
+        }
+    }
+    assert!(keys > 10, "only {keys} keys were found");
+}
+
+#[test]
+fn cells_of_tables_are_short() {
+    let mut wrong = Vec::new();
+    for page in pages() {
+        for row in prose(&page.text).filter(|line| line.starts_with('|')) {
+            // What stands between backticks is code, and what a link shows and names is the link's.
+            let plain: String = row.split('`').step_by(2).collect();
+            for cell in plain.split('|') {
+                let words = words(&without_links(cell));
+                if words > CELL_WORDS_MAX {
+                    wrong.push(format!("{}: {words} words: {cell}", page.name));
+                }
+            }
+        }
+    }
+    expect_none("cells of more than 12 words", &wrong);
+}
+
+fn without_links(text: &str) -> String {
+    let mut left = String::new();
+    let mut rest = text;
+    while let Some((before, after)) = rest.split_once("](") {
+        left += before.rsplit_once('[').map_or(before, |(text, _)| text);
+        rest = after.split_once(')').map_or("", |(_, text)| text);
+    }
+    left + rest
+}
+
+#[test]
+fn all_pages_together_stay_within_the_budget() {
+    let counts: Vec<_> = markdown()
+        .into_iter()
+        .map(|page| (words(&page.text), page.name))
+        .collect();
+    let sum: usize = counts.iter().map(|(words, _)| words).sum();
     assert!(
-        wrong.is_empty(),
-        "links that lead nowhere:\n{}",
-        wrong.join("\n")
+        sum <= WORDS_MAX,
+        "{sum} words; at most {WORDS_MAX}: {counts:#?}"
     );
 }
 
 #[test]
 fn the_readme_is_short() {
-    let text = fs::read_to_string(super::repo_rules::root().join("README.md")).unwrap();
-    let lines = text.lines().count();
+    let text = fs::read_to_string(root().join("README.md")).unwrap();
+    let (lines, words) = (text.lines().count(), words(&text));
     assert!(
-        lines <= README_LINES_MAX,
-        "{lines} lines; at most {README_LINES_MAX}"
+        lines <= README_LINES_MAX && words <= README_WORDS_MAX,
+        "{lines} lines and {words} words; at most {README_LINES_MAX} and {README_WORDS_MAX}"
     );
 }

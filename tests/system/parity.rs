@@ -1,4 +1,4 @@
-//! `driml parity` on updates computed elsewhere in float64; `parity/README.md` describes the files.
+//! `driml parity` on updates computed elsewhere in float64; `deploy/docs/src/reference/parity.md` says what the files hold.
 //! How each tensor compares is the learner's own test.
 
 use std::{fs, path::Path};

@@ -156,14 +156,14 @@ fn onnx_runtime_computes_what_driml_does() {
 
 #[test]
 fn the_page_has_the_actions_in_their_order() {
-    let page = fs::read_to_string(root().join("deploy/python/weights.md")).unwrap();
+    let page = fs::read_to_string(root().join("deploy/docs/src/reference/weights.md")).unwrap();
     for (world, names) in [
         ("chain", &CorridorWorld::ACTION_NAMES[..]),
         ("mspacman", &PacmanWorld::ACTION_NAMES),
         ("ising", &IsingWorld::ACTION_NAMES),
         ("procgen:GAME", &ProcgenWorld::ACTION_NAMES),
     ] {
-        let line = format!("| `{world}` | {} |", names.join(", "));
+        let line = format!("| `{world}` | `{}` |", names.join(", "));
         assert!(page.lines().any(|it| it == line), "{line}");
     }
 }

@@ -164,7 +164,7 @@ fn a_silent_part_is_named_and_a_restarted_server_found_again() {
     watched.wait().expect_code(130);
 }
 
-/// The fields of `--once --json`, which deploy/launch/README.md describes.
+/// The fields of `--once --json`, which deploy/docs/src/reference/run-folder.md describes.
 const FIELDS: [&str; 38] = [
     "actors",
     "actors_planned",

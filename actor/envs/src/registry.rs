@@ -366,7 +366,7 @@ impl fmt::Display for WorldNameError {
             write!(
                 f,
                 "; a world of Gymnasium is \"exec:python3 deploy/python/driml_env.py {} {flags}\", \
-                 and deploy/python/README.md says what that needs",
+                 and deploy/docs/src/how-to/own-world.md says what that needs",
                 self.text
             )?;
         }

@@ -1,4 +1,4 @@
-"""The network in PyTorch: torso, C51 head and DIM heads, with the names and shapes that tests/parity/README.md gives.
+"""The network in PyTorch: torso, C51 head and DIM heads, with the names and shapes that deploy/docs/src/reference/parity.md gives.
 
 It is driml_model's network layer by layer; `torch_update.py --check` compares what comes out with float64 references.
 """

@@ -10,7 +10,7 @@ use serde_json::Value;
 pub const KEY: &str = "driml";
 /// 1: the tables of the settings that a reader needs, under their names there.
 const FORMAT: u32 = 1;
-/// For a reader who has nothing but the file. More: `deploy/python/weights.md`.
+/// For a reader who has nothing but the file. More: `deploy/docs/src/reference/weights.md`.
 const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [model], divided by 255; channels are the newest frame_stack \
     frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k] without padding, each \
     followed by ReLU; torso.fc takes their output as channel, row, column; HEAD. \

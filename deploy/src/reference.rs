@@ -1,0 +1,210 @@
+//! The reference pages of `deploy/docs` that are generated: the commands from clap, the settings from the commented presets.
+//! A test fails when they are stale; `UPDATE_DOCS=1` rewrites them. It also holds every `driml` command of the pages to clap.
+
+use std::{
+    collections::BTreeMap,
+    fmt::Write,
+    fs,
+    path::{Path, PathBuf},
+};
+
+use clap::{Arg, Command, CommandFactory, Parser};
+
+use crate::cli::Cli;
+
+const GENERATED: &str =
+    "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml --lib reference` rewrites this page. -->";
+
+/// A flag or argument as its command's list shows it.
+fn entry(arg: &Arg) -> String {
+    let values: Vec<_> = arg.get_value_names().unwrap_or_default().iter().collect();
+    let takes_values = arg.get_action().takes_values();
+    let value = match values[..] {
+        [name] if takes_values => format!(" <{name}>"),
+        _ => String::new(),
+    };
+    let name = match arg.get_long() {
+        Some(long) => format!("--{long}{value}"),
+        None => value.trim_start().to_owned(),
+    };
+    let mut help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+    let defaults: Vec<_> = arg
+        .get_default_values()
+        .iter()
+        .map(|it| it.to_string_lossy().into_owned())
+        .collect();
+    if takes_values && !defaults.is_empty() {
+        write!(help, " [default: {}]", defaults.join(", ")).unwrap();
+    }
+    let possible: Vec<_> = arg
+        .get_possible_values()
+        .iter()
+        .map(|it| it.get_name().to_owned())
+        .collect();
+    if takes_values && !possible.is_empty() {
+        write!(help, " [values: {}]", possible.join(", ")).unwrap();
+    }
+    format!("* `{name}`: {help}\n")
+}
+
+/// Every command that does something, by the words that call it.
+fn leaves(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
+    if command.has_subcommands() {
+        for sub in command.get_subcommands() {
+            leaves(sub, &format!("{name} {}", sub.get_name()), found);
+        }
+    } else {
+        found.push((name.to_owned(), command.clone()));
+    }
+}
+
+/// The page of all commands; a flag that several commands have in the same words stands once.
+fn commands() -> String {
+    let mut found = Vec::new();
+    leaves(&Cli::command(), "driml", &mut found);
+    let mut uses = BTreeMap::<String, usize>::new();
+    for arg in found.iter().flat_map(|(_, it)| it.get_arguments()) {
+        *uses.entry(entry(arg)).or_default() += 1;
+    }
+    let is_shared = |arg: &Arg| arg.get_long().is_some() && uses[&entry(arg)] > 1;
+
+    let mut page = format!("# Commands\n\n{GENERATED}\n\n");
+    page += "`driml COMMAND --help` prints the same with every flag in place.\n";
+    for (name, command) in &found {
+        let about = command.get_about().map(ToString::to_string).unwrap();
+        let aliases: Vec<_> = command.get_visible_aliases().collect();
+        write!(page, "\n## `{name}`\n\n{about}.").unwrap();
+        if !aliases.is_empty() {
+            write!(page, " Alias: `{}`.", aliases.join("`, `")).unwrap();
+        }
+        page += "\n\n";
+        let (shared, own): (Vec<_>, Vec<_>) = command
+            .get_arguments()
+            .filter(|it| !it.is_hide_set())
+            .partition(|it| is_shared(it));
+        for arg in own {
+            page += &entry(arg);
+        }
+        let flags: Vec<_> = shared.iter().filter_map(|it| it.get_long()).collect();
+        if !flags.is_empty() {
+            let flags = flags.join("`, `--");
+            writeln!(page, "* [Shared](#shared-options): `--{flags}`").unwrap();
+        }
+    }
+    page += "\n## Shared options\n\n";
+    let mut shared: Vec<_> = uses.into_iter().filter(|(_, uses)| *uses > 1).collect();
+    shared.retain(|(entry, _)| entry.starts_with("* `--"));
+    for (entry, _) in shared {
+        page += &entry;
+    }
+    page
+}
+
+fn root() -> PathBuf {
+    let deploy = Path::new(env!("CARGO_MANIFEST_DIR"));
+    deploy
+        .parent()
+        .expect("the package lies in the repository")
+        .into()
+}
+
+/// The page of settings: the base preset in full, and what each of the others is for.
+fn settings() -> String {
+    let presets = root().join("deploy/settings/presets");
+    let mut page = format!("# Settings\n\n{GENERATED}\n\n");
+    page += "Settings are layered: base, world, agent, preset, then `--set` and the flags. The result stands in the run's `config.toml`.\n\
+        `driml presets --game bigfish --agent driml-fix` prints it with the source of every value.\n\n\
+        ## Base\n\n```toml\n";
+    page += &fs::read_to_string(presets.join("base.toml")).unwrap();
+    page += "```\n";
+    for (folder, title) in [
+        ("variant", "Presets"),
+        ("agent", "Agents"),
+        ("world", "Worlds"),
+    ] {
+        write!(page, "\n## {title}\n\n").unwrap();
+        let mut files: Vec<_> = fs::read_dir(presets.join(folder))
+            .unwrap()
+            .map(|it| it.unwrap().path())
+            .collect();
+        files.sort();
+        for file in files {
+            let text = fs::read_to_string(&file).unwrap();
+            let name = file.file_stem().unwrap().to_str().unwrap();
+            let first = text.lines().next().unwrap().trim_start_matches("# ");
+            let first = first.strip_prefix(&format!("{name}: ")).unwrap_or(first);
+            let first = first.split_inclusive(". ").next().unwrap().trim();
+            let link = format!("../../../settings/presets/{folder}/{name}.toml");
+            writeln!(page, "* [`{name}`]({link}): {first}").unwrap();
+        }
+    }
+    page
+}
+
+#[test]
+fn the_generated_pages_are_up_to_date() {
+    let folder = root().join("deploy/docs/src/reference");
+    for (name, page) in [("commands.md", commands()), ("settings.md", settings())] {
+        let path = folder.join(name);
+        if std::env::var_os("UPDATE_DOCS").is_some() {
+            fs::write(&path, &page).unwrap();
+        }
+        let there = fs::read_to_string(&path).unwrap_or_default();
+        assert!(
+            there == page,
+            "{name} is stale: UPDATE_DOCS=1 cargo test -p driml --lib reference"
+        );
+    }
+}
+
+/// The words of a shell's line, without its comment and redirection.
+fn words(line: &str) -> Vec<String> {
+    let mut words = vec![String::new()];
+    let mut quote = None;
+    for c in line.chars() {
+        match (c, quote) {
+            ('#' | '>', None) if words.last().is_some_and(String::is_empty) => break,
+            ('"' | '\'', None) => quote = Some(c),
+            (c, Some(open)) if c == open => quote = None,
+            (' ', None) => words.push(String::new()),
+            (c, _) => words.last_mut().unwrap().push(c),
+        }
+    }
+    words.retain(|it| !it.is_empty());
+    words
+}
+
+/// The lines of a page's shell blocks that call the program.
+fn calls(page: &str) -> impl Iterator<Item = &str> {
+    page.split("```sh\n")
+        .skip(1)
+        .flat_map(|it| it.split("```").next().unwrap().lines())
+        .filter(|it| it.starts_with("driml "))
+}
+
+#[test]
+fn every_command_in_the_pages_parses() {
+    let mut pages = vec![root().join("README.md")];
+    let mut folders = vec![root().join("deploy/docs/src")];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|it| it == "md") {
+                pages.push(path);
+            }
+        }
+    }
+    let mut seen = 0;
+    for path in pages {
+        let text = fs::read_to_string(&path).unwrap();
+        for call in calls(&text) {
+            if let Err(e) = Cli::try_parse_from(words(call)) {
+                panic!("{}: {call}\n{e}", path.display());
+            }
+            seen += 1;
+        }
+    }
+    assert!(seen > 50, "only {seen} commands were found");
+}
