@@ -27,7 +27,8 @@ fn entry(arg: &Arg) -> String {
         Some(long) => format!("--{long}{value}"),
         None => value.trim_start().to_owned(),
     };
-    let mut help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+    let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+    let mut help = first_clause(&help).to_owned();
     let defaults: Vec<_> = arg
         .get_default_values()
         .iter()
@@ -45,6 +46,12 @@ fn entry(arg: &Arg) -> String {
         write!(help, " [values: {}]", possible.join(", ")).unwrap();
     }
     format!("* `{name}`: {help}\n")
+}
+
+/// The help up to its first full stop or semicolon; `--help` has the rest.
+fn first_clause(help: &str) -> &str {
+    let ends = [". ", "; "].into_iter().filter_map(|it| help.find(it));
+    ends.min().map_or(help, |end| &help[..end])
 }
 
 /// Every command that does something, by the words that call it.
@@ -69,7 +76,7 @@ fn commands() -> String {
     let is_shared = |arg: &Arg| arg.get_long().is_some() && uses[&entry(arg)] > 1;
 
     let mut page = format!("# Commands\n\n{GENERATED}\n\n");
-    page += "`driml COMMAND --help` prints the same with every flag in place.\n";
+    page += "`driml COMMAND --help` says more about each flag.\n";
     for (name, command) in &found {
         let about = command.get_about().map(ToString::to_string).unwrap();
         let aliases: Vec<_> = command.get_visible_aliases().collect();
