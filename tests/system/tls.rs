@@ -285,7 +285,7 @@ fn own_files_that_cannot_be_used() {
         .expect_said("add --tls-dir DIR");
 }
 
-/// A replay server lets nobody in whose certificate is not good, and logs why; those that are let in stay.
+/// A replay server rejects each certificate that is not good, and logs why; accepted connections stay.
 #[test]
 fn strangers_at_a_replay_server() {
     let Some(tls) = TlsSystem::new("strangers_at_a_replay_server") else {
@@ -330,7 +330,7 @@ fn strangers_at_a_replay_server() {
     learner.stop().expect_code(0);
 }
 
-/// A part does not follow whoever listens where its replay server should, and names the endpoint.
+/// A process does not follow a stranger in the place of its replay server, and names the endpoint.
 #[test]
 fn strangers_in_the_place_of_a_replay_server() {
     let Some(tls) = TlsSystem::new("strangers_in_the_place_of_a_replay_server") else {
@@ -359,7 +359,7 @@ fn strangers_in_the_place_of_a_replay_server() {
             "good, and this part's is not to it",
             Some((&unknowing, server)),
         ),
-        ("not there, as nobody listens", None),
+        ("not there, as the port is closed", None),
     ]
     .map(|(name, stranger)| {
         let endpoint = format!("quic/127.0.0.1:{}", free_port());

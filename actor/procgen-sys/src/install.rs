@@ -153,7 +153,7 @@ impl Engine {
         wheel::unpack(&wheel, &fresh)?;
         wheel::check_hash(&fresh.join("libenv.so"), hashes.library)?;
         // A crash of the machine must not leave a folder in place whose files are empty.
-        let _ = File::open(&fresh).map(|fresh| nix::unistd::syncfs(fresh));
+        let _ = File::open(&fresh).map(nix::unistd::syncfs);
         if root.exists() {
             // What is moved into the temporary folder goes with it.
             fs::rename(&root, folder.path().join("damaged"))
@@ -161,7 +161,7 @@ impl Engine {
         }
         let renamed = fs::rename(&fresh, &root).map_err(InstallError::io("renaming", &root));
         // Where files cannot be locked, another process may have put the same there.
-        Engine::locate_in(cache).or_else(|error| Err(renamed.err().unwrap_or(error)))
+        Engine::locate_in(cache).map_err(|error| renamed.err().unwrap_or(error))
     }
 }
 
@@ -313,7 +313,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut cache = cache_in(folder.path());
         let fetch = |_: &Path| Err(InstallError::Fetch("no route".to_owned()));
-        let mut said = |cache: &Cache, lines| {
+        let said = |cache: &Cache, lines| {
             let mut told = 0;
             let error = Engine::install_in(cache, PINNED, &mut |_| told += 1, fetch);
             let text = error.unwrap_err().to_string();

@@ -97,8 +97,8 @@ impl Options {
 /// The settings in the engine's layout, with the memory they point to.
 pub(crate) struct RawOptions {
     items: Vec<LibenvOption>,
-    /// Each item's value; an item points into one of these, which stay where they are when this is moved.
-    values: Vec<Vec<u8>>,
+    /// Each item's value: held for the items that point into them, and staying where it is when this is moved.
+    _values: Vec<Vec<u8>>,
 }
 
 impl RawOptions {
@@ -141,7 +141,10 @@ impl RawOptions {
             })
             .into_iter()
             .unzip();
-        RawOptions { items, values }
+        RawOptions {
+            items,
+            _values: values,
+        }
     }
 
     /// The struct that `libenv_make` takes by value; it points into `self`, which must outlive the call.
@@ -200,10 +203,10 @@ mod tests {
     fn values_lie_where_the_items_point() {
         let mut raw = RawOptions::new(&OPTIONS, "/somewhere/");
         assert_eq!(raw.as_libenv().count, 17);
-        for (item, value) in raw.items.iter().zip(&raw.values) {
+        for (item, value) in raw.items.iter().zip(&raw._values) {
             assert_eq!(item.data.cast_const().cast::<u8>(), value.as_ptr());
         }
-        assert_eq!(raw.values[0], b"coinrun");
-        assert_eq!(raw.values[2], 500_i32.to_ne_bytes());
+        assert_eq!(raw._values[0], b"coinrun");
+        assert_eq!(raw._values[2], 500_i32.to_ne_bytes());
     }
 }

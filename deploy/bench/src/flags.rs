@@ -27,11 +27,26 @@ pub enum BenchCommand {
     /// Transitions into a replay server and batches out of it, over the wire; and its batches without the wire
     Replay(BenchReplayArgs),
     /// Procgen's steps through our wrapper, or those of other worlds
-    Env(BenchEnvArgs),
+    Env {
+        /// Instead: this world, such as "exec:COMMAND"; may be given several times
+        #[arg(long, value_name = "WORLD")]
+        env: Vec<String>,
+    },
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
-    System(BenchSystemArgs),
+    System {
+        /// Frames of the run [default: 12000, or 2500 with --quick]
+        #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
+        frames: Option<u64>,
+    },
     /// Whole runs with more and more actors: what is stored and served, how long each waits, how old the weights are
-    Scale(BenchScaleArgs),
+    Scale {
+        /// Numbers of actors, such as 1,8,32 [default: 1,2,4,8,16,32, or 1,2 with --quick]
+        #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=4096))]
+        actors: Vec<u32>,
+        /// Seconds for which each number of actors is watched [default: 5, or 2 with --quick]
+        #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=86_400))]
+        seconds: Option<u32>,
+    },
     /// All of these but the runs, in turn with PyTorch, Reverb and gym3 doing the same work
     Peers(BenchPeersArgs),
 }
@@ -74,14 +89,6 @@ pub struct BenchLearnerArgs {
     pub(crate) on: DeviceFlag,
 }
 
-/// What `driml bench env` takes.
-#[derive(Clone, Debug, Args)]
-pub struct BenchEnvArgs {
-    /// Instead: this world, such as "exec:COMMAND"; may be given several times
-    #[arg(long, value_name = "WORLD")]
-    pub(crate) env: Vec<String>,
-}
-
 /// What `driml bench replay` takes.
 #[derive(Clone, Debug, Args)]
 pub struct BenchReplayArgs {
@@ -101,25 +108,6 @@ pub struct BenchReplayArgs {
     /// Instead: over TCP and over QUIC, with the certificates of replay-server, observer, learner and actors 1 to 5 in this folder
     #[arg(long, value_name = "DIR", conflicts_with_all = ["replay_dir", "rounds"])]
     pub(crate) tls_dir: Option<PathBuf>,
-}
-
-/// What `driml bench system` takes.
-#[derive(Debug, Args)]
-pub struct BenchSystemArgs {
-    /// Frames of the run [default: 12000, or 2500 with --quick]
-    #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
-    pub(crate) frames: Option<u64>,
-}
-
-/// What `driml bench scale` takes.
-#[derive(Clone, Debug, Args)]
-pub struct BenchScaleArgs {
-    /// Numbers of actors, such as 1,8,32 [default: 1,2,4,8,16,32, or 1,2 with --quick]
-    #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=4096))]
-    pub(crate) actors: Vec<u32>,
-    /// Seconds for which each number of actors is watched [default: 5, or 2 with --quick]
-    #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=86_400))]
-    pub(crate) seconds: Option<u32>,
 }
 
 /// What `driml bench peers` takes.

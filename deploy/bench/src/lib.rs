@@ -46,7 +46,8 @@ use crate::{
     report::{Report, publish},
 };
 
-/// Runs one bench and reports its figures.
+/// Runs one bench and reports its figures. A bench that computes in this process starts the program again in its place, if it has
+/// another number of threads than the flags ask for.
 ///
 /// # Errors
 /// A component that failed, an engine that cannot be had, a file that cannot be written.
@@ -58,7 +59,7 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     device::ready_for(on)?;
     let of_processes = matches!(
         command,
-        BenchCommand::System(_) | BenchCommand::Scale(_) | BenchCommand::Peers(_)
+        BenchCommand::System { .. } | BenchCommand::Scale { .. } | BenchCommand::Peers(_)
     );
     if !of_processes {
         subprocess::ensure_threads(flags.threads)?;
@@ -69,10 +70,10 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         BenchCommand::Learner(args) => ("learner", learner::measure(args, flags, &effort)?),
         BenchCommand::Policy => ("policy", policy::measure(flags, &effort)?),
         BenchCommand::Replay(args) => ("replay", replay::measure(args, &effort)?),
-        BenchCommand::Env(args) => ("env", env::measure(&args.env, &effort)?),
-        BenchCommand::System(args) => ("system", system::measure(args, flags)?),
-        BenchCommand::Scale(args) => {
-            let (figures, text) = system::scale(args, flags)?;
+        BenchCommand::Env { env } => ("env", env::measure(env, &effort)?),
+        BenchCommand::System { frames } => ("system", system::measure(*frames, flags)?),
+        BenchCommand::Scale { actors, seconds } => {
+            let (figures, text) = system::scale(actors, *seconds, flags)?;
             table = Some(text);
             ("scale", figures)
         }

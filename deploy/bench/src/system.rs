@@ -19,7 +19,7 @@ use driml_protocol::{Keys, LearnerStatus, ReplayStatus, session};
 use tempfile::TempDir;
 
 use crate::{
-    flags::{BenchFlags, BenchScaleArgs, BenchSystemArgs},
+    flags::BenchFlags,
     report::{Measurement, aligned},
     settings::{self, AGENT, WORLD},
     subprocess::{connect, reach, start},
@@ -42,12 +42,9 @@ const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
 const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 
 /// Updates and frames a second of a run, the share of time in which the learner computes, and the highest memory of each process.
-pub(super) fn measure(
-    args: &BenchSystemArgs,
-    flags: &BenchFlags,
-) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(frames: Option<u64>, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
     procgen_sys::Engine::install(&mut console::line)?;
-    let frames = args.frames.unwrap_or(match flags.quick {
+    let frames = frames.unwrap_or(match flags.quick {
         true => FRAMES.1,
         false => FRAMES.0,
     });
@@ -64,10 +61,12 @@ pub(super) fn measure(
     let computing = after.computing_s - before.computing_s;
     let waiting = after.waiting_s - before.waiting_s;
     let share = 100.0 * computing / (computing + waiting);
+    let updates = watched.rate(|it| it.learner.updates);
+    let frames = watched.rate(|it| it.replay.transitions_inserted);
     let computes = "share of its time in which the learner computes";
     let mut figures = vec![
-        Measurement::found("updates", watched.rate(Moment::updates), "updates/s"),
-        Measurement::found("frames", watched.rate(Moment::frames), "frames/s"),
+        Measurement::found("updates", updates, "updates/s"),
+        Measurement::found("frames", frames, "frames/s"),
         Measurement::found(computes, share, "%"),
     ];
     for (process, mib) in &watched.summary.rss_mib_max {
@@ -79,16 +78,17 @@ pub(super) fn measure(
 
 /// Runs at both ratios with more and more actors, as figures and as a table.
 pub(super) fn scale(
-    args: &BenchScaleArgs,
+    actors: &[u32],
+    seconds: Option<u32>,
     flags: &BenchFlags,
 ) -> anyhow::Result<(Vec<Measurement>, String)> {
     procgen_sys::Engine::install(&mut console::line)?;
-    let actors = match (args.actors.as_slice(), flags.quick) {
+    let actors = match (actors, flags.quick) {
         ([], true) => &ACTORS[..2],
         ([], false) => &ACTORS,
         (asked, _) => asked,
     };
-    let seconds = args.seconds.unwrap_or(if flags.quick { 2 } else { 5 });
+    let seconds = seconds.unwrap_or(if flags.quick { 2 } else { 5 });
     let (mut figures, mut rows) = (Vec::new(), Vec::new());
     for (ratio, slack) in RATIOS {
         for &actors in actors {
@@ -148,9 +148,11 @@ impl Watched {
 
     /// A row of the table of actors.
     fn columns(&self) -> Vec<(String, Option<f64>)> {
+        let frames = self.rate(|it| it.replay.transitions_inserted);
+        let updates = self.rate(|it| it.learner.updates);
         let mut columns = vec![
-            ("frames/s".to_owned(), Some(self.rate(Moment::frames))),
-            ("updates/s".to_owned(), Some(self.rate(Moment::updates))),
+            ("frames/s".to_owned(), Some(frames)),
+            ("updates/s".to_owned(), Some(updates)),
             ("all act after s".to_owned(), Some(self.all_act_after_s)),
         ];
         let replay = &self.last.replay;
@@ -185,16 +187,6 @@ struct Moment {
     at: Instant,
     replay: ReplayStatus,
     learner: LearnerStatus,
-}
-
-impl Moment {
-    fn frames(&self) -> u64 {
-        self.replay.transitions_inserted
-    }
-
-    fn updates(&self) -> u64 {
-        self.learner.updates
-    }
 }
 
 /// A run of bigfish with driml-ada, which ends when this is dropped.

@@ -7,7 +7,7 @@ use std::{
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault, tls,
+    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault,
 };
 
 use super::{

@@ -271,7 +271,7 @@ fn no_copies_and_wrong_buffers_are_errors() {
 fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
     WorldConfig::Procgen(ProcgenConfig {
         game: "coinrun".parse().unwrap(),
-        distribution_mode: "easy".parse().unwrap(),
+        distribution_mode: procgen_sys::DistributionMode::Easy,
         num_levels,
         start_level,
         use_sequential_levels: true,

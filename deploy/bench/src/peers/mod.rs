@@ -13,13 +13,13 @@ use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console;
 use driml_machine::{resources::MachineNote, units::number};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::{
     effort::median,
     flags::{BenchFlags, BenchPeersArgs, Component},
     peers::{
-        pairs::{Pair, Theirs, pairs},
+        pairs::{Pair, pairs},
         script::Script,
     },
     recording::Recording,
@@ -41,7 +41,7 @@ struct Sides {
 }
 
 /// One line of the comparison.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize)]
 struct Row {
     #[serde(rename = "part")]
     component: String,
@@ -64,7 +64,7 @@ struct Row {
 }
 
 /// The comparison, as it is written to JSON.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize)]
 struct Comparison {
     rounds: u32,
     quick: bool,
@@ -158,10 +158,11 @@ impl Sides {
 /// Medians and ratio of one pair; none if ours was not measured, as in a precision that was not asked for.
 fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     let (ours, unit) = sides.ours.of(&pair.ours)?;
-    let (peer, theirs) = match &pair.theirs {
-        Theirs::Peers(what) if *what == pair.ours => (sides.peer.clone(), sides.theirs.of(what)),
-        Theirs::Peers(what) => (format!("{}: {what}", sides.peer), sides.theirs.of(what)),
-        Theirs::Ours(what, name) => ((*name).to_owned(), sides.ours.of(what)),
+    let (what, own_peer) = (&pair.theirs, &sides.peer);
+    let (peer, theirs) = match pair.of_ours {
+        Some(name) => (name.to_owned(), sides.ours.of(what)),
+        None if *what == pair.ours => (own_peer.clone(), sides.theirs.of(what)),
+        None => (format!("{own_peer}: {what}"), sides.theirs.of(what)),
     };
     let theirs = theirs.map(|(values, _)| values);
     let rounds = ours.iter().zip(theirs.unwrap_or_default());

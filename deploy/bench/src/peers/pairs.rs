@@ -3,7 +3,7 @@
 
 use crate::{
     env,
-    flags::Component,
+    flags::Component::{self, Env, Learner, Policy, Replay},
     in_process,
     learner::{CANDLE, GLOBAL_DIM},
     recording::CHUNKS,
@@ -17,33 +17,30 @@ pub(super) struct Pair {
     pub(super) component: Component,
     /// The name of our figure.
     pub(super) ours: String,
-    /// What it is compared with.
-    pub(super) theirs: Theirs,
+    /// The name of the figure that it is compared with.
+    pub(super) theirs: String,
+    /// None if that is the peer's; else another one of ours, and what it stands for.
+    pub(super) of_ours: Option<&'static str>,
     /// The least ratio of ours to theirs that is wanted; none where it is only of interest.
     pub(super) goal: Option<f64>,
-}
-
-/// What a figure is compared with.
-#[derive(Clone, Debug)]
-pub(super) enum Theirs {
-    /// A figure of the component's peer.
-    Peers(String),
-    /// Another figure of the same bench of ours, and what it stands for.
-    Ours(String, &'static str),
 }
 
 /// All comparisons, in the order of the table.
 pub(super) fn pairs() -> Vec<Pair> {
     let mut pairs = Vec::new();
-    let mut add = |component, ours: &str, theirs: Theirs, goal| {
+    let mut add = |component, ours: &str, theirs: &str, goal| {
         pairs.push(Pair {
             component,
             ours: ours.to_owned(),
-            theirs,
+            theirs: theirs.to_owned(),
+            of_ours: match theirs {
+                in_process::COPIED => Some("a plain copy of the same bytes"),
+                _ if theirs.ends_with(CANDLE) => Some(CANDLE),
+                _ => None,
+            },
             goal,
         });
     };
-    let peers = |name: &str| Theirs::Peers(name.to_owned());
     // In bf16 beside the faster of PyTorch's f32 and bf16 autocast; that goal is for AVX512_BF16, with AMX it is 3.
     for (name, f32, bf16) in [
         ("C51, 64x64x3", None, None),
@@ -55,18 +52,18 @@ pub(super) fn pairs() -> Vec<Pair> {
         ),
         ("C51 + global-global DIM, 104x80x3", Some(1.2), None),
     ] {
-        add(Component::Learner, name, peers(name), f32);
+        add(Learner, name, name, f32);
         let name = format!("{name}, bf16");
-        add(Component::Learner, &name, peers(&name), bf16);
+        add(Learner, &name, &name, bf16);
     }
-    let candle = Theirs::Ours(format!("{GLOBAL_DIM}, {CANDLE}"), CANDLE);
-    add(Component::Learner, GLOBAL_DIM, candle, None);
+    let candle = format!("{GLOBAL_DIM}, {CANDLE}");
+    add(Learner, GLOBAL_DIM, &candle, None);
     for size in ["64x64x3", "104x80x3"] {
         for frames in [32, 256] {
             let name = format!("{frames} frames of {size}");
-            add(Component::Policy, &name, peers(&name), Some(1.3));
+            add(Policy, &name, &name, Some(1.3));
             let name = format!("{name}, bf16");
-            add(Component::Policy, &name, peers(&name), None);
+            add(Policy, &name, &name, None);
         }
     }
     for (wire, insert, batch) in [
@@ -78,33 +75,20 @@ pub(super) fn pairs() -> Vec<Pair> {
             // What an actor sends.
             let goal = (chunk.transitions() == 256).then_some(insert);
             let name = insert_name(chunk.transitions(), wire);
-            add(Component::Replay, &name, peers("insert"), goal);
+            add(Replay, &name, "insert", goal);
         }
         let name = format!("batch of 3 states, {wire}");
-        add(
-            Component::Replay,
-            &name,
-            peers("batch of 3 states"),
-            Some(batch),
-        );
+        add(Replay, &name, "batch of 3 states", Some(batch));
         // With k chosen by the client, as only a sequence allows it there.
-        let sequences = peers("batch of sequences of 8 states");
-        add(Component::Replay, &name, sequences, None);
+        let sequences = "batch of sequences of 8 states";
+        add(Replay, &name, sequences, None);
     }
-    let copy = Theirs::Ours(
-        in_process::COPIED.to_owned(),
-        "a plain copy of the same bytes",
-    );
-    add(
-        Component::Replay,
-        in_process::ASSEMBLED,
-        copy,
-        Some(1.0 / 1.5),
-    );
+    let copied = in_process::COPIED;
+    add(Replay, in_process::ASSEMBLED, copied, Some(1.0 / 1.5));
     for game in env::GAMES {
         for threads in env::ENGINE_THREADS {
             let name = env::name(game, threads);
-            add(Component::Env, &name, peers(&name), Some(1.0));
+            add(Env, &name, &name, Some(1.0));
         }
     }
     pairs

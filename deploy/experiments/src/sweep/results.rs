@@ -2,7 +2,7 @@
 //! Returns of the training are in their summaries.
 
 use driml_launch::{
-    evaluate::{Levels, Player, Which, Who, random_returns},
+    evaluate::{Levels, Player, Weights, Which, Who, random_returns},
     run_folder::RunFolder,
 };
 use driml_learner::checkpoint;
@@ -76,7 +76,7 @@ impl Played {
         let players = players(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(players.len().max(1) as u32);
         for which in players {
-            let player = Player::load_at(folder, which)?;
+            let player = Player::load_at(folder, which, Weights::default())?;
             match player.returns(Who::Agent, self.levels, each, SEED)? {
                 Some(returns) => all.extend(returns),
                 None => return Ok(None),
@@ -91,8 +91,8 @@ fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>>
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();
     if newest.is_none_or(|(_, path)| path.join(AVERAGE).is_file()) {
-        // Without a checkpoint the player says what is missing.
-        return Ok(vec![newest.map_or(Which::Newest, |_| Which::Average)]);
+        // Averages of three checkpoints differ little. Without a checkpoint the player says what is missing.
+        return Ok(vec![Which::Newest]);
     }
     let newest = all.iter().rev().take(checkpoints);
     Ok(newest.map(|(updates, _)| Which::After(*updates)).collect())
@@ -124,6 +124,6 @@ mod tests {
         assert_eq!(players(&folder, 3).unwrap(), newest);
         let path = folder.checkpoints().join("checkpoint-000000000004");
         fs::write(path.join(AVERAGE), "").unwrap();
-        assert_eq!(players(&folder, 3).unwrap(), [Which::Average]);
+        assert_eq!(players(&folder, 3).unwrap(), [Which::Newest]);
     }
 }
