@@ -97,9 +97,11 @@ pub(super) fn scale(
             for (column, value) in Watched::new(actors, ratio, slack, seconds)?.columns() {
                 row.push(value.map_or("-".into(), number));
                 let what = format!("ratio {ratio}, {actors} actors: {column}");
-                figures.extend(value.map(|value| Measurement::found(what, value, &column)));
+                let unit = column.clone();
+                figures.extend(value.map(|value| Measurement { what, value, unit }));
                 heads.push(column);
             }
+            console::line(&format!("  {}", row.join("  ")));
             if rows.is_empty() {
                 rows.push(heads);
             }
