@@ -19,9 +19,8 @@ use crate::commands::{
     presets::{self, PresetsArgs},
     procgen::{self, ProcgenCommand},
     replay_server::{self, ReplayServerArgs},
-    status::{self, StatusArgs},
     train::{self, TrainArgs},
-    watch::{self, WatchArgs},
+    watch::{self, StatusArgs, WatchArgs},
 };
 
 /// What `driml train --help` ends with.
@@ -55,9 +54,9 @@ pub(crate) enum Command {
     ReplayServer(ReplayServerArgs),
     /// The learner of a run whose replay server is reached at ENDPOINT
     Learner(LearnerArgs),
-    /// Who takes part in a run, who waits for whom and since when, and what it would take to go on
+    /// Show a run's processes, what waits, and how to unblock it: `watch --once`
     Status(StatusArgs),
-    /// Show how a run goes, wherever its parts are and whoever started them, and record it in a folder
+    /// Monitor a run, local or remote, and record it in a folder
     Watch(WatchArgs),
     /// Play whole episodes with the weights of a run or of a pretrained network, beside a random policy
     Evaluate(EvaluateArgs),
@@ -107,7 +106,7 @@ impl Command {
             Self::Actor(args) => actor::run(args),
             Self::ReplayServer(args) => replay_server::run(args),
             Self::Learner(args) => learner::run(args),
-            Self::Status(args) => status::run(&args),
+            Self::Status(args) => watch::status(&args),
             Self::Watch(args) => watch::run(&args),
             Self::Evaluate(args) => evaluate::run(&args),
             Self::Inspect(args) => inspect::run(&args),

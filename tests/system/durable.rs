@@ -512,7 +512,7 @@ fn a_full_disk_makes_everybody_wait_until_there_is_room() {
             "REFUSED for",
             "No space left on device",
             "If the replay server dies now",
-            "to go on: the disk of the replay server on",
+            "to do: the disk of the replay server on",
         ];
         words.iter().all(|it| said.contains(it)).then_some(())
     });

@@ -1,4 +1,4 @@
-//! `driml status`: what a person is told of a run in which somebody is missing, gone, frozen or done.
+//! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
 //! The parts' own words while they wait are here too.
 
 use driml_protocol::session::{self, Endpoints};
@@ -50,14 +50,18 @@ fn whoever_is_missing_is_named_with_what_to_do() {
     let again = format!("`driml actor --connect {endpoint} --id 5`");
     wait_for_status(
         &system,
-        &["actor-5        GONE for", "the others go on", &again],
+        &[
+            "actor-5        GONE for",
+            "the run continues without it",
+            &again,
+        ],
     );
     learner.signal(Signal::SIGKILL);
     wait_for_status(
         &system,
         &[
             "learner        GONE for",
-            "goes on from its newest checkpoint",
+            "it resumes from its newest checkpoint",
         ],
     );
 
@@ -92,17 +96,17 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     process.wait().expect_code(130);
     let ended = system.run("status --run run").expect_code(0);
     assert!(
-        ended.stdout.contains("nobody runs in run, which holds")
+        ended.stdout.contains("no process runs in run, which holds")
             && ended
                 .stdout
-                .contains("`driml train --resume run` goes on with it"),
+                .contains("`driml train --resume run` resumes it"),
         "{}",
         ended.stdout
     );
     system
         .run("status --run nowhere")
         .expect_code(64)
-        .expect_said("nowhere is no run folder");
+        .expect_said("nowhere is not a run folder");
 }
 
 /// Its launcher still plays the last checkpoint, and nobody else is there.
@@ -139,7 +143,7 @@ fn the_wrong_place_is_told_from_an_empty_one() {
     system
         .run(&format!("status --connect {endpoint}"))
         .expect_code(64)
-        .expect_said("somebody listens on")
-        .expect_said("but it is no replay server with the namespace \"driml\"");
+        .expect_said("a program listens on")
+        .expect_said("but it is not a replay server with the namespace \"driml\"");
     system.run("status").expect_code(64);
 }

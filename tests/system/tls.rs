@@ -197,7 +197,7 @@ fn a_launched_run_with_an_actor_from_outside() {
         (is_there("0") && is_there("2")).then_some(())
     });
     watched.signal(Signal::SIGINT);
-    watched.wait_for_stderr("the run goes on without being watched");
+    watched.wait_for_stderr("the run continues without being watched");
     watched.wait().expect_code(130);
     outside.stop().expect_code(0).expect_said("leaves: ");
     drop(observer);

@@ -12,7 +12,7 @@ use driml_launch::{
     endpoint::NAMESPACE,
     managed_process::ManagedProcess,
     run_folder::{RunFolder, Summary},
-    status_client::Statuses,
+    view::{Poller, Reached},
 };
 use driml_machine::units::number;
 use driml_protocol::{Keys, LearnerStatus, ReplayStatus, session};
@@ -194,7 +194,7 @@ struct Moment {
 /// A run of bigfish with driml-ada, which ends when this is dropped.
 struct Run {
     launcher: ManagedProcess,
-    statuses: Statuses,
+    poller: Poller,
     folder: TempDir,
 }
 
@@ -218,8 +218,13 @@ impl Run {
         let endpoints = connect(&endpoint);
         let session = reach(&mut launcher, || session::open(&endpoints))?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
+        let reached = Reached {
+            name: "replay-server".into(),
+            endpoint,
+            session,
+        };
         Ok(Self {
-            statuses: Statuses::new(vec![session], keys, config.run.hash()),
+            poller: Poller::new(&config, vec![reached], &keys),
             launcher,
             folder,
         })
@@ -230,14 +235,14 @@ impl Run {
         if self.launcher.end().is_some() {
             bail!("{}", self.launcher.exit_report());
         }
-        let answers = self.statuses.ask_replay();
-        if answers.and_then(|()| self.statuses.ask_learner()).is_err() {
+        let answers = self.poller.ask_replay();
+        if answers.and_then(|()| self.poller.ask_learner()).is_err() {
             return Ok(None);
         }
         Ok(Some(Moment {
             at: Instant::now(),
-            replay: self.statuses.replay.clone(),
-            learner: self.statuses.learner.clone(),
+            replay: self.poller.view.replay.clone(),
+            learner: self.poller.view.learner.clone(),
         }))
     }
 
@@ -280,7 +285,7 @@ impl Run {
 
     /// Waits for the run's end, with this exit code, and gives its summary.
     fn finish(mut self, code: i32) -> anyhow::Result<Summary> {
-        self.statuses.close();
+        self.poller.close();
         let end = self
             .launcher
             .wait_until(Instant::now() + WAIT_MAX, || false);

@@ -92,14 +92,17 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
 #[cfg(test)]
 mod tests {
     use driml_machine::resources::Machine;
-    use driml_protocol::{LearnerStatus, ReplayStatus};
     use driml_settings::{
         presets::preset,
         resolve::{Flags, Source, resolve},
     };
 
     use super::*;
-    use crate::run_folder::{Episodes, Outcome};
+    use crate::{
+        moment::Episodes,
+        run_folder::Outcome,
+        run_view::{Plan, RunView},
+    };
 
     #[test]
     fn what_cannot_be_played_fails_no_run() {
@@ -107,9 +110,9 @@ mod tests {
         let mut config = resolve(&source, &Flags::default(), &Machine::this()).unwrap();
         assert!(!config.local.play, "a run that tests parts is not played");
         config.local.play = true;
-        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+        let view = RunView::new(Plan::of(&config));
         let (none, outcome) = (Episodes::default(), Outcome::Finished);
-        let mut summary = Summary::of(outcome, &config.run, &replay, &learner, none, 2.0);
+        let mut summary = Summary::of(outcome, &config.run, &view, none, 2.0);
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
         play(&mut summary, &config, &folder, &|| false);

@@ -5,10 +5,12 @@ use std::{
     time::{Duration, Instant},
 };
 
+use crate::moment::Speed;
+
 /// The time over which rates are means.
 const RATE_WINDOW: Duration = Duration::from_secs(20);
 
-/// Frames and updates a second, over the last while.
+/// The counts of the last while, and so the speed.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Rates {
     samples: VecDeque<(Instant, u64, u64)>,
@@ -23,9 +25,8 @@ impl Rates {
         }
     }
 
-    /// Frames a second and updates a second, each since the last moment at which nothing of it had happened yet; 0 before the second
-    /// sample.
-    pub(crate) fn per_second(&self) -> (f64, f64) {
+    /// Each since the last time at which nothing of it had happened yet; 0 before the second sample.
+    pub(crate) fn speed(&self) -> Speed {
         let rate = |count: fn(&(Instant, u64, u64)) -> u64| {
             let (first, last) = (self.samples.front()?, self.samples.back()?);
             let idle = self
@@ -36,10 +37,10 @@ impl Rates {
             let seconds = (last.0 - idle.0).as_secs_f64();
             (seconds > 0.0).then(|| count(last).saturating_sub(count(idle)) as f64 / seconds)
         };
-        (
-            rate(|it| it.1).unwrap_or(0.0),
-            rate(|it| it.2).unwrap_or(0.0),
-        )
+        Speed {
+            frames: rate(|it| it.1).unwrap_or(0.0),
+            updates: rate(|it| it.2).unwrap_or(0.0),
+        }
     }
 }
 
@@ -50,7 +51,7 @@ mod tests {
     #[test]
     fn rates_forget_what_is_long_ago() {
         let (mut rates, start) = (Rates::default(), Instant::now());
-        assert_eq!(rates.per_second(), (0.0, 0.0));
+        assert_eq!(rates.speed(), Speed::default());
         for second in 0..100 {
             rates.add(
                 start + Duration::from_secs(second),
@@ -58,7 +59,7 @@ mod tests {
                 0,
             );
         }
-        assert_eq!(rates.per_second().0, 10.0);
+        assert_eq!(rates.speed().frames, 10.0);
         assert!(rates.samples.len() <= 22);
     }
 
@@ -68,6 +69,10 @@ mod tests {
         for (second, updates) in [(0, 7), (10, 7), (12, 47)] {
             rates.add(start + Duration::from_secs(second), second, updates);
         }
-        assert_eq!(rates.per_second(), (1.0, 20.0));
+        let expected = Speed {
+            frames: 1.0,
+            updates: 20.0,
+        };
+        assert_eq!(rates.speed(), expected);
     }
 }

@@ -10,9 +10,7 @@ pub(crate) mod parity;
 pub(crate) mod presets;
 pub(crate) mod procgen;
 pub(crate) mod replay_server;
-pub(crate) mod status;
 pub(crate) mod train;
 pub(crate) mod watch;
 
 mod join;
-mod look;

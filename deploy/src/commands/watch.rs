@@ -1,43 +1,73 @@
-//! `driml watch`: how a run goes, wherever its parts are and whoever started them.
+//! `driml watch` and `driml status`: how a run goes, on whatever machines its processes are and however they were started.
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{ArgGroup, Args};
 use driml_launch::{
+    console,
+    endpoint::{NAMESPACE, check_endpoints},
     run_folder::RunFolder,
-    watch::{self, Outputs},
+    view::Poller,
+    watch::{self, Live, Look, Outputs, endpoints_of},
 };
+use driml_protocol::tls::Role;
 
-use super::look::LookFlags;
+use super::join::TlsFlags;
+
+/// Which run is looked at.
+#[derive(Debug, Args)]
+#[command(group = ArgGroup::new("whose").required(true))]
+pub(crate) struct LookFlags {
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
+    #[arg(long, value_name = "ENDPOINT", group = "whose")]
+    connect: Vec<String>,
+    /// Folder of a run that `driml train` started on this machine
+    #[arg(long, value_name = "DIR", group = "whose")]
+    run: Option<PathBuf>,
+    /// Prefix of the run's keys
+    #[arg(long, value_name = "NS", default_value = NAMESPACE)]
+    namespace: String,
+    #[command(flatten)]
+    tls: TlsFlags,
+}
 
 #[derive(Debug, Args)]
 pub(crate) struct WatchArgs {
     #[command(flatten)]
     look: LookFlags,
-    /// Write settings, metrics and summary there, as `driml train` does; a folder that holds the same run is gone on with
+    /// Write settings, metrics and summary there, as `driml train` does; a folder that holds the same run is continued
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
     /// Write events for TensorBoard too, in that folder
     #[arg(long, requires = "run_dir")]
     pub(crate) tensorboard: bool,
-    /// One look and out, as `driml status` prints it; the exit code is 0 if nothing is missing, else 1
+    /// Ask once, print the page of `driml status` and exit: with code 0 if nothing is missing, else 1
     #[arg(long, conflicts_with = "run_dir")]
     pub(crate) once: bool,
     /// With --once: print one JSON object
     #[arg(long, requires = "once")]
     pub(crate) json: bool,
-    /// Write the numbers into this file in Prometheus' text format at each answer, whole or not at all: for node_exporter's textfile
+    /// Write the metrics into this file in Prometheus' text format at each answer, whole or not at all: for node_exporter's textfile
     /// collector, which reads files named *.prom
     #[arg(long, value_name = "FILE")]
     pub(crate) prometheus: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct StatusArgs {
+    #[command(flatten)]
+    look: LookFlags,
+    /// Ask every two seconds until the run is over or Ctrl-C
+    #[arg(long)]
+    pub(crate) watch: bool,
+    /// Write JSON to stdout, an object for each answer
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
 /// Watches until the run is over.
-///
-/// # Errors
-/// A call that cannot work, nobody there, or a folder that cannot be written to.
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    let Some(connection) = args.look.open()? else {
+    let Some(poller) = args.look.open()? else {
         return Ok(());
     };
     let outputs = Outputs {
@@ -46,7 +76,49 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
         prometheus: args.prometheus.clone(),
     };
     match args.once {
-        true => watch::once(connection, &outputs, args.json),
-        false => watch::run(connection, &outputs),
+        true => watch::once(poller, &outputs, args.json),
+        false => watch::run(poller, &outputs),
+    }
+}
+
+/// Asks, and prints the answers.
+pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
+    let look = Look {
+        again: args.watch,
+        json: args.json,
+    };
+    match args.look.open()? {
+        Some(mut poller) => watch::look(&mut poller, args.look.folder().as_ref(), look),
+        None => Ok(()),
+    }
+}
+
+impl LookFlags {
+    /// A connection to the run; none if it is over, which is then printed.
+    fn open(&self) -> anyhow::Result<Option<Poller>> {
+        check_endpoints(&self.connect, self.tls.is_set())?;
+        let credentials = self.tls.credentials(Role::Observer)?;
+        let endpoints = match self.live()? {
+            None => self.connect.clone(),
+            Some(Live::At(endpoints)) => endpoints,
+            Some(Live::Over(how)) => return console::print(&how).map(|()| None),
+        };
+        let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
+        // It may have ended meanwhile.
+        if opened.is_err()
+            && let Some(Live::Over(how)) = self.live()?
+        {
+            return console::print(&how).map(|()| None);
+        }
+        opened.map(Some)
+    }
+
+    /// How the run stands by its folder, if one was given.
+    fn live(&self) -> anyhow::Result<Option<Live>> {
+        self.folder().map(|it| endpoints_of(&it)).transpose()
+    }
+
+    fn folder(&self) -> Option<RunFolder> {
+        self.run.as_ref().map(RunFolder::new)
     }
 }

@@ -170,92 +170,8 @@ impl ReplayStatus {
         let Some((first, others)) = shards.split_first() else {
             return Self::default();
         };
-        let add = |sums: &mut Vec<u64>, counts: &[u64]| {
-            let each = sums.iter_mut().zip(counts);
-            each.for_each(|(sum, n)| *sum = sum.saturating_add(*n));
-        };
         let mut sum = first.clone();
-        for it in others {
-            // All by name, so that a new one is not forgotten.
-            let Self {
-                transitions_inserted,
-                transitions_refilled,
-                transitions_held,
-                frame_bytes_held,
-                transitions_lost,
-                transitions_duplicated,
-                chunks_retried,
-                batches_retried,
-                messages_refused,
-                rows_sampled,
-                rows_unlearned,
-                updates,
-                updates_relearned,
-                // Every shard has the whole run's.
-                warmup_transitions: _,
-                episodes,
-                returns,
-                k_histogram,
-                // Weighted below.
-                mean_age: _,
-                action_histogram,
-                waiting,
-                learner_waited_s,
-                actors_waited_s,
-                actors,
-                actors_acting,
-                actors_waiting,
-                answer_ms,
-                insert_ms,
-                weights_behind_s,
-                weights_behind_updates,
-                affinity_version,
-                finished,
-                learner_finished,
-            } = it;
-            sum.transitions_inserted = sum
-                .transitions_inserted
-                .saturating_add(*transitions_inserted);
-            sum.transitions_refilled = sum
-                .transitions_refilled
-                .saturating_add(*transitions_refilled);
-            sum.transitions_held = sum.transitions_held.saturating_add(*transitions_held);
-            sum.frame_bytes_held = sum.frame_bytes_held.saturating_add(*frame_bytes_held);
-            sum.transitions_lost = sum.transitions_lost.saturating_add(*transitions_lost);
-            sum.transitions_duplicated = sum
-                .transitions_duplicated
-                .saturating_add(*transitions_duplicated);
-            sum.chunks_retried = sum.chunks_retried.saturating_add(*chunks_retried);
-            sum.batches_retried = sum.batches_retried.saturating_add(*batches_retried);
-            sum.messages_refused = sum.messages_refused.saturating_add(*messages_refused);
-            sum.rows_sampled = sum.rows_sampled.saturating_add(*rows_sampled);
-            sum.rows_unlearned = sum.rows_unlearned.saturating_add(*rows_unlearned);
-            // Each hears of them with its next request.
-            sum.updates = sum.updates.max(*updates);
-            sum.updates_relearned = sum.updates_relearned.max(*updates_relearned);
-            sum.episodes = sum.episodes.saturating_add(*episodes);
-            sum.returns.known = sum.returns.known.saturating_add(returns.known);
-            sum.returns.newest.extend(&returns.newest);
-            add(&mut sum.k_histogram, k_histogram);
-            add(&mut sum.action_histogram, action_histogram);
-            sum.learner_waited_s += learner_waited_s;
-            sum.actors_waited_s += actors_waited_s;
-            sum.actors = sum.actors.saturating_add(*actors);
-            sum.actors_acting = sum.actors_acting.saturating_add(*actors_acting);
-            sum.actors_waiting = sum.actors_waiting.saturating_add(*actors_waiting);
-            sum.answer_ms = Quantiles::worst(sum.answer_ms, *answer_ms);
-            sum.insert_ms = Quantiles::worst(sum.insert_ms, *insert_ms);
-            sum.weights_behind_s = Quantiles::worst(sum.weights_behind_s, *weights_behind_s);
-            sum.weights_behind_updates =
-                Quantiles::worst(sum.weights_behind_updates, *weights_behind_updates);
-            sum.affinity_version = sum.affinity_version.min(*affinity_version);
-            // Each knows of the others what the learner told it; the one that knows of the end is right.
-            sum.finished |= finished;
-            sum.learner_finished |= learner_finished;
-            if *waiting == Waiting::Finished || sum.waiting == Waiting::Nobody {
-                sum.waiting = *waiting;
-            }
-        }
+        others.iter().for_each(|it| sum.add(it));
         let ages = shards.iter();
         let ages: f64 = ages.map(|it| it.mean_age * it.rows_sampled as f64).sum();
         sum.mean_age = match sum.rows_sampled {
@@ -263,6 +179,62 @@ impl ReplayStatus {
             rows => ages / rows as f64,
         };
         sum
+    }
+
+    /// Adds another shard's account, but for the mean age. Every shard has the whole run's warm-up.
+    fn add(&mut self, it: &Self) {
+        for (sum, n) in [
+            (&mut self.transitions_inserted, it.transitions_inserted),
+            (&mut self.transitions_refilled, it.transitions_refilled),
+            (&mut self.transitions_held, it.transitions_held),
+            (&mut self.frame_bytes_held, it.frame_bytes_held),
+            (&mut self.transitions_lost, it.transitions_lost),
+            (&mut self.transitions_duplicated, it.transitions_duplicated),
+            (&mut self.chunks_retried, it.chunks_retried),
+            (&mut self.batches_retried, it.batches_retried),
+            (&mut self.messages_refused, it.messages_refused),
+            (&mut self.rows_sampled, it.rows_sampled),
+            (&mut self.rows_unlearned, it.rows_unlearned),
+            (&mut self.episodes, it.episodes),
+            (&mut self.returns.known, it.returns.known),
+        ] {
+            *sum = sum.saturating_add(n);
+        }
+        for (sum, n) in [
+            (&mut self.actors, it.actors),
+            (&mut self.actors_acting, it.actors_acting),
+            (&mut self.actors_waiting, it.actors_waiting),
+        ] {
+            *sum = sum.saturating_add(n);
+        }
+        for (sums, counts) in [
+            (&mut self.k_histogram, &it.k_histogram),
+            (&mut self.action_histogram, &it.action_histogram),
+        ] {
+            let each = sums.iter_mut().zip(counts);
+            each.for_each(|(sum, n)| *sum = sum.saturating_add(*n));
+        }
+        for (worst, other) in [
+            (&mut self.answer_ms, it.answer_ms),
+            (&mut self.insert_ms, it.insert_ms),
+            (&mut self.weights_behind_s, it.weights_behind_s),
+            (&mut self.weights_behind_updates, it.weights_behind_updates),
+        ] {
+            *worst = Quantiles::worst(*worst, other);
+        }
+        // Each learns of them with its next request.
+        self.updates = self.updates.max(it.updates);
+        self.updates_relearned = self.updates_relearned.max(it.updates_relearned);
+        self.returns.newest.extend(&it.returns.newest);
+        self.learner_waited_s += it.learner_waited_s;
+        self.actors_waited_s += it.actors_waited_s;
+        self.affinity_version = self.affinity_version.min(it.affinity_version);
+        // Each knows of the others what the learner told it; the one that knows of the end is right.
+        self.finished |= it.finished;
+        self.learner_finished |= it.learner_finished;
+        if it.waiting == Waiting::Finished || self.waiting == Waiting::Nobody {
+            self.waiting = it.waiting;
+        }
     }
 
     /// Rows sampled per transition inserted after the warm-up; none before.
@@ -342,7 +314,7 @@ impl Keyed for LearnerStatus {
 mod tests {
     use super::*;
 
-    /// A status in which no field is zero or what it is by default.
+    /// A status in which no field is zero or what it is by default. All by name, so that a new one is not forgotten where shards are added.
     fn full(n: u64) -> ReplayStatus {
         let quantiles = |what: u64| {
             // The first shard's median is the worse one, the second's are the others.

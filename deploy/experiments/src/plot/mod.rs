@@ -14,8 +14,8 @@ use driml_figure::{Axis, Chart, Figure, Format, GREY, Look, Mark, Panel, Series}
 use driml_launch::{
     console::{self, print},
     evaluate::{mean_and_deviation, random_returns},
-    live_view::loss_title,
     run_folder::RunFolder,
+    view::loss_title,
 };
 use driml_machine::error::usage;
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_launch::run_folder::{Columns, RunFolder};
+use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, nearest, usage};
 use driml_settings::config::RunConfig;
 
@@ -14,7 +14,7 @@ pub(super) const SPREAD_OF_K: &str = "sd_k";
 /// The column before those of the auxiliary losses, and the one after them.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
-/// Columns of `metrics.csv` that hold words.
+/// Table of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
 /// The metrics of one run, and its settings.
@@ -29,9 +29,9 @@ pub(crate) struct Run {
     pub(super) seed: Option<i64>,
     /// The settings without seed and without what the machine decides; none if there are none.
     pub(super) settings: Option<toml::Table>,
-    columns: Columns,
+    columns: Table,
     /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
-    evaluations: Columns,
+    evaluations: Table,
 }
 
 /// What a curve is drawn over: columns that only grow.
@@ -66,8 +66,7 @@ impl Run {
         let path = folder.metrics();
         let text = std::fs::read(&path)
             .map_err(|e| usage!("{} is not the folder of a run: {e}", folder.display()))?;
-        let columns =
-            Columns::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let columns = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
         if columns.place("frames").is_none() {
             return Err(usage!(
                 "{} has no column \"frames\": it is no run's",
@@ -76,9 +75,9 @@ impl Run {
             .into());
         }
         let evaluations = match std::fs::read(folder.evaluations()) {
-            Ok(text) => Columns::parse(&text)
+            Ok(text) => Table::parse(&text)
                 .with_context(|| format!("reading {}", folder.evaluations().display()))?,
-            Err(_) => Columns::default(),
+            Err(_) => Table::default(),
         };
         let (settings, seed) = settings(&folder.config()).unzip();
         let run = settings.as_ref().and_then(|table| table.get("run"));
@@ -141,7 +140,7 @@ impl Run {
     }
 
     /// The table that has the column, and its file; the metrics if neither has.
-    fn table(&self, column: &str) -> (&Columns, PathBuf) {
+    fn table(&self, column: &str) -> (&Table, PathBuf) {
         let in_metrics = self.columns.place(column).is_some();
         if !in_metrics && self.evaluations.place(column).is_some() {
             (&self.evaluations, self.folder.evaluations())
@@ -151,7 +150,7 @@ impl Run {
     }
 
     /// The place of a column of numbers.
-    fn place(&self, table: &Columns, column: &str) -> Result<usize, Usage> {
+    fn place(&self, table: &Table, column: &str) -> Result<usize, Usage> {
         let place = table.place(column);
         place.filter(|_| !WORDS.contains(&column)).ok_or_else(|| {
             let numbers = || {

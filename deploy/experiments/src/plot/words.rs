@@ -1,6 +1,8 @@
 //! What a figure of runs says: titles and labels of columns, and what was done to the numbers.
 //! It draws nothing.
 
+use driml_launch::metrics;
+
 use super::{
     flags::{Band, PlotArgs},
     groups::Group,
@@ -12,35 +14,19 @@ pub(super) const EVALUATED: &str = "evaluated_return";
 
 /// Title and label of a column's chart, with its unit.
 pub(super) fn words(column: &str) -> (String, String) {
-    let (title, label) = match column {
-        "mean_return" => ("Return", "mean of the last 100 episodes"),
-        EVALUATED => (
-            "Return of checkpoints, played greedily",
-            "mean over episodes",
-        ),
-        "c51_kl" => ("C51 loss", "KL divergence [nats]"),
-        "total_loss" => ("Total loss", "[nats]"),
-        "mean_k" => (
-            "How far ahead: k, mean since the start",
-            "k [environment steps]",
-        ),
-        "replay_ratio" => ("Replay ratio", "rows sampled per transition"),
-        "frames_per_second" => ("Acting speed", "frames per second"),
-        "updates_per_second" => ("Learning speed", "updates per second"),
-        "mean_age" => ("Age of sampled rows", "transitions"),
-        "grad_norm" => ("Gradient before clipping", "global 2-norm"),
-        "epsilon" => ("Epsilon", "probability of a random action"),
-        _ => {
-            let text = column.replace('_', " ");
-            let label = if column.starts_with("rss_mib_") {
-                "resident memory [MiB]".into()
-            } else {
-                text.clone()
-            };
-            return (text, label);
-        }
-    };
-    (title.into(), label.into())
+    if column == EVALUATED {
+        return (
+            "Return of checkpoints, played greedily".into(),
+            "mean over episodes".into(),
+        );
+    }
+    let named = column.replace('_', " ");
+    match metrics::column(column) {
+        Some(it) if it.name == column => (it.plot_label.into(), it.unit.into()),
+        // One of several things.
+        Some(it) => (named, it.unit.into()),
+        None => (named.clone(), named),
+    }
 }
 
 /// What is compared.

@@ -120,8 +120,11 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use driml_launch::run_folder::{Recorded, RunRecorder};
-    use driml_protocol::{Horizon, LearnerStatus, ReplayStatus, RunSpec, TimeoutRule};
+    use driml_launch::{
+        run_folder::{Recorded, RunRecorder},
+        run_view::{Plan, RunView},
+    };
+    use driml_protocol::{Horizon, RunSpec, TimeoutRule};
 
     use super::*;
     use crate::sweep::plan::Call;
@@ -159,11 +162,11 @@ mod tests {
             episodes: None,
             units: frames,
         };
-        let (replay, learner) = (ReplayStatus::default(), LearnerStatus::default());
+        let view = RunView::new(Plan::default());
         let folder = RunFolder::new(runs.root.join("run"));
         let mut recorder = RunRecorder::create(&folder, Recorded::default()).unwrap();
-        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+        recorder.record(&view, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &spec(), &view);
         summary.write(&folder).unwrap();
         assert!(runs.finished(&plan(10)).is_none(), "it has no call");
         runs.write_call(&plan(10), "abc").unwrap();

@@ -1,6 +1,6 @@
 //! The launcher: starts replay servers, learner and actors as processes, watches them to the end of the run, and ends them in
 //! order.
-//! Each is a `managed_process`; `status_client` asks how they are, `live_view` shows it and `run_folder` keeps it.
+//! Each is a `managed_process`; `view` asks how they are and shows it, and `run_folder` keeps it.
 
 mod parts;
 
@@ -25,13 +25,13 @@ use crate::{
     evaluator::Evaluator,
     interrupts::Interrupts,
     last_play,
-    live_view::{Display, TEMPLATE, recovery, silence},
     meeting::Meeting,
     open_files,
     processes::{Processes, Revived, stop},
     resume,
     run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
-    status_client::Statuses,
+    run_view::{Plan, RunView},
+    view::{Display, Poller, Reached, TEMPLATE, notes},
 };
 
 /// How often the processes are asked how they are.
@@ -105,12 +105,8 @@ pub fn run(
     let place = meeting.path().as_os_str().as_encoded_bytes();
     write_whole(&run_dir.meeting(), place)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let display = Display::new(
-        screen.clone(),
-        config.frames(),
-        config.updates(),
-        resume_point,
-    );
+    let plan = Plan::of(config);
+    let display = Display::new(screen.clone(), plan, Instant::now(), resume_point.updates);
     // What killed processes left is room again.
     session::sweep_shared_memory();
     let shared_memory = config.transport.shared_memory && {
@@ -134,11 +130,11 @@ pub fn run(
         evaluator,
         restarts: 0,
         actor_restarts: 0,
-        statuses: None,
+        poller: None,
     };
 
     let ran = launch.start_and_watch(&mut recorder);
-    let ended = launch.end(ran);
+    let ended = launch.end(ran, &mut recorder);
     session::sweep_shared_memory();
     launch.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
@@ -208,7 +204,7 @@ struct Launch<'a> {
     restarts: u32,
     /// How often an actor was.
     actor_restarts: u32,
-    statuses: Option<Statuses>,
+    poller: Option<Poller>,
 }
 
 /// The processes of a run that is started on one machine: replay servers, learner, actors.
@@ -236,17 +232,26 @@ impl Launch<'_> {
             let server = self.start_server(shard)?;
             self.processes.replay_servers.push(server);
         }
-        let mut sessions = Vec::new();
-        for endpoint in self.endpoints.clone() {
-            match connect(&endpoint, &self.interrupts, || {
+        let mut reached = Vec::new();
+        for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
+            match connect(endpoint, &self.interrupts, || {
                 self.processes.check_alive(Revived::default())
             })? {
-                Some(session) => sessions.push(session),
+                Some(session) => reached.push(Reached {
+                    name: name.clone(),
+                    endpoint: endpoint.clone(),
+                    session,
+                }),
                 None => return Ok(Outcome::Interrupted),
             }
         }
         let keys = Keys::new(NAMESPACE).map_err(Usage)?;
-        self.statuses = Some(Statuses::new(sessions, keys, self.config.run.hash()));
+        let mut poller = Poller::new(self.config, reached, &keys);
+        let ResumePoint {
+            frames, updates, ..
+        } = self.resume_point;
+        poller.view = RunView::beginning(poller.view.plan, frames, updates);
+        self.poller = Some(poller);
 
         self.processes.learner = Some(self.start_learner()?);
         for id in 0..self.config.local.actors {
@@ -258,7 +263,6 @@ impl Launch<'_> {
 
     /// Asks, shows and records once a second until the run is over.
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
-        let mut heard = [Instant::now(); 2];
         let mut progress = (Instant::now(), (0, 0));
         loop {
             if self.interrupts.wait_timeout(POLL) > 0 {
@@ -268,60 +272,42 @@ impl Launch<'_> {
             self.revive_servers()?;
             self.revive_actors()?;
             self.processes.check_alive(self.revived())?;
-            let statuses = self
-                .statuses
-                .as_mut()
-                .expect("it was set before the run is watched");
-            let answers = [
-                ("replay server", statuses.ask_replay()),
-                ("learner", statuses.ask_learner()),
-            ];
-            if !statuses.recovering.is_empty() {
-                // It is there, and the others wait for it; whether any of them has died is seen above.
-                heard = [Instant::now(); 2];
-                progress.0 = Instant::now();
-                let servers = statuses.recovering.iter();
-                let notes = servers.map(|(shard, it)| recovery(&self.servers[*shard], *it));
-                self.display
-                    .show_alone(&notes.collect::<Vec<_>>().join("; "));
-                continue;
-            }
-            for (heard, (name, answer)) in heard.iter_mut().zip(answers) {
-                match answer {
-                    Ok(()) => *heard = Instant::now(),
-                    Err(e) if heard.elapsed() > SILENCE_MAX => {
-                        return Err(e.context(format!(
-                            "the {name} has not answered for {}",
-                            duration(heard.elapsed())
-                        )));
-                    }
-                    Err(e) => tracing::debug!("the {name} did not answer: {e:#}"),
+            let poller = self.poller.as_mut();
+            let poller = poller.expect("it was set before the run is watched");
+            poller.ask();
+            let view = &poller.view;
+            for (name, heard) in [
+                ("replay server", view.replay_last_seen),
+                ("learner", view.learner_last_seen),
+            ] {
+                if heard.elapsed() > SILENCE_MAX {
+                    let why = view.servers.iter().find_map(|it| it.error.as_deref());
+                    bail!(
+                        "the {name} has not answered for {}: {}",
+                        duration(heard.elapsed()),
+                        why.unwrap_or("no answer")
+                    );
                 }
             }
-            let (replay, mut learner) = (statuses.replay.clone(), statuses.learner.clone());
-            // Until the learner has answered, too.
-            learner.updates = learner.updates.max(self.resume_point.updates);
             let rss = self.processes.rss_mib();
-            let mut said = recorder.hear_episodes(&statuses.shards, &statuses.episodes.take());
-            said.extend(recorder.record(&statuses.shards, &learner, &rss));
-            said.iter().for_each(|line| self.screen.line(line));
-            let notes: Vec<_> = ["replay server", "learner"]
-                .into_iter()
-                .zip(heard)
-                .filter_map(|(part, heard)| silence(part, heard))
-                .collect();
-            self.display
-                .show(&replay, &learner, recorder.episodes(&replay), &notes);
+            if view.is_answered() {
+                let ask = |shard, since| poller.episodes(shard, since);
+                let mut warnings = recorder.record_episodes(view, ask);
+                warnings.extend(recorder.record(view, &rss));
+                warnings.iter().for_each(|line| self.screen.line(line));
+            }
+            self.display.show(&recorder.moment(view), &notes(view));
             if let Some(evaluator) = &mut self.evaluator {
                 evaluator.look(&self.screen);
             }
-            if replay.finished && learner.finished {
+            if view.replay.finished && view.learner.finished {
                 self.display
                     .show_alone("all frames and updates are done: the processes end");
                 return Ok(Outcome::Finished);
             }
-            let counts = (replay.transitions_inserted, learner.updates);
-            if counts != progress.1 {
+            let counts = (view.replay.transitions_inserted, view.learner.updates);
+            // While a replay server reads its replay back the others wait for it.
+            if counts != progress.1 || view.recovering().next().is_some() {
                 progress = (Instant::now(), counts);
             } else if progress.0.elapsed() > STALL_MAX {
                 bail!(
@@ -329,7 +315,7 @@ impl Launch<'_> {
                     duration(STALL_MAX),
                     counts.0,
                     counts.1,
-                    replay.waiting,
+                    view.replay.waiting,
                     self.run_dir.logs().display()
                 );
             }
@@ -341,7 +327,11 @@ impl Launch<'_> {
     ///
     /// # Errors
     /// What the run failed by. A run whose transitions and updates are complete cannot fail any more: who did not end well is a warning.
-    fn end(&mut self, ran: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
+    fn end(
+        &mut self,
+        ran: anyhow::Result<Outcome>,
+        recorder: &mut RunRecorder,
+    ) -> anyhow::Result<Outcome> {
         let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
         // The signal that interrupted this process may have reached the others first.
         let ran = match self.interrupts.count() {
@@ -369,12 +359,13 @@ impl Launch<'_> {
             LEARNER_DRAIN_MAX,
             &abort,
         );
-        if let Some(statuses) = &mut self.statuses {
-            if let Err(e) = statuses.ask_replay() {
-                tracing::debug!("the replay server's last word: {e:#}");
+        if let Some(poller) = &mut self.poller {
+            if let Err(e) = poller.ask_replay() {
+                tracing::debug!("the replay server's last answer: {e:#}");
             }
+            recorder.record_episodes(&poller.view, |shard, since| poller.episodes(shard, since));
             // Before its router goes away, so that it does not try to reach it again.
-            statuses.close();
+            poller.close();
         }
         others.extend(stop(
             &mut self.processes.replay_servers,
@@ -411,35 +402,34 @@ impl Launch<'_> {
 
     /// Whether all transitions are in and learned from, and the result saved, by the last answers.
     fn is_complete(&self) -> bool {
-        self.statuses.as_ref().is_some_and(|it| {
-            let rows = it.learner.updates * u64::from(self.config.learner.batch_size);
-            it.replay.waiting == Waiting::Finished
-                && it.learner.finished
-                && rows >= it.replay.rows_sampled
+        self.poller.as_ref().is_some_and(|Poller { view, .. }| {
+            let rows = view.learner.updates * u64::from(self.config.learner.batch_size);
+            view.replay.waiting == Waiting::Finished
+                && view.learner.finished
+                && rows >= view.replay.rows_sampled
         })
     }
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let (Some(learner), Some(statuses)) = (&mut self.processes.learner, &mut self.statuses)
-        else {
+        let (Some(learner), Some(poller)) = (&mut self.processes.learner, &mut self.poller) else {
             return;
         };
         if learner.end().is_some() {
             return;
         }
         // One that has finished may end as soon as it is told to.
-        if let Err(e) = statuses.ask_learner() {
+        if let Err(e) = poller.ask_learner() {
             tracing::debug!("a question before the last: {e:#}");
         }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
         loop {
-            if let Err(e) = statuses.ask_learner() {
+            if let Err(e) = poller.ask_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;
             }
-            if statuses.learner.finished || Instant::now() > deadline || abort() {
+            if poller.view.learner.finished || Instant::now() > deadline || abort() {
                 return;
             }
             std::thread::sleep(DRAIN_POLL);
@@ -453,18 +443,15 @@ impl Launch<'_> {
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
-        let (replay, learner) = match &mut self.statuses {
-            Some(it) => {
-                recorder.hear_episodes(&it.shards, &it.episodes.take());
-                recorder.record(&it.shards, &it.learner, &[]);
-                (it.replay.clone(), it.learner.clone())
-            }
-            None => Default::default(),
-        };
+        let nothing = RunView::new(Plan::default());
+        let view = self.poller.as_ref().map_or(&nothing, |it| &it.view);
+        if self.poller.is_some() {
+            recorder.record(view, &[]);
+        }
         let logs = self.processes.missing_log_lines();
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
-        let mut summary = recorder.summarise(outcome, &self.config.run, &replay, &learner);
+        let mut summary = recorder.summarise(outcome, &self.config.run, view);
         summary.replay_servers_restarted = servers_before + self.restarts;
         summary.actors_restarted = actors_before + self.actor_restarts;
         let written = summary.write(self.run_dir);

@@ -15,17 +15,17 @@ use std::{
 
 use anyhow::Context;
 use driml_machine::error::Interrupted;
-use driml_protocol::{ReplayStatus, Shutdown};
+use driml_protocol::Shutdown;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     console::{self, Screen, print, print_wrapped},
-    ended_episodes::EndedEpisodes,
     evaluate::Which,
     keep::keep,
-    live_view::{Display, TEMPLATE},
     resume,
     run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},
+    run_view::{Plan, RunView},
+    view::{Display, TEMPLATE},
 };
 use parts::Lockstep;
 
@@ -58,19 +58,18 @@ pub fn run(
         Some(_) => Lockstep::resume(config, run_dir)?,
         None => Lockstep::begin(config, run_dir)?,
     };
-    let mut display = Display::new(
-        screen.clone(),
-        config.frames(),
-        config.updates(),
-        resumed.unwrap_or_default(),
-    );
+    let ResumePoint {
+        frames, updates, ..
+    } = resumed.unwrap_or_default();
+    let mut view = RunView::beginning(Plan::of(config), frames, updates);
+    let plan = view.plan.clone();
+    let mut display = Display::new(screen.clone(), plan, Instant::now(), updates);
     let mut evaluations = Evaluations::new(config, run_dir)?;
     let mut shown = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
     let mut row = lockstep.frames() / row_frames;
     let folder = run_dir.checkpoints();
 
-    let mut episodes = EndedEpisodes::default();
     let mut outcome = Outcome::Finished;
     let mut saved = resumed.map(|point| point.updates);
     // After how many updates a save was last tried.
@@ -94,14 +93,11 @@ pub fn run(
         let show = shown.elapsed() >= POLL;
         if show || lockstep.frames() / row_frames > row {
             row = lockstep.frames() / row_frames;
-            let (replay, status) = lockstep.status();
-            let status = &status.clone();
-            let mut said = hear_episodes(&mut recorder, &mut episodes, &mut lockstep, &replay);
-            said.extend(recorder.record(std::slice::from_ref(&replay), status, &[]));
-            said.iter().for_each(|line| screen.line(line));
+            let warnings = record(&mut recorder, &mut view, &mut lockstep);
+            warnings.iter().for_each(|line| screen.line(line));
             if show {
                 shown = Instant::now();
-                display.show(&replay, status, recorder.episodes(&replay), &[]);
+                display.show(&recorder.moment(&view), &[]);
             }
         }
         if shutdown.is_set() {
@@ -118,14 +114,11 @@ pub fn run(
     if outcome == Outcome::Finished {
         evaluations.play(lockstep.updates(), true, &screen)?;
     }
-    let (replay, status) = lockstep.status();
-    let status = &status.clone();
-    hear_episodes(&mut recorder, &mut episodes, &mut lockstep, &replay);
-    recorder.record(std::slice::from_ref(&replay), status, &[]);
+    record(&mut recorder, &mut view, &mut lockstep);
     let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
     run_dir.check_whole()?;
-    let summary = recorder.summarise(outcome, &config.run, &replay, status);
+    let summary = recorder.summarise(outcome, &config.run, &view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
     if outcome == Outcome::Interrupted {
@@ -136,17 +129,17 @@ pub fn run(
     }
 }
 
-/// Records the episodes that ended by this `status`. Returns warnings.
-fn hear_episodes(
-    recorder: &mut RunRecorder,
-    episodes: &mut EndedEpisodes,
-    lockstep: &mut Lockstep,
-    status: &ReplayStatus,
-) -> Vec<String> {
-    let ask = |since| Ok::<_, Infallible>(lockstep.episodes_since(since));
-    let Ok(()) = episodes.fetch(0, status.episodes, ask);
-    lockstep.note_recorded(status.episodes);
-    recorder.hear_episodes(std::slice::from_ref(status), &episodes.take())
+/// Records how the run stands, and the episodes that ended. Returns warnings.
+fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockstep) -> Vec<String> {
+    let (replay, learner) = lockstep.status();
+    let ended = replay.episodes;
+    view.take_learner(Some(learner.clone()));
+    view.take_replay(vec![replay]);
+    let ask = |_, since| Ok::<_, Infallible>(lockstep.episodes_since(since));
+    let mut warnings = recorder.record_episodes(view, ask);
+    lockstep.note_recorded(ended);
+    warnings.extend(recorder.record(view, &[]));
+    warnings
 }
 
 /// Plays checkpoints between rounds, if they are to be played.

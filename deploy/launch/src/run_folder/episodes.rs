@@ -1,48 +1,33 @@
 //! `episodes.csv`: a row for every training episode, kept over a run's resumptions, and the mean return of the last 100.
-//! It is told what each shard's replay server answered; what an episode is, is theirs to say.
+//! Each shard's replay server is asked for the episodes that ended; what an episode is, is theirs to say.
 //!
 //! Columns: `seconds` of the run when the episode was heard of, up to a second after it ended (empty where it had ended before the
 //! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `copy`, who
 //! played it, and in which copy of its world; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
 //! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, fmt::Display};
 
 use driml_machine::error::usage;
 use driml_protocol::{EndedEpisode, EpisodesReply, Played, RETURNS_OF, ReplayStatus};
 
 use super::{
-    columns::{Columns, set_aside},
     folder::RunFolder,
-    growing_csv::GrowingCsv,
+    table::{AppendLog, Table, csv_row},
 };
+use crate::moment::{MeanReturn, rounded};
+
+/// Answers that are asked of one shard at a time; what they do not hold comes the next time.
+const ASKS_MAX: usize = 16;
 
 const HEADER: [&str; 7] = [
     "seconds", "frames", "episode", "actor", "copy", "return", "length",
 ];
 
-/// A mean, and of how many returns it is.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MeanReturn {
-    /// The mean return of the newest episodes.
-    pub mean: f64,
-    /// Episodes: 100, or as many as there were.
-    pub of: usize,
-}
-
-/// The training's episodes so far, also over a resumption.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Episodes {
-    /// How many ended.
-    pub count: u64,
-    /// Mean return of the last 100 of them, or of as many as there were; none before the first.
-    pub mean_return: Option<MeanReturn>,
-}
-
 /// The episodes of a run.
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
-    table: GrowingCsv,
+    table: AppendLog,
     /// The newest returns, the oldest first.
     newest: VecDeque<f64>,
     /// The number of the newest episode.
@@ -57,51 +42,39 @@ pub(super) struct TrainingEpisodes {
     lost: u64,
     folder: RunFolder,
     /// The rows with which it began, until it is known how many of them stay.
-    rows: Vec<csv::StringRecord>,
+    rows: Table,
     /// The shards know of the episodes that were heard before this one was made.
     is_known: bool,
 }
 
 impl TrainingEpisodes {
     /// Of a run that begins.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::begin(folder, &[], false)
+        Self::begin(folder, Table::default(), false)
     }
 
-    /// Of a run that goes on: with what was heard until it had `frames_max` frames; `is_known` if its replay knows of them. The others are moved to another file, and a line names it.
-    ///
-    /// # Errors
-    /// A file that is none of this kind, a file system that refuses.
+    /// Of a run that is resumed: with what ended until it had `frames_max` frames; `is_known` if its replay knows of them. The others are
+    /// set aside.
     pub(super) fn go_on(
         folder: &RunFolder,
         frames_max: u64,
         is_known: bool,
     ) -> anyhow::Result<Self> {
         let path = folder.episodes();
-        let (mut rows, mut aside) = (Vec::new(), Vec::new());
-        for row in Columns::read(&path)?.rows {
-            let (frames, ..) = read(&row)
-                .ok_or_else(|| usage!("{}: {row:?} is no row of episodes", path.display()))?;
-            // A replay that was kept says itself how far it is, once it is heard.
-            match is_known || frames <= frames_max {
-                true => rows.push(row),
-                false => aside.push(row),
-            }
-        }
-        set_aside(&path, &HEADER.map(String::from), &aside)?;
-        Self::begin(folder, &rows, is_known)
+        let mut rows = Table::read(&path)?;
+        rows.keep(&path, |_, row| {
+            let (frames, ..) = read(row)
+                .ok_or_else(|| usage!("{}: {row:?} is not a row of episodes", path.display()))?;
+            // A replay that was kept says itself how far it is, once it answers.
+            Ok(is_known || frames <= frames_max)
+        })?;
+        Self::begin(folder, rows, is_known)
     }
 
-    fn begin(
-        folder: &RunFolder,
-        rows: &[csv::StringRecord],
-        is_known: bool,
-    ) -> anyhow::Result<Self> {
-        let table = GrowingCsv::create(&folder.episodes(), &HEADER.map(String::from), rows)?;
-        let known: Vec<_> = rows.iter().filter_map(read).collect();
+    fn begin(folder: &RunFolder, mut rows: Table, is_known: bool) -> anyhow::Result<Self> {
+        rows.header = HEADER.map(String::from).to_vec();
+        let table = AppendLog::create(&folder.episodes(), &rows.text())?;
+        let known: Vec<_> = rows.rows.iter().filter_map(read).collect();
         let returns = known.iter().filter_map(|&(.., value)| value);
         let mut newest: VecDeque<_> = returns.rev().take(RETURNS_OF).collect();
         newest.make_contiguous().reverse();
@@ -116,71 +89,86 @@ impl TrainingEpisodes {
             lost: 0,
             is_known,
             rows: match is_known {
-                true => rows.to_vec(),
-                false => Vec::new(),
+                true => rows,
+                false => Table::default(),
             },
             folder: folder.clone(),
         })
     }
 
-    /// Takes what each shard says, and the episodes that `ended` there since, after so many `seconds` of the run, if they are known.
-    /// Returns warnings about the file.
-    pub(super) fn hear(
+    /// Takes what each shard counts and asks it for the episodes that ended since those that are known, after so many `seconds` of the
+    /// run, if they are known. The file then holds as many as the shards count, and each once. Returns warnings about the file.
+    pub(super) fn hear<E: Display>(
         &mut self,
         shards: &[ReplayStatus],
-        ended: &[(usize, EpisodesReply)],
+        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
         seconds: Option<f64>,
     ) -> Vec<String> {
         let frames = shards.iter().map(|it| it.transitions_inserted).sum();
-        // They were not there when it was looked last; what a shard knows of the others is older.
+        // They were not there the last time; what a shard knows of the others is older.
         let heard = self.frames_heard.replace(frames);
         let later = heard.map_or(0, |before| before.saturating_add(1).min(frames));
         // While a resumed run's replay fills again it counts frames that it had before.
         self.frames = self.frames.max(later);
         self.heard.resize(shards.len().max(self.heard.len()), 0);
-        let mut said = Vec::new();
+        let mut warnings = Vec::new();
         if std::mem::take(&mut self.is_known) {
-            said.extend(self.cut(frames).err().map(|e| format!("{e:#}")));
+            warnings.extend(self.cut(frames).err().map(|e| format!("{e:#}")));
             self.take_as_heard(shards);
         }
         let mut rows = Vec::new();
-        for (shard, reply) in ended {
-            let heard = &mut self.heard[*shard];
+        for (shard, status) in shards.iter().enumerate() {
             // A server that knows of fewer than before is another one.
-            if reply.ended < *heard {
-                *heard = 0;
+            let mut heard = self.heard[shard];
+            if status.episodes < heard {
+                heard = 0;
             }
-            let missing = reply.before.saturating_sub(*heard);
-            let again = heard.saturating_sub(reply.before) as usize;
-            *heard = reply.up_to().max(*heard);
-            if missing > 0 {
-                said.extend((self.lost == 0).then(|| {
-                    format!("{missing} episodes have no row in episodes.csv: the replay server keeps no more between two looks")
-                }));
-                self.lost += missing;
-                self.episode += missing;
+            for _ in 0..ASKS_MAX {
+                if heard >= status.episodes {
+                    break;
+                }
+                let reply = match ask(shard, heard) {
+                    Ok(reply) if reply.ended >= status.episodes && reply.before >= heard => reply,
+                    Ok(_) => break,
+                    Err(e) => {
+                        tracing::debug!("episodes of shard {shard}: {e}");
+                        break;
+                    }
+                };
+                let missing = reply.before - heard;
+                if missing > 0 {
+                    warnings.extend((self.lost == 0).then(|| {
+                        format!("{missing} episodes have no row in episodes.csv: the replay server keeps no more between two looks")
+                    }));
+                    self.lost += missing;
+                    self.episode += missing;
+                }
+                // One that ended after the status comes with the next.
+                let wanted = status.episodes.saturating_sub(reply.before) as usize;
+                let ended = reply.episodes.iter().take(wanted);
+                let all = reply.before + ended.len() as u64;
+                rows.extend(ended.map(|it| csv_row(self.take(it, seconds))));
+                heard = all.max(heard + 1);
             }
-            for episode in reply.episodes.iter().skip(again) {
-                rows.push(self.take(episode, seconds));
-            }
+            self.heard[shard] = heard;
         }
         // Those that could not be written before are tried again, too.
-        said.extend(self.table.add_all(rows));
-        said
+        warnings.extend(self.table.add_all(rows));
+        warnings
     }
 
     /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
     fn cut(&mut self, frames_max: u64) -> anyhow::Result<()> {
-        let rows = std::mem::take(&mut self.rows);
-        let is_kept = |row: &csv::StringRecord| read(row).is_some_and(|it| it.0 <= frames_max);
-        let (kept, aside): (Vec<_>, Vec<_>) = rows.into_iter().partition(is_kept);
-        if !aside.is_empty() {
-            set_aside(&self.folder.episodes(), &HEADER.map(String::from), &aside)?;
+        let mut rows = std::mem::take(&mut self.rows);
+        let all = rows.rows.len();
+        let is_kept = |row: &_| read(row).is_some_and(|it| it.0 <= frames_max);
+        rows.keep(&self.folder.episodes(), |_, row| Ok(is_kept(row)))?;
+        if rows.rows.len() < all {
             let heard = std::mem::take(&mut self.heard);
             *self = Self {
                 heard,
                 frames_heard: self.frames_heard,
-                ..Self::begin(&self.folder, &kept, false)?
+                ..Self::begin(&self.folder, rows, false)?
             };
         }
         Ok(())
@@ -248,16 +236,6 @@ impl TrainingEpisodes {
         });
         self.table.missing().into_iter().chain(lost).collect()
     }
-}
-
-/// A sum of rewards that were f32 without the digits that their conversion added: -0.6, not -0.5999999940395355. Small numbers keep
-/// seven digits.
-pub fn rounded(value: f64) -> f64 {
-    let text = match value.abs() < 1e-3 {
-        true => format!("{value:.6e}"),
-        false => format!("{value:.6}"),
-    };
-    text.parse().unwrap_or(value)
 }
 
 /// Frames, number and return in a row.

@@ -10,7 +10,11 @@ use std::{
 use anyhow::Context;
 use driml_machine::error::usage;
 
-use super::{columns::Columns, episodes::rounded, folder::RunFolder};
+use super::{
+    folder::RunFolder,
+    table::{Table, csv_row},
+};
+use crate::moment::rounded;
 
 const HEADER: [&str; 6] = [
     "seconds",
@@ -48,11 +52,7 @@ impl Evaluated {
     /// A file that is no table of evaluations, or that cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
-        let text = match fs::read(&path) {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
-            read => read.with_context(|| format!("reading {}", path.display()))?,
-        };
-        let table = Columns::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+        let table = Table::read(&path)?;
         let rows = table.rows.iter().map(|row| {
             let number = |name| table.value::<f64>(row, name);
             let whole = |name| table.value::<u64>(row, name);
@@ -74,18 +74,12 @@ impl Evaluated {
     }
 
     /// Updates behind the newest checkpoint that was played; 0 if none was.
-    ///
-    /// # Errors
-    /// As [`Evaluated::all`].
     pub(crate) fn newest(folder: &RunFolder) -> anyhow::Result<u64> {
         let all = Self::all(folder)?;
         Ok(all.iter().map(|it| it.updates).max().unwrap_or(0))
     }
 
     /// The kept best checkpoint and what it earned when it was played for the most episodes; none of a folder that has none.
-    ///
-    /// # Errors
-    /// As [`Evaluated::all`].
     pub(crate) fn best(folder: &RunFolder) -> anyhow::Result<Option<Self>> {
         let kept = driml_learner::checkpoint::list(&folder.best())?;
         let played = Self::all(folder)?.into_iter();
@@ -101,10 +95,7 @@ impl Evaluated {
         episodes: u32,
         (mean_return, deviation): (f64, f64),
     ) -> Self {
-        let metrics = fs::read(folder.metrics()).ok();
-        let metrics = metrics
-            .and_then(|text| Columns::parse(&text).ok())
-            .unwrap_or_default();
+        let metrics = Table::read(&folder.metrics()).unwrap_or_default();
         let before = metrics.rows.iter().rev().find(|row| {
             metrics
                 .value::<u64>(row, "updates")
@@ -130,9 +121,6 @@ impl Evaluated {
     }
 
     /// Adds it to the run's table, which is made where there is none.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
@@ -141,20 +129,20 @@ impl Evaluated {
             .append(true)
             .open(&path)
             .with_context(doing)?;
-        let mut csv = csv::Writer::from_writer(Vec::new());
+        let mut rows = Vec::new();
         if file.metadata().with_context(doing)?.len() == 0 {
-            csv.write_record(HEADER)?;
+            rows.extend(csv_row(HEADER));
         }
-        csv.write_record([
+        rows.extend(csv_row([
             self.seconds.map(|it| it.to_string()).unwrap_or_default(),
             self.frames.map(|it| it.to_string()).unwrap_or_default(),
             self.updates.to_string(),
             self.episodes.to_string(),
             rounded(self.mean_return).to_string(),
             rounded(self.deviation).to_string(),
-        ])?;
+        ]));
         // A whole row at once: others may read meanwhile.
-        file.write_all(&csv.into_inner()?).with_context(doing)
+        file.write_all(&rows).with_context(doing)
     }
 }
 
@@ -168,9 +156,6 @@ pub(crate) struct Candidate {
 
 impl Candidate {
     /// Holds the files of a checkpoint of the run.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn hold(folder: &RunFolder, checkpoint: &Path) -> anyhow::Result<Self> {
         sweep(folder);
         let best = folder.best();
@@ -198,9 +183,6 @@ impl Candidate {
 
     /// Adds what it earned to the run's table, and keeps it if it earned more than the best before it, over at least as many episodes.
     /// Says whether it is the best.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn judge(
         self,
         folder: &RunFolder,

@@ -11,7 +11,7 @@ use driml_machine::error::{Usage, usage};
 use driml_protocol::{lock_file, whole_file};
 use nix::unistd::{AccessFlags, access};
 
-use super::columns::Columns;
+use super::table::Table;
 
 /// What the names of TensorBoard's files begin with.
 pub(super) const EVENTS: &str = "events.out.tfevents.";
@@ -129,7 +129,7 @@ impl RunFolder {
         ];
         let frames = |path: PathBuf| -> u64 {
             let text = fs::read(path).unwrap_or_default();
-            let rows = Columns::parse(&text).ok();
+            let rows = Table::parse(&text).ok();
             rows.and_then(|it| it.last("frames")).unwrap_or(0)
         };
         let entries: Vec<_> = entries.flatten().collect();
@@ -185,9 +185,6 @@ impl RunFolder {
     }
 
     /// Checks that what a run has written is still there.
-    ///
-    /// # Errors
-    /// Which files are gone.
     pub(crate) fn check_whole(&self) -> anyhow::Result<()> {
         // A run in lockstep has no logs.
         let files = [self.config(), self.metrics(), self.episodes(), self.logs()];
@@ -202,9 +199,6 @@ impl RunFolder {
     }
 
     /// Writes the settings.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
         write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())

@@ -1,27 +1,30 @@
 //! What is written into the run folder while a run goes on: settings, metrics, episodes, events on request, and the summary at its end.
-//! It reads no status from anywhere: its caller hands them over.
+//! It asks no process: its caller hands a view over.
 
 use std::{
+    fmt::Display,
     fs::{self, File},
     time::Instant,
 };
 
 use anyhow::Context;
-use driml_actor::Schedule;
-use driml_protocol::{EpisodesReply, LearnerStatus, ReplayStatus, RunSpec};
+use driml_protocol::{EpisodesReply, ReplayStatus, RunSpec};
 use driml_settings::config::RunConfig;
 
 use super::{
-    columns::Columns,
-    episodes::{Episodes, TrainingEpisodes},
+    episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    growing_csv::GrowingCsv,
-    metrics::{Moment, header, rows_up_to, seconds_of},
+    metrics::{rows_up_to, seconds_of},
     resume_point::ResumePoint,
     summary::{Outcome, Summary},
+    table::{AppendLog, Table, csv_row},
 };
-use crate::rates::Rates;
+use crate::{
+    metrics::{cells, points},
+    moment::{Episodes, Moment, Spread},
+    run_view::{Plan, RunView},
+};
 
 /// What a recorder knows of a run before it begins.
 #[derive(Clone, Debug, Default)]
@@ -32,20 +35,35 @@ pub struct Recorded {
     pub losses: &'static [&'static str],
     /// The processes whose memory is recorded.
     pub processes: Vec<String>,
-    /// How likely all actors act at random; none where they differ in that.
-    pub epsilon: Option<Schedule>,
 }
 
 impl Recorded {
     /// Of a run with these settings and processes.
     pub(crate) fn of(config: &RunConfig, processes: Vec<String>) -> Self {
-        let is_common = config.actor.epsilon_ladder.is_none();
         Self {
             config_toml: config.to_toml(),
             losses: config.learner.update.objective.losses(),
             processes,
-            // Without a ladder it is every actor's.
-            epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
+        }
+    }
+
+    /// The columns of the run's metrics.
+    pub(super) fn header(&self) -> Vec<String> {
+        let nothing = RunView::new(Plan::default());
+        let cells = cells(&self.moment(&nothing, &[]));
+        cells.into_iter().map(|(name, _)| name).collect()
+    }
+
+    /// What a view says, of this run's losses and processes; their memory is in the order of the processes.
+    fn moment<'a>(&'a self, view: &'a RunView, rss_mib: &[Option<f64>]) -> Moment<'a> {
+        let memory = rss_mib.iter().copied().chain(std::iter::repeat(None));
+        let processes = self.processes.iter().map(String::as_str);
+        Moment {
+            // Until it answers it has its last status.
+            learner: Some(&view.learner),
+            losses: self.losses.to_vec(),
+            rss_mib: processes.zip(memory).collect(),
+            ..view.moment()
         }
     }
 }
@@ -60,18 +78,18 @@ pub struct RunRecorder {
     seconds_before: f64,
     frames_before: u64,
     episodes_before: u64,
-    /// Mean and standard deviation of k up to there.
-    k_before: Option<(f64, f64)>,
-    metrics: GrowingCsv,
-    header: Vec<String>,
+    /// The k of all rows up to there.
+    k_before: Option<Spread>,
+    metrics: AppendLog,
     events: Option<Events>,
     episodes: TrainingEpisodes,
     /// The next episodes that are heard had ended before.
     is_late: bool,
     run: Recorded,
+    /// Resident memory of each process, now and at the most.
+    rss_mib: Vec<Option<f64>>,
     rss_max: Vec<Option<f64>>,
     started: Instant,
-    rates: Rates,
 }
 
 impl RunRecorder {
@@ -85,8 +103,8 @@ impl RunRecorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
         folder.write_config(&run.config_toml)?;
-        let rows = Columns {
-            header: header(run.losses, &run.processes),
+        let rows = Table {
+            header: run.header(),
             rows: Vec::new(),
         };
         let episodes = TrainingEpisodes::create(folder)?;
@@ -95,9 +113,6 @@ impl RunRecorder {
 
     /// Goes on from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
     /// to there stay.
-    ///
-    /// # Errors
-    /// A run that is still going on, metrics of other columns, or a file system that refuses.
     pub(crate) fn go_on(
         folder: &RunFolder,
         run: Recorded,
@@ -105,9 +120,8 @@ impl RunRecorder {
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
-        let head = header(run.losses, &run.processes);
         let seconds = seconds_of(folder);
-        let rows = rows_up_to(&folder.metrics(), head, resume_point, frames_max)?;
+        let rows = rows_up_to(&folder.metrics(), run.header(), resume_point, frames_max)?;
         let is_known = resume_point.replay_is_kept;
         let episodes = TrainingEpisodes::go_on(folder, resume_point.frames, is_known)?;
         Summary::remove(folder)?;
@@ -121,7 +135,7 @@ impl RunRecorder {
         folder: &RunFolder,
         run: Recorded,
         lock: File,
-        rows: Columns,
+        rows: Table,
         episodes: TrainingEpisodes,
         resume_point: ResumePoint,
     ) -> anyhow::Result<Self> {
@@ -132,35 +146,28 @@ impl RunRecorder {
             true => 0,
             false => rows.last("episodes").unwrap_or(0).max(episodes.count()),
         };
-        let mut this = Self {
+        Ok(Self {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: resume_point.frames,
             episodes_before,
-            k_before: before("mean_k").zip(before("sd_k")),
-            metrics: GrowingCsv::create(&folder.metrics(), &rows.header, &rows.rows)?,
-            header: rows.header,
+            k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
+            metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
             events: None,
             episodes,
             is_late: false,
+            rss_mib: Vec::new(),
             rss_max: vec![None; run.processes.len()],
             run,
             started: Instant::now(),
-            rates: Rates::default(),
-        };
-        this.rates
-            .add(this.started, resume_point.frames, resume_point.updates);
-        Ok(this)
+        })
     }
 
     /// Writes TensorBoard's events from now on, too.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
         let kept = (self.resume_point.updates > 0).then_some(self.frames_before);
-        self.events = Some(Events::create(folder, self.header.clone(), kept)?);
+        self.events = Some(Events::create(folder, kept)?);
         Ok(())
     }
 
@@ -174,76 +181,67 @@ impl RunRecorder {
         self.seconds_before = self.seconds_before.max(seconds);
     }
 
-    /// Mean and standard deviation of k over all rows of the run, before it was resumed too.
-    fn k(&self, replay: &ReplayStatus) -> Option<(f64, f64)> {
-        let since = replay.mean_k().zip(replay.sd_k());
+    /// The k of all rows of the run, before it was resumed too.
+    fn k(&self, replay: &ReplayStatus, since: Option<Spread>) -> Option<Spread> {
         let (Some(before), Some(since)) = (self.k_before, since) else {
             return since.or(self.k_before);
         };
         let rows = replay.rows_sampled.max(self.resume_point.rows).max(1);
         let share = self.resume_point.rows as f64 / rows as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
-        let square = |(mean, sd): (f64, f64)| mean * mean + sd * sd;
-        let mean = mixed(before.0, since.0);
+        let square = |it: Spread| it.mean * it.mean + it.sd * it.sd;
+        let mean = mixed(before.mean, since.mean);
         let variance = mixed(square(before), square(since)) - mean * mean;
-        Some((mean, variance.max(0.0).sqrt()))
+        let sd = variance.max(0.0).sqrt();
+        Some(Spread { mean, sd })
+    }
+
+    /// What a view says of the whole run, before it was resumed too.
+    pub fn moment<'a>(&'a self, view: &'a RunView) -> Moment<'a> {
+        let moment = self.run.moment(view, &self.rss_mib);
+        Moment {
+            seconds: Some(self.seconds()),
+            episodes: self.episodes(&view.replay),
+            k: self.k(&view.replay, moment.k),
+            ..moment
+        }
     }
 
     fn seconds(&self) -> f64 {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Takes the episodes that `ended` since the last time, each answer with its shard; `shards` are the replay servers' own accounts.
-    /// Warnings are returned as by [`Self::record`], which is to follow.
-    pub fn hear_episodes(
+    /// Asks for the episodes that ended since the last time: those of a shard after the first so many. Warnings are returned as by
+    /// [`Self::record`], which is to follow.
+    pub(crate) fn record_episodes<E: Display>(
         &mut self,
-        shards: &[ReplayStatus],
-        ended: &[(usize, EpisodesReply)],
+        view: &RunView,
+        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
     ) -> Vec<String> {
         let seconds = (!std::mem::take(&mut self.is_late)).then(|| self.seconds());
-        self.episodes.hear(shards, ended, seconds)
+        self.episodes.hear(&view.shards, ask, seconds)
     }
 
     /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.
-    /// `shards` are the replay servers' own accounts; `rss_mib` is in the order of the processes given at
-    /// the start, none for one that ended.
+    /// `rss_mib` is in the order of the processes given at the start, none for one that ended.
     ///
     /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
     /// at the end what was lost.
-    pub fn record(
-        &mut self,
-        shards: &[ReplayStatus],
-        learner: &LearnerStatus,
-        rss_mib: &[Option<f64>],
-    ) -> Vec<String> {
-        let replay = &ReplayStatus::merged(shards);
-        self.rates
-            .add(Instant::now(), replay.transitions_inserted, learner.updates);
+    pub fn record(&mut self, view: &RunView, rss_mib: &[Option<f64>]) -> Vec<String> {
+        self.rss_mib = rss_mib.to_vec();
         for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
             *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
         }
-        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        let (frames, updates) = (view.replay.transitions_inserted, view.learner.updates);
         let resumed = self.resume_point.updates > 0;
         if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
             return Vec::new();
         }
-        let processes = 0..self.run.processes.len();
-        let moment = Moment {
-            seconds: self.seconds(),
-            rates: self.rates.per_second(),
-            episodes: self.episodes(replay),
-            k: self.k(replay),
-            replay,
-            learner,
-            epsilon: self.run.epsilon.map(|it| it.epsilon(frames)),
-            losses: self.run.losses,
-            rss_mib: processes
-                .map(|i| rss_mib.get(i).copied().flatten())
-                .collect(),
-        };
-        let row = moment.row();
+        let moment = self.moment(view);
+        let row = csv_row(cells(&moment).into_iter().map(|(_, cell)| cell));
+        let points = points(&moment);
         let events = self.events.as_mut();
-        let drawn = events.and_then(|events| events.add(&row, replay, learner.finished));
+        let drawn = events.and_then(|it| it.add(&points, &view.replay, view.learner.finished));
         let written = self.metrics.add(row);
         written.into_iter().chain(drawn).collect()
     }
@@ -265,37 +263,25 @@ impl RunRecorder {
     }
 
     /// What there is to say of the run, which ended so.
-    pub fn summarise(
-        &self,
-        outcome: Outcome,
-        run: &RunSpec,
-        replay: &ReplayStatus,
-        learner: &LearnerStatus,
-    ) -> Summary {
+    pub fn summarise(&self, outcome: Outcome, run: &RunSpec, view: &RunView) -> Summary {
         let wall_seconds = self.seconds();
+        let moment = self.moment(view);
+        let of_view = Summary::of(outcome, run, view, moment.episodes, wall_seconds);
         // A resumed run that did not get anywhere still has what was done before.
-        let frames = replay.transitions_inserted.max(self.resume_point.frames);
-        let updates = learner.updates.max(self.resume_point.updates);
+        let frames = of_view.frames.max(self.resume_point.frames);
+        let updates = of_view.updates.max(self.resume_point.updates);
         let rss = self.run.processes.iter().zip(&self.rss_max);
-        let of_whole_run = Summary::of(
-            outcome,
-            run,
-            replay,
-            learner,
-            self.episodes(replay),
-            wall_seconds,
-        );
         Summary {
             resumed_after_updates: self.resume_point.updates,
             frames,
             updates,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: self.k(replay).map(|(mean, _)| mean),
+            mean_k: moment.k.map(|it| it.mean),
             rss_mib_max: rss
                 .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
                 .collect(),
-            ..of_whole_run
+            ..of_view
         }
     }
 }

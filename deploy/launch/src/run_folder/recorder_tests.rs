@@ -1,6 +1,11 @@
 //! The run folder's files: what a run leaves, and what a resumed one goes on with.
 
-use driml_protocol::{EndedEpisode, Horizon, Played, Returns, RunSpec, TimeoutRule, Waiting};
+use std::convert::Infallible;
+
+use driml_actor::Schedule;
+use driml_protocol::{
+    EndedEpisode, Horizon, LearnerStatus, Played, Returns, RunSpec, TimeoutRule, Waiting,
+};
 use expect_test::expect;
 
 use super::*;
@@ -56,12 +61,22 @@ fn recorded(processes: &[&str]) -> Recorded {
         config_toml: "[run]\n".into(),
         losses: &LOSSES,
         processes: processes.iter().map(ToString::to_string).collect(),
-        epsilon: Some(Schedule::Falling {
-            start: 0.5,
-            end: 0.1,
-            decay_frames: 4_000,
-        }),
     }
+}
+
+fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
+    let epsilon = Schedule::Falling {
+        start: 0.5,
+        end: 0.1,
+        decay_frames: 4_000,
+    };
+    let mut view = RunView::new(Plan {
+        epsilon: Some(epsilon),
+        ..Plan::default()
+    });
+    view.take_learner(Some(learner.clone()));
+    view.take_replay(vec![replay.clone()]);
+    view
 }
 
 #[test]
@@ -70,8 +85,9 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let run = RunFolder::new(folder.path().join("run"));
     let mut recorder = RunRecorder::create(&run, recorded(&["replay-server", "actor-0"])).unwrap();
     let (replay, learner) = statuses();
-    let nothing = ReplayStatus::default();
-    let said = recorder.record(&[nothing], &LearnerStatus::default(), &[]);
+    let all = view(&replay, &learner);
+    let nothing = view(&ReplayStatus::default(), &LearnerStatus::default());
+    let said = recorder.record(&nothing, &[]);
     assert!(said.is_empty(), "{said:?}");
     let episode = EndedEpisode {
         frames: 2_000,
@@ -87,16 +103,12 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
         before: 0,
         episodes: vec![episode; 7],
     };
-    let said = recorder.hear_episodes(std::slice::from_ref(&replay), &[(0, ended)]);
+    let said = recorder.record_episodes(&all, |_, _| Ok::<_, Infallible>(ended.clone()));
     assert!(said.is_empty(), "{said:?}");
-    let said = recorder.record(
-        std::slice::from_ref(&replay),
-        &learner,
-        &[Some(12.34), None],
-    );
+    let said = recorder.record(&all, &[Some(12.34), None]);
     assert!(said.is_empty(), "{said:?}");
     assert!(recorder.missing().is_empty());
-    let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+    let summary = recorder.summarise(Outcome::Finished, &spec(), &all);
     summary.write(&run).unwrap();
     assert!(Summary::is_finished(&run));
     assert_eq!(
@@ -105,11 +117,9 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     );
 
     let csv = fs::read_to_string(run.metrics()).unwrap();
-    let columns: Vec<_> = csv.lines().map(|line| line.split(',').count()).collect();
-    assert_eq!(columns, [27, 27, 27], "{csv}");
-    expect!["seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,dim_3t3,dim_3t4,dim_4t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon,rss_mib_replay_server,rss_mib_actor_0"]
-        .assert_eq(csv.lines().next().unwrap());
-    let table = Columns::parse(csv.as_bytes()).unwrap();
+    let header = recorded(&["replay-server", "actor-0"]).header();
+    assert_eq!(csv.lines().next().unwrap(), header.join(","));
+    let table = Table::parse(csv.as_bytes()).unwrap();
     let epsilons = table.rows.iter().map(|row| table.value(row, "epsilon"));
     assert_eq!(epsilons.collect::<Vec<_>>(), [Some(0.5), Some(0.3)]);
 
@@ -149,7 +159,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
         (replay.transitions_inserted, replay.episodes) = (frames, episodes);
         learner.updates = updates;
-        recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+        recorder.record(&view(&replay, &learner), &[]);
     }
     let resume_point = ResumePoint {
         updates: 31,
@@ -159,7 +169,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     };
     let said = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap_err();
     assert!(said.to_string().contains("is still going on"), "{said}");
-    let summary = recorder.summarise(Outcome::Interrupted, &spec(), &replay, &learner);
+    let summary = recorder.summarise(Outcome::Interrupted, &spec(), &view(&replay, &learner));
     summary.write(&run).unwrap();
     drop(recorder);
     // A launcher that was killed while it wrote.
@@ -173,13 +183,13 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     (replay.transitions_inserted, replay.episodes) = (2_000, 1);
     replay.rows_sampled = 31 * 16;
     learner.updates = 31;
-    recorder.record(std::slice::from_ref(&replay), &learner, &[]);
+    recorder.record(&view(&replay, &learner), &[]);
     (replay.transitions_inserted, replay.episodes) = (2_100, 2);
     replay.k_histogram = vec![0, 0, 5];
     replay.rows_sampled = 62 * 16;
     learner.updates = 62;
-    recorder.record(std::slice::from_ref(&replay), &learner, &[]);
-    let summary = recorder.summarise(Outcome::Finished, &spec(), &replay, &learner);
+    recorder.record(&view(&replay, &learner), &[]);
+    let summary = recorder.summarise(Outcome::Finished, &spec(), &view(&replay, &learner));
     let counts = (summary.frames, summary.updates, summary.episodes);
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
@@ -188,15 +198,8 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         updates: 99,
         ..resume_point
     };
-    let read = |frames_max| {
-        rows_up_to(
-            &path,
-            header(&LOSSES, &recorded(&processes).processes),
-            all,
-            frames_max,
-        )
-        .unwrap()
-    };
+    let read =
+        |frames_max| rows_up_to(&path, recorded(&processes).header(), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
@@ -237,7 +240,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         let recorder = RunRecorder::go_on(&run, recorded(&["actor-0"]), point, 9_999).unwrap();
         let rows = |name: &str| {
             let text = fs::read(run.path().join(name)).unwrap_or_default();
-            Columns::parse(&text).unwrap().rows.len()
+            Table::parse(&text).unwrap().rows.len()
         };
         assert_eq!(rows("episodes.csv"), 2, "{what}");
         assert_eq!(rows("episodes.aside-1.csv"), 1, "{what}");
@@ -251,8 +254,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         let summary = recorder.summarise(
             Outcome::Finished,
             &spec(),
-            &nothing,
-            &LearnerStatus::default(),
+            &view(&nothing, &LearnerStatus::default()),
         );
         assert!(
             summary.wall_seconds >= seconds,
@@ -270,8 +272,8 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
 }
 
 fn summary(replay: &ReplayStatus) -> Summary {
-    let (learner, none) = (LearnerStatus::default(), Episodes::default());
-    Summary::of(Outcome::Finished, &spec(), replay, &learner, none, 2.0)
+    let view = view(replay, &LearnerStatus::default());
+    Summary::of(Outcome::Finished, &spec(), &view, Episodes::default(), 2.0)
 }
 
 #[test]

@@ -5,10 +5,11 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{LearnerStatus, Quantiles, ReplayStatus, RunSpec, whole_file};
+use driml_protocol::{Quantiles, RunSpec, whole_file};
 use serde::{Deserialize, Serialize};
 
-use super::{episodes::Episodes, folder::RunFolder};
+use super::folder::RunFolder;
+use crate::{moment::Episodes, run_view::RunView};
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -165,11 +166,11 @@ impl Summary {
     pub(crate) fn of(
         outcome: Outcome,
         run: &RunSpec,
-        replay: &ReplayStatus,
-        learner: &LearnerStatus,
+        view: &RunView,
         episodes: Episodes,
         wall_seconds: f64,
     ) -> Self {
+        let (replay, learner) = (&view.replay, &view.learner);
         let (frames, updates) = (replay.transitions_inserted, learner.updates);
         Self {
             outcome,
@@ -236,9 +237,6 @@ impl Summary {
     }
 
     /// Removes the one of an earlier time from the run folder, if there is one.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.summary();
         match fs::remove_file(&path) {

@@ -1,79 +1,125 @@
-//! `driml watch`: the launcher's live view, metrics and summary for a run that others have started, on any machine.
-//! It asks and never tells: the run goes on whether or not it is watched.
+//! `driml watch` and `driml status`: the live lines, metrics and summary of a run that other commands have started, on any machine.
+//! It asks and never tells: the run does not depend on whether it is watched.
 
 mod folder;
-mod outputs;
-mod prometheus;
+mod run_of_folder;
 mod watched;
 
-use std::time::{Duration, Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
 use driml_protocol::Seldom;
 
+pub use self::run_of_folder::{Live, endpoints_of};
+use self::watched::Watched;
 use crate::{
     console,
     interrupts::Interrupts,
-    live_view::recovery,
     run_folder::{Outcome, RunFolder, commands, plot},
-    status::{self, Connection, Snapshot},
+    view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
-pub use outputs::Outputs;
-use prometheus::PrometheusFile;
-use watched::Watched;
 
 /// How often the run is asked.
 const POLL: Duration = Duration::from_secs(1);
 /// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
 const LAST_POLL: Duration = Duration::from_millis(200);
+/// How often a page is shown anew.
+const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Asks a run once, as `driml status` does, and prints what it is told; on request as JSON.
+/// What is left of a run that is watched.
+#[derive(Clone, Debug, Default)]
+pub struct Outputs {
+    /// Where settings, metrics and summary go; none to only look.
+    pub run_dir: Option<RunFolder>,
+    /// Write TensorBoard's events there, too.
+    pub tensorboard: bool,
+    /// Where the metrics go in Prometheus' text format, at each answer.
+    pub prometheus: Option<PathBuf>,
+}
+
+/// How a run is looked at, a page at a time.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Look {
+    /// Again and again until the run is over or Ctrl-C.
+    pub again: bool,
+    /// An object of JSON instead of a page.
+    pub json: bool,
+}
+
+/// Asks a run and prints a page. Once no process can be asked any more, the run's `folder` tells how it ended, if it is known.
 ///
 /// # Errors
-/// The run is not well: somebody is missing, gone or silent. A file that cannot be written; [`Interrupted`].
-pub fn once(mut connection: Connection, outputs: &Outputs, json: bool) -> anyhow::Result<()> {
-    let snapshot = status::run(&mut connection, None, false, json)?;
-    connection.close();
-    if let Some(path) = &outputs.prometheus
-        && let Some(failed) = PrometheusFile::new(path).write(&snapshot)
-    {
-        bail!("{failed}");
+/// [`Interrupted`] if one answer was asked for and Ctrl-C came first.
+pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyhow::Result<()> {
+    let interrupts = Interrupts::listen(None)?;
+    // For the speed: what happens until the next answer.
+    poller.ask();
+    if interrupts.wait_timeout(POLL) > 0 {
+        return Err(Interrupted.into());
     }
-    match snapshot.well {
-        true => Ok(()),
-        false => bail!("the run is not well: {}", snapshot.to_go_on.join("; ")),
+    let pages = console::Pages::on_stdout();
+    loop {
+        let view = poller.ask();
+        if let Some(folder) = folder.filter(|_| view.is_gone() && !look.json)
+            && let Live::Over(how) = endpoints_of(folder)?
+        {
+            return console::print(&how);
+        }
+        match look.json {
+            true => console::print(&json(view)?)?,
+            false if look.again => pages.show(&page(view))?,
+            false => console::print(&page(view))?,
+        }
+        if !look.again || view.is_over() || interrupts.wait_timeout(PAGE_PERIOD) > 0 {
+            return Ok(());
+        }
     }
 }
 
-/// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are; the first answer
-/// of all of them.
+/// [`look`] once, for scripts and monitors.
 ///
 /// # Errors
-/// One that has died instead and does not come back; [`Interrupted`].
-fn wait_until_known(
-    connection: &mut Connection,
-    interrupts: &Interrupts,
-) -> anyhow::Result<Snapshot> {
-    let silent_max = Duration::from_millis(connection.config.learner.unreachable_max_ms);
+/// The run is not well: a process is missing, gone or unresponsive. A file that cannot be written; [`Interrupted`].
+pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result<()> {
+    let again = false;
+    look(&mut poller, None, Look { again, json })?;
+    poller.close();
+    if let Some(path) = &outputs.prometheus
+        && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
+    {
+        bail!("{failed}");
+    }
+    match needed(&poller.view) {
+        needed if needed.is_empty() => Ok(()),
+        needed => bail!("the run is not well: {}", needed.join("; ")),
+    }
+}
+
+/// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
+fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Result<()> {
+    let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let (mut heard, mut said) = (Instant::now(), Seldom::default());
     loop {
-        let snapshot = connection.ask();
-        if snapshot.is_answered() && connection.after_updates.is_some() {
-            return Ok(snapshot);
+        let view = poller.ask();
+        if view.is_answered() && view.after_updates.is_some() {
+            return Ok(());
         }
-        if snapshot.is_answered() || snapshot.recovering().next().is_some() {
+        if view.is_answered() || view.recovering().next().is_some() {
             heard = Instant::now();
         }
-        let is_another_run = snapshot.servers.iter().any(|it| it.is_another_run);
+        let is_another_run = view.servers.iter().any(|it| it.is_another_run);
         if is_another_run || heard.elapsed() > silent_max {
-            bail!("{}", snapshot.to_go_on.join("; "));
+            bail!("{}", needed(view).join("; "));
         }
         if said.due().is_some() {
-            for (server, progress) in snapshot.recovering() {
-                console::line(&recovery(&server.endpoint, progress));
+            for (server, progress) in view.recovering() {
+                console::line(&recovery(&server.name, progress));
             }
-            if snapshot.is_answered() {
+            if view.is_answered() {
                 console::line("no learner has joined the run yet: waiting for it");
             }
         }
@@ -86,61 +132,53 @@ fn wait_until_known(
 /// Shows and records a run until it is over, or until Ctrl-C, which leaves the run alone.
 ///
 /// # Errors
-/// A folder that cannot be written to; replay servers that are silent for as long as the run's parts wait for them, or that serve
-/// another run; [`Interrupted`].
-pub fn run(mut connection: Connection, outputs: &Outputs) -> anyhow::Result<()> {
+/// A folder that cannot be written to; replay servers that do not answer for as long as the run's processes wait for them, or that
+/// serve another run; [`Interrupted`].
+pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
     let interrupts = Interrupts::listen(None).context("listening for signals")?;
-    let mut snapshot = connection.ask();
+    poller.ask();
     let mut file = outputs.prometheus.as_deref().map(PrometheusFile::new);
-    if let Some(failed) = file.as_mut().and_then(|it| it.write(&snapshot)) {
+    if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
         return Err(usage!("--prometheus: {failed}").into());
     }
-    let goes_on = |folder: &RunFolder| folder.metrics().exists();
+    let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown =
-        outputs.run_dir.as_ref().is_some_and(goes_on) && connection.after_updates.is_none();
-    if is_unknown || snapshot.recovering().next().is_some() {
+        outputs.run_dir.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
+    if is_unknown || poller.view.recovering().next().is_some() {
         // What the run has done so far is not known before.
-        snapshot = wait_until_known(&mut connection, &interrupts)?;
+        wait_until_known(&mut poller, &interrupts)?;
     }
-    let mut watched = Watched::new(&connection, &snapshot, outputs)?;
+    let mut watched = Watched::new(&poller, outputs)?;
     let ended = loop {
-        match watched.take(&snapshot, &mut connection) {
+        match watched.take(&mut poller) {
             Ok(false) => {}
             Ok(true) => break Ok(Outcome::Finished),
             Err(e) => break Err(e),
         }
-        let pause = match watched.all_frames_are_in() {
+        let pause = match poller.view.replay.finished {
             true => LAST_POLL,
             false => POLL,
         };
         if interrupts.wait_timeout(pause) > 0 {
             break Ok(Outcome::Interrupted);
         }
-        snapshot = connection.ask();
-        if let Some(failed) = file.as_mut().and_then(|it| it.write(&snapshot)) {
+        poller.ask();
+        if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
             watched.say(&failed);
         }
     };
-    connection.close();
-    let summary = watched.conclude(*ended.as_ref().unwrap_or(&Outcome::Failed));
-    let run_dir = outputs.run_dir.as_ref();
-    match ended? {
-        Outcome::Interrupted => {
-            console::line("the run goes on without being watched");
-            return Err(Interrupted.into());
-        }
-        Outcome::Finished | Outcome::Failed => {}
+    poller.close();
+    let summary = watched.conclude(&poller, *ended.as_ref().unwrap_or(&Outcome::Failed));
+    if ended? == Outcome::Interrupted {
+        console::line("the run continues without being watched");
+        return Err(Interrupted.into());
     }
-    let text = match run_dir {
-        Some(folder) => summary.describe(folder),
-        None => format!("{}\n", summary.counts()),
-    };
-    console::print(&text)?;
-    match run_dir {
+    match &outputs.run_dir {
         Some(folder) => {
+            console::print(&summary.describe(folder))?;
             summary.write(folder)?;
             console::print(&commands(&[plot(folder)]))
         }
-        None => Ok(()),
+        None => console::print(&format!("{}\n", summary.counts())),
     }
 }

@@ -19,7 +19,7 @@ use driml_protocol::ReplayStatus;
 use self::encode::{At, Value};
 use super::{
     folder::{EVENTS, RunFolder},
-    growing_file::GrowingFile,
+    table::AppendLog,
 };
 
 /// How often histograms are written, and looked whether there is another A; curves are written with each row.
@@ -29,13 +29,11 @@ const CELL: usize = 24;
 const CAPTION: usize = 22;
 const MARGIN: usize = 8;
 
-/// The event file of a run that goes on.
+/// The event file of a run.
 #[derive(Debug)]
 pub(super) struct Events {
-    file: GrowingFile,
+    file: AppendLog,
     checkpoints: PathBuf,
-    /// The column that curves are drawn over, and those that are drawn.
-    columns: Vec<String>,
     slow_at: Option<Instant>,
     /// Counts when histograms were written last.
     k: Vec<u64>,
@@ -46,14 +44,7 @@ pub(super) struct Events {
 
 impl Events {
     /// Begins a file; rows beyond `frames_kept` of a run that is resumed are taken back.
-    ///
-    /// # Errors
-    /// A file system that refuses.
-    pub(super) fn create(
-        folder: &RunFolder,
-        columns: Vec<String>,
-        frames_kept: Option<u64>,
-    ) -> anyhow::Result<Self> {
+    pub(super) fn create(folder: &RunFolder, frames_kept: Option<u64>) -> anyhow::Result<Self> {
         let seconds = now();
         let name = |number: u32| match number {
             0 => format!("{EVENTS}{:010}.driml", seconds as u64),
@@ -68,9 +59,8 @@ impl Events {
             first.extend(encode::begin_anew(At { seconds, step }));
         }
         Ok(Self {
-            file: GrowingFile::create(&path, &first)?,
+            file: AppendLog::create(&path, &first)?,
             checkpoints: folder.checkpoints(),
-            columns,
             slow_at: None,
             k: Vec::new(),
             actions: Vec::new(),
@@ -78,11 +68,11 @@ impl Events {
         })
     }
 
-    /// Adds a row of metrics, and from time to time and at the run's end what is not in it. A warning is returned as by
-    /// [`GrowingFile::add`].
+    /// Adds points of curves by name, and from time to time and at the run's end histograms and A. A warning is returned as by
+    /// [`AppendLog::add`].
     pub(super) fn add(
         &mut self,
-        row: &[String],
+        points: &[(String, f64)],
         replay: &ReplayStatus,
         is_last: bool,
     ) -> Option<String> {
@@ -90,12 +80,8 @@ impl Events {
             seconds: now(),
             step: replay.transitions_inserted,
         };
-        // Cells that are empty or text are no points.
-        let points = self.columns.iter().zip(row).filter_map(|(column, cell)| {
-            let value: f64 = cell.parse().ok()?;
-            let is_step = column == "frames";
-            (!is_step).then(|| (tag(column), Value::Scalar(value as f32)))
-        });
+        let points = points.iter();
+        let points = points.map(|(name, value)| (name.clone(), Value::Scalar(*value as f32)));
         let said = self
             .file
             .add(encode::summary(at, &points.collect::<Vec<_>>()));
@@ -153,7 +139,7 @@ impl Events {
             .add(encode::summary(at, &[("affinity/A".to_owned(), image)]))
     }
 
-    /// What is missing in the file, as [`GrowingFile::missing`] says it.
+    /// What is missing in the file, as [`AppendLog::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
         self.file.missing()
     }
@@ -162,22 +148,6 @@ impl Events {
 fn now() -> f64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     since.unwrap_or_default().as_secs_f64()
-}
-
-/// The name of a column's curve: TensorBoard shows those beside each other that agree up to the slash.
-fn tag(column: &str) -> String {
-    let group = match column {
-        "mean_return" | "mean_return_of" | "episodes" => "return",
-        "total_loss" | "c51_kl" | "grad_norm" | "q_mean" => "learning",
-        "mean_k" | "sd_k" => "k",
-        "frames_per_second" | "updates_per_second" => "speed",
-        "seconds" | "updates" | "replay_ratio" | "mean_age" | "weights_version"
-        | "affinity_version" | "actors" | "epsilon" => "run",
-        _ if column.starts_with("rss_mib") => "memory",
-        // The auxiliary losses have the agents' own names.
-        _ => "learning",
-    };
-    format!("{group}/{column}")
 }
 
 /// What was counted since `before`; all of it where a counter is another one.
@@ -232,35 +202,20 @@ mod tests {
         assert_eq!(since(&[1, 0], &[2, 0]), [1, 0], "of another server");
     }
 
-    #[test]
-    fn every_column_has_a_group() {
-        for (column, wanted) in [
-            ("mean_return", "return/mean_return"),
-            ("dim_3t3", "learning/dim_3t3"),
-            ("rss_mib_actor_0", "memory/rss_mib_actor_0"),
-            ("replay_ratio", "run/replay_ratio"),
-        ] {
-            assert_eq!(tag(column), wanted);
-        }
-    }
-
     /// Records are whole, in order and right by their sums, as a reader wants them.
     #[test]
     fn a_file_is_records_of_which_each_is_right() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
-        let columns = ["frames", "mean_return", "waiting"]
-            .map(String::from)
-            .to_vec();
-        let mut events = Events::create(&folder, columns.clone(), None).unwrap();
+        let mut events = Events::create(&folder, None).unwrap();
         let replay = ReplayStatus {
             transitions_inserted: 70,
             k_histogram: vec![0, 4, 1],
             ..ReplayStatus::default()
         };
-        let row = ["70", "1.5", "nobody waits"].map(String::from);
-        assert_eq!(events.add(&row, &replay, false), None);
-        let again = Events::create(&folder, columns, Some(70)).unwrap();
+        let points = [("return/mean_return".to_owned(), 1.5)];
+        assert_eq!(events.add(&points, &replay, false), None);
+        let again = Events::create(&folder, Some(70)).unwrap();
         assert_eq!(again.missing(), None);
         let mut counts = Vec::new();
         let mut paths: Vec<_> = fs::read_dir(root.path())

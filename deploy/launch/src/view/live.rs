@@ -1,23 +1,21 @@
-//! The live view of a run: one progress display on a terminal, a plain line now and then elsewhere.
-//! It asks no process: the launcher and the lockstep mode hand it the numbers.
+//! The live lines of a run: one progress display on a terminal, a plain line now and then elsewhere.
+//! It asks no process.
 
 use std::time::{Duration, Instant};
 
 use driml_machine::units::duration;
-use driml_protocol::{LearnerStatus, RecoveryProgress, ReplayStatus, Waiting};
+use driml_protocol::{ReplayStatus, Waiting};
 
 use crate::{
     console::{self, Screen},
-    rates::Rates,
-    run_folder::{Episodes, ResumePoint},
+    moment::Moment,
+    run_view::Plan,
 };
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// How long updates go on before the rates are steady enough for a time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
-/// How long a part may be silent before it is said.
-const SILENT_MAX: Duration = Duration::from_secs(10);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
 
@@ -29,83 +27,79 @@ pub fn loss_title(name: &str) -> String {
     }
 }
 
+/// How far a run is and how fast; its frames are a question mark where they are not known, as are its updates.
+pub(super) fn progress(plan: &Plan, moment: &Moment<'_>, is_known: bool) -> String {
+    let count = |count: Option<u64>, planned| match count {
+        Some(count) => of_planned(count, planned),
+        None => format!("?/{planned}"),
+    };
+    let frames = is_known.then_some(moment.replay.transitions_inserted);
+    format!(
+        "frames {} ({:.0}/s)  updates {} ({:.1}/s)  replay ratio {}",
+        count(frames, plan.frames_planned),
+        moment.speed.frames,
+        count(moment.learner.map(|it| it.updates), plan.updates_planned),
+        moment.speed.updates,
+        number(moment.replay.replay_ratio()),
+    )
+}
+
+fn number(value: Option<f64>) -> String {
+    value.map_or("-".into(), |value| format!("{value:.2}"))
+}
+
 /// A count beside what is planned, which the last round may exceed: `8000/8000 (+192)`.
-pub(crate) fn of_planned(count: u64, planned: u64) -> String {
+fn of_planned(count: u64, planned: u64) -> String {
     match count.saturating_sub(planned) {
         0 => format!("{count}/{planned}"),
         more => format!("{planned}/{planned} (+{more})"),
     }
 }
 
-/// The live view.
+/// The live lines.
 #[derive(Debug)]
 pub struct Display {
     screen: Screen,
-    frames_max: u64,
-    updates_max: u64,
+    plan: Plan,
     /// Updates with which it began, and when the first beyond them was seen.
     updates_before: u64,
     learns_since: Option<Instant>,
-    rates: Rates,
     /// When the run began: a terminal's bar has a clock of its own.
     began: Instant,
     plain_next: Instant,
 }
 
 impl Display {
-    /// A view of a run of `frames_max` frames and `updates_max` updates that starts at `resume_point`.
-    pub fn new(
-        screen: Screen,
-        frames_max: u64,
-        updates_max: u64,
-        resume_point: ResumePoint,
-    ) -> Self {
-        let mut rates = Rates::default();
-        let began = Instant::now();
-        rates.add(began, resume_point.frames, resume_point.updates);
+    /// Of a run of this plan that began at `began`, and has done so many updates.
+    pub fn new(screen: Screen, plan: Plan, began: Instant, updates_before: u64) -> Self {
         Self {
             screen,
-            frames_max,
-            updates_max,
-            updates_before: resume_point.updates,
+            plan,
+            updates_before,
             learns_since: None,
-            rates,
             began,
-            plain_next: began + PLAIN_PERIOD,
+            plain_next: Instant::now() + PLAIN_PERIOD,
         }
-    }
-
-    /// The view of a run that began at `began`.
-    pub(crate) fn since(mut self, began: Instant) -> Self {
-        self.began = began;
-        self
     }
 
     /// Shows the state of the run, and `notes` under it, such as who does not answer.
-    pub fn show(
-        &mut self,
-        replay: &ReplayStatus,
-        learner: &LearnerStatus,
-        episodes: Episodes,
-        notes: &[String],
-    ) {
-        let now = Instant::now();
-        self.rates
-            .add(now, replay.transitions_inserted, learner.updates);
-        if learner.updates > self.updates_before {
-            self.learns_since.get_or_insert(now);
+    pub fn show(&mut self, moment: &Moment<'_>, notes: &[String]) {
+        let updates = moment.learner.map_or(0, |it| it.updates);
+        if updates > self.updates_before {
+            self.learns_since.get_or_insert_with(Instant::now);
         }
-        let mut texts = self.text(replay, learner, episodes).to_vec();
+        let mut texts = self.text(moment).to_vec();
         if !notes.is_empty() {
             texts.push(notes.join("; "));
         }
         if let Some(bar) = self.screen.bar() {
-            bar.set_position(replay.transitions_inserted.min(self.frames_max));
+            let frames = moment.replay.transitions_inserted;
+            bar.set_position(frames.min(self.plan.frames_planned));
         }
         self.write(&texts);
     }
 
-    /// Shows `note` in the place of the state of the run, which nobody can tell now.
+    /// Shows `note` in the place of the state of the run, which is not known now.
     pub(crate) fn show_alone(&mut self, note: &str) {
         self.write(&[note.to_owned()]);
     }
@@ -122,43 +116,32 @@ impl Display {
         }
     }
 
-    fn text(
-        &self,
-        replay: &ReplayStatus,
-        learner: &LearnerStatus,
-        episodes: Episodes,
-    ) -> [String; 2] {
-        let (frames_rate, updates_rate) = self.rates.per_second();
-        let number = |value: Option<f64>, digits: usize| {
-            value.map_or("-".into(), |value| format!("{value:.digits$}"))
-        };
+    fn text(&self, moment: &Moment<'_>) -> [String; 2] {
+        let (replay, speed) = (moment.replay, moment.speed);
+        let frames = replay.transitions_inserted;
+        let updates = moment.learner.map_or(0, |it| it.updates);
         // Before the first update there are none.
-        let losses = self.learns_since.map_or(String::new(), |_| {
-            let others = learner.losses.iter();
+        let learned = moment.learner.filter(|_| self.learns_since.is_some());
+        let losses = learned.map_or(String::new(), |it| {
+            let others = it.losses.iter();
             let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
-            format!("  C51 {:.3}{}", learner.c51_kl, others.collect::<String>())
+            format!("  C51 {:.3}{}", it.c51_kl, others.collect::<String>())
         });
-        let k = replay
-            .mean_k()
-            .map_or(String::new(), |k| format!("  mean k {k:.2}"));
-        let is_steady = |since: Instant| since.elapsed() >= STEADY_MIN;
-        let left = self.learns_since.filter(|since| is_steady(*since));
-        let left = left.and_then(|_| {
-            let frames = self.frames_max.saturating_sub(replay.transitions_inserted);
-            let updates = self.updates_max.saturating_sub(learner.updates);
-            time_left((frames, frames_rate), (updates, updates_rate))
+        let k = moment
+            .k
+            .map_or(String::new(), |k| format!("  mean k {:.2}", k.mean));
+        let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
+        let left = self.learns_since.filter(is_steady).and_then(|_| {
+            let frames = self.plan.frames_planned.saturating_sub(frames);
+            let updates = self.plan.updates_planned.saturating_sub(updates);
+            time_left((frames, speed.frames), (updates, speed.updates))
         });
         [
-            format!(
-                "frames {} ({frames_rate:.0}/s)  updates {} ({updates_rate:.1}/s)  replay ratio {}",
-                of_planned(replay.transitions_inserted, self.frames_max),
-                of_planned(learner.updates, self.updates_max),
-                number(replay.replay_ratio(), 2),
-            ),
+            progress(&self.plan, moment, true),
             format!(
                 "return {} ({} episodes){losses}{k}  {}{}",
-                number(episodes.mean_return.map(|it| it.mean), 2),
-                episodes.count,
+                number(moment.episodes.mean_return.map(|it| it.mean)),
+                moment.episodes.count,
                 waiting(replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
@@ -169,17 +152,6 @@ impl Display {
 /// The line of a view without a terminal, that long after the run began.
 fn plain(elapsed: Duration, texts: &[String]) -> String {
     format!("{}  {}", duration(elapsed), texts.join("  "))
-}
-
-/// What to say of a part that was heard so long ago; nothing of one that was heard just now.
-pub(crate) fn silence(part: &str, heard: Instant) -> Option<String> {
-    let silent = heard.elapsed();
-    (silent >= SILENT_MAX).then(|| format!("{part}: no answer for {}", duration(silent)))
-}
-
-/// What to say of a replay server that reads its replay back.
-pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
-    format!("{server}: reads its replay back from disk, {progress}")
 }
 
 /// Who waits for whom, and how many actors do.
@@ -209,19 +181,38 @@ fn time_left(frames: (u64, f64), updates: (u64, f64)) -> Option<Duration> {
 
 #[cfg(test)]
 mod tests {
+    use driml_protocol::LearnerStatus;
     use expect_test::expect;
 
     use super::*;
-    use crate::run_folder::MeanReturn;
+    use crate::{
+        moment::{Episodes, MeanReturn, Speed, Spread},
+        run_view::RunView,
+    };
+
+    fn display(frames_planned: u64, updates_planned: u64) -> Display {
+        let plan = Plan {
+            frames_planned,
+            updates_planned,
+            ..Plan::default()
+        };
+        Display::new(Screen::plain(), plan, Instant::now(), 0)
+    }
+
+    fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
+        let mut view = RunView::new(Plan::default());
+        view.take_learner(Some(learner));
+        view.take_replay(vec![replay]);
+        view
+    }
 
     #[test]
-    fn the_view_says_what_a_person_wants_to_know() {
-        let mut display = Display::new(Screen::plain(), 200_000, 6_218, ResumePoint::default());
+    fn the_lines_say_what_a_person_wants_to_know() {
+        let mut display = display(200_000, 6_218);
         let replay = ReplayStatus {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,
             warmup_transitions: 1_000,
-            k_histogram: vec![0, 1, 1, 2],
             waiting: Waiting::ActorsWaitForLearner,
             actors: 24,
             actors_waiting: 23,
@@ -233,50 +224,55 @@ mod tests {
             losses: vec![("dim_4t4".into(), 4.0)],
             ..LearnerStatus::default()
         };
-        let episodes = Episodes {
-            count: 45,
-            mean_return: Some(MeanReturn {
-                mean: 1.234,
-                of: 45,
+        let view = view(replay, learner);
+        let moment = Moment {
+            episodes: Episodes {
+                count: 45,
+                mean_return: Some(MeanReturn {
+                    mean: 1.234,
+                    of: 45,
+                }),
+            },
+            k: Some(Spread {
+                mean: 2.25,
+                sd: 1.0,
             }),
+            speed: Speed {
+                frames: 160.0,
+                updates: 5.0,
+            },
+            ..view.moment()
         };
-        let start = Instant::now();
-        display.rates = Rates::default();
-        display.rates.add(start, 31_400, 950);
-        display
-            .rates
-            .add(start + Duration::from_secs(10), 33_000, 1000);
-        display.learns_since = start.checked_sub(STEADY_MIN);
+        display.learns_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
-        .assert_eq(&display.text(&replay, &learner, episodes).join("\n"));
+        .assert_eq(&display.text(&moment).join("\n"));
     }
 
     #[test]
     fn before_the_first_update_there_is_no_loss_and_no_time_left() {
-        let mut display = Display::new(Screen::plain(), 8_000, 218, ResumePoint::default());
-        let (mut replay, mut learner) = (ReplayStatus::default(), LearnerStatus::default());
-        display.show(&replay, &learner, Episodes::default(), &[]);
+        let mut display = display(8_000, 218);
+        let nothing = view(ReplayStatus::default(), LearnerStatus::default());
+        display.show(&nothing.moment(), &[]);
         expect![[r#"
             frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
             return - (0 episodes)  nobody waits"#]]
-        .assert_eq(
-            &display
-                .text(&replay, &learner, Episodes::default())
-                .join("\n"),
-        );
-        (replay.transitions_inserted, learner.updates) = (8_192, 224);
-        display.rates = Rates::default();
-        display.show(&replay, &learner, Episodes::default(), &[]);
+        .assert_eq(&display.text(&nothing.moment()).join("\n"));
+        let replay = ReplayStatus {
+            transitions_inserted: 8_192,
+            ..ReplayStatus::default()
+        };
+        let learner = LearnerStatus {
+            updates: 224,
+            ..LearnerStatus::default()
+        };
+        let all = view(replay, learner);
+        display.show(&all.moment(), &[]);
         expect![[r#"
             frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
             return - (0 episodes)  C51 0.000  nobody waits"#]]
-        .assert_eq(
-            &display
-                .text(&replay, &learner, Episodes::default())
-                .join("\n"),
-        );
+        .assert_eq(&display.text(&all.moment()).join("\n"));
     }
 
     #[test]

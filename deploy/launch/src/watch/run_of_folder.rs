@@ -1,4 +1,4 @@
-//! Where the parts of the run in a folder can be asked, or what the folder says of a run that is over.
+//! Where the processes of the run in a folder can be asked, or what the folder says of a run that is over.
 
 use driml_machine::error::usage;
 use driml_protocol::reach;
@@ -9,29 +9,29 @@ use crate::{
     run_folder::{RunFolder, Summary, progress},
 };
 
-/// Whether somebody runs in a folder.
+/// Whether the run in a folder can be asked.
 pub enum Live {
     /// The endpoints of its replay servers.
     At(Vec<String>),
-    /// Nobody who can be asked: how it ended and how it would go on, for a person.
+    /// No process can be asked: how it ended and how to resume it, for a person.
     Over(String),
 }
 
 /// Looks into the folder of a run.
 ///
 /// # Errors
-/// It is no run's, or one of parts that were started by hand.
+/// It is not a run's, or one whose processes were started by hand.
 pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
     let config = std::fs::read_to_string(folder.config()).map_err(|e| {
         usage!(
-            "{} is no run folder: reading {}: {e}",
+            "{} is not a run folder: reading {}: {e}",
             folder.display(),
             folder.config().display()
         )
     })?;
     let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
     let config = RunConfig::parse(&folder.config().display().to_string(), &config)?;
-    // Whoever runs there holds the lock.
+    // A launcher that runs there holds the lock.
     if folder.lock().is_err()
         && let Some(endpoints) = endpoints
     {
@@ -57,14 +57,11 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         format!("{} frames and {} episodes", so_far.frames, so_far.episodes)
     });
     let next = match resume::is_resumable(&config.world, folder) {
-        true => format!(
-            "`driml train --resume {}` goes on with it",
-            folder.display()
-        ),
-        false => "it has no checkpoint to go on from".into(),
+        true => format!("`driml train --resume {}` resumes it", folder.display()),
+        false => "it has no checkpoint to resume from".into(),
     };
     Ok(Live::Over(format!(
-        "nobody runs in {}, which holds {so_far}: {next}. A run whose parts were started by hand is asked with --connect ENDPOINT\n",
+        "no process runs in {}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT\n",
         folder.display()
     )))
 }

@@ -1,0 +1,504 @@
+//! Every metric of a run, once: [`COLUMNS`]. `metrics.csv`, `--json`, Prometheus' file, TensorBoard's events and the labels of plots
+//! loop over it.
+//! It asks no process and writes no file.
+
+use std::collections::BTreeMap;
+
+use crate::moment::{Moment, rounded};
+
+/// A metric: its column in `metrics.csv`, or its columns where it is one of several things.
+#[derive(Clone, Copy, Debug)]
+pub struct Column {
+    /// Its name in `metrics.csv` and in JSON. Prometheus' is `driml_NAME`, of a counter `driml_NAME_total`.
+    pub name: &'static str,
+    /// What it measures, in a sentence.
+    pub help: &'static str,
+    /// What its numbers count.
+    pub unit: &'static str,
+    /// The title of its chart.
+    pub plot_label: &'static str,
+    /// TensorBoard shows the curves of a group beside each other.
+    pub group: &'static str,
+    /// How it is taken from a moment of a run.
+    pub value: Value,
+}
+
+/// How a metric is taken from a moment of a run; none where it is not known yet.
+#[derive(Clone, Copy, Debug)]
+pub enum Value {
+    /// A number that rises until the run is started anew.
+    Counter(fn(&Moment<'_>) -> Option<f64>),
+    /// A number that may fall.
+    Gauge(fn(&Moment<'_>) -> Option<f64>),
+    /// A gauge for each of several things, such as each auxiliary loss: a column each.
+    Each {
+        /// What tells them apart, as Prometheus' label.
+        label: &'static str,
+        /// All of them.
+        members: fn(&Moment<'_>) -> Vec<Member>,
+    },
+    /// Words, which are in `metrics.csv` and JSON alone.
+    Words(fn(&Moment<'_>) -> String),
+}
+
+/// One of several things that a metric is known of.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Member {
+    /// The name of its column.
+    pub column: String,
+    /// Its own name.
+    pub name: String,
+    /// Its number.
+    pub value: Option<f64>,
+}
+
+/// All metrics, in the order of the columns of `metrics.csv`. The auxiliary losses stand between C51's loss and the total.
+pub const COLUMNS: &[Column] = &[
+    Column {
+        name: "seconds",
+        help: "Time since the run began, without the time in which it was interrupted.",
+        unit: "seconds",
+        plot_label: "Time",
+        group: "run",
+        value: Value::Counter(|it| it.seconds),
+    },
+    Column {
+        name: "frames",
+        help: "Transitions that the replay has stored.",
+        unit: "frames",
+        plot_label: "Frames",
+        group: "run",
+        value: Value::Counter(|it| Some(it.replay.transitions_inserted as f64)),
+    },
+    Column {
+        name: "updates",
+        help: "Updates of the learner.",
+        unit: "updates",
+        plot_label: "Updates",
+        group: "run",
+        value: Value::Counter(|it| {
+            let last_known = it.replay.learner_finished.then_some(it.replay.updates);
+            let updates = it.learner.map(|it| it.updates).or(last_known);
+            updates.map(|it| it as f64)
+        }),
+    },
+    Column {
+        name: "frames_per_second",
+        help: "Frames a second, over the last 20 seconds.",
+        unit: "frames per second",
+        plot_label: "Acting speed",
+        group: "speed",
+        value: Value::Gauge(|it| Some(it.speed.frames)),
+    },
+    Column {
+        name: "updates_per_second",
+        help: "Updates a second, over the last 20 seconds.",
+        unit: "updates per second",
+        plot_label: "Learning speed",
+        group: "speed",
+        value: Value::Gauge(|it| Some(it.speed.updates)),
+    },
+    Column {
+        name: "replay_ratio",
+        help: "Rows sampled per transition stored, both counted from the end of the warm-up.",
+        unit: "rows sampled per transition",
+        plot_label: "Replay ratio",
+        group: "run",
+        value: Value::Gauge(|it| it.replay.replay_ratio()),
+    },
+    Column {
+        name: "episodes",
+        help: "Training episodes that ended.",
+        unit: "episodes",
+        plot_label: "Episodes",
+        group: "return",
+        value: Value::Counter(|it| Some(it.episodes.count as f64)),
+    },
+    Column {
+        name: "mean_return",
+        help: "Mean undiscounted return of the newest training episodes.",
+        unit: "mean of the last 100 episodes",
+        plot_label: "Return",
+        group: "return",
+        value: Value::Gauge(|it| it.episodes.mean_return.map(|it| it.mean)),
+    },
+    Column {
+        name: "mean_return_of",
+        help: "Episodes in the mean return: 100, or as many as there were.",
+        unit: "episodes",
+        plot_label: "Episodes in the mean return",
+        group: "return",
+        value: Value::Gauge(|it| Some(it.episodes.mean_return.map_or(0.0, |it| it.of as f64))),
+    },
+    Column {
+        name: "c51_kl",
+        help: "C51's loss of the last update.",
+        unit: "KL divergence [nats]",
+        plot_label: "C51 loss",
+        group: "learning",
+        value: Value::Gauge(|it| it.learned(|it| it.c51_kl.into())),
+    },
+    Column {
+        name: "losses",
+        help: "The agent's auxiliary losses of the last update, by name, such as `dim_4t4`.",
+        unit: "auxiliary loss [nats]",
+        plot_label: "Auxiliary loss",
+        group: "learning",
+        value: Value::Each {
+            label: "loss",
+            members: |it| {
+                let loss = |name: &str| it.learner?.loss(name).map(f64::from);
+                let member = |name: &&str| Member::new(name, name, loss(name));
+                it.losses.iter().map(member).collect()
+            },
+        },
+    },
+    Column {
+        name: "total_loss",
+        help: "The total loss of the last update.",
+        unit: "loss [nats]",
+        plot_label: "Total loss",
+        group: "learning",
+        value: Value::Gauge(|it| it.learned(|it| it.total.into())),
+    },
+    Column {
+        name: "grad_norm",
+        help: "Norm of the last update's gradient before clipping.",
+        unit: "global 2-norm",
+        plot_label: "Gradient before clipping",
+        group: "learning",
+        value: Value::Gauge(|it| it.learned(|it| it.grad_norm)),
+    },
+    Column {
+        name: "q_mean",
+        help: "Mean Q value of the last update's states.",
+        unit: "discounted return",
+        plot_label: "Mean Q value",
+        group: "learning",
+        value: Value::Gauge(|it| it.learned(|it| it.q_mean.into())),
+    },
+    Column {
+        name: "mean_k",
+        help: "Mean k of the rows served with a positive; of several positives the furthest counts.",
+        unit: "k [environment steps]",
+        plot_label: "How far ahead: k, mean since the start",
+        group: "k",
+        value: Value::Gauge(|it| it.k.map(|it| it.mean)),
+    },
+    Column {
+        name: "sd_k",
+        help: "Standard deviation of k over the same rows.",
+        unit: "environment steps",
+        plot_label: "Standard deviation of k",
+        group: "k",
+        value: Value::Gauge(|it| it.k.map(|it| it.sd)),
+    },
+    Column {
+        name: "mean_age",
+        help: "Mean age of the rows served last: transitions stored since theirs.",
+        unit: "transitions",
+        plot_label: "Age of sampled rows",
+        group: "run",
+        value: Value::Gauge(|it| Some(it.replay.mean_age)),
+    },
+    Column {
+        name: "weights_version",
+        help: "Version of the newest weights.",
+        unit: "version",
+        plot_label: "Version of the weights",
+        group: "run",
+        value: Value::Gauge(|it| it.learner.map(|it| it.weights_version as f64)),
+    },
+    Column {
+        name: "affinity_version",
+        help: "Version of the affinity in use; 0 is the uniform one.",
+        unit: "version",
+        plot_label: "Version of the affinity",
+        group: "run",
+        value: Value::Gauge(|it| Some(it.replay.affinity_version as f64)),
+    },
+    Column {
+        name: "actors",
+        help: "Actors that are connected.",
+        unit: "actors",
+        plot_label: "Actors",
+        group: "run",
+        value: Value::Gauge(|it| Some(it.replay.actors.into())),
+    },
+    Column {
+        name: "waiting",
+        help: "Which side waits at the rate limiter.",
+        unit: "words",
+        plot_label: "Waiting",
+        group: "run",
+        value: Value::Words(|it| it.replay.waiting.to_string()),
+    },
+    Column {
+        name: "epsilon",
+        help: "Probability with which all actors act at random; empty where they differ in it.",
+        unit: "probability of a random action",
+        plot_label: "Epsilon",
+        group: "run",
+        value: Value::Gauge(|it| it.epsilon),
+    },
+    Column {
+        name: "transitions_lost",
+        help: "Transitions that actors produced and that never arrived.",
+        unit: "transitions",
+        plot_label: "Lost transitions",
+        group: "faults",
+        value: Value::Counter(|it| Some(it.replay.transitions_lost as f64)),
+    },
+    Column {
+        name: "transitions_duplicated",
+        help: "Transitions stored twice.",
+        unit: "transitions",
+        plot_label: "Duplicated transitions",
+        group: "faults",
+        value: Value::Counter(|it| Some(it.replay.transitions_duplicated as f64)),
+    },
+    Column {
+        name: "messages_refused",
+        help: "Messages rejected as malformed or foreign, or because of their sender's role.",
+        unit: "messages",
+        plot_label: "Rejected messages",
+        group: "faults",
+        value: Value::Counter(|it| Some(it.replay.messages_refused as f64)),
+    },
+    Column {
+        name: "learner_waited_seconds",
+        help: "Time that requests for a batch waited at the rate limiter.",
+        unit: "seconds",
+        plot_label: "Time that the learner waited",
+        group: "speed",
+        value: Value::Counter(|it| Some(it.replay.learner_waited_s)),
+    },
+    Column {
+        name: "actors_waited_seconds",
+        help: "Time that chunks waited at the rate limiter, summed over actors.",
+        unit: "seconds",
+        plot_label: "Time that actors waited",
+        group: "speed",
+        value: Value::Counter(|it| Some(it.replay.actors_waited_s)),
+    },
+    Column {
+        name: "rss_mib",
+        help: "Resident memory of each process that `driml train` started, such as `rss_mib_actor_0`.",
+        unit: "resident memory [MiB]",
+        plot_label: "Memory",
+        group: "memory",
+        value: Value::Each {
+            label: "process",
+            members: |it| {
+                let column = |name: &str| format!("rss_mib_{}", name.replace('-', "_"));
+                let member = |(name, mib): &(&str, _)| Member::new(&column(name), name, *mib);
+                it.rss_mib.iter().map(member).collect()
+            },
+        },
+    },
+];
+
+impl Member {
+    fn new(column: &str, name: &str, value: Option<f64>) -> Self {
+        Self {
+            column: column.into(),
+            name: name.into(),
+            value,
+        }
+    }
+}
+
+impl Column {
+    /// Its numbers: one, or one for each of several things; none of words.
+    pub(crate) fn members(&self, moment: &Moment<'_>) -> Vec<Member> {
+        match self.value {
+            Value::Counter(value) | Value::Gauge(value) => {
+                vec![Member::new(self.name, self.name, value(moment))]
+            }
+            Value::Each { members, .. } => members(moment),
+            Value::Words(_) => Vec::new(),
+        }
+    }
+}
+
+/// The name and the cell of each column of `metrics.csv`, in order. What is not known is empty.
+pub fn cells(moment: &Moment<'_>) -> Vec<(String, String)> {
+    let text = |value: Option<f64>| value.map_or(String::new(), |it| rounded(it).to_string());
+    let cells = COLUMNS.iter().flat_map(|column| match column.value {
+        Value::Words(words) => vec![(column.name.to_owned(), words(moment))],
+        _ => {
+            let members = column.members(moment).into_iter();
+            members.map(|it| (it.column, text(it.value))).collect()
+        }
+    });
+    cells.collect()
+}
+
+/// The curves of TensorBoard, `GROUP/COLUMN`, and their points. Frames are what they are drawn over.
+pub fn points(moment: &Moment<'_>) -> Vec<(String, f64)> {
+    let drawn = COLUMNS.iter().filter(|it| it.name != "frames");
+    let points = drawn.flat_map(|column| {
+        let curve = |it: &Member| format!("{}/{}", column.group, it.column);
+        let members = column.members(moment).into_iter();
+        members.filter_map(move |it| Some((curve(&it), rounded(it.value?))))
+    });
+    points.collect()
+}
+
+/// The metrics as JSON by name, whole numbers as such; what is not known is null. Metrics of several things are objects.
+pub fn json(moment: &Moment<'_>) -> BTreeMap<&'static str, serde_json::Value> {
+    let value = |column: &Column| match column.value {
+        Value::Counter(value) | Value::Gauge(value) => {
+            value(moment).map_or(serde_json::Value::Null, json_number)
+        }
+        Value::Words(words) => words(moment).into(),
+        Value::Each { members, .. } => {
+            let members = members(moment).into_iter();
+            let known = members.filter_map(|it| Some((it.name, json_number(it.value?))));
+            serde_json::Value::Object(known.collect())
+        }
+    };
+    COLUMNS.iter().map(|it| (it.name, value(it))).collect()
+}
+
+/// A number of JSON, which has none for NaN and infinity.
+fn json_number(value: f64) -> serde_json::Value {
+    /// Below this every whole number is one of f64's.
+    const WHOLE_MAX: f64 = 9_007_199_254_740_992.0;
+    match value.fract() == 0.0 && value.abs() < WHOLE_MAX {
+        true => (value as i64).into(),
+        false => value.into(),
+    }
+}
+
+/// The metric of a column of `metrics.csv`, if it is one of a fixed name; processes differ by run.
+pub fn column(name: &str) -> Option<&'static Column> {
+    COLUMNS.iter().find(|it| match it.value {
+        Value::Each {
+            label: "process", ..
+        } => name.starts_with(it.name),
+        _ => it.name == name,
+    })
+}
+
+/// All metrics as a table of Markdown.
+pub fn markdown() -> String {
+    let mut table =
+        "| column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
+    for column in COLUMNS {
+        let prometheus = match column.value {
+            Value::Counter(_) => format!("`driml_{}_total`", column.name),
+            Value::Gauge(_) => format!("`driml_{}`", column.name),
+            Value::Each { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
+            Value::Words(_) => "-".into(),
+        };
+        let Column {
+            name, unit, help, ..
+        } = column;
+        table += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::{LearnerStatus, ReplayStatus};
+
+    use super::*;
+    use crate::moment::{Episodes, Speed};
+
+    fn moment<'a>(replay: &'a ReplayStatus, learner: Option<&'a LearnerStatus>) -> Moment<'a> {
+        Moment {
+            seconds: Some(12.5),
+            speed: Speed::default(),
+            episodes: Episodes::default(),
+            k: None,
+            epsilon: Some(0.25),
+            replay,
+            learner,
+            losses: vec!["dim_3t3", "dim_4t4"],
+            rss_mib: vec![("actor-0", Some(12.34)), ("actor-1", None)],
+        }
+    }
+
+    /// Scripts read the file by these names.
+    #[test]
+    fn the_columns_of_the_file_keep_their_names_and_their_order() {
+        let replay = ReplayStatus::default();
+        let names: Vec<_> = cells(&moment(&replay, None))
+            .into_iter()
+            .map(|(name, _)| name)
+            .collect();
+        let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
+                      dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
+        assert!(names.join(",").starts_with(before), "{names:?}");
+        assert_eq!(
+            names[names.len() - 2..],
+            ["rss_mib_actor_0", "rss_mib_actor_1"]
+        );
+    }
+
+    #[test]
+    fn what_is_not_known_is_left_out() {
+        let replay = ReplayStatus {
+            transitions_inserted: 7,
+            ..ReplayStatus::default()
+        };
+        let mut learner = LearnerStatus {
+            losses: vec![("dim_4t4".into(), 2.0)],
+            ..LearnerStatus::default()
+        };
+        let unknown = json(&moment(&replay, None));
+        assert_eq!(unknown["updates"], serde_json::Value::Null);
+        assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
+        learner.updates = 3;
+        learner.c51_kl = 0.5;
+        let known = moment(&replay, Some(&learner));
+        let text = serde_json::to_string(&json(&known)).unwrap();
+        for part in [
+            r#""frames":7,"#,
+            r#""c51_kl":0.5,"#,
+            r#""losses":{"dim_4t4":2},"#,
+            r#""rss_mib":{"actor-0":12.34},"#,
+            r#""waiting":"nobody waits","#,
+        ] {
+            assert!(text.contains(part), "{part} in {text}");
+        }
+        let points = points(&known);
+        let of = |name: &str| points.iter().find(|it| it.0 == name).map(|it| it.1);
+        assert_eq!(of("memory/rss_mib_actor_0"), Some(12.34));
+        assert_eq!(of("memory/rss_mib_actor_1"), None);
+        assert_eq!(of("learning/dim_4t4"), Some(2.0));
+        assert_eq!(of("run/frames"), None);
+    }
+
+    #[test]
+    fn a_name_is_one_metric_s_and_none_hides_another() {
+        for (at, it) in COLUMNS.iter().enumerate() {
+            assert_eq!(column(it.name).map(|it| it.name), Some(it.name));
+            assert!(COLUMNS[..at].iter().all(|other| other.name != it.name));
+            assert!(it.help.ends_with('.') && !it.unit.is_empty(), "{}", it.name);
+        }
+        assert_eq!(column("rss_mib_actor_7").unwrap().name, "rss_mib");
+        assert!(column("dim_4t4").is_none());
+    }
+
+    /// `UPDATE_DOCS=1` writes the page anew.
+    #[test]
+    fn the_page_has_every_metric() {
+        let path = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../docs/src/reference/metrics.md"
+        );
+        let page = format!(
+            "# Metrics\n\n`metrics.csv` in the run folder has a row a second with these columns. `driml watch --once --json` has the same \
+             names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n{}",
+            markdown()
+        );
+        if std::env::var_os("UPDATE_DOCS").is_some() {
+            std::fs::write(path, &page).unwrap();
+        }
+        let found = std::fs::read_to_string(path).unwrap_or_default();
+        assert_eq!(found, page, "run this test with UPDATE_DOCS=1");
+    }
+}

@@ -1,0 +1,267 @@
+//! A table of the run folder: a CSV file read by the names of its columns, and a log to which a run appends rows.
+//! A full disk never ends the run: rows wait in memory until they can be written, and only what is still missing at the end, or too
+//! much to keep, is lost.
+
+use std::{
+    collections::VecDeque,
+    fs::{self, File},
+    io::{self, ErrorKind, Write},
+    path::Path,
+    str::FromStr,
+};
+
+use anyhow::Context;
+use csv::StringRecord;
+use driml_protocol::whole_file;
+
+use crate::console;
+
+/// Rows that are kept in memory while they cannot be written; of more the oldest are lost. A day of metrics, minutes of the episodes
+/// of a world whose episodes take milliseconds.
+const WAITING_MAX: usize = 100_000;
+
+/// The whole rows of a file that a run writes.
+#[derive(Clone, Debug, Default)]
+pub struct Table {
+    /// The columns' names.
+    pub header: Vec<String>,
+    /// A record for each row, without the header.
+    pub rows: Vec<StringRecord>,
+}
+
+impl Table {
+    /// Reads a file's text. What follows the last line's end is still being written, or was cut off, and is left out.
+    ///
+    /// # Errors
+    /// Rows of different lengths, or text that is no UTF-8.
+    pub fn parse(text: &[u8]) -> Result<Self, csv::Error> {
+        let whole = text.iter().rposition(|&byte| byte == b'\n');
+        let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
+        let header = reader.headers()?.iter().map(String::from).collect();
+        let rows = reader.records().collect::<Result<_, _>>()?;
+        Ok(Self { header, rows })
+    }
+
+    /// Reads the file at `path`; one that is not there is empty.
+    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+        let reading = || format!("reading {}", path.display());
+        match fs::read(path) {
+            Err(e) if e.kind() == ErrorKind::NotFound => Ok(Self::default()),
+            text => Self::parse(&text.with_context(reading)?).with_context(reading),
+        }
+    }
+
+    /// The place of the column `name`; none if there is no such column.
+    pub fn place(&self, name: &str) -> Option<usize> {
+        self.header.iter().position(|it| it == name)
+    }
+
+    /// What `row` has in the column `name`; none if that is empty, or of another type.
+    pub fn value<T: FromStr>(&self, row: &StringRecord, name: &str) -> Option<T> {
+        row.get(self.place(name)?)?.parse().ok()
+    }
+
+    /// What the last row has in the column `name`.
+    pub fn last<T: FromStr>(&self, name: &str) -> Option<T> {
+        self.value(self.rows.last()?, name)
+    }
+
+    /// The file's text: the header and the rows.
+    pub(super) fn text(&self) -> Vec<u8> {
+        let rows = self.rows.iter().flat_map(csv_row);
+        csv_row(&self.header).into_iter().chain(rows).collect()
+    }
+
+    /// Leaves the rows in the table at `path` that are to be kept; the others are written into a file beside it, and a line names it.
+    pub(super) fn keep(
+        &mut self,
+        path: &Path,
+        is_kept: impl Fn(&Self, &StringRecord) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<()> {
+        let is_kept = self.rows.iter().map(|row| is_kept(self, row));
+        let is_kept = is_kept.collect::<anyhow::Result<Vec<_>>>()?;
+        let rows = std::mem::take(&mut self.rows).into_iter().zip(is_kept);
+        let (kept, aside): (Vec<_>, Vec<_>) = rows.partition(|(_, is_kept)| *is_kept);
+        let of = |rows: Vec<(StringRecord, bool)>| rows.into_iter().map(|it| it.0).collect();
+        self.rows = of(kept);
+        if aside.is_empty() {
+            return Ok(());
+        }
+        let aside = Self {
+            header: self.header.clone(),
+            rows: of(aside),
+        };
+        let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
+        let free = (1..).map(free).find(|it| !it.exists());
+        let beside = free.context("no name is free beside the table")?;
+        let writing = || format!("writing {}", beside.display());
+        whole_file::write(&beside, &aside.text()).with_context(writing)?;
+        let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
+        console::line(&format!(
+            "{} rows of {} are past the point where the run is resumed; they are now in {}",
+            aside.rows.len(),
+            name(path),
+            name(&beside)
+        ));
+        Ok(())
+    }
+}
+
+/// The file and what is not in it yet.
+#[derive(Debug)]
+pub(super) struct AppendLog {
+    /// Its name, for messages.
+    name: String,
+    file: File,
+    /// Bytes of it that are whole rows.
+    length: u64,
+    waiting: VecDeque<Vec<u8>>,
+    lost: u64,
+    /// The first error.
+    failed: Option<io::Error>,
+}
+
+impl AppendLog {
+    /// Makes the file anew, with the bytes that it begins with.
+    pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
+        let doing = || format!("writing {}", path.display());
+        whole_file::write(path, first).with_context(doing)?;
+        let file = File::options()
+            .append(true)
+            .open(path)
+            .with_context(doing)?;
+        let name = path.file_name().unwrap_or_default();
+        Ok(Self {
+            name: name.to_string_lossy().into_owned(),
+            file,
+            length: first.len() as u64,
+            waiting: VecDeque::new(),
+            lost: 0,
+            failed: None,
+        })
+    }
+
+    /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
+    pub(super) fn add(&mut self, row: Vec<u8>) -> Option<String> {
+        self.add_all([row])
+    }
+
+    /// [`Self::add`] of several rows, in one write.
+    pub(super) fn add_all(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
+        self.waiting.extend(rows);
+        let more = self.waiting.len().saturating_sub(WAITING_MAX);
+        self.waiting.drain(..more);
+        self.lost += more as u64;
+        let error = self.write().err()?;
+        let said = self.failed.is_none().then(|| {
+            format!(
+                "{} cannot be written: {error}; its rows wait in memory until it can be",
+                self.name
+            )
+        });
+        self.failed.get_or_insert(error);
+        said
+    }
+
+    /// Writes all rows that wait, or none.
+    fn write(&mut self) -> io::Result<()> {
+        let bytes = self.waiting.make_contiguous().concat();
+        if let Err(e) = self.file.write_all(&bytes) {
+            // Half a row may be there. Should this fail too, the next try begins with half a row before it.
+            let _ = self.file.set_len(self.length);
+            return Err(e);
+        }
+        self.length += bytes.len() as u64;
+        self.waiting.clear();
+        Ok(())
+    }
+
+    /// How many rows are not in the file, and why; none if all are.
+    pub(super) fn missing(&self) -> Option<String> {
+        let rows = self.lost + self.waiting.len() as u64;
+        let error = self.failed.as_ref().filter(|_| rows > 0)?;
+        Some(format!("{rows} rows of {} are lost: {error}", self.name))
+    }
+}
+
+/// A row of a CSV file, as bytes.
+///
+/// # Panics
+/// If it cannot be made into text, which takes no file.
+pub(super) fn csv_row<T: AsRef<[u8]>>(cells: impl IntoIterator<Item = T>) -> Vec<u8> {
+    let mut csv = csv::Writer::from_writer(Vec::new());
+    csv.write_record(cells).expect("a row in memory");
+    csv.into_inner().expect("a row in memory")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_found_by_name_in_whole_rows_alone() {
+        let read = Table::parse(b"frames,loss\n1,\n2,0.5\n3,0.2").unwrap();
+        assert_eq!(read.rows.len(), 2);
+        assert_eq!(
+            (read.last("frames"), read.last("loss")),
+            (Some(2), Some(0.5))
+        );
+        assert_eq!(read.value::<f64>(&read.rows[0], "loss"), None);
+        assert_eq!(read.last::<u64>("k"), None);
+        assert!(Table::parse(b"frames,lo").unwrap().header.is_empty());
+    }
+
+    #[test]
+    fn rows_that_are_not_kept_stand_in_a_file_beside_the_table() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.csv");
+        let mut table = Table::parse(b"a,b\n1,2\n3,\"4, of five\"\n5,6\n").unwrap();
+        let is_kept = |table: &Table, row: &StringRecord| Ok(table.value(row, "a") != Some(3));
+        table.keep(&path, is_kept).unwrap();
+        assert_eq!(table.text(), b"a,b\n1,2\n5,6\n");
+        let beside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
+        assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
+    }
+
+    /// A file on a full disk.
+    fn full(path: &Path) -> AppendLog {
+        let mut table = AppendLog::create(path, b"a\n").unwrap();
+        table.file = File::options().append(true).open("/dev/full").unwrap();
+        table
+    }
+
+    #[test]
+    fn rows_wait_until_they_can_be_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.csv");
+        let mut table = full(&path);
+        let row = |n: u32| format!("\"{n}, of five\"\n").into_bytes();
+        let said = table.add(row(1)).unwrap();
+        assert!(
+            said.starts_with("metrics.csv cannot be written: No space left"),
+            "{said}"
+        );
+        assert_eq!(table.add(row(2)), None, "it is said once");
+        let missing = table.missing().unwrap();
+        assert!(
+            missing.starts_with("2 rows of metrics.csv are lost: "),
+            "{missing}"
+        );
+
+        table.file = File::options().append(true).open(&path).unwrap();
+        assert_eq!((table.add(row(3)), table.missing()), (None, None));
+        let text = fs::read_to_string(&path).unwrap();
+        assert_eq!(text, "a\n\"1, of five\"\n\"2, of five\"\n\"3, of five\"\n");
+        assert_eq!(table.length, text.len() as u64);
+    }
+
+    #[test]
+    fn the_oldest_of_too_many_rows_are_lost() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut table = full(&folder.path().join("x.csv"));
+        table.waiting = vec![Vec::new(); WAITING_MAX - 1].into();
+        table.add(b"1".to_vec());
+        table.add(b"2".to_vec());
+        assert_eq!((table.lost, table.waiting.len()), (1, WAITING_MAX));
+    }
+}

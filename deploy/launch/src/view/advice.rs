@@ -1,0 +1,262 @@
+//! Who waits for whom, who does not respond, and what to do about it, in sentences.
+//! It knows no more than a view.
+
+use std::time::{Duration, Instant};
+
+use driml_machine::units::duration;
+use driml_protocol::{PartName, PartStatus, PartsStatus, RecoveryProgress, Waiting, session};
+
+use crate::run_view::{RunView, ServerAnswer};
+
+/// How long an actor may send nothing before it is unresponsive.
+const UNRESPONSIVE_S: f64 = 30.0;
+/// How long a replay server or the learner may leave questions unanswered before a note says so.
+const SILENT_MAX: Duration = Duration::from_secs(10);
+/// Unresponsive actors that a note names.
+const NAMED_MAX: usize = 4;
+
+/// The endpoint and the account of each replay server that answered.
+fn accounts(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &PartsStatus)> {
+    let answered = view.servers.iter();
+    answered.filter_map(|server| Some((server, server.parts.as_ref()?)))
+}
+
+/// The learner's account, and all actors', each with the server that they are connected to.
+fn parts(view: &RunView) -> impl Iterator<Item = (&str, &PartStatus)> {
+    accounts(view)
+        .flat_map(|(server, account)| account.parts.iter().map(|part| (&*server.endpoint, part)))
+}
+
+/// Which side waits at the rate limiter and since when.
+pub(super) fn waits(view: &RunView) -> Vec<String> {
+    let limiter = |(_, account): (_, &PartsStatus)| match account.waiting {
+        Waiting::Nobody => None,
+        Waiting::Finished => Some(account.waiting.to_string()),
+        waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
+    };
+    let mut waits: Vec<_> = accounts(view).filter_map(limiter).collect();
+    waits.dedup();
+    waits
+}
+
+/// What is missing and what to do about it, the most important first.
+pub(crate) fn needed(view: &RunView) -> Vec<String> {
+    let servers = view.servers.iter().filter(|_| !view.is_over());
+    let mut needed: Vec<_> = servers.filter_map(of_server).collect();
+    needed.extend(accounts(view).filter_map(of_disk));
+    if !view.is_over() && accounts(view).next().is_some() {
+        needed.extend(of_learner(view));
+        if !view.replay.finished {
+            needed.extend(of_actors(view));
+        }
+    }
+    needed
+}
+
+fn of_server(server: &ServerAnswer) -> Option<String> {
+    let endpoint = &server.endpoint;
+    Some(if server.is_another_run {
+        format!("{endpoint} now serves a run with other settings: connect again")
+    } else if let Some(progress) = server.recovering {
+        format!(
+            "the replay server on {endpoint} reads its replay back from disk ({progress}): no action needed, the run then continues"
+        )
+    } else if server.is_gone {
+        format!("the replay server on {endpoint} has exited: restart it unless the run is complete")
+    } else {
+        let error = server.error.as_ref()?;
+        format!(
+            "the replay server on {endpoint} does not answer ({error}): its process may be suspended, or its machine unreachable"
+        )
+    })
+}
+
+fn of_disk((server, account): (&ServerAnswer, &PartsStatus)) -> Option<String> {
+    let log = account.log.as_ref()?;
+    let (since, why) = log.refused.as_ref()?;
+    Some(format!(
+        "the disk of the replay server on {} has rejected its replay for {} ({why}): make room for {}, or make it writable; the run then \
+         continues",
+        server.endpoint,
+        seconds(*since),
+        log.folder
+    ))
+}
+
+fn of_learner(view: &RunView) -> Option<String> {
+    let connects = view
+        .servers
+        .iter()
+        .map(|it| format!(" --connect {}", it.endpoint));
+    let flags = connects.collect::<String>() + certificates(&view.servers[0].endpoint);
+    match parts(view).find(|(_, part)| part.who == PartName::Learner) {
+        None => Some(format!(
+            "no learner has joined: start `driml learner{flags} --run-dir DIR`"
+        )),
+        Some((_, learner)) if !learner.connected => Some(format!(
+            "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: \
+             `driml learner{flags} --run-dir DIR`",
+            seconds(learner.since_s)
+        )),
+        Some(_) if view.learner_status().is_none() => Some(
+            "the learner is connected but does not respond: its process may be suspended, or the machine overloaded".into(),
+        ),
+        Some(_) => None,
+    }
+}
+
+fn of_actors(view: &RunView) -> Vec<String> {
+    let actors: Vec<_> = parts(view)
+        .filter(|(_, part)| part.who != PartName::Learner)
+        .collect();
+    if !actors.iter().any(|(_, part)| part.connected) {
+        let endpoint = &view.servers[0].endpoint;
+        let what = match actors.is_empty() {
+            true => "no actor has joined",
+            false => "all actors have disconnected",
+        };
+        let flags = certificates(endpoint);
+        return vec![format!(
+            "{what}: start `driml actor --connect {endpoint}{flags} --id N`, each with another number"
+        )];
+    }
+    let of_actor = |(endpoint, part): &(&str, &PartStatus)| {
+        let PartName::Actor(id) = part.who else {
+            return None;
+        };
+        if !part.connected {
+            return Some(format!(
+                "actor-{id} disconnected {} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{} --id {id}`",
+                seconds(part.since_s),
+                certificates(endpoint)
+            ));
+        }
+        let silent = seconds(silent_for(part)?);
+        Some(format!(
+            "actor-{id} is connected but has sent nothing for {silent}: its process may be suspended"
+        ))
+    };
+    actors.iter().filter_map(of_actor).collect()
+}
+
+/// The flag that an endpoint with certificates wants.
+fn certificates(endpoint: &str) -> &'static str {
+    match session::is_quic(endpoint) {
+        true => " --tls-dir DIR",
+        false => "",
+    }
+}
+
+/// What to say below the live lines: the processes that do not respond, and for how long.
+pub(crate) fn notes(view: &RunView) -> Vec<String> {
+    let recovering = view.recovering();
+    let recovering: Vec<_> = recovering
+        .map(|(server, it)| recovery(&server.name, it))
+        .collect();
+    if !recovering.is_empty() {
+        return recovering;
+    }
+    // No other process can be asked while the replay server does not answer.
+    if let Some(replay) = silence("replay server", view.replay_last_seen) {
+        return vec![replay];
+    }
+    let is_known = accounts(view).next().is_some();
+    let has_joined = |learner| parts(view).any(|it| (it.1.who == PartName::Learner) == learner);
+    let learner = match view.learner.finished {
+        true => None,
+        false if is_known && !has_joined(true) => Some("no learner has joined yet".to_owned()),
+        false => silence("learner", view.learner_last_seen),
+    };
+    let actor = (is_known && !has_joined(false)).then(|| "no actor has joined yet".to_owned());
+    let mut notes: Vec<_> = learner.into_iter().chain(actor).collect();
+    notes.extend(unresponsive_actors(view));
+    notes
+}
+
+/// What to say of a replay server that reads its replay back.
+pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
+    format!("{server}: reads its replay back from disk, {progress}")
+}
+
+/// What to say of a process that answered last so long ago; nothing of one that answered just now.
+fn silence(process: &str, last_seen: Instant) -> Option<String> {
+    let silent = last_seen.elapsed();
+    (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
+}
+
+/// For how many seconds a connected part has said nothing, where that is worth a sentence.
+fn silent_for(part: &PartStatus) -> Option<f64> {
+    let silent = part.heard_s.unwrap_or(part.since_s);
+    let doing = part.doing.as_ref();
+    let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
+    (part.connected && silent > UNRESPONSIVE_S && says > UNRESPONSIVE_S && part.held_s.is_none())
+        .then_some(silent)
+}
+
+/// Actors that are gone or unresponsive, a few words each; the first of them.
+fn unresponsive_actors(view: &RunView) -> Vec<String> {
+    let words = |part: &PartStatus| match silent_for(part) {
+        _ if part.who == PartName::Learner => None,
+        _ if !part.connected && view.replay.finished => None,
+        _ if !part.connected => Some(format!("{}: gone for {}", part.who, seconds(part.since_s))),
+        Some(silent) => Some(format!("{}: no answer for {}", part.who, seconds(silent))),
+        None => None,
+    };
+    let mut words: Vec<_> = parts(view).filter_map(|it| words(it.1)).collect();
+    let more = words.len().saturating_sub(NAMED_MAX);
+    if more > 0 {
+        words.truncate(NAMED_MAX);
+        words.push(format!("and {more} more actors"));
+    }
+    words
+}
+
+/// A time in seconds for a person.
+pub(super) fn seconds(seconds: f64) -> String {
+    duration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_protocol::ReplayStatus;
+    use expect_test::expect;
+
+    use super::*;
+    use crate::run_view::Plan;
+
+    /// A run whose only replay server does not answer any more; `waiting` is what it answered last.
+    fn silent(is_gone: bool, waiting: Waiting) -> RunView {
+        let mut view = RunView::new(Plan::default());
+        view.take_replay(vec![ReplayStatus {
+            waiting,
+            ..ReplayStatus::default()
+        }]);
+        view.servers = vec![ServerAnswer {
+            name: "replay-server".into(),
+            endpoint: "tcp/host:1".into(),
+            replay: None,
+            parts: None,
+            recovering: None,
+            error: Some("no answer".into()),
+            is_gone,
+            is_another_run: false,
+        }];
+        view
+    }
+
+    #[test]
+    fn a_server_that_ended_is_told_from_one_that_stands_still() {
+        let said = [
+            (false, Waiting::Nobody),
+            (true, Waiting::Nobody),
+            (true, Waiting::Finished),
+        ]
+        .map(|(is_gone, waiting)| needed(&silent(is_gone, waiting)).join("; "));
+        expect![[r#"
+            the replay server on tcp/host:1 does not answer (no answer): its process may be suspended, or its machine unreachable
+            the replay server on tcp/host:1 has exited: restart it unless the run is complete
+        "#]]
+        .assert_eq(&said.join("\n"));
+        assert!(silent(true, Waiting::Finished).is_over());
+    }
+}

@@ -1,0 +1,17 @@
+//! Looking at a run: one poller asks its processes, and what it finds is shown as live lines, as a page, as JSON and to Prometheus.
+
+mod advice;
+mod export;
+mod live;
+mod page;
+mod poll;
+
+pub(crate) use self::{
+    advice::{needed, notes, recovery},
+    export::{PrometheusFile, json},
+    page::page,
+};
+pub use self::{
+    live::{Display, TEMPLATE, loss_title},
+    poll::{Poller, Reached},
+};

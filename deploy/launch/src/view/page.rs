@@ -1,0 +1,186 @@
+//! A run as a page of text: `driml status` and `driml watch --once`.
+
+use driml_protocol::{LogStatus, PartStatus, Waiting, Warning};
+
+use super::{
+    advice::{needed, seconds, waits},
+    live::progress,
+};
+use crate::run_view::{RunView, ServerAnswer};
+
+/// Actors that have a line of their own; of the others it is said how many there are.
+const ACTORS_MAX: usize = 64;
+
+/// Age from which on the page tells how old a process's own report is, seconds.
+const REPORT_AGE_MAX: f64 = 10.0;
+
+/// The page.
+pub(crate) fn page(view: &RunView) -> String {
+    let (replay, plan, moment) = (&view.replay, &view.plan, view.moment());
+    let is_known = view.is_answered() || view.is_gone();
+    let mut page = format!(
+        "{}, {}: {} of {}\n",
+        plan.world,
+        plan.agent,
+        progress(plan, &moment, is_known),
+        plan.replay_ratio_planned
+    );
+    let counts = [
+        ("lost", replay.transitions_lost),
+        ("stored twice", replay.transitions_duplicated),
+        ("chunks sent again", replay.chunks_retried),
+        ("batches asked again", replay.batches_retried),
+        ("messages refused", replay.messages_refused),
+    ];
+    page += &counts.map(|(what, n)| format!("{what} {n}")).join("  ");
+    let mut waits = waits(view);
+    if waits.is_empty() {
+        waits.push(Waiting::Nobody.to_string());
+    }
+    page += &format!("\n{}\n\n", waits.join("; "));
+
+    let head = "process,state,activity,last seen,held,weights,lives";
+    let mut rows = vec![head.split(',').map(str::to_owned).collect()];
+    let mut notes = Vec::new();
+    for server in &view.servers {
+        rows.push(server_row(server, view.servers.len()));
+        let Some(account) = &server.parts else {
+            continue;
+        };
+        let log = account.log.as_ref();
+        notes.extend(log.map(|log| log_line(server, log, view.servers.len())));
+        notes.extend(warning("replay-server", account.last_warning.as_ref()));
+        for part in account.parts.iter().take(ACTORS_MAX + 1) {
+            rows.push(part_row(part));
+            notes.extend(warning(&part.who.to_string(), part.last_warning.as_ref()));
+        }
+        if let more @ 1.. = account.parts.len().saturating_sub(ACTORS_MAX + 1) {
+            rows.push(vec![format!("and {more} more actors")]);
+        }
+    }
+    page += &table(&rows);
+    for note in notes {
+        page += &format!("\n{note}\n");
+    }
+    page.push('\n');
+    let needed = needed(view);
+    page += match needed.is_empty() {
+        _ if view.is_finished() => "the run is over: everything is learned and saved\n",
+        _ if view.is_over() => "the run is over: all frames were stored and sampled\n",
+        true => "nothing is missing\n",
+        false => "",
+    };
+    for needed in &needed {
+        page += &format!("to do: {needed}\n");
+    }
+    page
+}
+
+fn warning(who: &str, warning: Option<&Warning>) -> Option<String> {
+    let warning = warning?;
+    let age = seconds(warning.age_s);
+    Some(format!("{who} warned {age} ago: {}", warning.text))
+}
+
+/// How the log of a replay server that keeps its replay on disk stands.
+fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
+    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
+    let name = match of {
+        1 => "replay on disk".to_owned(),
+        _ => format!("{}, replay on disk", server.endpoint),
+    };
+    let most = log
+        .bytes_max
+        .map_or(String::new(), |max| format!(" of at most {:.1}", mib(max)));
+    let bytes = mib(log.bytes);
+    let flushed = seconds(log.flushed_s);
+    let mut line = format!(
+        "{name}: {bytes:.1} MiB{most} in {}, flushed {flushed} ago",
+        log.folder
+    );
+    if let Some((since, why)) = &log.refused {
+        let since = seconds(*since);
+        line += &format!(
+            "; REFUSED for {since} ({why}): nothing is taken or served. If the replay server dies now, "
+        );
+        // What a disk that refuses costs then.
+        line += &match log.unwritten_bytes {
+            0 => "nothing is lost".to_owned(),
+            bytes => format!(
+                "it forgets who joined or left and what was drawn since, {bytes} bytes, and no transition"
+            ),
+        };
+    }
+    line
+}
+
+fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
+    let name = match of {
+        1 => "replay-server".to_owned(),
+        _ => server.endpoint.clone(),
+    };
+    if let Some(progress) = server.recovering {
+        return vec![name, "reads its replay back".into(), progress.to_string()];
+    }
+    let Some(account) = &server.parts else {
+        let state = match server.is_gone {
+            true => "has ended",
+            false => "does not answer",
+        };
+        return vec![name, state.into()];
+    };
+    let does = format!(
+        "{} chunks ({:.1} MiB) and {} requests wait",
+        account.chunks_waiting,
+        account.chunk_bytes_waiting as f64 / f64::from(1 << 20),
+        account.requests_waiting
+    );
+    let weights = account.weights_age_s.map_or("none yet".into(), |age| {
+        format!("{}, {} old", account.weights_version, seconds(age))
+    });
+    let state = format!("up for {}", seconds(account.up_s));
+    vec![name, state, does, String::new(), String::new(), weights]
+}
+
+fn part_row(part: &PartStatus) -> Vec<String> {
+    let state = match part.connected {
+        true => format!("there for {}", seconds(part.since_s)),
+        false => format!("GONE for {}", seconds(part.since_s)),
+    };
+    let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
+    let doing = part
+        .doing
+        .as_ref()
+        .map_or("-".into(), |(doing, since, said)| {
+            let doing = format!("{doing} since {}", seconds(*since));
+            match *said > REPORT_AGE_MAX {
+                true => format!("{doing} (reported {} ago)", seconds(*said)),
+                false => doing,
+            }
+        });
+    vec![
+        part.who.to_string(),
+        state,
+        doing,
+        ago(part.heard_s),
+        part.held_s.map_or("-".into(), seconds),
+        part.weights_version.map_or("-".into(), |it| it.to_string()),
+        part.lives.to_string(),
+    ]
+}
+
+/// Rows with columns as wide as their widest cell.
+fn table(rows: &[Vec<String>]) -> String {
+    let width = |column| {
+        let cells = rows.iter().filter_map(|row: &Vec<String>| row.get(column));
+        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+    };
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().enumerate();
+        let cells: Vec<_> = cells
+            .map(|(column, cell)| format!("{cell:0$}", width(column)))
+            .collect();
+        format!("{}\n", cells.join("  ").trim_end())
+    };
+    rows.iter().map(line).collect()
+}

@@ -1,0 +1,242 @@
+//! The one poller: asks the processes of a run how they are, as any client would, and keeps what they answer in a [`RunView`].
+//! It judges nothing and changes nothing.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use driml_machine::error::usage;
+use driml_protocol::{
+    CodecError, EpisodesReply, EpisodesRequest, Hello, Keys, LearnerStatus, PartsStatus,
+    Recovering, ReplayStatus, RunClient, join, reach,
+    session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
+    tls::Credentials,
+};
+use driml_settings::config::RunConfig;
+use zenoh::{Session, Wait};
+
+use crate::run_view::{Plan, RunView, ServerAnswer};
+
+/// How long an answer may take; a process that is busy answers the next time.
+const ANSWER_MAX: Duration = Duration::from_secs(3);
+
+/// A replay server and the session to it.
+#[derive(Debug)]
+pub struct Reached {
+    /// What it is called in messages.
+    pub name: String,
+    /// Where it listens.
+    pub endpoint: String,
+    /// The session.
+    pub session: Session,
+}
+
+/// Asks a run's processes.
+pub struct Poller {
+    /// The run's settings.
+    pub config: RunConfig,
+    /// What they have answered.
+    pub view: RunView,
+    /// One for each shard of the replay.
+    servers: Vec<Server>,
+}
+
+struct Server {
+    name: String,
+    endpoint: String,
+    client: RunClient,
+}
+
+impl Poller {
+    /// Of the run with these settings, whose replay servers are reached already, one for each shard.
+    pub fn new(config: &RunConfig, servers: Vec<Reached>, keys: &Keys) -> Self {
+        let spec_hash = config.run.hash();
+        let server = |it: Reached| Server {
+            client: RunClient::new(it.session, keys.clone(), spec_hash),
+            name: it.name,
+            endpoint: it.endpoint,
+        };
+        Self {
+            view: RunView::new(Plan::of(config)),
+            config: config.clone(),
+            servers: servers.into_iter().map(server).collect(),
+        }
+    }
+
+    /// Connects to the replay servers at `endpoints`, with an observer's certificate where they want one.
+    ///
+    /// # Errors
+    /// Nothing listens there, or something that is not a replay server of this program and namespace.
+    pub fn open(
+        endpoints: &[String],
+        namespace: &str,
+        credentials: Option<&Credentials>,
+    ) -> anyhow::Result<Self> {
+        let keys = Keys::new(namespace).map_err(driml_machine::error::Usage)?;
+        let mut servers = Vec::new();
+        let mut first: Option<Greeting> = None;
+        for endpoint in endpoints {
+            let reached = Endpoints {
+                listen: Vec::new(),
+                connect: vec![endpoint.clone()],
+            };
+            // An observer does not wait for a server that is still to come.
+            reach::look(endpoint)?;
+            let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
+            let greeting = greeting(&session, &keys, endpoint, namespace)?;
+            let hash = greeting.config.run.hash();
+            if first.get_or_insert(greeting).config.run.hash() != hash {
+                return Err(usage!(
+                    "{} and {endpoint} are of different runs: name the replay shards of one",
+                    endpoints[0]
+                )
+                .into());
+            }
+            servers.push(Reached {
+                name: endpoint.clone(),
+                endpoint: endpoint.clone(),
+                session,
+            });
+        }
+        let first = first.context("no endpoint to ask")?;
+        let mut this = Self::new(&first.config, servers, &keys);
+        this.view.after_updates = first.after_updates;
+        Ok(this)
+    }
+
+    /// Asks all processes. Those that do not answer are named in the view.
+    pub fn ask(&mut self) -> &RunView {
+        let servers: Vec<_> = self.servers.iter().map(Server::ask).collect();
+        // The learner is asked through the first of them.
+        let first = self.servers.first();
+        let first = first.filter(|_| servers[0].replay.is_some());
+        let view = &mut self.view;
+        if let (None, Some(first)) = (view.after_updates, first) {
+            let hello = first.client.fetch::<Hello>(ANSWER_MAX);
+            let known = hello.ok().filter(|it| it.has_learner);
+            view.after_updates = known.map(|it| it.after_updates);
+        }
+        let learner = first.and_then(|it| it.client.fetch(ANSWER_MAX).ok());
+        view.take_learner(learner);
+        let shards: Option<Vec<_>> = servers.iter().map(|it| it.replay.clone()).collect();
+        if let Some(shards) = shards {
+            view.take_replay(shards);
+        }
+        view.servers = servers;
+        if view.recovering().next().is_some() {
+            // It is there, and no other process can be asked through it.
+            (view.replay_last_seen, view.learner_last_seen) = (Instant::now(), Instant::now());
+        }
+        view
+    }
+
+    /// Asks the replay servers for their counts alone.
+    ///
+    /// # Errors
+    /// No answer in time, or one that is not of this run.
+    pub fn ask_replay(&mut self) -> anyhow::Result<()> {
+        let answers = self.servers.iter().map(|it| it.client.fetch(ANSWER_MAX));
+        let shards = answers.collect::<Result<Vec<ReplayStatus>, _>>()?;
+        self.view.take_replay(shards);
+        Ok(())
+    }
+
+    /// Asks the learner alone.
+    ///
+    /// # Errors
+    /// No answer in time, or one that is not of this run.
+    pub fn ask_learner(&mut self) -> anyhow::Result<()> {
+        let first = self.servers.first();
+        let first = first.context("a run has at least one replay server")?;
+        let learner: LearnerStatus = first.client.fetch(ANSWER_MAX)?;
+        self.view.take_learner(Some(learner));
+        Ok(())
+    }
+
+    /// Asks a shard for the episodes that ended after the first `since`.
+    pub(crate) fn episodes(&self, shard: usize, since: u64) -> Result<EpisodesReply, SessionError> {
+        let request = EpisodesRequest { since };
+        self.servers[shard].client.ask(&request, ANSWER_MAX)
+    }
+
+    /// Leaves the run; the last answers stay.
+    pub fn close(&self) {
+        for server in &self.servers {
+            if let Err(e) = server.client.session().close().wait() {
+                tracing::debug!("closing the session: {e}");
+            }
+        }
+    }
+}
+
+impl Server {
+    fn ask(&self) -> ServerAnswer {
+        let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
+        let answers = replay.and_then(|it| Ok((it, self.client.fetch::<PartsStatus>(ANSWER_MAX)?)));
+        let is_another_run = matches!(
+            &answers,
+            Err(SessionError::Unreadable {
+                why: CodecError::RunSpec { .. },
+                ..
+            })
+        );
+        let (answers, recovering, error) = match answers {
+            Ok(answers) => (Some(answers), None, None),
+            Err(SessionError::Recovering(it)) => (None, Some(it.progress), None),
+            Err(e) => (None, None, Some(e.to_string())),
+        };
+        let (replay, parts) = answers.unzip();
+        ServerAnswer {
+            name: self.name.clone(),
+            endpoint: self.endpoint.clone(),
+            replay,
+            parts,
+            recovering,
+            is_gone: error.is_some() && reach::look(&self.endpoint).is_err(),
+            error,
+            is_another_run,
+        }
+    }
+}
+
+/// What a replay server says of its run to those who come.
+struct Greeting {
+    config: RunConfig,
+    /// Updates after which the run was resumed; none before its learner has joined.
+    after_updates: Option<u64>,
+}
+
+fn greeting(
+    session: &Session,
+    keys: &Keys,
+    endpoint: &str,
+    namespace: &str,
+) -> anyhow::Result<Greeting> {
+    let (config_toml, after_updates) = match join::hello_within(session, keys, ANSWER_MAX) {
+        Ok(hello) => {
+            let after_updates = hello.has_learner.then_some(hello.after_updates);
+            (hello.config_toml, after_updates)
+        }
+        Err(SessionError::Recovering(Recovering {
+            config_toml: Some(config_toml),
+            ..
+        })) => (config_toml, None),
+        Err(SessionError::Unreadable { why, .. }) => {
+            let what = format!("the greeting of the replay server on {endpoint}");
+            return Err(why).context(what);
+        }
+        Err(SessionError::Nobody { .. }) => {
+            return Err(usage!(
+                "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}"
+            )
+            .into());
+        }
+        Err(other) => {
+            let what = format!("the replay server on {endpoint} does not answer");
+            return Err(anyhow::Error::new(other).context(what));
+        }
+    };
+    Ok(Greeting {
+        config: RunConfig::parse("the replay server's settings", &config_toml)?,
+        after_updates,
+    })
+}
