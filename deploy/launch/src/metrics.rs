@@ -56,7 +56,7 @@ pub struct Member {
 pub const COLUMNS: &[Column] = &[
     Column {
         name: "seconds",
-        help: "Time since the run began, without the time in which it was interrupted.",
+        help: "Time since the run began, without interruptions.",
         unit: "seconds",
         plot_label: "Time",
         group: "run",
@@ -100,7 +100,7 @@ pub const COLUMNS: &[Column] = &[
     },
     Column {
         name: "replay_ratio",
-        help: "Rows sampled per transition stored, both counted from the end of the warm-up.",
+        help: "Rows sampled per transition stored, both since the warm-up.",
         unit: "rows sampled per transition",
         plot_label: "Replay ratio",
         group: "run",
@@ -140,7 +140,7 @@ pub const COLUMNS: &[Column] = &[
     },
     Column {
         name: "losses",
-        help: "The agent's auxiliary losses of the last update, by name, such as `dim_4t4`.",
+        help: "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
         unit: "auxiliary loss [nats]",
         plot_label: "Auxiliary loss",
         group: "learning",
@@ -179,7 +179,7 @@ pub const COLUMNS: &[Column] = &[
     },
     Column {
         name: "mean_k",
-        help: "Mean k of the rows served with a positive; of several positives the furthest counts.",
+        help: "Mean k of the rows served; of several positives the furthest.",
         unit: "k [environment steps]",
         plot_label: "How far ahead: k, mean since the start",
         group: "k",
@@ -235,7 +235,7 @@ pub const COLUMNS: &[Column] = &[
     },
     Column {
         name: "epsilon",
-        help: "Probability with which all actors act at random; empty where they differ in it.",
+        help: "Probability of a random action; empty where actors differ in it.",
         unit: "probability of a random action",
         plot_label: "Epsilon",
         group: "run",
@@ -283,7 +283,7 @@ pub const COLUMNS: &[Column] = &[
     },
     Column {
         name: "rss_mib",
-        help: "Resident memory of each process that `driml train` started, such as `rss_mib_actor_0`.",
+        help: "Resident memory of each process, such as `rss_mib_actor_0`.",
         unit: "resident memory [MiB]",
         plot_label: "Memory",
         group: "memory",
@@ -491,7 +491,7 @@ mod tests {
             "/../docs/src/reference/metrics.md"
         );
         let page = format!(
-            "# Metrics\n\n`metrics.csv` in the run folder has a row a second with these columns. `driml watch --once --json` has the same \
+            "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row a second with these columns. `driml watch --once --json` has the same \
              names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n{}",
             markdown()
         );
