@@ -114,7 +114,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
         system
             .run(&format!("{command} {endpoint}"))
             .expect_code(64)
-            .expect_said("it is no replay server with the namespace \"driml\"");
+            .expect_said("it is not a replay server with the namespace \"driml\"");
     }
 }
 

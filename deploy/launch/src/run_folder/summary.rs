@@ -79,7 +79,6 @@ pub struct Summary {
     pub seed: u64,
     /// Updates that were done when the run was resumed, the last time; 0 if it never was. Frames, updates,
     /// rows, episodes, mean return, seconds and mean k are of the whole run, all else is of what came since.
-    #[serde(default)]
     pub resumed_after_updates: u64,
     /// Frames that trained: transitions stored.
     pub frames: u64,
@@ -88,7 +87,6 @@ pub struct Summary {
     /// Transitions that the replay has stored.
     pub transitions_inserted: u64,
     /// Transitions that filled the replay again since the run was resumed last; they are in no other count.
-    #[serde(default)]
     pub transitions_refilled: u64,
     /// Transitions that actors produced and that never arrived.
     pub transitions_lost: u64,
@@ -100,17 +98,13 @@ pub struct Summary {
     pub replay_ratio: Option<f64>,
     /// Episodes that ended, in a resumed run those too in which the replay filled again.
     pub episodes: u64,
-    /// Rows served to a learner that died before it saved what it learned from them; they do not count as served. Older runs do
-    /// not say.
-    #[serde(default)]
+    /// Rows served to a learner that died before it saved what it learned from them; they do not count as served.
     pub rows_unlearned: u64,
     /// Updates that a learner with an older checkpoint has learned again.
-    #[serde(default)]
     pub updates_relearned: u64,
     /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
     pub mean_return: Option<f64>,
-    /// Of how many episodes that is: of fewer than 100 only if there were fewer. Older runs do not say.
-    #[serde(default)]
+    /// Of how many episodes that is: of fewer than 100 only if there were fewer.
     pub mean_return_of: u64,
     /// From the start of the first process to the end of the run.
     pub wall_seconds: f64,
@@ -122,8 +116,7 @@ pub struct Summary {
     pub mean_k: Option<f64>,
     /// How often each k was served; index 0 counts rows without a positive.
     pub k_histogram: Vec<u64>,
-    /// How often each action was taken; older runs do not say.
-    #[serde(default)]
+    /// How often each action was taken.
     pub action_histogram: Vec<u64>,
     /// Version of the last weights.
     pub weights_version: u64,
@@ -131,33 +124,26 @@ pub struct Summary {
     pub weights_sha256: String,
     /// Chunks recognised as a retry of a stored one.
     pub chunks_retried: u64,
-    /// Batches that did not reach the learner and were asked for again; older runs do not say.
-    #[serde(default)]
+    /// Batches that did not reach the learner and were asked for again.
     pub batches_retried: u64,
-    /// How often a replay server that had died was started again with what it had kept; older runs do not say.
-    #[serde(default)]
+    /// How often a replay server that had died was started again with what it had kept.
     pub replay_servers_restarted: u32,
-    /// How often an actor that had died was started again; what it had not delivered is in no count. Older runs do not say.
-    #[serde(default)]
+    /// How often an actor that had died was started again; what it had not delivered is in no count.
     pub actors_restarted: u32,
     /// Memory that the frames in the replay took at the end, MiB.
     pub replay_frame_mib: u64,
     /// Messages refused as malformed or foreign.
     pub messages_refused: u64,
-    /// Milliseconds from a chunk's arrival at the replay server until it was stored, waiting at the rate limiter included. Older
-    /// runs do not say, nor does lockstep.
-    #[serde(default)]
+    /// Milliseconds from a chunk's arrival at the replay server until it was stored, waiting at the rate limiter included; none
+    /// in lockstep.
     pub insert_ms: Option<Quantiles>,
     /// Seconds for which newer weights had been there when what older ones chose was stored; as above.
-    #[serde(default)]
     pub weights_behind_s: Option<Quantiles>,
     /// Updates by which the weights that acted were behind then; as above.
-    #[serde(default)]
     pub weights_behind_updates: Option<Quantiles>,
     /// Highest resident memory of each process, MiB.
     pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
     /// What its weights earn; none where they were not played.
-    #[serde(default)]
     pub played: Option<LastPlay>,
 }
 
