@@ -80,7 +80,8 @@ fn commands() -> String {
     for (name, command) in &found {
         let about = command.get_about().map(ToString::to_string).unwrap();
         let aliases: Vec<_> = command.get_visible_aliases().collect();
-        write!(page, "\n## `{name}`\n\n{about}.").unwrap();
+        let end = if about.ends_with('?') { "" } else { "." };
+        write!(page, "\n## `{name}`\n\n{about}{end}").unwrap();
         if !aliases.is_empty() {
             write!(page, " Alias: `{}`.", aliases.join("`, `")).unwrap();
         }
@@ -115,35 +116,38 @@ fn root() -> PathBuf {
         .into()
 }
 
-/// The page of settings: the base preset in full, and what each of the others is for.
+/// The presets of a folder: their names and files.
+fn presets(folder: &str) -> Vec<(String, PathBuf)> {
+    let folder = root().join("deploy/settings/presets").join(folder);
+    let files = fs::read_dir(folder).unwrap().map(|it| it.unwrap().path());
+    let name = |file: &Path| file.file_stem().unwrap().to_str().unwrap().to_owned();
+    let mut presets: Vec<_> = files.map(|file| (name(&file), file)).collect();
+    presets.sort();
+    presets
+}
+
+/// The page of settings: the base preset in full, and links to the others.
 fn settings() -> String {
-    let presets = root().join("deploy/settings/presets");
+    let base = root().join("deploy/settings/presets/base.toml");
     let mut page = format!("# Settings\n\n{GENERATED}\n\n");
     page += "Settings are layered: base, world, agent, preset, then `--set` and the flags. The result stands in the run's `config.toml`.\n\
         `driml presets --game bigfish --agent driml-fix` prints it with the source of every value.\n\n\
         ## Base\n\n```toml\n";
-    page += &fs::read_to_string(presets.join("base.toml")).unwrap();
-    page += "```\n";
-    for (folder, title) in [
-        ("variant", "Presets"),
-        ("agent", "Agents"),
-        ("world", "Worlds"),
-    ] {
-        write!(page, "\n## {title}\n\n").unwrap();
-        let mut files: Vec<_> = fs::read_dir(presets.join(folder))
-            .unwrap()
-            .map(|it| it.unwrap().path())
-            .collect();
-        files.sort();
-        for file in files {
-            let text = fs::read_to_string(&file).unwrap();
-            let name = file.file_stem().unwrap().to_str().unwrap();
-            let first = text.lines().next().unwrap().trim_start_matches("# ");
-            let first = first.strip_prefix(&format!("{name}: ")).unwrap_or(first);
-            let first = first.split_inclusive(". ").next().unwrap().trim();
-            let link = format!("../../../settings/presets/{folder}/{name}.toml");
-            writeln!(page, "* [`{name}`]({link}): {first}").unwrap();
-        }
+    page += &fs::read_to_string(base).unwrap();
+    page += "```\n\n## Presets\n\n";
+    let link = |folder, name| format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)");
+    for (name, file) in presets("variant") {
+        let text = fs::read_to_string(&file).unwrap();
+        let first = text.lines().next().unwrap().trim_start_matches("# ");
+        let first = first.split_inclusive(". ").next().unwrap().trim();
+        writeln!(page, "* {}: {first}", link("variant", &name)).unwrap();
+    }
+    for (folder, title) in [("agent", "Agents"), ("world", "Worlds")] {
+        let links = presets(folder)
+            .into_iter()
+            .map(|(name, _)| link(folder, &name));
+        let links: Vec<_> = links.collect();
+        write!(page, "\n## {title}\n\n{}\n", links.join(", ")).unwrap();
     }
     page
 }
