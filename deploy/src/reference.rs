@@ -135,7 +135,9 @@ fn settings() -> String {
         ## Base\n\n```toml\n";
     page += &fs::read_to_string(base).unwrap();
     page += "```\n\n## Presets\n\n";
-    let link = |folder, name| format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)");
+    let link = |folder: &str, name: &str| {
+        format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)")
+    };
     for (name, file) in presets("variant") {
         let text = fs::read_to_string(&file).unwrap();
         let first = text.lines().next().unwrap().trim_start_matches("# ");

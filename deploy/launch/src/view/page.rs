@@ -171,9 +171,12 @@ fn part_row(part: &PartStatus) -> Vec<String> {
 
 /// Rows with columns as wide as their widest cell.
 fn table(rows: &[Vec<String>]) -> String {
-    let width = |column| {
+    let width = |column: usize| {
         let cells = rows.iter().filter_map(|row: &Vec<String>| row.get(column));
-        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+        cells
+            .map(|cell: &String| cell.chars().count())
+            .max()
+            .unwrap_or(0)
     };
     let line = |row: &Vec<String>| {
         let cells = row.iter().enumerate();
