@@ -66,7 +66,6 @@ pub(crate) enum Command {
     Parity(ParityArgs),
     /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
     Plot(PlotArgs),
-    #[command(visible_alias = "sweep")]
     /// Train with every combination of settings, several seeds each: a table and a plot
     #[command(visible_alias = "grid")]
     Sweep(SweepArgs),
