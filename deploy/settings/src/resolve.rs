@@ -132,6 +132,7 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
         // A key that was not there may be an optional one. The type of its table decides.
         if new {
             let mut derived = tried.clone();
+            derived::precision(&mut derived, false);
             let read = derive(&mut derived).and_then(|()| parts_read(&derived));
             if read.is_err_and(|e| e.0.contains("unknown field")) {
                 return Err(one.unknown(table));
