@@ -209,7 +209,7 @@ fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
     client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
     let mut second = system.start_actor(3);
     second.wait_for_stderr(
-        "another process is actor 3 of this run: give each actor a number of its own",
+        "another process is actor 3 of this run: give each actor another number (--id)",
     );
     let before = client.replay().unwrap();
     client.wait_for_replay("more of the first", |replay| {

@@ -1,7 +1,5 @@
 //! Why a world could not be made or stepped.
 
-use crate::worlds::exec::protocol::{ExecError, Fault};
-
 /// Why a world could not be made or stepped.
 #[derive(Debug, thiserror::Error)]
 pub enum EnvError {
@@ -57,4 +55,30 @@ impl From<ExecError> for EnvError {
     fn from(error: ExecError) -> Self {
         Self::Exec(Box::new(error))
     }
+}
+
+/// Why a world's process cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("the world `{command}` {fault}{words}")]
+pub struct ExecError {
+    /// The command, as `--env` has it after `exec:`.
+    pub command: String,
+    /// What is wrong.
+    pub fault: Fault,
+    /// The last lines that it wrote to stderr, as the message ends with them; empty if it wrote none.
+    pub words: String,
+}
+
+/// What is wrong with a world's process.
+#[derive(Debug, thiserror::Error)]
+pub enum Fault {
+    /// It ended by itself, or was killed as it did not answer.
+    #[error("{0}")]
+    Dead(String),
+    /// It offers to save its state, and found that it cannot: why, in its own words.
+    #[error("cannot save its state: {0}")]
+    NotSaved(String),
+    /// It is not the world that was asked for, does what no world may, or the operating system reports an error.
+    #[error("{0}")]
+    Other(String),
 }

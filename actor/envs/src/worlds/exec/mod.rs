@@ -3,7 +3,7 @@
 //! What is said to the process and what it answers is in `protocol`.
 
 mod process;
-pub(crate) mod protocol;
+mod protocol;
 #[cfg(test)]
 mod tests;
 mod world;
@@ -20,8 +20,8 @@ use crate::copies::{RngUse, copy_rng};
 use crate::environment::FrameShape;
 use crate::error::EnvError;
 
-pub use self::protocol::ExecError;
 pub use self::world::ExecWorld;
+pub use crate::error::ExecError;
 
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;

@@ -17,7 +17,7 @@ use nix::unistd::Pid;
 use serde::Serialize;
 use tracing::Level;
 
-use super::protocol::{ExecError, Fault};
+use crate::error::{ExecError, Fault};
 
 const SHELL: &str = "/bin/sh";
 

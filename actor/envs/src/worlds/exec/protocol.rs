@@ -46,34 +46,8 @@ use serde::{Deserialize, Serialize};
 
 use super::ExecConfig;
 use crate::environment::FrameShape;
-use crate::error::EnvError;
+use crate::error::{EnvError, Fault};
 use crate::saved;
-
-/// Why a world's process cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("the world `{command}` {fault}{words}")]
-pub struct ExecError {
-    /// The command, as `--env` has it after `exec:`.
-    pub command: String,
-    /// What is wrong.
-    pub fault: Fault,
-    /// The last lines that it wrote to stderr, as the message ends with them; empty if it wrote none.
-    pub words: String,
-}
-
-/// What is wrong with a world's process.
-#[derive(Debug, thiserror::Error)]
-pub enum Fault {
-    /// It ended by itself, or was killed as it did not answer.
-    #[error("{0}")]
-    Dead(String),
-    /// It offers to save its state, and found that it cannot: why, in its own words.
-    #[error("cannot save its state: {0}")]
-    NotSaved(String),
-    /// It is not the world that was asked for, does what no world may, or the operating system reports an error.
-    #[error("{0}")]
-    Other(String),
-}
 
 /// The protocol's version. A process that speaks another is refused.
 pub(super) const VERSION: u64 = 1;

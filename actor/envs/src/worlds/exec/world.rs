@@ -4,13 +4,11 @@
 use tracing::Level;
 
 use super::process::{Patience, WorldProcess};
-use super::protocol::{
-    Block, ExecError, Fault, Opening, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
-};
+use super::protocol::{Block, Opening, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX};
 use super::{ExecConfig, in_words, introduce, seeds};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
-use crate::error::EnvError;
+use crate::error::{EnvError, ExecError, Fault};
 use crate::settings::{Variants, WorldSettings};
 
 /// Says that the actions lie in the block.

@@ -218,7 +218,10 @@ fn settings_are_read_in_full_or_not_at_all() {
     };
     assert!(error(&text.replace("num_levels = 500\n", "")).contains("missing field `num_levels`"));
     assert!(error(&format!("{text}\nlevels = 1")).contains("unknown field `levels`"));
-    assert!(error(&text.replace("\"maze\"", "\"mase\"")).contains("unknown variant `mase`, expected one of"));
+    assert!(
+        error(&text.replace("\"maze\"", "\"mase\""))
+            .contains("unknown variant `mase`, expected one of")
+    );
     assert!(error(&text.replace("\"easy\"", "\"medium\"")).contains("medium"));
 }
 
