@@ -207,7 +207,7 @@ fn chunks_that_make_no_sense_in_this_run() {
     served.client.join_as_actor(0, 10);
     assert_eq!(served.client.insert(&second_life), stored(18));
     let late = served.sealed(&served.chunk(2));
-    served.refuses_chunks([(late, "give each actor a number of its own")]);
+    served.refuses_chunks([(late, "give each actor another number (--id)")]);
 }
 
 #[test]
