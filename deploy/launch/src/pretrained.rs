@@ -22,7 +22,16 @@ const PREFIX: &str = "pretrained:";
 const EXTENSION: &str = "safetensors";
 /// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and the line
 /// `("GAME", include_bytes!("../../pretrained/GAME.safetensors")),`.
-const BUILT_IN: &[(&str, &[u8])] = &[];
+const BUILT_IN: &[(&str, &[u8])] = &[
+    (
+        "coinrun",
+        include_bytes!("../../pretrained/coinrun.safetensors"),
+    ),
+    (
+        "starpilot",
+        include_bytes!("../../pretrained/starpilot.safetensors"),
+    ),
+];
 
 /// The key of [`Exported`] in the file's description.
 const EXPORTED: &str = "exported";
