@@ -5,16 +5,14 @@ mod folder;
 mod run_of_folder;
 mod watched;
 
-use std::{
-    path::PathBuf,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
 use driml_protocol::Seldom;
 
 pub use self::run_of_folder::{Live, endpoints_of};
+pub use self::watched::Outputs;
 use self::watched::Watched;
 use crate::{
     console,
@@ -29,17 +27,6 @@ const POLL: Duration = Duration::from_secs(1);
 const LAST_POLL: Duration = Duration::from_millis(200);
 /// How often a page is shown anew.
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
-
-/// What is left of a run that is watched.
-#[derive(Clone, Debug, Default)]
-pub struct Outputs {
-    /// Where settings, metrics and summary go; none to only look.
-    pub run_dir: Option<RunFolder>,
-    /// Write TensorBoard's events there, too.
-    pub tensorboard: bool,
-    /// Where the metrics go in Prometheus' text format, at each answer.
-    pub prometheus: Option<PathBuf>,
-}
 
 /// How a run is looked at, a page at a time.
 #[derive(Clone, Copy, Debug, Default)]

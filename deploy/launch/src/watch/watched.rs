@@ -1,17 +1,20 @@
 //! A run that is watched, as far as its answers tell: what is shown of it, what is recorded, and when it is over.
 //! It asks for no more than the episodes that it records.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use anyhow::bail;
 use driml_machine::units::duration;
 use driml_protocol::Waiting;
 
-use super::{Outputs, folder};
+use super::folder;
 use crate::{
     console::{self, Screen},
     moment::Moment,
-    run_folder::{Outcome, RunRecorder, Summary},
+    run_folder::{Outcome, RunFolder, RunRecorder, Summary},
     run_view::RunView,
     view::{Display, Poller, TEMPLATE, notes},
 };
@@ -20,6 +23,17 @@ use crate::{
 const FAREWELL_MAX: Duration = Duration::from_secs(5);
 /// Most seconds of a run's clock that are shown: ten years.
 const UP_MAX: f64 = 315_360_000.0;
+
+/// What is left of a run that is watched.
+#[derive(Clone, Debug, Default)]
+pub struct Outputs {
+    /// Where settings, metrics and summary go; none to only look.
+    pub run_dir: Option<RunFolder>,
+    /// Write TensorBoard's events there, too.
+    pub tensorboard: bool,
+    /// Where the metrics go in Prometheus' text format, at each answer.
+    pub prometheus: Option<PathBuf>,
+}
 
 /// A run that is watched.
 pub(super) struct Watched {

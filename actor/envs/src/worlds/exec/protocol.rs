@@ -44,7 +44,7 @@ use nix::fcntl::{FcntlArg, SealFlag, fcntl};
 use nix::sys::memfd::{MFdFlags, memfd_create};
 use serde::{Deserialize, Serialize};
 
-use super::ExecConfig;
+use super::config::ExecConfig;
 use crate::environment::FrameShape;
 use crate::error::{EnvError, Fault};
 use crate::saved;

@@ -4,6 +4,7 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
+use super::declaration::seeds;
 use super::protocol::SavedExec;
 use super::*;
 use crate::environment::{Environment, FrameShape, StepEnd};

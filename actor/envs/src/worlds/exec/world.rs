@@ -3,9 +3,10 @@
 
 use tracing::Level;
 
+use super::config::{ExecConfig, in_words};
+use super::declaration::{introduce, seeds};
 use super::process::{Patience, WorldProcess};
 use super::protocol::{Block, Opening, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX};
-use super::{ExecConfig, in_words, introduce, seeds};
 use crate::copies::{check_num_envs, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::{EnvError, ExecError, Fault};
