@@ -182,9 +182,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
 
 /// Plays and queues what was played until `shutdown`, or until nobody wants more. `chunk_steps` says how many steps a chunk has,
 /// of the number of actors in the run.
-///
-/// # Errors
-/// A world that fails; what was queued before is still to be delivered.
 fn play(
     collector: &mut Collector,
     chunk_steps: impl Fn(u32) -> u32,

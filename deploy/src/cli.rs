@@ -46,13 +46,13 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     #[command(visible_alias = "local", after_help = EXAMPLES)]
-    /// Train on this machine: start all parts, show how it goes, leave a run folder
+    /// Train on this machine: start all processes, show progress, write a run folder
     Train(TrainArgs),
-    /// One actor of a run whose replay server is reached at ENDPOINT
+    /// Run one actor of a run whose replay server is at ENDPOINT
     Actor(ActorArgs),
-    /// The replay server of a run; the other parts connect to it and take its settings
+    /// Run the replay server; the other processes connect to it and take its settings
     ReplayServer(ReplayServerArgs),
-    /// The learner of a run whose replay server is reached at ENDPOINT
+    /// Run the learner of a run whose replay server is at ENDPOINT
     Learner(LearnerArgs),
     /// Show a run's processes, what waits, and how to unblock it: `watch --once`
     Status(StatusArgs),
@@ -60,7 +60,7 @@ pub(crate) enum Command {
     Watch(WatchArgs),
     /// Play whole episodes with the weights of a run or of a pretrained network, beside a random policy
     Evaluate(EvaluateArgs),
-    /// What a world and an agent build, compute and send, what it would be if everything were on, and why
+    /// Show what a configuration builds, computes and sends, beside the same with every feature on
     Inspect(InspectArgs),
     /// Check the learner's arithmetic against updates computed elsewhere in float64
     Parity(ParityArgs),
@@ -74,13 +74,12 @@ pub(crate) enum Command {
     Experiment(ExperimentCommand),
     /// Measure what each setting that buys speed costs in accuracy: benches, short trainings, a page
     Tradeoff(TradeoffArgs),
-    /// Measure how fast the parts are, alone and beside what others use
+    /// Measure the speed of learner, policy, replay and whole runs, also beside PyTorch and Reverb
     Bench(BenchArgs),
     /// List presets, agents and what differs by game; or print the settings of one game and agent with their sources
     Presets(PresetsArgs),
-    /// What this machine can do and what it lacks, for training on the CPU and on a GPU
+    /// Check this machine for training on the CPU and on a GPU
     Doctor(DoctorArgs),
-    /// Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
     /// Print what a shell needs to complete driml's commands, such as `driml completions bash > driml.bash`

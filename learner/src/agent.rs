@@ -285,9 +285,6 @@ impl Agent {
     }
 
     /// Checks that `batch` is one of this network's and objective's.
-    ///
-    /// # Errors
-    /// [`UpdateError::Batch`] with what is wrong with it.
     pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
         batch.validate(&self.model, self.settings.objective.positives())
     }

@@ -39,9 +39,6 @@ impl Bellman<'_> {
     /// The target of this batch, whose noisy layers have this noise.
     ///
     /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
-    ///
-    /// # Errors
-    /// Values or distributions that are not finite; states that do not fit the networks.
     pub(crate) fn target(
         &self,
         batch: &Batch<'_>,

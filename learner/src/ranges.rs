@@ -9,9 +9,6 @@ use crate::error::UpdateError;
 pub(crate) const TAU: RangeInclusive<f64> = 1e-5..=1.0;
 
 /// Checks that a setting is in its range; NaN is not.
-///
-/// # Errors
-/// [`UpdateError::Settings`] with the setting, its value and its range.
 pub(crate) fn check_range(
     name: &str,
     value: f64,

@@ -125,9 +125,6 @@ impl Patience {
     }
 
     /// Takes note that a try failed; says now and then what is waited for.
-    ///
-    /// # Errors
-    /// Nobody has answered for too long. A server that reads its replay back does answer.
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
         match e {
             SessionError::Recovering(recovering) => {

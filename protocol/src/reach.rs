@@ -133,9 +133,6 @@ fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
 }
 
 /// Waits until something accepts connections at one of `endpoints`.
-///
-/// # Errors
-/// Nothing does after `wait_max`, or never will.
 pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(), Unreachable> {
     let (started, [mut pause, pause_max]) = (Instant::now(), PAUSES);
     let mut said = false;

@@ -372,9 +372,6 @@ impl PendingBytes {
     }
 
     /// Waits for the one answer that `read` takes. Where there are no certificates others may answer too, what they like.
-    ///
-    /// # Errors
-    /// As [`PendingBytes::wait`]; nothing that `read` takes.
     pub(crate) fn wait_for<T>(
         &mut self,
         read: impl Fn(&ZBytes) -> Result<T, CodecError>,
@@ -388,9 +385,6 @@ impl PendingBytes {
     }
 
     /// [`PendingBytes::wait_for`] at most for `wait_max`; `None` if it has not come by then.
-    ///
-    /// # Errors
-    /// As there.
     pub(crate) fn wait_for_within<T>(
         &mut self,
         wait_max: Duration,

@@ -16,7 +16,6 @@ use crate::waiting::{DEADLINE, wait_for};
 
 /// The prefix of a run's keys unless a part is told otherwise.
 const NAMESPACE: &str = "driml";
-/// One answer.
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
 /// An open session and what the replay server said of its run.

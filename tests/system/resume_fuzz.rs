@@ -21,9 +21,7 @@ const RATIO: u64 = 8;
 /// How the first life ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Stop {
-    /// By itself.
     End,
-    /// Ctrl-C.
     Interrupt,
     /// The launcher is killed; its processes end by themselves.
     KillLauncher,

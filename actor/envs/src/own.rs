@@ -62,9 +62,6 @@ pub struct OwnWorld {
 
 impl OwnWorld {
     /// Reads the settings of a registered world; `None` if nobody registered its `kind`.
-    ///
-    /// # Errors
-    /// Settings that the world's own type does not take.
     pub(crate) fn read(table: &Table) -> Option<Result<Self, toml::de::Error>> {
         let name = table.get("kind").and_then(Value::as_str)?;
         let found = {

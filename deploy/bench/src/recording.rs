@@ -56,7 +56,6 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Plays.
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;

@@ -54,9 +54,6 @@ pub(crate) struct Session {
 
 impl Session {
     /// Opens the folder, or makes it. `units` is the work of all pieces together.
-    ///
-    /// # Errors
-    /// A folder whose pieces were made with other settings, a file system that refuses.
     pub(crate) fn open(
         name: &str,
         flags: &ExperimentFlags,
@@ -90,9 +87,6 @@ impl Session {
     }
 
     /// [`Session::open`] of a sweep. For a report alone it makes no folder; runs that lie in one with their calls are enough.
-    ///
-    /// # Errors
-    /// A report where nothing was made yet; as for [`Session::open`].
     pub(crate) fn open_queue(
         name: &str,
         flags: &ExperimentFlags,
@@ -120,9 +114,6 @@ impl Session {
     }
 
     /// Keeps a piece that took no time.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
         let kept = Kept {
             of: String::new(),
@@ -154,9 +145,6 @@ impl Session {
     }
 
     /// The piece of this name, which is `units` of work: read if it is there, else made and kept.
-    ///
-    /// # Errors
-    /// What `make` says; an interrupt; a file system that refuses.
     pub(crate) fn piece<T: Serialize + DeserializeOwned>(
         &mut self,
         key: &str,
@@ -167,9 +155,6 @@ impl Session {
     }
 
     /// [`Session::piece`] that was made of something which may have changed since, and then is made anew: `of` names it.
-    ///
-    /// # Errors
-    /// As for [`Session::piece`].
     pub(crate) fn piece_of<T: Serialize + DeserializeOwned>(
         &mut self,
         of: &str,
@@ -208,9 +193,6 @@ impl Session {
     }
 
     /// Writes a table as `name.csv`.
-    ///
-    /// # Errors
-    /// The file system refuses.
     pub(crate) fn csv(&self, name: &str, table: &Table) -> anyhow::Result<()> {
         let path = self.folder.join(format!("{name}.csv"));
         let doing = || format!("writing {}", path.display());
@@ -223,17 +205,11 @@ impl Session {
     }
 
     /// Writes a figure as SVG and PNG.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
         Ok(figure.save_both(&self.folder, stem)?)
     }
 
     /// Writes the page, says where it is, and ends.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn finish(self, page: &Page) -> anyhow::Result<()> {
         self.progress.clear();
         let text = page.text(self.seconds, self.at_once);
@@ -259,9 +235,6 @@ fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
 }
 
 /// Names this program and the processor it runs on, for [`Session::piece_of`]: the size of its file and when that was written.
-///
-/// # Errors
-/// A file that cannot be looked at.
 pub(crate) fn program() -> anyhow::Result<String> {
     let file = std::env::current_exe().context("finding this program's own file")?;
     let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;

@@ -61,9 +61,6 @@ impl Progress {
     }
 
     /// Counts work done.
-    ///
-    /// # Errors
-    /// [`Interrupted`] after a Ctrl-C or a signal to stop.
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.done += units;
         let period = if self.screen.bar().is_some() {

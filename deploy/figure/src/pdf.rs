@@ -16,9 +16,6 @@ use super::{
 const POINTS: f64 = 0.75;
 
 /// The picture as a file. Source: ISO 32000-1, chapters 7 (syntax), 8.4 and 8.5 (graphics state and paths).
-///
-/// # Errors
-/// The page cannot be compressed.
 pub(super) fn encode(canvas: &Canvas) -> std::io::Result<Vec<u8>> {
     let (width, height) = (canvas.width * POINTS, canvas.height * POINTS);
     let mut page = Page::default();

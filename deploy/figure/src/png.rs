@@ -15,9 +15,6 @@ use super::{
 const SIDE_MIN: f32 = 1.0 / 4096.0;
 
 /// The picture, `zoom` pixels to a unit; what no shape covers is transparent.
-///
-/// # Errors
-/// A canvas without area, or too large for memory.
 pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, String> {
     let pixels = |length: f64| (length as f32 * zoom).ceil() as u32;
     let (width, height) = (pixels(canvas.width), pixels(canvas.height));

@@ -16,9 +16,6 @@ use crate::interrupts::Interrupts;
 const LISTEN_MAX: Duration = Duration::from_secs(30);
 
 /// A session to the replay server as soon as it listens; none after an interrupt. `check_alive` says whether it still can.
-///
-/// # Errors
-/// That of `check_alive`; a server that does not listen in time.
 pub(crate) fn connect(
     endpoint: &str,
     interrupts: &Interrupts,

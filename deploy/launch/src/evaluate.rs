@@ -269,7 +269,6 @@ pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow:
     play_with(config, &mut policy, &world, episodes, seed, &mut play_on)
 }
 
-/// Watches nothing.
 fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }

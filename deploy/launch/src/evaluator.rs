@@ -31,9 +31,6 @@ pub(crate) struct Evaluator {
 
 impl Evaluator {
     /// Goes on after what the run's folder says was played already.
-    ///
-    /// # Errors
-    /// A table of evaluations that cannot be read.
     pub(crate) fn new(config: EvaluationConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         Ok(Self {
             config,
@@ -62,7 +59,7 @@ impl Evaluator {
                     return;
                 }
                 last = true;
-                screen.line("the last checkpoint is being played (Ctrl-C leaves that out)");
+                screen.line("playing the last checkpoint (skip it with Ctrl-C)");
             }
             if abort() || Instant::now() > deadline {
                 screen.line("the last evaluation was left out");

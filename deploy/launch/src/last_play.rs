@@ -36,7 +36,7 @@ pub(crate) fn play(
         return;
     }
     console::line(
-        "playing the weights beside a random policy, for about 30 s at most (Ctrl-C leaves that out, --no-play too)",
+        "playing the weights beside a random policy, for at most about 30 s (skip it with Ctrl-C or --no-play)",
     );
     let noted = played(folder, is_stopped).and_then(|played| {
         summary.played = played;
@@ -44,7 +44,7 @@ pub(crate) fn play(
     });
     if let Err(e) = noted {
         console::line(&format!(
-            "the run is finished, but what its weights earn is not known: {}; `driml evaluate {}` tries again",
+            "the run is finished, but playing its weights failed: {}; `driml evaluate {}` plays them again",
             console::describe(&e),
             folder.display()
         ));

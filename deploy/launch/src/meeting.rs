@@ -35,9 +35,6 @@ pub struct Meeting {
 
 impl Meeting {
     /// Makes one, and removes those that are no longer in use.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn create() -> anyhow::Result<Self> {
         let place = place_under(std::env::temp_dir());
         sweep(&place);
@@ -74,9 +71,6 @@ impl Meeting {
     }
 
     /// The lock, for a process that uses the folder: its standard input.
-    ///
-    /// # Errors
-    /// No more open files.
     pub(crate) fn hold(&self) -> io::Result<File> {
         self.lock.try_clone()
     }

@@ -17,9 +17,6 @@ fn of_server(actors: u64, shared_memory: bool) -> u64 {
 }
 
 /// Checks that the launcher and its replay servers may open as many files as the run's actors take.
-///
-/// # Errors
-/// They may not; what to do.
 pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
     let (actors, shards) = (
         u64::from(config.local.actors),

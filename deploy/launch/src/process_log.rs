@@ -42,9 +42,6 @@ struct Kept {
 
 impl ProcessLog {
     /// Opens the log of the process `name` in the folder `logs`, to go on at its end.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
         let file = File::options().create(true).append(true).open(&path);
@@ -65,9 +62,6 @@ impl ProcessLog {
     }
 
     /// Carries what comes through `pipe`, on a thread of its own, until its other end is closed.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
     pub(crate) fn follow(
         &mut self,
         pipe: impl Read + Send + 'static,

@@ -48,9 +48,6 @@ impl Processes {
     }
 
     /// Checks that all are as they should be: running, about to be started again, or actors that are not needed any more.
-    ///
-    /// # Errors
-    /// The first that has ended, and its last words.
     pub(crate) fn check_alive(&mut self, revived: Revived) -> anyhow::Result<()> {
         let servers = self.replay_servers.iter_mut().filter(|_| !revived.servers);
         for process in servers.chain(&mut self.learner) {

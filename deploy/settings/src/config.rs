@@ -107,9 +107,6 @@ pub struct RunConfig {
 }
 
 /// Reads one table of the settings.
-///
-/// # Errors
-/// It is missing or does not fit.
 pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
     let value = table
         .get(name)

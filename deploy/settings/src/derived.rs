@@ -64,9 +64,6 @@ pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
 const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
 
 /// Asks a world that is a process of its own what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
-///
-/// # Errors
-/// A command that declares no world.
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     let [start, step] = LIMITS.map(|limit| whole_size(table, &format!("world.{limit}")));
     let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
@@ -112,9 +109,6 @@ pub(crate) fn keep_whole_frames(table: &mut Table) {
 }
 
 /// Refuses a `--set` of something that follows from something else.
-///
-/// # Errors
-/// Says what to set instead.
 pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
     match followed(path) {
         Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
@@ -137,9 +131,6 @@ fn followed(path: &str) -> Option<(&'static str, &'static str)> {
 }
 
 /// Fills in what follows.
-///
-/// # Errors
-/// A table from which something follows and that cannot be read.
 pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let world: WorldName = text(table, "run.world")?
         .parse()
@@ -255,9 +246,6 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
 }
 
 /// Checks that what a file says of what follows is what follows.
-///
-/// # Errors
-/// The first value at odds, and what it follows from.
 pub(crate) fn check(read: &Table) -> Result<(), Usage> {
     let mut right = read.clone();
     derive(&mut right)?;

@@ -17,9 +17,6 @@ use crate::{
 };
 
 /// Makes the replay as small as the memory and says so, or refuses a size that was asked for and does not fit.
-///
-/// # Errors
-/// Actors or a replay that take more than is free; says what does fit.
 pub(crate) fn fit(
     table: &mut Table,
     capacity_set: bool,

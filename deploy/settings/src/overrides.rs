@@ -18,9 +18,6 @@ pub(crate) struct Override {
 
 impl Override {
     /// Reads `key=value`; a value that is not TOML is taken as a word.
-    ///
-    /// # Errors
-    /// No `=`, or no path of at least a table and a key.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form = "--set takes table.key=value, such as learner.update.adam.lr=1e-4";
         let (path, value) = text
@@ -46,9 +43,6 @@ impl Override {
     }
 
     /// A flag's number for the setting at `path`.
-    ///
-    /// # Errors
-    /// More than TOML's whole numbers hold.
     pub(crate) fn number(path: &str, number: u64) -> Result<Self, Usage> {
         let whole = i64::try_from(number)
             .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
@@ -61,9 +55,6 @@ impl Override {
     /// Puts the value into `table`; returns whether the key was not there before.
     ///
     /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
-    ///
-    /// # Errors
-    /// A path that leads nowhere, or a value of another type than the one it replaces.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let unknown = self.unknown(table);
         let (tables, key) = self

@@ -244,9 +244,6 @@ pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
 }
 
 /// Lays base, world, agent and preset over one another, in this order: a later one wins.
-///
-/// # Errors
-/// A preset that is not made for the world.
 pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
     if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
         return Err(usage!(

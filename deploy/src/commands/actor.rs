@@ -48,9 +48,6 @@ fn actor_id(text: &str) -> Result<u32, String> {
 }
 
 /// Plays until the run ends.
-///
-/// # Errors
-/// A call that cannot work, or what the actor met.
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Actor(args.id))?;

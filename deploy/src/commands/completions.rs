@@ -24,9 +24,6 @@ pub(crate) struct ManArgs {
 }
 
 /// Prints the script that a shell reads.
-///
-/// # Errors
-/// The script cannot be printed.
 pub(crate) fn completions(
     args: &CompletionsArgs,
     mut command: clap::Command,
@@ -37,9 +34,6 @@ pub(crate) fn completions(
 }
 
 /// Writes the pages.
-///
-/// # Errors
-/// A file system that refuses.
 pub(crate) fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
     let doing = || format!("writing pages into {}", args.out.display());
     std::fs::create_dir_all(&args.out).with_context(doing)?;

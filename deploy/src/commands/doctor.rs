@@ -23,9 +23,6 @@ pub(crate) struct DoctorArgs {
 }
 
 /// Prints the facts.
-///
-/// # Errors
-/// Something is missing that training on the CPU needs; with `--tls-dir`, a certificate is not good; with `--cuda`, also what training on a GPU needs.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
     if args.json {

@@ -28,7 +28,7 @@ pub(crate) struct JoinFlags {
 /// When a replay server or a learner ends.
 #[derive(Debug, Args)]
 pub(crate) struct StayFlag {
-    /// Stay when the run is over, to be asked, until this is ended by Ctrl-C or a signal
+    /// Keep answering when the run is over, until Ctrl-C or a signal
     #[arg(long)]
     pub(super) stay: bool,
 }
@@ -46,7 +46,7 @@ pub(crate) struct TlsFlags {
 /// Whether everybody is trusted who can connect.
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
-    /// Listen also where other machines can connect without certificates: whoever reaches the endpoint can read the run, change
+    /// Listen also where other machines can connect without certificates: anyone who reaches the endpoint can read the run, change
     /// what is learned, and end it
     #[arg(long)]
     pub(crate) insecure_network: bool,
@@ -69,9 +69,6 @@ impl TlsFlags {
     }
 
     /// The certificate of `role`, if one was asked for.
-    ///
-    /// # Errors
-    /// One that is missing or not good, and what to do.
     pub(super) fn credentials(&self, role: Role) -> Result<Option<Arc<Credentials>>, Usage> {
         let read = |folder: &PathBuf| Credentials::read(folder, role).map(Arc::new);
         let read = self.tls_dir.as_ref().map(read).transpose();
@@ -80,18 +77,12 @@ impl TlsFlags {
 }
 
 /// Checks how a process reaches the run, and starts to listen for signals.
-///
-/// # Errors
-/// A namespace that is none.
 pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
     prepare(flags)?;
     Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
 }
 
 /// [`join`] of a process that the others need while they end.
-///
-/// # Errors
-/// A namespace that is none, or signals that cannot be listened for.
 pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<TwoSteps> {
     prepare(flags)?;
     TwoSteps::on_signals(flags.exit_with_parent).context("listening for signals")

@@ -31,9 +31,6 @@ pub(crate) struct LearnerArgs {
 }
 
 /// Learns until the run ends.
-///
-/// # Errors
-/// A call that cannot work, or what the learner met.
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;

@@ -23,9 +23,6 @@ pub(crate) struct PresetsArgs {
 }
 
 /// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` takes.
-///
-/// # Errors
-/// Names that nothing has.
 pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);

@@ -10,9 +10,6 @@ pub(crate) enum ProcgenCommand {
 }
 
 /// Fetches the engine and says where it is.
-///
-/// # Errors
-/// It cannot be had.
 pub(crate) fn run(command: &ProcgenCommand) -> anyhow::Result<()> {
     match command {
         ProcgenCommand::Install => {

@@ -42,9 +42,6 @@ pub(crate) struct ReplayServerArgs {
 }
 
 /// Serves until the run ends.
-///
-/// # Errors
-/// A call or settings that cannot work, or what the server met.
 pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listening(&args.listen, args.network.guard(&args.tls))?;
     check_unused(&args.listen)?;

@@ -47,21 +47,20 @@ pub(crate) struct TrainArgs {
     /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
-    /// Go on with the interrupted run in this folder, from its newest checkpoint and with its own settings, but for --frames,
-    /// --device and --set
+    /// Resume the run in this folder from its newest checkpoint, with its own settings; --frames, --device and --set may change
     #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
     pub(crate) resume: Option<PathBuf>,
     /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
-    /// Keep the replay on disk too, in the run folder: a replay server that dies goes on with it, and so does --resume
+    /// Persist the replay in the run folder, so that a restarted server or --resume continues with it
     #[arg(long)]
     pub(crate) durable: bool,
     /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
     #[arg(long)]
     pub(crate) tensorboard: bool,
-    /// Play the newest checkpoint every so many updates, in a process of its own beside the run (which takes a core meanwhile), and
-    /// keep the best: evaluations.csv, `driml evaluate RUN --checkpoint best`
+    /// Play the newest checkpoint every so many updates in a separate process, which takes a core meanwhile, and keep the best:
+    /// evaluations.csv, `driml evaluate RUN --checkpoint best`
     #[arg(long, value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) evaluate_every: Option<u64>,
     /// Whole episodes of each of these evaluations
@@ -71,11 +70,11 @@ pub(crate) struct TrainArgs {
     /// Do not play the weights of the finished run beside a random policy, which takes about 30 s at most
     #[arg(long)]
     pub(crate) no_play: bool,
-    /// All parts in one process in a fixed order: the same seed gives the same weights, also if the run is interrupted and resumed
+    /// Run everything in one process in a fixed order: the same seed gives the same weights, also after a resume
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
-    /// Endpoint on which the parts meet [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
-    /// listens for parts of other machines, such as quic/0.0.0.0:7447, while those of this one meet at a unix socket
+    /// Endpoint at which the processes connect [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
+    /// listens for other machines, such as quic/0.0.0.0:7447, while the processes of this one use a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
     #[command(flatten)]
@@ -88,9 +87,6 @@ pub(crate) struct TrainArgs {
 }
 
 /// Trains on this machine.
-///
-/// # Errors
-/// Settings that cannot work, a run folder in use, an engine that cannot be had, a part that failed, an interrupt.
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     if let Some(device) = args.device {

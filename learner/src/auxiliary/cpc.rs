@@ -114,9 +114,6 @@ impl Cpc {
     ///
     /// `features_t` of s_t, B rows; `features_k` of the positives that exist, offset by offset, none if there are none;
     /// `action` [B]; `valid` [P, B]: 0 where a row has no positive.
-    ///
-    /// # Errors
-    /// A head that a pair needs and `network` lacks, or rows that do not fit.
     fn offsets(
         &self,
         network: &Network,

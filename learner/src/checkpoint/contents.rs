@@ -20,7 +20,6 @@ pub(super) const TARGET: &str = "target.safetensors";
 pub(super) const KEY: &str = "key.safetensors";
 /// The averaged network; there if the settings ask for one.
 pub(super) const AVERAGE: &str = "average.safetensors";
-/// Adam's moments.
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 /// What whoever drives the learner keeps with it; there if it keeps something.
 pub(super) const COMPANION: &str = "companion.bin";

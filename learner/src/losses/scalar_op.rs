@@ -11,9 +11,6 @@ use crate::tensors::slice;
 ///
 /// `loss` gets the input's values, row-major, writes their gradient over its second argument, of the same length, and returns
 /// the value.
-///
-/// # Errors
-/// An input that is not f32 on the CPU.
 pub(super) fn scalar_op<F>(name: &'static str, input: &Tensor, loss: F) -> Result<Tensor>
 where
     F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync + 'static,

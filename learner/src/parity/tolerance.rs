@@ -12,11 +12,9 @@ pub(super) struct Tolerances {
     pub(super) next_action_rows: f64,
     /// Projected target distributions, each probability, of the rows with the same greedy action.
     pub(super) projection: f64,
-    /// Losses, relative.
     pub(super) loss: f64,
     /// Losses, relative, where scores saturate.
     pub(super) saturated_loss: f64,
-    /// Losses, absolute.
     pub(super) least_loss: f64,
     /// Gradients, as a share of the tensor's own 2-norm, to which that of the global one is added.
     pub(super) gradient: f64,

@@ -174,9 +174,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
 }
 
 /// Learns from batch after batch, until there are no more or `shutdown`.
-///
-/// # Errors
-/// The replay server was out of reach for too long or refuses, or an update failed; the learner is then as after the last update.
 fn learn(
     learner: &mut Learner,
     batches: &mut BatchSource,
@@ -274,9 +271,6 @@ impl Saving {
     }
 
     /// Saves what is not saved yet.
-    ///
-    /// # Errors
-    /// The first failure since the last checkpoint that was saved.
     fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
         if self.saved != Some(learner.updates()) {
             self.save(learner);

@@ -36,9 +36,6 @@ pub(crate) struct Membership {
 
 impl Shards {
     /// Joins the shard at each endpoint; `None` if told to stop before.
-    ///
-    /// # Errors
-    /// A shard that is not there, is given twice, is missing or belongs to another run.
     pub(crate) fn join(
         connect: &[String],
         keys: &Keys,
@@ -78,9 +75,6 @@ impl Shards {
 
     /// Takes part as the run's one learner, `learner`, which is after `updates` and has counted `progress`; `restart` begins the run
     /// again. `None` if told to stop before.
-    ///
-    /// # Errors
-    /// Another learner takes part, or a replay server rejects this one.
     pub(crate) fn take_part(
         &self,
         clients: &[RunClient],

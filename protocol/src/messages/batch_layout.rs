@@ -105,7 +105,6 @@ const _: () =
 /// The shape of a batch, from which the place of every value follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct BatchLayout {
-    /// Rows, B.
     pub(super) rows: usize,
     /// Positives a row, P.
     pub(super) positives: usize,

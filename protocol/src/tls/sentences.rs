@@ -54,9 +54,7 @@ pub enum TlsError {
         .key.display(), .certificate.display(), how(.certificate, *.role)
     )]
     OtherKey {
-        /// The key.
         key: PathBuf,
-        /// The certificate.
         certificate: PathBuf,
         /// Whose they are.
         role: Role,
@@ -67,7 +65,6 @@ pub enum TlsError {
         .path.display(), how(.path, *.role), have = .have, role = .role.to_string()
     )]
     OtherRole {
-        /// The certificate.
         path: PathBuf,
         /// Its common name.
         have: String,
@@ -80,7 +77,6 @@ pub enum TlsError {
         .path.display(), how(.path, *.role)
     )]
     Expired {
-        /// The certificate.
         path: PathBuf,
         /// Until when it was good.
         when: String,
@@ -93,7 +89,6 @@ pub enum TlsError {
         .path.display()
     )]
     NotYet {
-        /// The certificate.
         path: PathBuf,
         /// From when on it is good.
         when: String,
@@ -104,9 +99,7 @@ pub enum TlsError {
         .path.display(), .authority.display()
     )]
     OtherAuthority {
-        /// The certificate.
         path: PathBuf,
-        /// The authority's.
         authority: PathBuf,
         /// What the check said.
         why: String,

@@ -116,10 +116,7 @@ pub enum Alive {
         mark: u64,
     },
     /// A learner.
-    Learner {
-        /// Its mark.
-        mark: u64,
-    },
+    Learner { mark: u64 },
 }
 
 impl Alive {

@@ -105,9 +105,6 @@ pub fn check_room(bytes: usize) -> Result<(), String> {
 }
 
 /// Whether this process may make a file of so many bytes, as a piece of shared memory is one.
-///
-/// # Errors
-/// It may not; what to do, for a person.
 pub(super) fn check_file_size(bytes: usize) -> Result<(), String> {
     match getrlimit(Resource::RLIMIT_FSIZE) {
         Ok((most, _)) if most < bytes as u64 => Err(format!(
@@ -133,9 +130,6 @@ pub fn is_granted(asked: Result<(), String>) -> bool {
 
 /// Takes room in [`FOLDER`] by `take` if so many bytes are free there: of processes that look at the same time one after the other,
 /// so that all of them together take no more than there is.
-///
-/// # Errors
-/// There is too little, or what `take` says.
 pub(super) fn take_room<T>(
     bytes: usize,
     take: impl FnOnce() -> Result<T, String>,

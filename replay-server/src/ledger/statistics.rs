@@ -41,7 +41,6 @@ pub(crate) struct Statistics {
     pub(crate) action_histogram: Vec<u64>,
     pub(crate) learner_waited_s: f64,
     pub(crate) actors_waited_s: f64,
-    /// Connected now.
     #[serde(skip)]
     pub(crate) actors: u32,
 }

@@ -185,7 +185,6 @@ impl History {
             .collect()
     }
 
-    /// s_t.
     pub(crate) fn state(&self, key: StreamKey, t: usize) -> Vec<u8> {
         let channels = self.spec.frame_channels as usize;
         let frames: Vec<_> = self

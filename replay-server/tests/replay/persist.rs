@@ -150,7 +150,6 @@ impl Life {
             .map(|it| it.unpack())
     }
 
-    /// Something happens.
     pub(crate) fn act(&mut self) {
         match self.rng.random_range(0..20) {
             0..9 => {

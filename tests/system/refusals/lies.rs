@@ -20,7 +20,6 @@ use zenoh::{Wait, query::Query};
 use super::{Row, SILENCE, sealed, send};
 use crate::{LONG, PRIORITISED, launched, system};
 
-/// Nobody's numbers.
 const LIFE: u64 = 77;
 const LEARNER: u64 = 78;
 /// An actor's number that nobody has.

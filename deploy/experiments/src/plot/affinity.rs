@@ -11,9 +11,6 @@ use driml_settings::config::RunConfig;
 use super::runs::folder_name;
 
 /// One heat map a run.
-///
-/// # Errors
-/// A folder without settings or checkpoint, a run whose agent does not learn A.
 pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
     let panels = folders
         .iter()

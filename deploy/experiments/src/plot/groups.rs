@@ -60,9 +60,6 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
 
 impl Group<'_> {
     /// The group's mean of a column, and its band.
-    ///
-    /// # Errors
-    /// A column that a run does not have.
     pub(super) fn curve(&self, column: &str, way: Way) -> anyhow::Result<Curve> {
         let mean = self.over_seeds(column, way)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));

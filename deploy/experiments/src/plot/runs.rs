@@ -59,9 +59,6 @@ impl Over {
 
 impl Run {
     /// Reads a run's folder.
-    ///
-    /// # Errors
-    /// A folder without `metrics.csv`, or with one that is no run's.
     pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         let path = folder.metrics();
         let text = std::fs::read(&path)
@@ -96,9 +93,6 @@ impl Run {
     }
 
     /// The values of a column over frames; rows without a value are left out.
-    ///
-    /// # Errors
-    /// A column that is not there, or holds words.
     pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         self.values_over(Over::Frames, column)
     }
@@ -106,9 +100,6 @@ impl Run {
     /// The values of a column over frames, updates or seconds, in their order; rows without a value are left out.
     ///
     /// Rows at the same place are one point, their mean: a row is written each second, in which there may be no new frame.
-    ///
-    /// # Errors
-    /// As for [`Run::values`], and metrics without the column that it goes over.
     pub(crate) fn values_over(&self, over: Over, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let (table, path) = self.table(column);
         let x = self.place(table, over.column())?;
@@ -169,9 +160,6 @@ impl Run {
     }
 
     /// The whole settings of the run, as `driml local --config` takes them.
-    ///
-    /// # Errors
-    /// They are not there or do not hold.
     pub(crate) fn config(&self) -> anyhow::Result<RunConfig> {
         let path = self.folder.config();
         let text = std::fs::read_to_string(&path)

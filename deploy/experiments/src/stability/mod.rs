@@ -68,10 +68,6 @@ impl Results {
 }
 
 /// Runs the experiment.
-///
-/// # Errors
-/// A folder of other settings, an interrupt, a file system that refuses; and, after the page is written, a promise that is not
-/// kept or a value out of range that was not refused by name.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,

@@ -27,9 +27,6 @@ impl Axis {
     }
 
     /// Reads `KEY=VALUE,VALUE,..`. Commas within brackets, braces and quotes belong to a value.
-    ///
-    /// # Errors
-    /// No `=`, an empty or a repeated value.
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form =
             "--set takes table.key=value,value,.., such as learner.update.adam.lr=1e-4,2.5e-4";
@@ -48,8 +45,6 @@ impl Axis {
         Ok(axis)
     }
 
-    /// # Errors
-    /// An empty or a repeated value: a run by mistake, or the same one twice.
     pub(crate) fn check(&self, form: &str) -> Result<(), Usage> {
         for (at, value) in self.values.iter().enumerate() {
             if value.is_empty() {
@@ -86,9 +81,6 @@ fn split(text: &str) -> Vec<&str> {
 }
 
 /// Every combination of the axes' values; the last axis changes fastest.
-///
-/// # Errors
-/// More runs than anybody means, with so many seeds.
 pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
     let counts = axes.iter().map(|axis| axis.values.len());
     let runs = counts.fold(seeds as usize, usize::saturating_mul);

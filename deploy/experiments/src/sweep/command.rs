@@ -28,9 +28,6 @@ const LEGEND: &str = "mean_return: of each run's last 100 training episodes, the
                       interval (Student's t)\n";
 
 /// Makes the runs that are not there yet, then the table and the plot.
-///
-/// # Errors
-/// A combination that cannot work, before anything starts; a folder of another sweep, an interrupt, runs that failed.
 pub(crate) fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let axes = axes_of(args)?;
     let cells = cells(&axes, args.seeds)?;

@@ -45,9 +45,6 @@ impl Call {
     }
 
     /// The settings of the run.
-    ///
-    /// # Errors
-    /// Names that nothing has, settings that cannot work.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
         let flags = RunFlags {
             env: self.env.clone(),
@@ -109,9 +106,6 @@ pub(crate) struct Swept<P> {
 
 impl<P> Swept<P> {
     /// Makes sure that there is something to report.
-    ///
-    /// # Errors
-    /// No run is finished.
     pub(crate) fn check_any(&self) -> Result<(), Usage> {
         if self.made.is_empty() {
             return Err(usage!("no run is finished yet: there is nothing to report"));

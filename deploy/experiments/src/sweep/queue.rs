@@ -43,9 +43,6 @@ const DRAIN_MAX: Duration = Duration::from_secs(240);
 
 /// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. All settings are resolved, and what their worlds
 /// need is installed, before anything starts.
-///
-/// # Errors
-/// An interrupt, after the running ones were stopped; settings that cannot work; the file system refuses.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
@@ -127,9 +124,6 @@ fn commit() -> anyhow::Result<String> {
 }
 
 /// Makes sure that no run is missing, unless a report of what there is was asked for.
-///
-/// # Errors
-/// The names of those that are.
 pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
     anyhow::ensure!(
         missing.is_empty() || report_only,

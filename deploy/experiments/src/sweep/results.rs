@@ -28,9 +28,6 @@ pub(crate) struct Played {
 
 impl Played {
     /// Returns of a run's agent, played greedily; none if its world does not have the levels. Kept under `key` for these weights.
-    ///
-    /// # Errors
-    /// A damaged checkpoint, a world that fails, an interrupt.
     pub(crate) fn greedy(
         self,
         session: &mut Session,
@@ -42,9 +39,6 @@ impl Played {
     }
 
     /// Returns of a random policy in a run's world, on the levels trained on.
-    ///
-    /// # Errors
-    /// As for [`Played::greedy`].
     pub(crate) fn random(
         self,
         session: &mut Session,

@@ -23,9 +23,6 @@ pub(crate) struct Runs {
 
 impl Runs {
     /// Opens the folder in the sweep's `folder`, or makes it.
-    ///
-    /// # Errors
-    /// The file system refuses.
     pub(crate) fn open(folder: &Path) -> anyhow::Result<Self> {
         let root = folder.join(RUNS);
         fs::create_dir_all(&root).with_context(|| format!("making {}", root.display()))?;
@@ -62,9 +59,6 @@ impl Runs {
     }
 
     /// Notes that the plan's run is made by this plan, and by a program of this commit.
-    ///
-    /// # Errors
-    /// The file system refuses.
     pub(super) fn write_call(&self, plan: &PlannedRun, commit: &str) -> anyhow::Result<()> {
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
         write_whole(&self.beside(plan, "call.json"), &call)?;

@@ -14,9 +14,6 @@ use crate::{
 };
 
 /// Runs the experiment.
-///
-/// # Errors
-/// Names that nothing has, a folder of other settings, an interrupt, the file system refuses.
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = settings::with_flags(args)?;
     let plans = seed_by_seed(&settings.points(), settings.seeds, |point, seed| {

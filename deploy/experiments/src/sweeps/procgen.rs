@@ -23,9 +23,6 @@ use crate::{
 };
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
-///
-/// # Errors
-/// Names that nothing has, a folder of other settings, an interrupt, the file system refuses.
 pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let settings = Settings::of(args)?;
     let plans = seed_by_seed(&settings.points(), settings.seeds, |point, seed| {

@@ -61,9 +61,6 @@ struct Planned {
 }
 
 /// Plans, benches, trains, and writes the page.
-///
-/// # Errors
-/// Names that nothing has, a folder of other settings, an interrupt, a file system that refuses.
 pub(crate) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let name = folder_name(args)?;
     let found: Option<Common> = cache::settings_of(&name, &args.flags);

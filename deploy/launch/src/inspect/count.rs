@@ -112,9 +112,6 @@ pub(super) fn update_flops(config: &RunConfig, every: &Everything) -> Vec<Line> 
 }
 
 /// Bytes of a transition, a batch whose rows have every state, and a broadcast. Compression and the socket's own are not counted.
-///
-/// # Errors
-/// The weights' file cannot be laid out.
 pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Result<Vec<Line>> {
     let header = |run: &RunSpec| {
         BatchHeader::of(run, config.learner.batch_size).sampled_by(&config.replay.sampling)

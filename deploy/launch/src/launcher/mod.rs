@@ -324,9 +324,6 @@ impl Launch<'_> {
 
     /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once. Gives how the run ended.
-    ///
-    /// # Errors
-    /// What the run failed by. A run whose transitions and updates are complete cannot fail any more: who did not end well is a warning.
     fn end(
         &mut self,
         ran: anyhow::Result<Outcome>,

@@ -48,9 +48,6 @@ impl Launch<'_> {
     }
 
     /// Starts the learner.
-    ///
-    /// # Errors
-    /// The process cannot be started.
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
@@ -74,9 +71,6 @@ impl Launch<'_> {
     }
 
     /// Starts an actor.
-    ///
-    /// # Errors
-    /// The process cannot be started.
     pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
         let mut args = words(&[
             "actor",
@@ -102,9 +96,6 @@ impl Launch<'_> {
     }
 
     /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
-    ///
-    /// # Errors
-    /// The process cannot be started, or would begin anew what goes on from episode to episode in this world.
     pub(super) fn revive_actors(&mut self) -> anyhow::Result<()> {
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
@@ -159,9 +150,6 @@ impl Launch<'_> {
     }
 
     /// Starts replay servers that have died again, if they go on with what they have kept.
-    ///
-    /// # Errors
-    /// It has happened too often, or the process cannot be started.
     pub(super) fn revive_servers(&mut self) -> anyhow::Result<()> {
         if !self.config.local.durable {
             return Ok(());

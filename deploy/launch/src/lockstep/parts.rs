@@ -60,9 +60,6 @@ pub(super) struct Lockstep {
 
 impl Lockstep {
     /// The parts of a run that begins, whose replay is kept in the run's folder if a checkpoint of it could go on.
-    ///
-    /// # Errors
-    /// Settings that cannot work, a world that cannot be made, a folder that cannot be written.
     pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let mut this = Self::in_memory(config)?;
         if let Err(e) = this.actor_states() {
@@ -80,9 +77,6 @@ impl Lockstep {
     }
 
     /// The parts of the run in `run_dir`, as they were at its newest checkpoint.
-    ///
-    /// # Errors
-    /// A checkpoint or a replay that is damaged or of other settings.
     pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let saved = SavedParts::read(run_dir)?;
         let mut this = Self::in_memory(config)?;
@@ -96,9 +90,6 @@ impl Lockstep {
     }
 
     /// The parts of a run that begins and is not kept.
-    ///
-    /// # Errors
-    /// Settings that cannot work, a world that cannot be made.
     pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;
@@ -162,9 +153,6 @@ impl Lockstep {
     }
 
     /// How the actors stand.
-    ///
-    /// # Errors
-    /// A world that cannot say, which [`EnvError::is_not_saved`](driml_envs::EnvError::is_not_saved) tells, or one that failed.
     fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
         self.actors.iter_mut().map(Collector::state).collect()
     }
@@ -217,9 +205,6 @@ impl Lockstep {
     }
 
     /// Writes a checkpoint into `folder`, from which the run goes on exactly as it does now.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
         let inserted = self.replay.tally().inserted;
         self.learner.progress_mut().note_inserted(0, inserted);

@@ -39,9 +39,6 @@ struct Written {
 
 impl SavedParts {
     /// The bytes of a checkpoint's companion.
-    ///
-    /// # Errors
-    /// More than a file of this kind may hold.
     pub(super) fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
         let Weights {
             header,
@@ -62,9 +59,6 @@ impl SavedParts {
     }
 
     /// What the newest checkpoint in a run's folder holds.
-    ///
-    /// # Errors
-    /// No checkpoint, one of a run that is not in lockstep, a damaged one.
     pub(super) fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;

@@ -14,7 +14,6 @@ const ACTORS_MAX: usize = 64;
 /// Age from which on the page tells how old a process's own report is, seconds.
 const REPORT_AGE_MAX: f64 = 10.0;
 
-/// The page.
 pub(crate) fn page(view: &RunView) -> String {
     let (replay, plan, moment) = (&view.replay, &view.plan, view.moment());
     let is_known = view.is_answered() || view.is_gone();

@@ -35,7 +35,6 @@ pub(crate) struct EvaluateArgs {
     /// Folder of the run, a file that --export wrote, or pretrained:GAME for a network that is built in
     #[arg(value_name = "RUN", required_unless_present = "run")]
     pub(crate) folder: Option<PathBuf>,
-    /// The same
     #[arg(long, value_name = "DIR", conflicts_with = "folder", hide = true)]
     pub(crate) run: Option<PathBuf>,
     /// Whole episodes to play
@@ -76,9 +75,6 @@ pub(crate) struct EvaluateArgs {
 }
 
 /// Plays, and prints mean and standard deviation.
-///
-/// # Errors
-/// A folder that is no run's, a damaged checkpoint, levels that the world does not have, a film that cannot be written.
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.film.record {
         Film::check_name(path).map_err(|e| usage!("--record: {e}"))?;

@@ -81,9 +81,6 @@ struct Moment {
 
 impl Recording {
     /// Begins the film of an evaluation of so many episodes, if one is asked for.
-    ///
-    /// # Errors
-    /// A name or place that no film can have.
     pub(crate) fn begin(
         args: &RecordArgs,
         player: &Player,
@@ -220,9 +217,6 @@ impl Recording {
     }
 
     /// Ends the film, and says what it shows.
-    ///
-    /// # Errors
-    /// What went wrong in it, or a file that cannot be written.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
         while self.failed.is_none() && !self.waiting.is_empty() {
             self.failed = self.draw_next(0).err();

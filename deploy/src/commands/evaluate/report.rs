@@ -26,9 +26,6 @@ pub(super) struct Table {
 
 impl Table {
     /// Makes the file, so that one that cannot be made is known before anything is played.
-    ///
-    /// # Errors
-    /// The file system refuses.
     pub(super) fn begin(path: &Path) -> anyhow::Result<Self> {
         let file = File::create(path).with_context(|| format!("--returns {}", path.display()))?;
         Ok(Self {
@@ -38,9 +35,6 @@ impl Table {
     }
 
     /// Writes all returns.
-    ///
-    /// # Errors
-    /// The file system refuses.
     pub(super) fn finish(&mut self, played: &[Played<'_>]) -> anyhow::Result<()> {
         self.write(played)
             .with_context(|| format!("writing {}", self.path.display()))
@@ -58,9 +52,6 @@ impl Table {
 }
 
 /// The object, on a line of its own.
-///
-/// # Errors
-/// It cannot be written as JSON.
 pub(super) fn json(
     player: &Player,
     levels: Levels,

@@ -20,9 +20,7 @@ const LEADING: usize = 19;
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.
     pub(super) frame: Vec<u8>,
-    /// From 1.
     pub(super) episode: u32,
-    /// From 0.
     pub(super) step: u32,
     /// The episode's return up to this step's reward.
     pub(super) total: f64,

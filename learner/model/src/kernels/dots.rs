@@ -17,9 +17,6 @@ use crate::kernels::units::Mode;
 ///
 /// Entry (l, i, j) is psi of row i times phi of row j, at location l. Differentiable in both; all f32. Results and gradients have
 /// the same bits whatever the number of threads.
-///
-/// # Errors
-/// Shapes that do not match, or other types.
 pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     let sizes = |vectors: &Tensor| match *vectors.dims() {
         [rows, rkhs] => Some((rows, 1, rkhs)),

@@ -21,9 +21,6 @@ use crate::kernels::units::Mode;
 ///
 /// `x` [rows, in]; `w` [groups * out, in]; `b` [groups * out]; result [rows, out]. All f32; operands of products are rounded to
 /// `precision`. Results have the bits that [`super::linear::linear`] gives, whatever the number of threads.
-///
-/// # Errors
-/// Shapes that do not match, other types, or a group that `w` does not have.
 pub(crate) fn grouped_linear(
     x: &Tensor,
     w: &Tensor,

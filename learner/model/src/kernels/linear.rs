@@ -40,9 +40,6 @@ pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Resul
 }
 
 /// [`linear`] on maps [B, height, width, channels], flattened in the order of PyTorch's weights: channel, row, column.
-///
-/// # Errors
-/// As [`linear`].
 pub(crate) fn linear_of_maps(
     maps: &Tensor,
     w: &Tensor,

@@ -38,9 +38,6 @@ pub(crate) struct BlockParameters {
 /// `joined` [groups, joined] serves an equal share of consecutive rows of x, and is never written out for each. Gradients of parameters
 /// that are variables are summed in place, so that a backward pass has to be one of [`Backward::of`](crate::Backward::of); those of
 /// other parameters are not computed. Results and gradients have the same bits whatever the number of threads.
-///
-/// # Errors
-/// Shapes that do not match, other types; in the backward pass, one that is not `Backward::of`'s.
 pub(crate) fn residual_block(
     x: &Tensor,
     joined: Option<&Tensor>,
@@ -298,9 +295,6 @@ impl Block {
 }
 
 /// Adds to the gradient of a parameter; of one that is no variable there is none.
-///
-/// # Errors
-/// A backward pass that is not one of [`Backward::of`](crate::Backward::of).
 pub(crate) fn sum_in_place(
     parameter: &Tensor,
     add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,

@@ -14,9 +14,6 @@ const TASK_ROWS: usize = 16;
 /// The rows `rows` [n] of `x` [R, ..] f32, as [n, ..].
 ///
 /// The gradient of a row of `x` is the sum of those of its copies, first to last: the same bits whatever the number of threads.
-///
-/// # Errors
-/// A row that `x` does not have, an `x` without rows or of another type.
 pub(crate) fn select_rows(x: &Tensor, rows: &[u32]) -> Result<Tensor> {
     let count = x.dims().first().copied().unwrap_or(0);
     if let Some(row) = rows.iter().find(|&&row| row as usize >= count) {

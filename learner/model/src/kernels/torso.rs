@@ -23,9 +23,6 @@ use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
 ///
 /// Gradients of `weight` [outputs, inputs] and `bias` [outputs] are summed in place, so that a backward pass has to be one of
 /// [`Backward::of`](crate::Backward::of).
-///
-/// # Errors
-/// As those two.
 pub(crate) fn torso(
     images: &Tensor,
     layers: &[ConvLayerTensors<'_>],

@@ -124,7 +124,6 @@ pub(crate) const NOISY: HeadConfig = HeadConfig {
     noisy_sigma: Some(0.5),
 };
 
-/// Rainbow's.
 pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
     dueling: true,
     noisy_sigma: Some(0.5),

@@ -26,7 +26,6 @@ pub(crate) struct Chance {
     pub(crate) switch_probability: f64,
 }
 
-/// One ghost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Ghost {
     pub(crate) place: Place,

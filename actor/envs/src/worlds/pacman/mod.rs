@@ -42,7 +42,6 @@ pub struct PacmanWorld {
     copies: Vec<Game>,
 }
 
-/// One game.
 struct Game {
     rng: ChaCha8Rng,
     agent: Place,

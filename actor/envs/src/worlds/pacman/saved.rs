@@ -46,8 +46,6 @@ impl Game {
         }
     }
 
-    /// # Errors
-    /// A state that no game in this maze has.
     pub(super) fn load(&mut self, saved: SavedGame, maze: &Maze) -> Result<(), EnvError> {
         let places = maze.items().len();
         let is_place = |place: Place| usize::from(place) < places;

@@ -75,9 +75,6 @@ impl ProcgenConfig {
     }
 
     /// The engine that plays: the build that is named, or the published one, which is fetched if it is not there.
-    ///
-    /// # Errors
-    /// An engine that cannot be had.
     pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
         let engine = match &self.library {
             Some(library) => Engine::other(Path::new(library)),

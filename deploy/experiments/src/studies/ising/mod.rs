@@ -28,9 +28,6 @@ const NAME: &str = "ising";
 const LOSS_WINDOW: usize = 10;
 
 /// World, network and optimiser as a run has them.
-///
-/// # Errors
-/// Settings that cannot work.
 fn task(settings: &Settings) -> anyhow::Result<Task> {
     // DIM with k = 1; what else distinguishes the agents is not used here.
     let agent = "driml-fix";
@@ -54,9 +51,6 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 }
 
 /// Runs the experiment.
-///
-/// # Errors
-/// A folder of other settings, an interrupt, a file system that refuses.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,

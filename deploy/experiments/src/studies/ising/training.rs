@@ -58,10 +58,6 @@ pub(super) struct Measured {
     pub(super) loss: f64,
 }
 
-/// Trains once.
-///
-/// # Errors
-/// A failing tensor operation, an interrupt.
 pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Trained> {
     let settings = &task.settings;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -109,9 +105,6 @@ pub(super) struct Episodes {
 
 impl Episodes {
     /// `steps` + 1 frames of each of `copies` episodes.
-    ///
-    /// # Errors
-    /// A world that cannot be.
     pub(super) fn play(
         config: &IsingConfig,
         copies: usize,
@@ -142,9 +135,6 @@ impl Episodes {
     }
 
     /// The episodes that `Scorer::measure` looks at first.
-    ///
-    /// # Errors
-    /// A world that cannot be.
     pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
         let seed = MEASURED_SEED;
         Self::play(&task.world, task.settings.batch_size, steps, seed)

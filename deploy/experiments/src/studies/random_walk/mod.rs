@@ -23,9 +23,6 @@ use crate::{
 const NAME: &str = "random-walk";
 
 /// Runs the experiment.
-///
-/// # Errors
-/// A folder of other settings, an interrupt, a file system that refuses.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,

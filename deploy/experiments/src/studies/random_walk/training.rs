@@ -61,10 +61,6 @@ pub(super) struct Learnt {
     pub(super) ratio: Vec<f64>,
 }
 
-/// Trains once.
-///
-/// # Errors
-/// A failing tensor operation, an interrupt.
 pub(super) fn train(
     chain: &Chain,
     settings: &Settings,

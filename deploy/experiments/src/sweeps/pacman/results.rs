@@ -18,11 +18,8 @@ pub(super) type Points = Vec<(f64, f64)>;
 /// All there is to report.
 pub(super) struct Results {
     pub(super) settings: Settings,
-    /// (a)
     pub(super) losses: Vec<Loss>,
-    /// (b)
     pub(super) ghosts: Vec<Trace>,
-    /// (c)
     pub(super) noise: Vec<Trace>,
     /// Of each epsilon the episodes of its runs.
     pub(super) episodes: Vec<(f64, f64)>,
@@ -50,9 +47,6 @@ pub(super) struct Trace {
 
 impl Results {
     /// Reads the metrics of the finished runs.
-    ///
-    /// # Errors
-    /// Metrics that cannot be read.
     pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
         let mut results = Self {
             settings,

@@ -156,7 +156,6 @@ pub(super) fn page(
     values
 }
 
-/// Two digits.
 fn percent(share: f64) -> String {
     let percent = 100.0 * share;
     let decimals = (1.0 - percent.log10().floor()).clamp(0.0, 6.0) as usize;

@@ -61,9 +61,6 @@ pub(super) struct Point {
 
 impl Settings {
     /// The settings of the length asked for.
-    ///
-    /// # Errors
-    /// Names that nothing has.
     pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
             sweep_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);

@@ -151,9 +151,6 @@ pub(super) fn dials(world: WorldName) -> Vec<Dial> {
 }
 
 /// What all runs in a world have.
-///
-/// # Errors
-/// A world without known settings with which C51 learns in minutes.
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
     let worlds = file().world;
     let mut of_kind: Vec<_> = worlds.iter().filter(|it| it.kind == world.kind()).collect();
@@ -174,9 +171,6 @@ pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
 }
 
 /// Those of `all` that are asked for by name, in the order of the menu; all if none are.
-///
-/// # Errors
-/// A name that no dial of this world has.
 pub(super) fn chosen(all: Vec<Dial>, names: &[String]) -> Result<Vec<Dial>, Usage> {
     if let Some(unknown) = names
         .iter()

@@ -76,9 +76,6 @@ fn acted_values(
 }
 
 /// Measures the newest checkpoint of a run of a level with `config`.
-///
-/// # Errors
-/// A checkpoint that cannot be read, a world that cannot be had.
 pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Exactness> {
     let (model, update) = (&config.model, &config.learner.update);
     let compute = Compute::cpu(config.learner.precision);

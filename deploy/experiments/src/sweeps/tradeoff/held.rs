@@ -44,9 +44,6 @@ struct Moment {
 
 impl HeldBatch {
     /// Plays the world of `config` for `rows` rows, greedily with `weights` but for one action in ten, else at random.
-    ///
-    /// # Errors
-    /// A world that cannot be had, weights that do not fit.
     pub(super) fn play(
         config: &RunConfig,
         weights: Option<&[u8]>,

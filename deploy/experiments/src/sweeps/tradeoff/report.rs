@@ -18,9 +18,6 @@ const MEASURES: [(&str, Measure); 7] = [
 ];
 
 /// Writes them all.
-///
-/// # Errors
-/// A run's metrics that cannot be read, a file system that refuses.
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     write_runs(&session, results)?;
     write_levels(&session, results)?;

@@ -41,9 +41,6 @@ pub(super) struct Settings {
 }
 
 /// The settings that the call asks for. A folder that has runs keeps their length.
-///
-/// # Errors
-/// Names that nothing has.
 pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings, Usage> {
     let world: WorldName = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let base = dials::world_base(world)?;
@@ -83,9 +80,6 @@ impl Settings {
 
 impl Common {
     /// The resolved settings of a run at `point`.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub(super) fn config(&self, point: &Point) -> Result<RunConfig, Usage> {
         self.run(point, 1).call.config()
     }

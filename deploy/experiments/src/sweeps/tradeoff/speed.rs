@@ -117,9 +117,6 @@ fn timed(turn: Duration, mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow
 }
 
 /// Times `level` beside `base`.
-///
-/// # Errors
-/// A world that cannot be had, an update that failed.
 pub(super) fn measure(
     base: &RunConfig,
     level: &RunConfig,

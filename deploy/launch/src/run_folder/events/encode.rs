@@ -19,7 +19,6 @@ pub(super) enum Value<'a> {
     Scalar(f32),
     /// How often each of 0, 1, 2, ... was counted.
     Counts(&'a [u64]),
-    /// A PNG.
     Image {
         width: usize,
         height: usize,

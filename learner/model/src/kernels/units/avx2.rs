@@ -21,7 +21,6 @@ pub(super) fn available() -> bool {
     is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")
 }
 
-/// f32 operands.
 #[derive(Clone, Copy)]
 pub(super) struct Single(());
 

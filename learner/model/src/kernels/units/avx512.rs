@@ -31,7 +31,6 @@ pub(super) fn available() -> bool {
         && is_x86_feature_detected!("fma")
 }
 
-/// f32 operands.
 #[derive(Clone, Copy)]
 pub(super) struct Single(());
 

@@ -8,7 +8,6 @@ use super::{
     vector::{Vector, compute_sizes},
 };
 
-/// f32 operands.
 #[derive(Clone, Copy)]
 pub(super) struct Single;
 
