@@ -37,7 +37,10 @@ pub enum ActError {
     },
     /// More actions than the wire has numbers for.
     #[error("{actions} actions: a world has at most 255")]
-    TooManyActions { actions: usize },
+    TooManyActions {
+        /// The network's.
+        actions: usize,
+    },
     /// An actor for which the ladder has no epsilon.
     #[error(transparent)]
     BeyondLadder(#[from] BeyondLadder),

@@ -31,7 +31,9 @@ pub enum EnvError {
     /// A step was asked for with a buffer of the wrong length.
     #[error("{name} has {got} entries, but the world has {num_envs} copies")]
     BufferLength {
+        /// Which buffer.
         name: &'static str,
+        /// Its entries.
         got: usize,
         /// The world's copies.
         num_envs: usize,

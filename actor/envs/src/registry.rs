@@ -78,9 +78,11 @@ macro_rules! worlds {
 worlds! {
     /// One of Procgen's games.
     "procgen" Procgen(ProcgenConfig);
+    /// Ms. PacMan.
     "mspacman" MsPacman(PacmanConfig);
     /// The Ising patch in noise.
     "ising" Ising(IsingConfig);
+    /// The corridor.
     "chain" Chain(CorridorConfig);
     /// A process that a command starts.
     "exec" Exec(ExecConfig);

@@ -65,7 +65,12 @@ pub enum FigureError {
     NoFilm(PathBuf),
     /// A picture or film of no area, or too large.
     #[error("a picture of {width} x {height} pixels cannot be made")]
-    Size { width: usize, height: usize },
+    Size {
+        /// Pixels across.
+        width: usize,
+        /// Pixels down.
+        height: usize,
+    },
     /// A picture cannot be encoded.
     #[error("encoding a picture: {0}")]
     Encode(String),

@@ -22,6 +22,7 @@ pub enum Life {
     Actor {
         /// The actor's number in the run.
         actor: u32,
+        /// This life's.
         incarnation: u64,
     },
     /// Of a learner.

@@ -54,7 +54,9 @@ pub enum TlsError {
         .key.display(), .certificate.display(), how(.certificate, *.role)
     )]
     OtherKey {
+        /// The key.
         key: PathBuf,
+        /// The certificate.
         certificate: PathBuf,
         /// Whose they are.
         role: Role,
@@ -65,6 +67,7 @@ pub enum TlsError {
         .path.display(), how(.path, *.role), have = .have, role = .role.to_string()
     )]
     OtherRole {
+        /// The certificate.
         path: PathBuf,
         /// Its common name.
         have: String,
@@ -77,6 +80,7 @@ pub enum TlsError {
         .path.display(), how(.path, *.role)
     )]
     Expired {
+        /// The certificate.
         path: PathBuf,
         /// Until when it was good.
         when: String,
@@ -89,6 +93,7 @@ pub enum TlsError {
         .path.display()
     )]
     NotYet {
+        /// The certificate.
         path: PathBuf,
         /// From when on it is good.
         when: String,
@@ -99,7 +104,9 @@ pub enum TlsError {
         .path.display(), .authority.display()
     )]
     OtherAuthority {
+        /// The certificate.
         path: PathBuf,
+        /// The authority's.
         authority: PathBuf,
         /// What the check said.
         why: String,

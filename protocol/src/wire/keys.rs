@@ -116,7 +116,10 @@ pub enum Alive {
         mark: u64,
     },
     /// A learner.
-    Learner { mark: u64 },
+    Learner {
+        /// Its mark.
+        mark: u64,
+    },
 }
 
 impl Alive {
