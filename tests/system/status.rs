@@ -116,7 +116,7 @@ fn a_run_that_is_ending_is_no_riddle() {
     let mut process = system.start(&format!(
         "local --agent c51 {SHORT} --evaluate-every 1000 --evaluate-episodes 1000000 --run-dir run"
     ));
-    process.wait_for_stderr("the last checkpoint is being played");
+    process.wait_for_stderr("playing the last checkpoint");
     let ended = system.run("status --run run").expect_code(0);
     let said = "the run in run is ending: all frames are in";
     assert!(ended.stdout.contains(said), "{}", ended.stdout);
