@@ -1,11 +1,7 @@
 //! Whole episodes with a run's weights, and a random policy's beside them.
 //! It trains nothing and changes nothing in the run folder.
 
-use std::{
-    ops::ControlFlow,
-    path::{Path, PathBuf},
-    str::FromStr,
-};
+use std::{ops::ControlFlow, path::Path};
 
 use anyhow::Context;
 use clap::ValueEnum;
@@ -15,16 +11,16 @@ use driml_learner::{
     Compute, UpdateError, checkpoint,
     insight::{Insight, Seen},
 };
-use driml_machine::{
-    error::{Usage, usage},
-    whole_number,
-};
+use driml_machine::error::{Usage, usage};
 use driml_model::{Enlarge, Parameters, Precision, StoredAs};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::run_folder::{Earned, RunFolder};
+use crate::{
+    chosen::{Weights, Which, checkpoint_at, config_of},
+    run_folder::RunFolder,
+};
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
@@ -44,47 +40,6 @@ pub enum Levels {
     TrainSingle,
     /// Others of the same game, each an episode of its own (Procgen)
     Unseen,
-}
-
-/// Which checkpoint of a run.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Which {
-    /// The one with the most updates behind it.
-    #[default]
-    Newest,
-    /// The one after so many updates.
-    After(u64),
-    /// The one that earned most when checkpoints were played.
-    Best,
-}
-
-/// Which weights of a checkpoint.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum Weights {
-    /// The averaged ones where the run has them (learner.update.average_tau), else the online ones
-    #[default]
-    Average,
-    /// Those of the last update
-    Online,
-}
-
-impl FromStr for Which {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "best" => Ok(Self::Best),
-            "newest" => Ok(Self::Newest),
-            "average" => {
-                Err("averaged weights are played wherever a run has them: leave it out".into())
-            }
-            _ => whole_number::within(1..=u64::MAX)(text)
-                .map(Self::After)
-                .map_err(|e| {
-                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
-                }),
-        }
-    }
 }
 
 /// Who chooses the actions.
@@ -307,58 +262,6 @@ const fn sent(config: &RunConfig) -> (usize, usize) {
     (spec.frame_height as usize, spec.frame_width as usize)
 }
 
-/// The settings of the run in `folder`.
-pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
-    let path = folder.config();
-    let text = std::fs::read_to_string(&path).map_err(|e| {
-        usage!(
-            "{} is not the folder of a run: reading {}: {e}",
-            folder.display(),
-            path.display()
-        )
-    })?;
-    Ok(RunConfig::parse(&path.display().to_string(), &text)?)
-}
-
-/// The folder of a checkpoint.
-pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
-    let updates = match which {
-        Which::Newest => None,
-        Which::After(updates) => Some(updates),
-        Which::Best => {
-            let mut best = checkpoint::list(&folder.best())?;
-            let (_, path) = best.pop().ok_or_else(|| {
-                usage!(
-                    "{} has no best checkpoint: none was played while it trained. Train with --evaluate-every UPDATES, or judge those \
-                     that are there with `driml evaluate {} --checkpoint UPDATES --keep`",
-                    folder.display(),
-                    folder.display()
-                )
-            })?;
-            return Ok(path);
-        }
-    };
-    let mut all = checkpoint::list(&folder.checkpoints())?;
-    let Some((newest, _)) = all.last() else {
-        return Err(usage!(
-            "{} has no checkpoint yet: let the run go on",
-            folder.display()
-        )
-        .into());
-    };
-    let wanted = updates.unwrap_or(*newest);
-    let known: Vec<String> = all.iter().map(|(updates, _)| updates.to_string()).collect();
-    let found = all.iter().position(|(updates, _)| *updates == wanted);
-    let at = found.ok_or_else(|| {
-        usage!(
-            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept says how many stay",
-            folder.display(),
-            known.join(", ")
-        )
-    })?;
-    Ok(all.swap_remove(at).1)
-}
-
 /// Sees what the policy sees.
 #[derive(Debug)]
 pub struct Viewer {
@@ -405,37 +308,6 @@ pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage>
     world.with_levels(levels).map_err(|e| usage!("{e}"))
 }
 
-/// The mean, and the interval in which it lies with 95% confidence if returns are normal: Student's.
-///
-/// Its quantile is expanded in 1 / degrees of freedom (Fisher and Cornish 1960), within 0.004 from 10 values on; of one value both ends
-/// are that.
-pub(crate) fn interval(values: &[f64]) -> Earned {
-    let (mean, deviation) = mean_and_deviation(values);
-    let freedom = (values.len() as f64 - 1.0).max(1.0);
-    let quantile = 1.960 + 2.372 / freedom + 2.822 / freedom.powi(2);
-    let by = quantile * deviation / (values.len() as f64).sqrt();
-    Earned {
-        mean,
-        low: mean - by,
-        high: mean + by,
-    }
-}
-
-/// Mean and sample standard deviation; 0 for a single value.
-pub fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
-    let count = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / count;
-    let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    (
-        mean,
-        if values.len() > 1 {
-            (squares / (count - 1.0)).sqrt()
-        } else {
-            0.0
-        },
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use rand::Rng;
@@ -459,26 +331,5 @@ mod tests {
                 assert_ne!(copy.random::<u64>(), first, "stream {stream}");
             }
         }
-    }
-
-    /// The quantiles are those of any textbook's table.
-    #[test]
-    fn the_interval_is_student_s() {
-        for (count, quantile) in [(10, 2.262), (20, 2.093), (100, 1.984)] {
-            let values: Vec<f64> = (0..count).map(f64::from).collect();
-            let (_, deviation) = mean_and_deviation(&values);
-            let Earned { mean, low, high } = interval(&values);
-            let found = (high - mean) * f64::from(count).sqrt() / deviation;
-            assert!((found - quantile).abs() < 0.004, "{count}: {found}");
-            assert!((low + high - 2.0 * mean).abs() < 1e-9);
-        }
-        let one = interval(&[4.0]);
-        assert_eq!([one.mean, one.low, one.high], [4.0; 3]);
-    }
-
-    #[test]
-    fn the_deviation_is_the_samples() {
-        assert_eq!(mean_and_deviation(&[1.0, 3.0]), (2.0, 2.0_f64.sqrt()));
-        assert_eq!(mean_and_deviation(&[4.0]), (4.0, 0.0));
     }
 }

@@ -6,10 +6,10 @@ use std::path::Path;
 use driml_learner::checkpoint;
 
 use crate::{
-    evaluate::{
-        Levels, Player, Weights, Which, Who, checkpoint_at, config_of, levels, mean_and_deviation,
-    },
+    chosen::{Weights, Which, checkpoint_at, config_of},
+    evaluate::{Levels, Player, Who, levels},
     run_folder::{Candidate, Evaluated, RunFolder},
+    stats::mean_and_deviation,
 };
 
 /// The seed of the episodes on which checkpoints are compared: none that anybody reports on.

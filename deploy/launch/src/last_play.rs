@@ -12,8 +12,8 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     console,
-    evaluate::{Levels, Player, Who, interval, levels},
-    run_folder::{LastPlay, RunFolder, Summary},
+    evaluate::{Levels, Player, Who, levels},
+    run_folder::{Earned, LastPlay, RunFolder, Summary},
 };
 
 /// Episodes that are played at once, one in each copy of the world. They count together, so that long ones are not left out.
@@ -84,8 +84,8 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
     Ok(Some(LastPlay {
         weights: player.weights_name().into(),
         episodes: agent.len() as u64,
-        agent: interval(&agent),
-        random: interval(&random),
+        agent: Earned::of(&agent),
+        random: Earned::of(&random),
     }))
 }
 

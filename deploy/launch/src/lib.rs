@@ -20,6 +20,7 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
+pub mod chosen;
 mod connect;
 pub mod console;
 pub mod endpoint;
@@ -46,5 +47,6 @@ pub mod resume;
 pub mod run_folder;
 pub mod run_view;
 pub mod shared_memory;
+pub mod stats;
 pub mod view;
 pub mod watch;

@@ -48,7 +48,7 @@ pub struct Member {
     pub column: String,
     /// Its own name.
     pub name: String,
-    /// Its number.
+    /// Its value, in the metric's unit; none where it is not known.
     pub value: Option<f64>,
 }
 

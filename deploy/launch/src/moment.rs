@@ -38,9 +38,9 @@ pub struct Speed {
 /// Mean and standard deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
-    /// The mean.
+    /// Mean over the rows served.
     pub mean: f64,
-    /// The standard deviation.
+    /// Standard deviation over the same rows.
     pub sd: f64,
 }
 

@@ -16,9 +16,9 @@ use crate::{
 /// What the settings say of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Plan {
-    /// The world.
+    /// The world, as `--env` names it.
     pub world: String,
-    /// The agent.
+    /// The agent, as `--agent` names it.
     pub agent: String,
     /// The seed of every generator of the run.
     pub seed: u64,

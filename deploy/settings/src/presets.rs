@@ -101,7 +101,7 @@ pub const PRESETS: &[Preset] = &[
         layers: &[layer!("variant/balanced")],
         families: &[],
         price: Some(
-            "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/experiments/results/tradeoff",
+            "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md",
         ),
     },
     Preset {
@@ -110,7 +110,7 @@ pub const PRESETS: &[Preset] = &[
         layers: &[layer!("variant/fast")],
         families: &[],
         price: Some(
-            "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/experiments/results/tradeoff",
+            "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md",
         ),
     },
     Preset {

@@ -19,7 +19,7 @@ pub(super) const TARGET: &str = "target.safetensors";
 /// CURL's key encoder; there for that objective alone.
 pub(super) const KEY: &str = "key.safetensors";
 /// The averaged network; there if the settings ask for one.
-pub(super) const AVERAGE: &str = "average.safetensors";
+pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 /// What whoever drives the learner keeps with it; there if it keeps something.
 pub(super) const COMPANION: &str = "companion.bin";

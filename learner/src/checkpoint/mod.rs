@@ -8,7 +8,7 @@ mod folder;
 mod load;
 mod save;
 
-pub use contents::check_state;
+pub use contents::{AVERAGE, check_state};
 pub use description::{KEY as DESCRIPTION, describe, described};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};

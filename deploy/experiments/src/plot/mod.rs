@@ -13,8 +13,9 @@ use std::{collections::BTreeSet, path::PathBuf};
 use driml_figure::{Axis, Chart, Figure, Format, GREY, Look, Mark, Panel, Series};
 use driml_launch::{
     console::{self, print},
-    evaluate::{mean_and_deviation, random_returns},
+    evaluate::random_returns,
     run_folder::RunFolder,
+    stats::mean_and_deviation,
     view::loss_title,
 };
 use driml_machine::error::usage;

@@ -2,18 +2,17 @@
 //! Returns of the training are in their summaries.
 
 use driml_launch::{
-    evaluate::{Levels, Player, Weights, Which, Who, random_returns},
+    chosen::{Weights, Which},
+    evaluate::{Levels, Player, Who, random_returns},
     run_folder::RunFolder,
 };
-use driml_learner::checkpoint;
+use driml_learner::checkpoint::{self, AVERAGE};
 
 use super::plan::FinishedRun;
 use crate::{cache::Session, plot::Run, progress::Progress};
 
 /// Seed of the played episodes: the same levels for every run.
 const SEED: u64 = 1;
-/// The file of a checkpoint's averaged weights.
-const AVERAGE: &str = "average.safetensors";
 
 /// What is played of a run.
 #[derive(Clone, Copy, Debug)]

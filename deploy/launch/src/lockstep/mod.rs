@@ -19,8 +19,8 @@ use driml_protocol::Shutdown;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
+    chosen::Which,
     console::{self, Screen, print, print_wrapped},
-    evaluate::Which,
     keep::keep,
     resume,
     run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},

@@ -9,7 +9,11 @@ use driml_protocol::{Quantiles, RunSpec, whole_file};
 use serde::{Deserialize, Serialize};
 
 use super::folder::RunFolder;
-use crate::{moment::Episodes, run_view::RunView};
+use crate::{
+    moment::Episodes,
+    run_view::RunView,
+    stats::{interval, mean_and_deviation},
+};
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -26,12 +30,21 @@ pub enum Outcome {
 /// The mean undiscounted return of whole episodes, and the 95% interval in which it lies.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Earned {
-    /// The mean.
+    /// Mean return of the episodes.
     pub mean: f64,
     /// Where the interval begins.
     pub low: f64,
     /// Where it ends.
     pub high: f64,
+}
+
+impl Earned {
+    /// Of these returns, at least one; both ends are the mean of a single one.
+    pub(crate) fn of(returns: &[f64]) -> Self {
+        let (mean, _) = mean_and_deviation(returns);
+        let (low, high) = interval(returns).unwrap_or((mean, mean));
+        Self { mean, low, high }
+    }
 }
 
 /// What a finished run's weights earned, and a random policy over as many episodes.

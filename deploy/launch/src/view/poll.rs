@@ -26,7 +26,7 @@ pub struct Reached {
     pub name: String,
     /// Where it listens.
     pub endpoint: String,
-    /// The session.
+    /// An open session to it, which the poller closes.
     pub session: Session,
 }
 

@@ -16,11 +16,13 @@ use clap::Args;
 use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
+    chosen::{Weights, Which},
     console::{self, print},
-    evaluate::{Levels, Player, Weights, Which, Who, levels, mean_and_deviation},
+    evaluate::{Levels, Player, Who, levels},
     keep::{Judged, keep},
     pretrained,
     run_folder::{RunFolder, sweep, write_whole},
+    stats::mean_and_deviation,
 };
 use driml_machine::error::{EXIT_INTERRUPTED, usage};
 use driml_protocol::Shutdown;

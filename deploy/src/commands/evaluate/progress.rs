@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use driml_launch::{console::Screen, evaluate::mean_and_deviation, view::TEMPLATE};
+use driml_launch::{console::Screen, stats::mean_and_deviation, view::TEMPLATE};
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);

@@ -10,8 +10,9 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::{
-    evaluate::{Levels, Player, mean_and_deviation},
+    evaluate::{Levels, Player},
     run_folder::rounded,
+    stats::mean_and_deviation,
 };
 use serde_json::json;
 

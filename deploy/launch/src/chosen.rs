@@ -1,0 +1,104 @@
+//! Which weights of a run's folder are meant, and where they lie.
+//! It reads the settings alone; weights are read by the player.
+
+use std::{path::PathBuf, str::FromStr};
+
+use clap::ValueEnum;
+use driml_learner::checkpoint;
+use driml_machine::{error::usage, whole_number};
+use driml_settings::config::RunConfig;
+
+use crate::run_folder::RunFolder;
+
+/// Which checkpoint of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Which {
+    /// The one with the most updates behind it.
+    #[default]
+    Newest,
+    /// The one after so many updates.
+    After(u64),
+    /// The one that earned most when checkpoints were played.
+    Best,
+}
+
+/// Which weights of a checkpoint.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Weights {
+    /// The averaged ones where the run has them (learner.update.average_tau), else the online ones
+    #[default]
+    Average,
+    /// Those of the last update
+    Online,
+}
+
+impl FromStr for Which {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "best" => Ok(Self::Best),
+            "newest" => Ok(Self::Newest),
+            "average" => {
+                Err("averaged weights are played wherever a run has them: leave it out".into())
+            }
+            _ => whole_number::within(1..=u64::MAX)(text)
+                .map(Self::After)
+                .map_err(|e| {
+                    format!("{e}: give the updates of a checkpoint, \"best\" or \"newest\"")
+                }),
+        }
+    }
+}
+
+/// The settings of the run in `folder`.
+pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+    let path = folder.config();
+    let text = std::fs::read_to_string(&path).map_err(|e| {
+        usage!(
+            "{} is not the folder of a run: reading {}: {e}",
+            folder.display(),
+            path.display()
+        )
+    })?;
+    Ok(RunConfig::parse(&path.display().to_string(), &text)?)
+}
+
+/// The folder of a checkpoint.
+pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
+    let updates = match which {
+        Which::Newest => None,
+        Which::After(updates) => Some(updates),
+        Which::Best => {
+            let mut best = checkpoint::list(&folder.best())?;
+            let (_, path) = best.pop().ok_or_else(|| {
+                usage!(
+                    "{} has no best checkpoint: none was played while it trained. Train with --evaluate-every UPDATES, or judge those \
+                     that are there with `driml evaluate {} --checkpoint UPDATES --keep`",
+                    folder.display(),
+                    folder.display()
+                )
+            })?;
+            return Ok(path);
+        }
+    };
+    let mut all = checkpoint::list(&folder.checkpoints())?;
+    let Some((newest, _)) = all.last() else {
+        return Err(usage!(
+            "{} has no checkpoint yet: let the run go on",
+            folder.display()
+        )
+        .into());
+    };
+    let wanted = updates.unwrap_or(*newest);
+    let known: Vec<String> = all.iter().map(|(updates, _)| updates.to_string()).collect();
+    let found = all.iter().position(|(updates, _)| *updates == wanted);
+    let at = found.ok_or_else(|| {
+        usage!(
+            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept says how many stay",
+            folder.display(),
+            known.join(", ")
+        )
+    })?;
+    Ok(all.swap_remove(at).1)
+}
