@@ -34,7 +34,7 @@ pub enum BenchCommand {
     },
     /// A short run with real processes: its speed, how long the learner computes and waits, its memory
     System {
-        /// Frames of the run [default: 12000, or 2500 with --quick]
+        /// Frames of the run [default: 12000, or 5000 with --quick]
         #[arg(long, value_name = "N", value_parser = whole_number::within(2_000..=100_000_000))]
         frames: Option<u64>,
     },

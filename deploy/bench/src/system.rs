@@ -26,7 +26,7 @@ use crate::{
 };
 
 /// Frames of the run, and of a quick one.
-const FRAMES: (u64, u64) = (12_000, 2_500);
+const FRAMES: (u64, u64) = (12_000, 5_000);
 /// Updates before the first that counts: by then all threads run and all memory is taken.
 const WARMUP_UPDATES: u64 = 10;
 /// How often a run is looked at.
