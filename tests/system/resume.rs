@@ -144,18 +144,34 @@ fn what_cannot_be_resumed() {
         let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
         assert!(said.contains(nothing), "{less}: {said}");
     }
-    // One that was cut off when all was learned: only its end is missing.
-    let summary = fs::read_to_string(system.path("run/summary.json")).unwrap();
-    let cut_off = summary.replace("\"finished\"", "\"failed\"");
-    fs::write(system.path("run/summary.json"), cut_off).unwrap();
-    system.run("local --resume run").expect_code(0);
-    let run = system.run_folder("run").summary();
-    assert_eq!(run.outcome, "finished");
-    // The last chunk of 32 is stored whole, which are 16 updates.
-    assert!((540..556).contains(&run.updates), "{run:#?}");
-
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     refused("local --resume run --frames 2000", "there is no checkpoint");
+}
+
+/// All was learned when the launcher was killed: only the run's end is missing, and its shards hold nothing any more.
+#[test]
+fn a_run_cut_off_at_its_end_is_finished() {
+    let system = system();
+    for shards in [1, 2] {
+        let dir = format!("run-{shards}");
+        let run = format!(
+            "--agent c51 {SHORT} --actors {shards} --replay-shards {shards} --run-dir {dir}"
+        );
+        system.run(&format!("local {run}")).expect_code(0);
+        let path = system.path(&dir).join("summary.json");
+        let summary = fs::read_to_string(&path).unwrap();
+        fs::write(&path, summary.replace("\"finished\"", "\"failed\"")).unwrap();
+        let run = system.run_folder(&dir);
+        let before = run.summary().updates;
+        system.run(&format!("local --resume {dir}")).expect_code(0);
+        let summary = run.summary();
+        assert_eq!(summary.outcome, "finished");
+        // The last chunk of 32 is stored whole, which are 16 updates.
+        assert!(
+            (before..before + 16).contains(&summary.updates),
+            "{summary:#?}"
+        );
+    }
 }
 
 #[test]

@@ -347,6 +347,8 @@ impl Fetcher {
                     partial.pending = split;
                     partial.shares = shards::shares(&partial.counts);
                 }
+                // A run that had all its updates when it was resumed: nothing comes to be held any more.
+                None if partial.all_in => return Ok(Some(Fetched::Finished)),
                 None => {
                     self.shutdown.wait_timeout(LOOK_AGAIN);
                     return Ok(None);
