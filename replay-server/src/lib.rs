@@ -66,7 +66,6 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-mod admission;
 mod config;
 mod ledger;
 mod persist;
@@ -86,8 +85,8 @@ pub use sampling::{
     horizon,
     packed_batch::PackedBatch,
     rows::{
+        PriorityCounts,
         prioritised::{CHANCE_ERROR, PRIORITY_MIN},
-        sampler::PriorityCounts,
     },
 };
 pub use service::{RunArgs, run, shared_memory_bytes};

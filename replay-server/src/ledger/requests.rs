@@ -1,21 +1,12 @@
 //! Which rows each client was given last, so that those of a batch that did not arrive can be taken back.
 //! It neither draws rows nor counts them.
 
-use std::{cmp::Ordering, collections::VecDeque};
+use std::collections::VecDeque;
 
 use driml_protocol::RequestId;
 
 /// Clients that are remembered; a learner has one for each batch on its way, and nothing is taken back from one forgotten.
 const CLIENTS_MAX: usize = 1024;
-
-/// What a request is, seen beside those of its client that came before.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Dedup {
-    /// To be answered. It repeats one that was given rows with these k, and did not receive them; none if it does not.
-    Fresh(Vec<u32>),
-    /// Answered already, or its client has sent it again or another since: it was given up.
-    Superseded,
-}
 
 /// The last request of each client, of the one whose request is oldest first.
 #[derive(Clone, Debug, Default)]
@@ -31,34 +22,33 @@ struct Request {
 }
 
 impl Requests {
-    /// Takes note of a request; the same one may come here any number of times until it is given rows.
-    pub(crate) fn begin(&mut self, id: RequestId) -> Dedup {
+    /// Takes note of a request; the same one may come here any number of times until it is given rows. Gives the k of the rows that it
+    /// was given by an earlier attempt and did not receive. `None`: it was answered already, or its client has sent it again or another
+    /// since.
+    pub(crate) fn begin(&mut self, id: RequestId) -> Option<Vec<u32>> {
         let mut last = self.last.iter();
         let known = last.position(|it| it.id.client_id == id.client_id);
         if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
-            return Dedup::Fresh(Vec::new());
+            return Some(Vec::new());
         }
-        let mut request = known
-            .and_then(|at| self.last.remove(at))
-            .unwrap_or(Request { id, given: None });
-        let order = (id.number, id.attempt).cmp(&(request.id.number, request.id.attempt));
-        let dedup = match order {
-            Ordering::Less => Dedup::Superseded,
-            Ordering::Equal if request.given.is_some() => Dedup::Superseded,
-            _ => {
-                let given = request
-                    .given
-                    .take()
-                    .filter(|_| request.id.number == id.number);
-                request.id = id;
-                Dedup::Fresh(given.unwrap_or_default())
-            }
-        };
+        let known = known.and_then(|at| self.last.remove(at));
+        let mut request = known.unwrap_or(Request {
+            id: RequestId::first(id.client_id),
+            given: None,
+        });
+        let order = |id: RequestId| (id.number, id.attempt);
+        let is_first = request.given.is_none() && id == request.id;
+        let lost = (is_first || order(id) > order(request.id)).then(|| {
+            let given = request.given.take();
+            let given = given.filter(|_| request.id.number == id.number);
+            request.id = id;
+            given.unwrap_or_default()
+        });
         if self.last.len() == CLIENTS_MAX {
             self.last.pop_front();
         }
         self.last.push_back(request);
-        dedup
+        lost
     }
 
     /// The request of this client that was begun last is given rows with these `ks`.
@@ -73,8 +63,8 @@ impl Requests {
 mod tests {
     use super::*;
 
-    fn fresh(ks: &[u32]) -> Dedup {
-        Dedup::Fresh(ks.to_vec())
+    fn fresh(ks: &[u32]) -> Option<Vec<u32>> {
+        Some(ks.to_vec())
     }
 
     #[test]
@@ -86,12 +76,12 @@ mod tests {
         let cases = [
             (first, fresh(&[]), None, "the first"),
             (first, fresh(&[]), Some(vec![1, 2]), "it still waits"),
-            (first, Dedup::Superseded, None, "it was answered"),
+            (first, None, None, "it was answered"),
             (again, fresh(&[1, 2]), None, "the answer did not arrive"),
             (again, fresh(&[]), None, "taken back before"),
-            (first, Dedup::Superseded, Some(vec![3]), "given up"),
+            (first, None, Some(vec![3]), "given up"),
             (again.next(), fresh(&[]), None, "the one before arrived"),
-            (again.again(), Dedup::Superseded, None, "given up"),
+            (again.again(), None, None, "given up"),
             (other, fresh(&[]), None, "another client"),
         ];
         for (id, expected, given, what) in cases {

@@ -2,9 +2,7 @@
 
 use std::collections::VecDeque;
 
-use driml_protocol::{
-    EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus, Returns,
-};
+use driml_protocol::{EPISODES_MAX, EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus};
 use serde::{Deserialize, Serialize};
 
 use super::actors::Difference;
@@ -14,58 +12,45 @@ const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
 /// The same in what a log keeps of a moment, where somebody records them: those for which he has not asked yet.
 const EPISODES_LOGGED_MAX: usize = 1_024;
 
-/// What the status reports beside the ring's and the limiter's own counts.
+/// What is counted beside the ring's and the limiter's own counts.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Statistics {
-    pub(crate) transitions_lost: u64,
-    pub(crate) transitions_duplicated: u64,
-    pub(crate) chunks_retried: u64,
-    pub(crate) batches_retried: u64,
-    /// Rows served to a learner that died before it saved what it learned from them.
-    pub(crate) rows_unlearned: u64,
-    /// Updates learned again by a learner with an older checkpoint.
-    pub(crate) updates_relearned: u64,
-    pub(crate) messages_refused: u64,
+    /// As the status says it; what is known elsewhere is at its default here.
+    pub(crate) counted: ReplayStatus,
     /// Messages by which an actor's own count differed.
     differences: u64,
-    pub(crate) episodes: u64,
-    /// The newest of them.
+    /// The newest of the episodes that ended.
     newest: VecDeque<EndedEpisode>,
     /// How many the process that records them had when it asked last; none before it asks.
     #[serde(skip)]
     recorded: Option<u64>,
-    returns_known: u64,
-    returns: VecDeque<f64>,
-    pub(crate) k_histogram: Vec<u64>,
-    pub(crate) mean_age: f64,
-    pub(crate) action_histogram: Vec<u64>,
-    pub(crate) learner_waited_s: f64,
-    pub(crate) actors_waited_s: f64,
-    #[serde(skip)]
-    pub(crate) actors: u32,
 }
 
 impl Statistics {
     /// Zeros, for k in 0..=`k_max` and actions below `num_actions`.
     pub(crate) fn new(k_max: u32, num_actions: u32) -> Self {
         Self {
-            k_histogram: vec![0; k_max as usize + 1],
-            action_histogram: vec![0; num_actions as usize],
+            counted: ReplayStatus {
+                k_histogram: vec![0; k_max as usize + 1],
+                action_histogram: vec![0; num_actions as usize],
+                ..ReplayStatus::default()
+            },
             ..Self::default()
         }
     }
 
     /// Without what is counted of messages that change nothing, which no log knows of.
     pub(crate) fn of_changes(mut self) -> Self {
-        (self.chunks_retried, self.messages_refused) = (0, 0);
-        (self.learner_waited_s, self.actors_waited_s) = (0.0, 0.0);
+        let counted = &mut self.counted;
+        (counted.chunks_retried, counted.messages_refused) = (0, 0);
+        (counted.learner_waited_s, counted.actors_waited_s) = (0.0, 0.0);
         self
     }
 
     /// Takes the ended episodes that `before` keeps, if these counts are of the same moment: a snapshot has those alone that were not
     /// recorded.
     pub(crate) fn keep_newest_of(&mut self, before: &mut Self) {
-        if self.episodes == before.episodes {
+        if self.counted.episodes == before.counted.episodes {
             self.newest = std::mem::take(&mut before.newest);
         }
     }
@@ -73,9 +58,10 @@ impl Statistics {
     /// What is counted of transitions stored, without what is counted of rows drawn.
     pub(crate) fn of_stored(self) -> Self {
         let mut stored = self.of_changes();
-        stored.k_histogram.fill(0);
-        (stored.batches_retried, stored.rows_unlearned) = (0, 0);
-        (stored.updates_relearned, stored.mean_age) = (0, 0.0);
+        let counted = &mut stored.counted;
+        counted.k_histogram.fill(0);
+        (counted.batches_retried, counted.rows_unlearned) = (0, 0);
+        (counted.updates_relearned, counted.mean_age) = (0, 0.0);
         stored
     }
 
@@ -85,50 +71,55 @@ impl Statistics {
             return false;
         }
         self.differences += 1;
-        self.transitions_lost = self.transitions_lost.saturating_add(lost);
-        self.transitions_duplicated = self.transitions_duplicated.saturating_add(duplicated);
+        for (count, more) in [
+            (&mut self.counted.transitions_lost, lost),
+            (&mut self.counted.transitions_duplicated, duplicated),
+        ] {
+            *count = count.saturating_add(more);
+        }
         self.differences.is_power_of_two()
     }
 
     /// Counts rows served with these `ks`.
     pub(crate) fn served(&mut self, ks: &[u32]) {
         for &k in ks {
-            self.k_histogram[k as usize] += 1;
+            self.counted.k_histogram[k as usize] += 1;
         }
     }
 
     /// Counts rows that [`Statistics::served`] counted as not served.
     pub(crate) fn refund(&mut self, ks: &[u32]) {
-        self.batches_retried += 1;
+        self.counted.batches_retried += 1;
         for &k in ks {
-            self.k_histogram[k as usize] -= 1;
+            self.counted.k_histogram[k as usize] -= 1;
         }
     }
 
     /// Counts an episode that ended; its return counts if all of it was seen.
     pub(crate) fn episode_ended(&mut self, episode: EndedEpisode) {
-        self.episodes += 1;
+        self.counted.episodes += 1;
         if self.newest.len() == EPISODES_KEPT_MAX {
             self.newest.pop_front();
         }
         self.newest.push_back(episode);
+        let returns = &mut self.counted.returns;
         if let Some(played) = episode.played {
-            self.returns_known += 1;
-            if self.returns.len() == RETURNS_OF {
-                self.returns.pop_front();
+            returns.known += 1;
+            if returns.newest.len() == RETURNS_OF {
+                returns.newest.remove(0);
             }
-            self.returns.push_back(played.episode_return);
+            returns.newest.push(played.episode_return);
         }
     }
 
     /// Episodes that ended after the first `since`: the oldest that are still kept, as many as fit into one answer.
     pub(crate) fn episodes_since(&self, since: u64) -> EpisodesReply {
-        let kept = self.newest.len() as u64;
-        let before = since.clamp(self.episodes - kept, self.episodes);
-        let skipped = (before + kept - self.episodes) as usize;
+        let (ended, kept) = (self.counted.episodes, self.newest.len() as u64);
+        let before = since.clamp(ended - kept, ended);
+        let skipped = (before + kept - ended) as usize;
         let episodes = self.newest.iter().skip(skipped).take(EPISODES_MAX);
         EpisodesReply {
-            ended: self.episodes,
+            ended,
             before,
             episodes: episodes.copied().collect(),
         }
@@ -136,52 +127,30 @@ impl Statistics {
 
     /// Somebody has the first so many of them.
     pub(crate) fn note_recorded(&mut self, episodes: u64) {
-        self.recorded = Some(episodes.min(self.episodes));
+        self.recorded = Some(episodes.min(self.counted.episodes));
     }
 
     /// Why these cannot be the counts of a replay; none if they can.
     pub(crate) fn unfit(&self) -> Option<&'static str> {
+        let (ended, returns) = (self.counted.episodes, &self.counted.returns);
         let fits = self.newest.len() <= EPISODES_KEPT_MAX
-            && self.newest.len() as u64 <= self.episodes
-            && self.returns.len() <= RETURNS_OF
-            && self.returns_known <= self.episodes;
+            && self.newest.len() as u64 <= ended
+            && returns.newest.len() <= RETURNS_OF
+            && returns.known <= ended;
         (!fits).then_some("a state with more episodes than have ended")
     }
 
     /// What a log keeps of a moment.
     pub(crate) fn logged(&self) -> Self {
         let mut logged = self.clone();
-        let unrecorded = logged.recorded.take().map_or(0, |it| self.episodes - it);
+        // Who is connected is not counted.
+        logged.counted.actors = 0;
+        let recorded = logged.recorded.take();
+        let unrecorded = recorded.map_or(0, |it| self.counted.episodes - it);
         let kept = EPISODES_LOGGED_MAX.min(unrecorded as usize);
+        let newest = logged.newest.len();
+        logged.newest.drain(..newest.saturating_sub(kept));
         logged
-            .newest
-            .drain(..logged.newest.len().saturating_sub(kept));
-        logged
-    }
-
-    /// What a status says of these counts; the rest is at its default.
-    pub(crate) fn status(&self) -> ReplayStatus {
-        ReplayStatus {
-            transitions_lost: self.transitions_lost,
-            transitions_duplicated: self.transitions_duplicated,
-            chunks_retried: self.chunks_retried,
-            batches_retried: self.batches_retried,
-            messages_refused: self.messages_refused,
-            rows_unlearned: self.rows_unlearned,
-            updates_relearned: self.updates_relearned,
-            episodes: self.episodes,
-            returns: Returns {
-                known: self.returns_known,
-                newest: self.returns.iter().copied().collect(),
-            },
-            k_histogram: self.k_histogram.clone(),
-            mean_age: self.mean_age,
-            action_histogram: self.action_histogram.clone(),
-            learner_waited_s: self.learner_waited_s,
-            actors_waited_s: self.actors_waited_s,
-            actors: self.actors,
-            ..ReplayStatus::default()
-        }
     }
 }
 
@@ -224,11 +193,11 @@ mod tests {
         }
         let late = statistics.episodes_since(0);
         assert_eq!((late.before, late.episodes[0].frames), (7, 7));
-        assert_eq!(statistics.episodes, EPISODES_KEPT_MAX as u64 + 7);
+        assert_eq!(statistics.counted.episodes, EPISODES_KEPT_MAX as u64 + 7);
         for (recorded, logged) in [
             (None, 0),
             (Some(9), EPISODES_LOGGED_MAX),
-            (Some(statistics.episodes - 3), 3),
+            (Some(statistics.counted.episodes - 3), 3),
         ] {
             statistics.recorded = recorded;
             let reply = statistics.logged().episodes_since(0);

@@ -1,5 +1,5 @@
-//! The folder of a log: one server alone uses it, and it says whose replay is in it.
-//! What the segments hold is for `recover`.
+//! The folder of a log: one server alone uses it, it says whose replay is in it, and it holds the log's segments.
+//! How segments are written is for `journal`, what they hold for `recover`.
 
 use std::{
     fs::{self, File},
@@ -8,19 +8,47 @@ use std::{
 };
 
 use driml_protocol::{lock_file, whole_file};
+use serde::{Deserialize, Serialize};
 
-use super::{
-    error::PersistError,
-    segment::{self, FORMAT, LogId, SegmentFile},
-};
+use super::snapshot::Snapshot;
+use crate::config::ConfigError;
 
+/// Form of the log; one of another form is refused.
+pub(super) const FORMAT: u32 = 4;
 /// The file that says which log it is.
 const ID: &str = "log.toml";
+/// Highest number of a segment; files of higher ones are none of a log's.
+const NUMBER_MAX: u64 = 1 << 60;
 
-/// A folder that is in use by this process.
-pub(super) struct LogFolder {
-    pub(super) path: PathBuf,
-    _lock: File,
+/// What keeps a replay from its folder.
+#[derive(Debug, thiserror::Error)]
+pub enum PersistError {
+    /// A file or folder that cannot be read or written.
+    #[error("{doing} {}: {source}; --replay-dir needs a folder with room that this process may write", path.display())]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// With which file or folder.
+        path: PathBuf,
+        /// What the system answered.
+        source: io::Error,
+    },
+    /// Another replay server uses the folder.
+    #[error("another replay server keeps its replay in {}: end it first, or choose another --replay-dir", .0.display())]
+    InUse(PathBuf),
+    /// What is in this file or folder is not this run's, is of another version, or makes no sense although its checksum is right: why,
+    /// and what to do.
+    #[error("{path} {1}", path = .0.display())]
+    Unusable(PathBuf, String),
+    /// The log does not reach back to a mark, which is this file.
+    #[error("{} is missing or damaged: the replay cannot go back to where the checkpoint was made", .0.display())]
+    NoMark(PathBuf),
+    /// The process was told to end before the log was read.
+    #[error("it was told to end while it read its replay back; what is kept was not changed")]
+    Stopped,
+    /// Settings that cannot work.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
 }
 
 /// Makes an error of the file system one that says what was done with which file.
@@ -34,6 +62,38 @@ pub(super) fn io_error(
         path,
         source,
     }
+}
+
+/// A moment in the life of a replay that is kept on disk: the segment that begins there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Mark(pub(super) u64);
+
+/// Which log it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct LogId {
+    pub(super) format: u32,
+    /// A random number, drawn when the log was begun.
+    pub(super) identity: u64,
+    /// Hash of the run spec.
+    pub(super) spec_hash: u64,
+    /// Which of the replay's shards it is, and how many there are.
+    pub(super) shard: (u32, u32),
+}
+
+/// What a segment says first.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct SegmentHeader {
+    pub(super) log: LogId,
+    /// Number of the segment, from 0.
+    pub(super) number: u64,
+    /// The state before its first record.
+    pub(super) snapshot: Snapshot,
+}
+
+/// A folder that is in use by this process.
+pub(super) struct LogFolder {
+    pub(super) path: PathBuf,
+    _lock: File,
 }
 
 impl LogFolder {
@@ -50,9 +110,46 @@ impl LogFolder {
         })
     }
 
-    /// All segments in the folder, by number.
-    pub(super) fn segments(&self) -> Result<Vec<SegmentFile>, PersistError> {
-        segment::list(&self.path).map_err(io_error("listing", &self.path))
+    /// Path of segment `number`.
+    pub(super) fn segment(&self, number: u64) -> PathBuf {
+        self.path.join(format!("segment-{number:012}.log"))
+    }
+
+    /// The numbers of all segments in the folder, in order.
+    pub(super) fn segments(&self) -> Result<Vec<u64>, PersistError> {
+        let number = |entry: io::Result<fs::DirEntry>| {
+            let name = entry?.file_name();
+            let name = name.to_str();
+            let digits = name.and_then(|it| it.strip_prefix("segment-")?.strip_suffix(".log"));
+            let number = digits.and_then(|digits| digits.parse().ok());
+            Ok(number.filter(|&number| number <= NUMBER_MAX))
+        };
+        let numbers = fs::read_dir(&self.path)
+            .and_then(|entries| entries.map(number).collect::<io::Result<Vec<_>>>())
+            .map_err(io_error("listing", &self.path))?;
+        let mut numbers: Vec<_> = numbers.into_iter().flatten().collect();
+        numbers.sort_unstable();
+        Ok(numbers)
+    }
+
+    /// All of a segment.
+    pub(super) fn read(&self, number: u64) -> Result<Vec<u8>, PersistError> {
+        let path = self.segment(number);
+        fs::read(&path).map_err(io_error("reading", &path))
+    }
+
+    /// Ends a segment's file at byte `at`.
+    pub(super) fn cut_off(&self, number: u64, at: usize) -> Result<(), PersistError> {
+        let path = self.segment(number);
+        let opened = File::options().write(true).open(&path);
+        opened
+            .and_then(|opened| opened.set_len(at as u64))
+            .map_err(io_error("cutting off the end of", &path))
+    }
+
+    pub(super) fn remove(&self, number: u64) -> Result<(), PersistError> {
+        let path = self.segment(number);
+        fs::remove_file(&path).map_err(io_error("removing", &path))
     }
 
     /// Which log is in the folder; none if it is a new one.
@@ -86,11 +183,9 @@ impl LogFolder {
                 found.format
             ));
         }
+        let ((shard, shards), (our_shard, our_shards)) = (found.shard, ours.shard);
         let why = if found.shard != ours.shard {
-            format!(
-                "shard {} of {}; this is shard {} of {}",
-                found.shard.0, found.shard.1, ours.shard.0, ours.shard.1
-            )
+            format!("shard {shard} of {shards}; this is shard {our_shard} of {our_shards}")
         } else if found.spec_hash != ours.spec_hash {
             let (theirs, ours) = (found.spec_hash, ours.spec_hash);
             format!("its run spec has the hash {theirs:016x}, this run's {ours:016x}")

@@ -1,12 +1,12 @@
-//! The writing side of the log: records at the end of the newest segment, new segments, and the oldest removed.
-//! When a record is due is for `upkeep`; it reads nothing back.
+//! The writing side of the log of a replay that is in use: records at the end of the newest segment, new segments, marks, and the oldest
+//! segments removed. When a record is due is for `upkeep`; it reads nothing back.
 
 use std::{
     collections::VecDeque,
     fs::{self, File},
     io,
     os::unix::fs::FileExt,
-    path::{Path, PathBuf},
+    path::Path,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -14,25 +14,59 @@ use std::{
 use driml_protocol::{LogStatus, Seldom, codec};
 
 use super::{
-    error::PersistError,
-    folder::io_error,
+    folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader, io_error},
     record::{self, RecordKind},
-    segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
     snapshot::{Note, Snapshot},
     sync::Syncer,
 };
+use crate::storage::frame_store::PackedChunk;
+
+/// Marks that hold: if the newest is of a checkpoint that was not written whole, the one before it is wanted.
+const MARKS: usize = 2;
 
 /// One segment of the log that is in the folder.
-struct Segment {
-    number: u64,
+#[derive(Debug)]
+pub(super) struct Segment {
+    pub(super) number: u64,
     /// The first transition that it may hold.
-    first_row: u64,
-    bytes: u64,
+    pub(super) first_row: u64,
+    pub(super) bytes: u64,
+}
+
+/// Where a log is continued.
+#[derive(Default)]
+pub(super) struct Place {
+    /// The segments that are of use.
+    pub(super) segments: VecDeque<Segment>,
+    /// Number of the next segment.
+    pub(super) number: u64,
+    /// Number of the next record.
+    pub(super) ordinal: u64,
+    /// The mark to which the log went back, and the oldest transition that was held then.
+    pub(super) mark: Option<(Mark, u64)>,
+}
+
+/// How a log is written, and how much it may take.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    /// From this size on, a segment is followed by another.
+    pub(super) segment_bytes: u64,
+    /// Most that all segments take.
+    pub(super) disk_bytes_max: Option<u64>,
+    /// How often it is flushed; zero after each write.
+    pub(super) fsync: Duration,
+}
+
+struct Failing {
+    since: Instant,
+    /// What it said last.
+    why: String,
+    said: Seldom,
 }
 
 /// The writing side of a log.
 pub(crate) struct Journal {
-    folder: PathBuf,
+    folder: LogFolder,
     id: LogId,
     /// All in the folder, the oldest first; the last one is written.
     segments: VecDeque<Segment>,
@@ -46,74 +80,50 @@ pub(crate) struct Journal {
     /// Records that the disk has refused so far; nothing is written before them.
     pending: Vec<u8>,
     failing: Option<Failing>,
-}
-
-/// Where a log is continued.
-#[derive(Default)]
-pub(super) struct Place {
-    /// The segments that are of use, each with its first transition.
-    pub(super) segments: Vec<(SegmentFile, u64)>,
-    /// Number of the next segment.
-    pub(super) number: u64,
-    /// Number of the next record.
-    pub(super) ordinal: u64,
-}
-
-/// How much a log may take.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Limits {
-    /// From this size on, a segment is followed by another.
-    pub(super) segment_bytes: u64,
-    /// Most that all segments take.
-    pub(super) disk_bytes_max: Option<u64>,
-}
-
-struct Failing {
-    since: Instant,
-    /// What it said last.
-    why: String,
-    said: Seldom,
+    /// The last two marks that were not given up, the newest last, each with the oldest transition that was held: what they need stays.
+    marks: VecDeque<(Mark, u64)>,
 }
 
 impl Journal {
     /// Continues the log `id` from `place` on, in a new segment that begins with `snapshot`.
     pub(super) fn begin(
-        folder: &Path,
+        folder: LogFolder,
         id: LogId,
-        place: &Place,
+        place: Place,
         limits: Limits,
-        fsync: Duration,
         snapshot: &Snapshot,
     ) -> Result<Self, PersistError> {
-        let mut segments = VecDeque::new();
-        for (file, first_row) in &place.segments {
-            let metadata = fs::metadata(&file.path).map_err(io_error("looking at", &file.path))?;
-            segments.push_back(Segment {
-                number: file.number,
-                first_row: *first_row,
-                bytes: metadata.len(),
-            });
-        }
-        let syncer = File::open(folder)
-            .and_then(|opened| Syncer::start(opened, fsync))
-            .map_err(io_error("opening", folder))?;
-        let path = segment::path(folder, place.number);
-        let begun = begin_segment(folder, id, place.number, place.ordinal, snapshot);
-        let (segment, file) = begun.map_err(io_error("writing", &path))?;
+        let syncer = File::open(&folder.path)
+            .and_then(|opened| Syncer::start(opened, limits.fsync))
+            .map_err(io_error("opening", &folder.path))?;
+        let Place {
+            mut segments,
+            number,
+            ordinal,
+            mark,
+        } = place;
+        let begun = begin_segment(&folder, id, number, ordinal, snapshot);
+        let (segment, file) = begun.map_err(io_error("writing", &folder.segment(number)))?;
         segments.push_back(segment);
-        syncer.opened(place.number, file.clone());
+        syncer.opened(number, file.clone());
         Ok(Self {
-            folder: folder.to_owned(),
+            folder,
             id,
             segments,
             file,
-            ordinal: place.ordinal + 1,
+            ordinal: ordinal + 1,
             limits,
             largest: 0,
             syncer,
             pending: Vec::new(),
             failing: None,
+            marks: mark.into_iter().collect(),
         })
+    }
+
+    /// Hash of the spec of the run whose chunks it holds.
+    pub(crate) const fn spec_hash(&self) -> u64 {
+        self.id.spec_hash
     }
 
     pub(crate) fn flush(&mut self) {
@@ -124,7 +134,7 @@ impl Journal {
     pub(crate) fn status(&self) -> LogStatus {
         let refused = self.failing.as_ref();
         LogStatus {
-            folder: self.folder.display().to_string(),
+            folder: self.folder.path.display().to_string(),
             bytes: self.bytes(),
             bytes_max: self.limits.disk_bytes_max,
             flushed_s: self.syncer.flushed_s(),
@@ -138,23 +148,19 @@ impl Journal {
         self.segments.iter().map(|it| it.bytes).sum()
     }
 
+    /// Whether the disk has refused what was to be written last.
+    pub(crate) const fn is_failing(&self) -> bool {
+        self.failing.is_some()
+    }
+
     /// Writes what the disk has refused before; whether all of it is written now.
     pub(crate) fn is_ready(&mut self) -> bool {
-        if self.pending.is_empty() {
-            return true;
-        }
         let pending = std::mem::take(&mut self.pending);
-        match self.write(&pending, &[]) {
-            Ok(()) => {
-                self.note_well();
-                true
-            }
-            Err(e) => {
-                self.pending = pending;
-                self.note_failing(&e);
-                false
-            }
+        let is_written = pending.is_empty() || self.write(&pending, &[]);
+        if !is_written {
+            self.pending = pending;
         }
+        is_written
     }
 
     /// Appends a note of what has happened; if the disk refuses, it is the first to be written later.
@@ -162,36 +168,21 @@ impl Journal {
         let body = codec::encode_value(note).expect("a note is far below the codec's limit");
         let record = record::head(RecordKind::Note, self.ordinal, &body, 0);
         self.ordinal += 1;
-        if !self.is_ready() {
-            self.pending.extend_from_slice(&record);
-        } else if let Err(e) = self.write(&record, &[]) {
-            self.pending = record;
-            self.note_failing(&e);
-        }
+        self.pending.extend_from_slice(&record);
+        self.is_ready();
     }
 
-    /// Appends a chunk that is to be stored: head and payload of its message. `false`: the disk refuses, and it must not be.
-    pub(super) fn append_chunk(&mut self, head: &[u8], payload: &[u8]) -> bool {
-        if !self.is_ready() {
-            return false;
-        }
+    /// Appends a chunk that is to be stored. `false`: the disk refuses, and it must not be. The error says why it makes no message.
+    pub(crate) fn append_chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
+        let chunk = &packed.chunk;
+        let sealed = packed.sealed.as_ref();
+        let sealed = sealed.expect("the packer of a replay with a log seals");
+        let head = sealed.as_ref().map_err(ToString::to_string)?;
+        let payload = chunk.payload();
         let record = record::head(RecordKind::Chunk, self.ordinal, head, payload.len());
-        match self.write(&record, payload) {
-            Ok(()) => {
-                self.ordinal += 1;
-                self.note_well();
-                true
-            }
-            Err(e) => {
-                self.note_failing(&e);
-                false
-            }
-        }
-    }
-
-    /// Whether the disk has refused what was to be written last.
-    pub(crate) const fn is_failing(&self) -> bool {
-        self.failing.is_some()
+        let is_written = self.is_ready() && self.write(&record, payload);
+        self.ordinal += u64::from(is_written);
+        Ok(is_written)
     }
 
     fn newest(&mut self) -> &mut Segment {
@@ -200,25 +191,34 @@ impl Journal {
             .expect("a log always has the segment that it writes")
     }
 
-    /// Writes at the end of the newest segment; on an error the segment ends where it did.
-    fn write(&mut self, record: &[u8], payload: &[u8]) -> io::Result<()> {
-        let at = self.newest().bytes;
+    /// Writes at the end of the newest segment; if the disk refuses, the segment ends where it did.
+    fn write(&mut self, record: &[u8], payload: &[u8]) -> bool {
+        let &mut Segment {
+            number, bytes: at, ..
+        } = self.newest();
         let bytes = (record.len() + payload.len()) as u64;
         self.largest = self.largest.max(bytes);
         let written = self
             .file
             .write_all_at(record, at)
             .and_then(|()| self.file.write_all_at(payload, at + record.len() as u64))
-            .and_then(|()| self.syncer.written());
-        if written.is_err() {
+            .and_then(|()| self.syncer.written(number, &self.file));
+        if let Err(e) = written {
             // What stays behind the end is not whole, and is taken for nothing; this makes room.
             if let Err(e) = self.file.set_len(at) {
                 tracing::debug!("cutting off what was not written whole: {e}");
             }
-            return written;
+            self.note_failing(&e);
+            return false;
         }
         self.newest().bytes = at + bytes;
-        Ok(())
+        if self.failing.take().is_some() {
+            tracing::warn!(
+                "the replay's log in {} can be written again; nothing was lost",
+                self.folder.path.display()
+            );
+        }
+        true
     }
 
     fn note_failing(&mut self, e: &io::Error) {
@@ -231,31 +231,19 @@ impl Journal {
         if let Some(more) = failing.said.due() {
             tracing::error!(
                 "the replay's log in {} cannot be written: {e}; nothing more is stored until it can: make room or make it writable{more}",
-                self.folder.display()
-            );
-        }
-    }
-
-    fn note_well(&mut self) {
-        if self.failing.take().is_some() {
-            tracing::warn!(
-                "the replay's log in {} can be written again; nothing was lost",
-                self.folder.display()
+                self.folder.path.display()
             );
         }
     }
 
     /// Whether the newest segment is full.
-    pub(crate) fn is_full(&self) -> bool {
-        self.pending.is_empty()
-            && self
-                .segments
-                .back()
-                .is_some_and(|it| it.bytes >= self.limits.segment_bytes)
+    pub(super) fn is_full(&self) -> bool {
+        let newest = self.segments.back();
+        self.pending.is_empty() && newest.is_some_and(|it| it.bytes >= self.limits.segment_bytes)
     }
 
     /// Where the disk budget does not allow another segment: the oldest transition that may stay.
-    pub(crate) fn over_budget(&self) -> Option<u64> {
+    pub(super) fn over_budget(&self) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
         let mut bytes = self.bytes() + self.limits.segment_bytes + self.largest;
         let mut keep = None;
@@ -279,10 +267,10 @@ impl Journal {
             Err(e) => return self.note_failing(&e),
         };
         let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
-        if let Err(e) = self.write(&closed, &[]) {
+        if !self.write(&closed, &[]) {
             // Without it the new one is one too many.
-            remove(&segment::path(&self.folder, number));
-            return self.note_failing(&e);
+            remove(&self.folder.segment(number));
+            return;
         }
         self.ordinal += 2;
         self.file = file.clone();
@@ -290,32 +278,44 @@ impl Journal {
         self.segments.push_back(segment);
     }
 
-    /// Begins another segment with `snapshot`, which is on the disk when this returns.
+    /// Begins another segment with `snapshot`, which is on the disk when this returns and stays.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
         if self.is_ready() {
             self.rotate(snapshot);
         }
-        let number = self.newest().number;
-        if number == before {
+        let mark = Mark(self.newest().number);
+        if mark.0 == before {
             let full = io::Error::other("it refuses to be written, as the log says");
-            return Err(io_error("marking", &self.folder)(full));
+            return Err(io_error("marking", &self.folder.path)(full));
         }
-        self.syncer
-            .flushed()
-            .map_err(io_error("flushing", &self.folder))?;
-        Ok(Mark::at(number))
+        let flushed = self.syncer.flushed();
+        flushed.map_err(io_error("flushing", &self.folder.path))?;
+        if self.marks.len() == MARKS {
+            self.marks.pop_front();
+        }
+        self.marks.push_back((mark, snapshot.oldest));
+        Ok(mark)
     }
 
-    /// Removes the oldest segments, whose transitions are all before `oldest_row`, as far as they come before segment `keep`.
-    pub(super) fn prune(&mut self, oldest_row: u64, keep: u64) {
+    /// Nothing will go back to `mark`.
+    pub(super) fn give_up(&mut self, mark: Mark) {
+        self.marks.retain(|(it, _)| *it != mark);
+    }
+
+    /// Removes the oldest segments that neither the ring, whose oldest transition is `oldest_row`, nor a mark needs.
+    pub(super) fn prune(&mut self, oldest_row: u64) {
+        let (oldest, keep) = match self.marks.front() {
+            Some((first, marked_row)) => (oldest_row.min(*marked_row), first.0),
+            None => (oldest_row, u64::MAX),
+        };
         while self.segments.len() > 1
-            && self.segments[1].first_row <= oldest_row
+            && self.segments[1].first_row <= oldest
             && self.segments[0].number < keep
         {
             let number = self.segments[0].number;
             self.syncer.removed(number);
-            if !remove(&segment::path(&self.folder, number)) {
+            if !remove(&self.folder.segment(number)) {
                 return;
             }
             self.segments.pop_front();
@@ -325,7 +325,7 @@ impl Journal {
 
 /// A new segment whose only record has the number `ordinal`; nothing stays if it cannot be written.
 fn begin_segment(
-    folder: &Path,
+    folder: &LogFolder,
     log: LogId,
     number: u64,
     ordinal: u64,
@@ -338,7 +338,7 @@ fn begin_segment(
     };
     let body = codec::encode_value(&header).map_err(io::Error::other)?;
     let head = record::head(RecordKind::Segment, ordinal, &body, 0);
-    let path = segment::path(folder, number);
+    let path = folder.segment(number);
     let file = File::create(&path)?;
     if let Err(e) = file.write_all_at(&head, 0) {
         remove(&path);

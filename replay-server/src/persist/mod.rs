@@ -11,22 +11,16 @@
 //! What was answered has been written: it survives the death of the process at any moment. What was flushed, once in
 //! `replay.fsync_ms`, survives a power cut too.
 
-pub(crate) mod error;
-mod folder;
-mod journal;
-pub(crate) mod log;
+pub(crate) mod folder;
+pub(crate) mod journal;
 mod opening;
-mod progress;
 mod record;
 mod recover;
-pub(crate) mod segment;
 pub(crate) mod snapshot;
 mod sync;
 mod upkeep;
 
-pub use error::PersistError;
+pub use folder::{Mark, PersistError};
 pub(crate) use opening::shard_dir;
 pub use opening::{KeptReplay, PersistArgs};
-pub use progress::Reading;
-pub use recover::Recovery;
-pub use segment::Mark;
+pub use recover::{Reading, Recovery};

@@ -9,13 +9,9 @@ use std::{
 use driml_protocol::{RunSpec, Shutdown, TRANSITION_BYTES};
 
 use super::{
-    error::PersistError,
-    folder::LogFolder,
+    folder::{FORMAT, LogFolder, LogId, Mark, PersistError},
     journal::{Journal, Limits},
-    log::{Log, Marked},
-    progress::Reading,
-    recover::{Recovery, find_id, go_back, recover},
-    segment::{FORMAT, LogId, Mark},
+    recover::{Reading, Recovery, find_id, go_back, recover},
 };
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},
@@ -61,7 +57,7 @@ impl Replay {
 
 /// The folder of a replay, which no other process uses any more and which is this run's. What is kept there is not read yet.
 pub struct KeptReplay {
-    args: PersistArgs,
+    mark: Option<Mark>,
     id: LogId,
     limits: Limits,
     folder: LogFolder,
@@ -87,11 +83,16 @@ impl KeptReplay {
         let id = known.unwrap_or(ours);
         folder.check(&id, &ours)?;
         Ok(Self {
-            args: args.clone(),
+            mark: args.mark,
             id,
             limits: limits(args, spec, config),
             folder,
         })
+    }
+
+    /// Its folder.
+    pub(crate) fn dir(&self) -> &Path {
+        &self.folder.path
     }
 
     /// Reads what is kept into `replay`, which is empty.
@@ -105,38 +106,24 @@ impl KeptReplay {
         reading: &Reading,
     ) -> Result<(Replay, Recovery), PersistError> {
         let started = Instant::now();
-        let Self {
-            args,
-            id,
-            limits,
-            folder,
-        } = self;
-        if let Some(mark) = args.mark {
+        let (folder, id) = (self.folder, self.id);
+        if let Some(mark) = self.mark {
             go_back(&folder, mark)?;
         }
-        let (place, mut recovery) = recover(&folder, id, &mut replay, args.mark, reading)?;
+        let (place, mut recovery) = recover(&folder, id, &mut replay, self.mark, reading)?;
         if !recovery.found {
             folder.write_id(&id)?;
         }
-        let fsync_ms = replay.config.fsync_ms;
-        let fsync = fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis);
         let snapshot = replay.snapshot();
-        let journal = Journal::begin(&args.dir, id, &place, limits, fsync, &snapshot)?;
-        let oldest_row = replay.ring.oldest();
-        let marked = args.mark.map(|mark| Marked { mark, oldest_row });
-        replay.log = Some(Log {
-            journal,
-            spec_hash: id.spec_hash,
-            marks: marked.into_iter().collect(),
-            _folder: folder,
-        });
+        let journal = Journal::begin(folder, id, place, self.limits, &snapshot)?;
+        replay.log = Some(journal);
         replay.tidy();
         recovery.took = started.elapsed();
         Ok((replay, recovery))
     }
 }
 
-/// How large a segment is, and what all may take.
+/// How large a segment is, what all may take, and how often they are flushed.
 fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Limits {
     let shards = u64::from(config.shards);
     let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
@@ -147,6 +134,7 @@ fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Limits {
     Limits {
         segment_bytes: args.segment_bytes.unwrap_or(fitting),
         disk_bytes_max,
+        fsync: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),
     }
 }
 

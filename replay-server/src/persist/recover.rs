@@ -2,26 +2,56 @@
 //! Transitions come back through the code that stored them; what is gone leaves a gap that no row of a batch reaches into.
 
 use std::{
-    fs, io,
+    borrow::Cow,
+    fs,
     path::Path,
+    sync::atomic::{AtomicU64, Ordering},
     time::{Duration, Instant},
 };
 
-use driml_protocol::{BufferPool, Chunk, codec};
+use driml_protocol::{BufferPool, Chunk, RecoveryProgress, Shutdown, codec};
 
 use super::{
-    error::PersistError,
-    folder::{LogFolder, io_error},
-    journal::Place,
-    progress::Reading,
-    record::{Broken, Record, RecordKind, RecordReader},
-    segment::{self, LogId, Mark, SegmentFile, SegmentHeader},
+    folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader},
+    journal::{Place, Segment},
+    record::{self, Broken, Record, RecordKind},
     snapshot::Note,
 };
 use crate::{replay::Replay, storage::frame_store::Packer};
 
 /// How often it is logged how far the reading is.
 const SAY: Duration = Duration::from_secs(5);
+
+/// How far a log has been read back, for those who ask meanwhile, and the word that it need not be read to its end. Threads share it by
+/// reference.
+#[derive(Debug)]
+pub struct Reading {
+    started: Instant,
+    bytes: AtomicU64,
+    bytes_read: AtomicU64,
+    stop: Shutdown,
+}
+
+impl Reading {
+    /// Nothing is read yet; once `stop` is raised, nothing more need be.
+    pub fn begin(stop: Shutdown) -> Self {
+        Self {
+            started: Instant::now(),
+            bytes: AtomicU64::new(0),
+            bytes_read: AtomicU64::new(0),
+            stop,
+        }
+    }
+
+    /// How far it is now.
+    pub fn progress(&self) -> RecoveryProgress {
+        RecoveryProgress {
+            bytes_read: self.bytes_read.load(Ordering::Relaxed),
+            bytes: self.bytes.load(Ordering::Relaxed),
+            since_s: self.started.elapsed().as_secs_f64(),
+        }
+    }
+}
 
 /// What was found in the folder of a log.
 #[derive(Clone, Debug, Default)]
@@ -34,6 +64,90 @@ pub struct Recovery {
     pub took: Duration,
     /// Damage, and what came of it: sentences for a person.
     pub warnings: Vec<String>,
+}
+
+/// Removes what the log in `folder` says after `mark`.
+pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
+    let no_mark = || PersistError::NoMark(folder.segment(mark.0));
+    let numbers = folder.segments()?;
+    if !numbers.contains(&mark.0) {
+        return Err(no_mark());
+    }
+    let bytes = folder.read(mark.0)?;
+    let first = record::first(&bytes).ok();
+    let first = first.filter(|it| it.kind == RecordKind::Segment);
+    let first = first.ok_or_else(no_mark)?;
+    // The newest first: what is left at any moment is a log that ends earlier.
+    for later in numbers.into_iter().rev().filter(|it| *it > mark.0) {
+        folder.remove(later)?;
+    }
+    folder.cut_off(mark.0, first.bytes())
+}
+
+/// Which log the newest segment in `folder` that can be read is of; none if there is none.
+pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
+    for number in folder.segments()?.into_iter().rev() {
+        if let Ok(record) = record::first(&folder.read(number)?)
+            && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
+        {
+            return Ok(Some(header.log));
+        }
+    }
+    Ok(None)
+}
+
+/// Rebuilds `replay`, which is empty, from the segments of log `id` in `folder`. With a `mark`, which is the last that the log says, all
+/// of the replay's state is taken from there.
+pub(super) fn recover(
+    folder: &LogFolder,
+    id: LogId,
+    replay: &mut Replay,
+    mark: Option<Mark>,
+    reading: &Reading,
+) -> Result<(Place, Recovery), PersistError> {
+    let numbers = folder.segments()?;
+    let packer = replay.packer();
+    replay.quiet = true;
+    let mut reader = Reader {
+        folder,
+        id,
+        replay,
+        packer,
+        pool: BufferPool::new(2),
+        place: Place {
+            number: numbers.last().map_or(0, |it| it + 1),
+            ..Place::default()
+        },
+        recovery: Recovery::default(),
+        oldest: 0,
+        same_capacity: false,
+        mark,
+    };
+    let bytes = |&number| fs::metadata(folder.segment(number)).map_or(0, |it| it.len());
+    let total: u64 = numbers.iter().map(bytes).sum();
+    let dir = folder.path.display();
+    if let count @ 1.. = numbers.len() {
+        tracing::info!(
+            "reads the replay in {dir}: {count} segments, {} MiB; requests are answered with its progress",
+            total >> 20
+        );
+    }
+    reading.bytes.store(total, Ordering::Relaxed);
+    let mut due = Instant::now() + SAY;
+    for (at, &number) in numbers.iter().enumerate() {
+        if Instant::now() > due {
+            due += SAY;
+            tracing::info!("reads the replay in {dir}: {}", reading.progress());
+        }
+        if reading.stop.is_set() {
+            return Err(PersistError::Stopped);
+        }
+        let segment = folder.read(number)?;
+        reader.read_segment(number, &segment, at + 1 == numbers.len())?;
+        let bytes = segment.len() as u64;
+        reading.bytes_read.fetch_add(bytes, Ordering::Relaxed);
+    }
+    reader.finish()
 }
 
 /// A log on its way back into a replay.
@@ -53,160 +167,55 @@ struct Reader<'a> {
     mark: Option<Mark>,
 }
 
-/// Removes what the log in `folder` says after `mark`.
-pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
-    let files = folder.segments()?;
-    let Some(marked) = files.iter().find(|it| it.number == mark.segment()) else {
-        return Err(PersistError::NoMark(segment::path(
-            &folder.path,
-            mark.segment(),
-        )));
-    };
-    let reading = || io_error("reading", &marked.path);
-    let mut reader = RecordReader::open(&marked.path).map_err(reading())?;
-    let begins = matches!(
-        reader.next().map_err(reading())?,
-        Some(Ok(record)) if record.kind == RecordKind::Segment
-    );
-    if !begins {
-        return Err(PersistError::NoMark(marked.path.clone()));
-    }
-    // The newest first: what is left at any moment is a log that ends earlier.
-    for later in files.iter().rev() {
-        if later.number > mark.segment() {
-            fs::remove_file(&later.path).map_err(io_error("removing", &later.path))?;
-        }
-    }
-    cut_off(marked, reader.at())
-}
-
-/// Ends a segment's file at byte `at`.
-fn cut_off(file: &SegmentFile, at: u64) -> Result<(), PersistError> {
-    fs::File::options()
-        .write(true)
-        .open(&file.path)
-        .and_then(|opened| opened.set_len(at))
-        .map_err(io_error("cutting off the end of", &file.path))
-}
-
-/// Rebuilds `replay`, which is empty, from the segments of log `id` in `folder`. With a `mark`, which is the last that the log says, all
-/// of the replay's state is taken from there.
-pub(super) fn recover(
-    folder: &LogFolder,
-    id: LogId,
-    replay: &mut Replay,
-    mark: Option<Mark>,
-    reading: &Reading,
-) -> Result<(Place, Recovery), PersistError> {
-    let files = folder.segments()?;
-    let packer = replay.packer();
-    replay.quiet = true;
-    let mut reader = Reader {
-        folder,
-        id,
-        replay,
-        packer,
-        pool: BufferPool::new(2),
-        place: Place {
-            number: files.last().map_or(0, |it| it.number + 1),
-            ..Place::default()
-        },
-        recovery: Recovery::default(),
-        oldest: 0,
-        same_capacity: false,
-        mark,
-    };
-    let bytes = |file: &SegmentFile| fs::metadata(&file.path).map_or(0, |it| it.len());
-    let total: u64 = files.iter().map(bytes).sum();
-    let dir = folder.path.display();
-    if !files.is_empty() {
-        tracing::info!(
-            "reads the replay in {dir}: {} segments, {} MiB; requests are answered with its progress",
-            files.len(),
-            total >> 20
-        );
-    }
-    reading.set_bytes(total);
-    let mut due = Instant::now() + SAY;
-    for (at, file) in files.iter().enumerate() {
-        if Instant::now() > due {
-            due += SAY;
-            tracing::info!("reads the replay in {dir}: {}", reading.progress());
-        }
-        if reading.is_stopped() {
-            return Err(PersistError::Stopped);
-        }
-        let of_it = bytes(file);
-        reader.read_segment(file, at + 1 == files.len())?;
-        reading.add_read(of_it);
-    }
-    reader.finish()
-}
-
-/// Which log the newest segment in `folder` that can be read is of; none if there is none.
-pub(super) fn find_id(folder: &LogFolder) -> Result<Option<LogId>, PersistError> {
-    let files = folder.segments()?;
-    for file in files.iter().rev() {
-        let mut reader = RecordReader::open(&file.path).map_err(io_error("reading", &file.path))?;
-        let first = reader.next().map_err(io_error("reading", &file.path))?;
-        if let Some(Ok(record)) = first
-            && let Ok(header) = codec::decode_value::<SegmentHeader>(record.body)
-        {
-            return Ok(Some(header.log));
-        }
-    }
-    Ok(None)
-}
-
 impl Reader<'_> {
     fn warn(&mut self, text: String) {
         self.recovery.warnings.push(text);
     }
 
-    /// Whether `ordinal` may be that of the next record, after none or some that are missing.
-    const fn may_follow(&self, ordinal: u64) -> bool {
-        !self.recovery.found || ordinal >= self.place.ordinal
-    }
-
-    fn read_segment(&mut self, file: &SegmentFile, is_last: bool) -> Result<(), PersistError> {
-        let name = file_name(&file.path);
-        let reading = || io_error("reading", &file.path);
-        let mut reader = RecordReader::open(&file.path).map_err(reading())?;
-        let begins = match reader.next().map_err(reading())? {
-            Some(Ok(record)) if record.kind == RecordKind::Segment => {
-                let header = codec::decode_value::<SegmentHeader>(record.body);
-                header.ok().map(|header| (header, record.ordinal))
-            }
-            Some(Err(Broken::Torn)) | None if is_last => {
-                // The server ended while it began this one; nothing is in it.
-                return fs::remove_file(&file.path).map_err(io_error("removing", &file.path));
-            }
-            _ => None,
-        };
-        let Some((header, ordinal)) = begins else {
-            self.set_aside(file, "its beginning is damaged");
+    fn read_segment(
+        &mut self,
+        number: u64,
+        bytes: &[u8],
+        is_last: bool,
+    ) -> Result<(), PersistError> {
+        let path = self.folder.segment(number);
+        let name = file_name(&path);
+        let first = record::first(bytes);
+        if first.as_ref().err() == Some(&Broken::Torn) && is_last {
+            // The server ended while it began this one; nothing is in it.
+            return self.folder.remove(number);
+        }
+        let begins = first.ok().filter(|it| it.kind == RecordKind::Segment);
+        let header = begins.and_then(|first| {
+            let header = codec::decode_value::<SegmentHeader>(first.body);
+            header.ok().map(|it| (it, first.ordinal, first.bytes()))
+        });
+        let Some((header, ordinal, at)) = header else {
+            self.set_aside(&path, "its beginning is damaged");
             return Ok(());
         };
-        let unusable = |why: String| {
-            PersistError::Unusable(file.path.clone(), format!("cannot be used: {why}"))
-        };
-        let snapshot = header.snapshot;
         if header.log != self.id {
             self.warn(format!("{name} is not of this log and was left unchanged"));
             return Ok(());
         }
-        if header.number != file.number || !self.may_follow(ordinal) {
-            self.set_aside(file, "it is not the segment that belongs here");
+        let is_first = !self.recovery.found;
+        let follows = is_first || ordinal >= self.place.ordinal;
+        if header.number != number || !follows {
+            self.set_aside(&path, "it is not the segment that belongs here");
             return Ok(());
         }
-        let is_mark = self.mark.is_some_and(|mark| mark.segment() == file.number);
+        let unusable =
+            |why: String| PersistError::Unusable(path.clone(), format!("cannot be used: {why}"));
+        let snapshot = header.snapshot;
         let is_prioritised = self.replay.config.sampling.is_prioritised();
-        if is_mark && snapshot.rows.is_prioritised() != is_prioritised {
-            let why = "replay.sampling is another rule than it was".into();
-            return Err(unusable(why));
+        if self.mark == Some(Mark(number)) {
+            if snapshot.rows.is_prioritised() != is_prioritised {
+                let why = "replay.sampling is another rule than it was".into();
+                return Err(unusable(why));
+            }
+            self.place.mark = Some((Mark(number), snapshot.oldest));
         }
         let (stored, first_row) = (self.replay.ring.inserted(), snapshot.inserted);
-        let is_first = !self.recovery.found;
         self.oldest = snapshot.oldest;
         self.same_capacity = snapshot.capacity == self.replay.ring.capacity()
             && self.replay.config.compressed_bytes_max.is_none();
@@ -220,68 +229,56 @@ impl Reader<'_> {
         }
         self.recovery.found = true;
         self.place.ordinal = ordinal + 1;
-        self.place.segments.push((file.clone(), first_row));
-        let ended = self.read_records(&mut reader).map_err(reading())?;
-        let at = reader.at();
-        self.recovery.bytes += at;
-        let cut = reader.length() - at;
+        let (at, ended) = self.read_records(bytes, at);
+        let cut = bytes.len() - at;
+        self.recovery.bytes += at as u64;
+        self.place.segments.push_back(Segment {
+            number,
+            first_row,
+            bytes: if is_last { at } else { bytes.len() } as u64,
+        });
         match ended {
-            Ok(is_closed) if is_closed && is_last => self.warn(format!(
+            Ok(true) if is_last => self.warn(format!(
                 "the segment after {name} is missing: the replay is what it was when that one began; what was stored and served since is lost"
             )),
             Ok(_) => {}
-            Err(broken) if is_last => self.cut(file, at, cut, &broken)?,
-            Err(_) => self.warn(format!(
+            Err(_) if !is_last => self.warn(format!(
                 "{name} is damaged at byte {at}: {cut} bytes of it are of no use"
             )),
-        }
-        Ok(())
-    }
-
-    /// Ends the last segment where its last whole record ends.
-    fn cut(
-        &mut self,
-        file: &SegmentFile,
-        at: u64,
-        cut: u64,
-        broken: &Broken,
-    ) -> Result<(), PersistError> {
-        let name = file_name(&file.path);
-        match broken {
             // No actor was told that it is stored.
-            Broken::Torn => tracing::info!(
+            Err(Broken::Torn) => tracing::info!(
                 "the last record of {name} was not written whole: its {cut} bytes are cut off"
             ),
-            Broken::Damaged => self.warn(format!(
+            Err(Broken::Damaged) => self.warn(format!(
                 "{name} is damaged at byte {at}: the {cut} bytes from there on are cut off, as nothing after them can be trusted. What was stored \
                  and served then is lost"
             )),
         }
-        cut_off(file, at)
+        match cut {
+            1.. if is_last => self.folder.cut_off(number, at),
+            _ => Ok(()),
+        }
     }
 
     /// Gives a segment that cannot be used another name.
-    fn set_aside(&mut self, file: &SegmentFile, why: &str) {
-        let name = file_name(&file.path);
-        let aside = file.path.with_extension("unusable");
-        let renamed = fs::rename(&file.path, &aside);
-        let so = match renamed {
+    fn set_aside(&mut self, path: &Path, why: &str) {
+        let name = file_name(path);
+        let aside = path.with_extension("unusable");
+        let so = match fs::rename(path, &aside) {
             Ok(()) => format!("it is now {}", file_name(&aside)),
             Err(e) => format!("it stays there, as it cannot be renamed: {e}"),
         };
         self.warn(format!("{name} cannot be used, {why}: {so}"));
     }
 
-    /// Takes the records of a segment: whether the last one says that another segment follows, or why the rest is of no use.
-    fn read_records(&mut self, reader: &mut RecordReader) -> io::Result<Result<bool, Broken>> {
+    /// Takes the records of a segment from byte `at` on. Gives where the last one ends that is of use, and whether it says that another
+    /// segment follows, or why the rest is of no use.
+    fn read_records(&mut self, segment: &[u8], mut at: usize) -> (usize, Result<bool, Broken>) {
         let mut is_closed = false;
-        loop {
-            // So that the reader ends before a record that says what cannot be.
-            let before = reader.at();
-            let record = match reader.next()? {
-                None => return Ok(Ok(is_closed)),
-                Some(Err(broken)) => return Ok(Err(broken)),
-                Some(Ok(record)) => record,
+        while at < segment.len() {
+            let record = match record::first(&segment[at..]) {
+                Ok(record) => record,
+                Err(broken) => return (at, Err(broken)),
             };
             let applied = match !is_closed && record.ordinal == self.place.ordinal {
                 true => self.apply(&record),
@@ -289,12 +286,13 @@ impl Reader<'_> {
             };
             if let Err(why) = applied {
                 tracing::debug!("record {}: {why}", record.ordinal);
-                reader.go_back_to(before);
-                return Ok(Err(Broken::Damaged));
+                return (at, Err(Broken::Damaged));
             }
             self.place.ordinal += 1;
             is_closed = record.kind == RecordKind::Closed;
+            at += record.bytes();
         }
+        (at, Ok(is_closed))
     }
 
     fn apply(&mut self, record: &Record<'_>) -> Result<(), String> {
@@ -306,11 +304,9 @@ impl Reader<'_> {
                 let num_actions = self.replay.spec.num_actions;
                 let chunk = Chunk::receive([record.body], len, &self.pool, hash, num_actions)
                     .map_err(|e| e.to_string())?;
-                if let Some(why) = self.replay.unfit(&chunk) {
-                    return Err(why);
-                }
+                self.replay.check_chunk(&chunk)?;
                 self.replay.state.actors.check_known(&chunk.header)?;
-                let packed = self.packer.pack(std::borrow::Cow::Owned(chunk));
+                let packed = self.packer.pack(Cow::Owned(chunk));
                 self.replay.store(&packed);
                 Ok(())
             }
@@ -351,6 +347,6 @@ impl Reader<'_> {
 }
 
 fn file_name(path: &Path) -> String {
-    path.file_name()
-        .map_or_else(String::new, |name| name.to_string_lossy().into_owned())
+    let name = path.file_name();
+    name.map_or_else(String::new, |name| name.to_string_lossy().into_owned())
 }

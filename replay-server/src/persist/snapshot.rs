@@ -10,7 +10,7 @@ use crate::{
     config::SHARDS_MAX,
     ledger::{actors::Actors, statistics::Statistics},
     rate_limiter::Counts,
-    sampling::{horizon::Affinity, rows::sampler::RowsState},
+    sampling::{horizon::Affinity, rows::RowsState},
 };
 
 /// Most of anything that a run counts.
@@ -92,20 +92,21 @@ impl Snapshot {
     /// no count overflows, and none becomes less than nothing.
     pub(crate) fn unfit(&self, ours: &State) -> Option<&'static str> {
         let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
-        let (statistics, num_actions) = (&state.statistics, ours.statistics.action_histogram.len());
+        let (counted, expected) = (&state.statistics.counted, &ours.statistics.counted);
+        let num_actions = expected.action_histogram.len();
         let is_ours = state.affinity.is_for(num_actions as u32)
-            && statistics.action_histogram.len() == num_actions
-            && statistics.k_histogram.len() == ours.statistics.k_histogram.len();
+            && counted.action_histogram.len() == num_actions
+            && counted.k_histogram.len() == expected.k_histogram.len();
         if !is_ours {
             return Some("a state of a run with other actions or another horizon");
         }
         let sum = |counts: &[u64]| counts.iter().copied().fold(0, u64::saturating_add);
-        let served = sum(&statistics.k_histogram);
-        let counted = [
+        let served = sum(&counted.k_histogram);
+        let all = [
             inserted,
             served,
-            statistics.rows_unlearned,
-            statistics.episodes,
+            counted.rows_unlearned,
+            counted.episodes,
             state.inserted_before,
             state.rows_before.unsigned_abs(),
             counts.this_shard.inserted,
@@ -113,11 +114,11 @@ impl Snapshot {
             counts.refilled,
             counts.refill_left,
         ];
-        if counted.iter().any(|&count| count > COUNT_MAX) {
+        if all.iter().any(|&count| count > COUNT_MAX) {
             return Some("a state with counts that no run reaches");
         }
-        let rows = counts.this_shard.rows_sampled + statistics.rows_unlearned;
-        let agrees = sum(&statistics.action_histogram) == inserted
+        let rows = counts.this_shard.rows_sampled + counted.rows_unlearned;
+        let agrees = sum(&counted.action_histogram) == inserted
             && state.inserted_before + inserted == counts.this_shard.inserted + counts.refilled
             && state.rows_before + served as i64 == rows as i64
             && self.oldest <= inserted;
@@ -126,7 +127,7 @@ impl Snapshot {
         }
         let actors = state.actors.unfit(inserted);
         actors
-            .or_else(|| statistics.unfit())
+            .or_else(|| state.statistics.unfit())
             .or_else(|| self.rows.unfit(inserted - self.oldest))
     }
 }

@@ -2,12 +2,10 @@
 //! What the process has written survives its death without this; what the machine has flushed survives a power cut too.
 
 use std::{
+    collections::BTreeMap,
     fs::File,
     io,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
@@ -15,42 +13,49 @@ use std::{
 use driml_protocol::{Seldom, Shutdown, fault};
 
 /// Segments that wait to be flushed; with one more they are flushed before anything else is written.
-const OPEN_MAX: usize = 32;
+const WAITING_MAX: usize = 32;
 
-/// What the thread flushes next.
-#[derive(Default)]
-struct Files {
-    /// The segment that is written, and older ones that are not flushed yet, by their numbers.
-    open: Vec<(u64, Arc<File>)>,
-    /// The folder, if a file was made or removed.
+/// What was written and is not flushed yet.
+struct Unflushed {
+    segments: BTreeMap<u64, Arc<File>>,
+    /// The folder, if a segment was made in it.
     folder: Option<Arc<File>>,
+    /// When the last flush that succeeded began.
+    flushed: Instant,
 }
 
 struct Shared {
-    files: Mutex<Files>,
-    dirty: AtomicBool,
+    unflushed: Mutex<Unflushed>,
     /// One flush at a time: a caller that asks for another one gets it done, not only begun.
     flushing: Mutex<()>,
-    /// When the last flush that succeeded began.
-    flushed: Mutex<Instant>,
 }
 
 impl Shared {
-    fn new() -> Self {
-        Self {
-            files: Mutex::default(),
-            dirty: AtomicBool::new(false),
-            flushing: Mutex::default(),
-            flushed: Mutex::new(Instant::now()),
+    fn unflushed(&self) -> MutexGuard<'_, Unflushed> {
+        let locked = self.unflushed.lock();
+        locked.unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn flush(&self) -> io::Result<()> {
+        let _one = self.flushing.lock().unwrap_or_else(PoisonError::into_inner);
+        let begun = Instant::now();
+        let mut unflushed = self.unflushed();
+        let segments = std::mem::take(&mut unflushed.segments);
+        let folder = unflushed.folder.take();
+        drop(unflushed);
+        let mut files = segments.values();
+        let flushed = files
+            .try_for_each(|file| file.sync_data())
+            .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
+        let mut unflushed = self.unflushed();
+        if flushed.is_ok() {
+            unflushed.flushed = begun;
+        } else {
+            // Due the next time again.
+            unflushed.segments.extend(segments);
+            unflushed.folder = unflushed.folder.take().or(folder);
         }
-    }
-
-    fn flushed(&self) -> MutexGuard<'_, Instant> {
-        self.flushed.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn files(&self) -> MutexGuard<'_, Files> {
-        self.files.lock().unwrap_or_else(PoisonError::into_inner)
+        flushed
     }
 }
 
@@ -65,16 +70,20 @@ pub(super) struct Syncer {
 impl Syncer {
     /// Flushes every `period`, or, where that is zero, whenever [`Syncer::written`] is called.
     pub(super) fn start(folder: File, period: Duration) -> io::Result<Self> {
-        let (shared, stop) = (Arc::new(Shared::new()), Shutdown::default());
+        let shared = Arc::new(Shared {
+            unflushed: Mutex::new(Unflushed {
+                segments: BTreeMap::new(),
+                folder: None,
+                flushed: Instant::now(),
+            }),
+            flushing: Mutex::default(),
+        });
+        let stop = Shutdown::default();
         let mut thread = None;
         if !period.is_zero() {
             let (shared, stop) = (shared.clone(), stop.clone());
-            let work = move || work(&shared, &stop, period);
-            thread = Some(
-                std::thread::Builder::new()
-                    .name("replay-fsync".into())
-                    .spawn(work)?,
-            );
+            let named = std::thread::Builder::new().name("replay-fsync".into());
+            thread = Some(named.spawn(move || work(&shared, &stop, period))?);
         }
         Ok(Self {
             shared,
@@ -84,14 +93,13 @@ impl Syncer {
         })
     }
 
-    /// Segment `number` is written from now on, and was made just now.
+    /// Segment `number` was made just now.
     pub(super) fn opened(&self, number: u64, file: Arc<File>) {
-        let mut files = self.shared.files();
-        files.open.push((number, file));
-        files.folder = Some(self.folder.clone());
-        let too_many = files.open.len() > OPEN_MAX;
-        drop(files);
-        self.shared.dirty.store(true, Ordering::Release);
+        let mut unflushed = self.shared.unflushed();
+        unflushed.segments.insert(number, file);
+        unflushed.folder = Some(self.folder.clone());
+        let too_many = unflushed.segments.len() > WAITING_MAX;
+        drop(unflushed);
         if too_many {
             self.flush();
         }
@@ -99,28 +107,34 @@ impl Syncer {
 
     /// Seconds since a flush began that succeeded; 0 where each write is flushed and all were.
     pub(super) fn flushed_s(&self) -> f64 {
-        if self.thread.is_none() && !self.shared.dirty.load(Ordering::Acquire) {
-            return 0.0;
+        let unflushed = self.shared.unflushed();
+        match self.thread.is_none() && unflushed.segments.is_empty() {
+            true => 0.0,
+            false => unflushed.flushed.elapsed().as_secs_f64(),
         }
-        self.shared.flushed().elapsed().as_secs_f64()
     }
 
     /// Segment `number` is gone, and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
-        self.shared.files().open.retain(|(open, _)| *open != number);
+        self.shared.unflushed().segments.remove(&number);
     }
 
-    /// Something was written to the newest file; where each write is flushed, the disk may refuse.
-    pub(super) fn written(&self) -> io::Result<()> {
-        self.shared.dirty.store(true, Ordering::Release);
+    /// Something was written to segment `number`; where each write is flushed, the disk may refuse.
+    pub(super) fn written(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
+        let mut unflushed = self.shared.unflushed();
+        unflushed
+            .segments
+            .entry(number)
+            .or_insert_with(|| file.clone());
+        drop(unflushed);
         match self.thread {
             Some(_) => Ok(()),
-            None => flush(&self.shared),
+            None => self.shared.flush(),
         }
     }
 
     pub(super) fn flushed(&self) -> io::Result<()> {
-        flush(&self.shared)
+        self.shared.flush()
     }
 
     /// Flushes now; a disk that refuses is a warning.
@@ -134,9 +148,8 @@ impl Syncer {
 impl Drop for Syncer {
     fn drop(&mut self) {
         self.stop.set();
-        match self.thread.take().map(JoinHandle::join) {
-            None | Some(Ok(())) => {}
-            Some(Err(_)) => tracing::error!("the thread that flushes the replay's log panicked"),
+        if let Some(Err(_)) = self.thread.take().map(JoinHandle::join) {
+            tracing::error!("the thread that flushes the replay's log panicked");
         }
         self.flush();
     }
@@ -146,7 +159,7 @@ fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
     let mut said = Seldom::default();
     while !stop.wait_timeout(period) {
         fault::point("replay-fsync");
-        if let Err(e) = flush(shared)
+        if let Err(e) = shared.flush()
             && let Some(more) = said.due()
         {
             tracing::error!(
@@ -154,40 +167,4 @@ fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
             );
         }
     }
-}
-
-/// Flushes what was written since the last time.
-fn flush(shared: &Shared) -> io::Result<()> {
-    let _one = shared
-        .flushing
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner);
-    let begun = Instant::now();
-    if shared.dirty.swap(false, Ordering::AcqRel) {
-        let files = shared.files();
-        let (open, folder) = (files.open.clone(), files.folder.clone());
-        drop(files);
-        if let Err(e) = flush_all(&open, folder.as_deref()) {
-            // What was not flushed is due the next time again.
-            shared.dirty.store(true, Ordering::Release);
-            return Err(e);
-        }
-        let mut files = shared.files();
-        // Older ones are not written any more.
-        if let Some((newest, _)) = open.last() {
-            files.open.retain(|(number, _)| number >= newest);
-            if files.open.last().is_none_or(|(number, _)| number == newest) {
-                files.folder = None;
-            }
-        }
-    }
-    *shared.flushed() = begun;
-    Ok(())
-}
-
-fn flush_all(open: &[(u64, Arc<File>)], folder: Option<&File>) -> io::Result<()> {
-    for (_, file) in open {
-        file.sync_data()?;
-    }
-    folder.map_or(Ok(()), File::sync_all)
 }

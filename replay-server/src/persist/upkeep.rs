@@ -3,47 +3,31 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{Chunk, ChunkHeader, CodecError, LogStatus, Tally, codec};
+use driml_protocol::{Chunk, ChunkHeader, CodecError, End, Tally, codec};
 
 use super::{
-    error::PersistError,
-    segment::Mark,
+    folder::{Mark, PersistError},
+    journal::Journal,
     snapshot::{Note, Snapshot, State},
 };
-use crate::{replay::Replay, sampling::rows::sampler::RowsState};
-
-/// Transitions of one piece of what is gone.
-const GONE_PIECE: u64 = 256;
+use crate::{
+    replay::Replay,
+    sampling::rows::RowsState,
+    storage::ring::{Link, Step},
+};
 
 /// What is written, and what others hear of it.
 impl Replay {
-    /// Bytes of the log; 0 without one.
-    pub fn log_bytes(&self) -> u64 {
-        self.log.as_ref().map_or(0, |log| log.journal.bytes())
-    }
-
-    /// How the log stands; none without one.
-    pub(crate) fn log_status(&self) -> Option<LogStatus> {
-        self.log.as_ref().map(|log| log.journal.status())
-    }
-
     /// Whether all notes are on disk; until then joins and goodbyes get no answer.
     pub(crate) fn is_ready(&mut self) -> bool {
         let log = self.log.as_mut();
-        log.is_none_or(|log| log.journal.is_ready())
+        log.is_none_or(Journal::is_ready)
     }
 
     /// Whether the disk refused what was to be written last.
     pub fn is_refused_by_disk(&self) -> bool {
         let log = self.log.as_ref();
-        log.is_some_and(|log| log.journal.is_failing())
-    }
-
-    /// Flushes what was written to the disk: nothing more is to come.
-    pub(crate) fn flush(&mut self) {
-        if let Some(log) = &mut self.log {
-            log.journal.flush();
-        }
+        log.is_some_and(Journal::is_failing)
     }
 
     /// Marks this moment in the log, on the disk. The log can be opened there again, also after it was continued: then all of the
@@ -53,7 +37,7 @@ impl Replay {
     /// A disk that refuses.
     pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
         let snapshot = self.snapshot();
-        let marked = self.log.as_mut().map(|log| log.mark(snapshot));
+        let marked = self.log.as_mut().map(|log| log.mark(&snapshot));
         self.prune();
         marked.transpose()
     }
@@ -68,16 +52,15 @@ impl Replay {
 
     pub(crate) fn note(&mut self, note: Note) {
         if let Some(log) = &mut self.log {
-            log.journal.append_note(&note);
+            log.append_note(&note);
         }
         self.tidy();
     }
 
     /// Begins another segment when one is full, and removes those that are not needed any more.
     pub(crate) fn tidy(&mut self) {
-        let journal = self.log.as_ref().map(|log| &log.journal);
-        if let Some(journal) = journal.filter(|it| it.is_full()) {
-            if let Some(oldest) = journal.over_budget() {
+        if let Some(log) = self.log.as_ref().filter(|log| log.is_full()) {
+            if let Some(oldest) = log.over_budget() {
                 self.forget_before(oldest);
                 self.prune();
             }
@@ -87,10 +70,9 @@ impl Replay {
     }
 
     pub(crate) fn begin_segment(&mut self) {
-        if self.log.is_some() {
-            let snapshot = self.snapshot();
-            let log = self.log.iter_mut();
-            log.for_each(|log| log.journal.rotate(&snapshot));
+        let snapshot = self.log.is_some().then(|| self.snapshot());
+        if let (Some(log), Some(snapshot)) = (&mut self.log, snapshot) {
+            log.rotate(&snapshot);
         }
     }
 
@@ -159,17 +141,23 @@ impl Replay {
         Ok(())
     }
 
-    /// Takes the place of `count` transitions that are gone.
-    fn push_gone(&mut self, mut count: u64) {
-        let packer = self.packer();
-        while count > 0 {
-            let steps = count.min(GONE_PIECE).min(self.ring.capacity());
-            let chunk = Chunk::zeroed(blank(steps as u32, self.spec.frame_bytes()));
-            let packed = packer.pack(Cow::Owned(chunk));
-            for run in packed.runs() {
-                self.ring.push_gone(run, steps);
-            }
-            count -= steps;
+    /// Takes the place of `count` transitions that are gone, which hang together with nothing and cannot be anchors.
+    fn push_gone(&mut self, count: u64) {
+        let chunk = Chunk::zeroed(ChunkHeader {
+            actor: 0,
+            incarnation: 0,
+            sequence: 0,
+            first_transition: 0,
+            weights_version: 0,
+            leaving: false,
+            streams: 1,
+            steps: 1,
+            frame_bytes: self.spec.frame_bytes() as u32,
+        });
+        let packed = self.packer().pack(Cow::Owned(chunk));
+        for run in (0..count).flat_map(|_| packed.runs()) {
+            let step = Step::new(0, 0.0, End::Running, 0);
+            self.ring.push_run(run, [step].into_iter(), Link::Lost);
         }
     }
 
@@ -213,73 +201,5 @@ impl Replay {
             },
             ..self.snapshot()
         })
-    }
-}
-
-/// Of a chunk that holds nothing.
-const fn blank(steps: u32, frame_bytes: usize) -> ChunkHeader {
-    ChunkHeader {
-        actor: 0,
-        incarnation: 0,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
-        streams: 1,
-        steps,
-        frame_bytes: frame_bytes as u32,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use driml_protocol::{ActorJoin, Horizon, RunSpec, TimeoutRule};
-
-    use super::*;
-
-    /// What it counts after the gap was logged when it happened: it must not be logged again.
-    #[test]
-    fn a_gap_larger_than_the_ring_does_not_end_a_recovery() {
-        let spec = RunSpec {
-            world: "test".into(),
-            agent: "test".into(),
-            seed: 1,
-            frame_height: 1,
-            frame_width: 1,
-            frame_channels: 1,
-            frame_stack: 1,
-            num_actions: 1,
-            n_step: 1,
-            gamma: 0.9,
-            horizon: Horizon::None,
-            timeout: TimeoutRule::Terminal,
-        };
-        let config = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8.0\nwarmup_transitions = 0\nslack_transitions = 9";
-        let config = toml::from_str(config).unwrap();
-        let replay = |chunks| {
-            let mut replay = Replay::new(&spec, &config, 1).unwrap();
-            let (actor, incarnation) = (0, 1);
-            replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
-            for sequence in 0..chunks {
-                replay.insert(&Chunk::zeroed(ChunkHeader {
-                    incarnation,
-                    sequence,
-                    first_transition: 5 * sequence,
-                    leaving: true,
-                    ..blank(5, 1)
-                }));
-            }
-            replay
-        };
-        let mut recovered = replay(1);
-        recovered.quiet = true;
-        recovered.restore(replay(9).snapshot()).unwrap();
-        assert!(recovered.quiet);
-        recovered.check_valid();
-        let status = recovered.status();
-        assert_eq!(
-            (status.transitions_inserted, status.transitions_held),
-            (45, 0)
-        );
     }
 }

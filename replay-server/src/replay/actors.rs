@@ -7,14 +7,17 @@ use driml_protocol::{ActorJoin, Chunk, Claim, EndedEpisode, Goodbye, InsertReply
 
 use super::Replay;
 use crate::{
-    admission::{self, TRANSITIONS_MAX},
+    config::compressed_bytes_least,
     ledger::actors::{Difference, Verdict},
-    persist::snapshot::Note,
+    persist::{journal::Journal, snapshot::Note},
     storage::{
         frame_store::{PackedChunk, Packer},
         ring::Step,
     },
 };
+
+/// Transitions that one life of an actor can have produced, by its own account: three years at three million a second.
+const TRANSITIONS_MAX: u64 = 1 << 48;
 
 impl Replay {
     /// Takes part from now on: chunks of this life of the actor are stored, those of an earlier one no longer. Gives the number
@@ -40,7 +43,7 @@ impl Replay {
     pub fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
-            seal_for: self.log.as_ref().map(|log| log.spec_hash),
+            seal_for: self.log.as_ref().map(Journal::spec_hash),
         }
     }
 
@@ -60,14 +63,14 @@ impl Replay {
     /// A retry is answered `Stored`, whatever the limiter says; a chunk that is not next is never stored.
     pub(crate) fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
         let chunk = &*packed.chunk;
-        let verdict = match self.unfit(chunk) {
-            Some(why) => Verdict::Refused(why),
-            None => self.state.actors.judge(&chunk.header),
+        let verdict = match self.check_chunk(chunk) {
+            Ok(()) => self.state.actors.judge(&chunk.header),
+            Err(why) => Verdict::Refused(why),
         };
         match verdict {
             Verdict::Refused(why) => Some(self.refused(why)),
             Verdict::Retried => {
-                self.state.statistics.chunks_retried += 1;
+                self.counted().chunks_retried += 1;
                 Some(self.stored())
             }
             _ if self.limiter.all_in() => Some(self.run_is_full()),
@@ -84,7 +87,11 @@ impl Replay {
         if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
             return self.wait(false);
         }
-        match self.log.as_mut().map_or(Ok(true), |log| log.chunk(packed)) {
+        match self
+            .log
+            .as_mut()
+            .map_or(Ok(true), |log| log.append_chunk(packed))
+        {
             Ok(true) => {}
             Ok(false) => return self.wait(false),
             Err(why) => return InsertReply::Refused { why },
@@ -112,12 +119,12 @@ impl Replay {
     }
 
     fn refused(&mut self, why: String) -> InsertReply {
-        self.note_refused_message();
+        self.counted().messages_refused += 1;
         InsertReply::Refused { why }
     }
 
     fn stored(&self) -> InsertReply {
-        let actors = self.state.statistics.actors;
+        let actors = self.state.statistics.counted.actors;
         InsertReply::Stored {
             inserted_total: self.inserted_total(),
             actors: actors.saturating_mul(self.config.shards),
@@ -131,8 +138,51 @@ impl Replay {
         }
     }
 
-    pub(crate) fn unfit(&self, chunk: &Chunk) -> Option<String> {
-        admission::unfit(&self.spec, &self.config, self.ring.capacity(), chunk)
+    /// Checks that a chunk can be one of this run at all, by its sizes and counts alone; the error says why not.
+    pub(crate) fn check_chunk(&self, chunk: &Chunk) -> Result<(), String> {
+        let (spec, capacity) = (&self.spec, self.ring.capacity());
+        let header = &chunk.header;
+        let (sent, frame_bytes) = (header.frame_bytes, spec.frame_bytes());
+        if sent as usize != frame_bytes {
+            return Err(format!(
+                "frames of {sent} bytes; this run has {frame_bytes}"
+            ));
+        }
+        let transitions = header.transitions() as u64;
+        if transitions == 0 || transitions > capacity {
+            return Err(format!(
+                "{transitions} transitions in one chunk; the replay holds {capacity}: use 1 to that many"
+            ));
+        }
+        let bytes = compressed_bytes_least(transitions, frame_bytes);
+        if let Some(max) = self.config.compressed_bytes_max.filter(|&max| max < bytes) {
+            return Err(format!(
+                "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"
+            ));
+        }
+        let (sequence, first) = (header.sequence, header.first_transition);
+        let count = first.checked_add(transitions);
+        if sequence == u64::MAX || count.is_none_or(|count| count > TRANSITIONS_MAX) {
+            return Err(format!(
+                "counts that no run reaches: chunk {sequence}, transition {first}"
+            ));
+        }
+        let reward_max = f32::MAX / spec.n_step as f32;
+        let mut rewards = (0..header.transitions()).map(|row| chunk.reward(row));
+        if let Some(reward) = rewards.find(|reward| reward.abs() > reward_max) {
+            return Err(format!(
+                "a reward of {reward:e}; returns of {} steps are float32, so a reward is at most {reward_max:e}: scale the world's rewards",
+                spec.n_step
+            ));
+        }
+        let mut actions = chunk.actions().iter();
+        match actions.find(|&&action| u32::from(action) >= spec.num_actions) {
+            Some(action) => Err(format!(
+                "action {action}; this run has {}",
+                spec.num_actions
+            )),
+            None => Ok(()),
+        }
     }
 
     /// Stores a chunk that is the next of its actor.
@@ -155,7 +205,7 @@ impl Replay {
             stream.link = self.ring.push_run(run, rows.clone().map(step), link);
             self.sampler.stored(&self.ring, first, link);
             for step in rows.map(step) {
-                statistics.action_histogram[usize::from(step.action)] += 1;
+                statistics.counted.action_histogram[usize::from(step.action)] += 1;
                 if let Some(episode) = &mut stream.episode {
                     episode.episode_return += f64::from(step.reward);
                     episode.steps += 1;
@@ -201,7 +251,7 @@ impl Replay {
                 None
             }
             Err(why) => {
-                self.note_refused_message();
+                self.counted().messages_refused += 1;
                 Some(why)
             }
         }

@@ -9,9 +9,9 @@ use driml_protocol::{
 use super::{Replay, Unready};
 use crate::{
     config,
-    ledger::requests::{Dedup, Requests},
+    ledger::requests::Requests,
     persist::snapshot::Note,
-    sampling::{packed_batch::PackedBatch, rows::sampler::PriorityCounts},
+    sampling::{packed_batch::PackedBatch, rows::PriorityCounts},
 };
 
 /// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
@@ -57,8 +57,8 @@ impl Replay {
         self.set_rows_sampled(learned);
         self.limiter.adopt_other_shards(join.other_shards);
         let state = &mut self.state;
-        state.statistics.rows_unlearned += unlearned;
-        state.statistics.updates_relearned += again;
+        state.statistics.counted.rows_unlearned += unlearned;
+        state.statistics.counted.updates_relearned += again;
         state.learned = Learned {
             updates: join.updates,
             saved_updates: join.updates,
@@ -203,7 +203,7 @@ impl Replay {
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Result<PackedBatch, Unready> {
-        let Dedup::Fresh(lost) = self.requests.begin(id) else {
+        let Some(lost) = self.requests.begin(id) else {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         };
         if !lost.is_empty() {
@@ -228,7 +228,7 @@ impl Replay {
         let rows_max = config::rows_max(&self.spec, &self.config.sampling);
         let rows_max = rows_max.min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
-            self.note_refused_message();
+            self.counted().messages_refused += 1;
             let why = format!(
                 "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
             );
@@ -254,7 +254,7 @@ impl Replay {
         };
         self.limiter.sampled(rows);
         drawn.batch.header.tally = self.limiter.tally();
-        state.statistics.mean_age = drawn.batch.header.mean_age;
+        state.statistics.counted.mean_age = drawn.batch.header.mean_age;
         state.statistics.served(&drawn.ks);
         state.starving = false;
         Ok(drawn)

@@ -10,7 +10,7 @@ use driml_protocol::{BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, T
 use crate::{
     config::{Config, ConfigError},
     ledger::requests::Requests,
-    persist::{log::Log, snapshot::State},
+    persist::{journal::Journal, snapshot::State},
     rate_limiter::RateLimiter,
     sampling::batch::BatchSampler,
     storage::{frame_store::Frames, ring::Ring},
@@ -56,7 +56,7 @@ pub struct Replay {
     pub(crate) quiet: bool,
     /// It was read back: how many rows the learner has, it says with its next request.
     pub(crate) awaits_learner: bool,
-    pub(crate) log: Option<Log>,
+    pub(crate) log: Option<Journal>,
 }
 
 /// An empty replay, and who draws from it.
@@ -128,34 +128,14 @@ impl Replay {
 
 /// What it says of itself, and what the service around it tells it to count.
 impl Replay {
-    /// Counts a message that could not be read.
-    pub(crate) fn note_refused_message(&mut self) {
-        self.state.statistics.messages_refused += 1;
-    }
-
-    /// Counts `seconds` that a request for a batch waited at the limiter.
-    pub(crate) fn note_learner_waited(&mut self, seconds: f64) {
-        self.state.statistics.learner_waited_s += seconds;
-    }
-
-    /// Counts `seconds` that a chunk waited at the limiter.
-    pub(crate) fn note_actors_waited(&mut self, seconds: f64) {
-        self.state.statistics.actors_waited_s += seconds;
-    }
-
-    /// Sets how many actors are connected.
-    pub(crate) fn set_actors(&mut self, actors: u32) {
-        self.state.statistics.actors = actors;
+    /// What is counted of messages, waits and connections.
+    pub(crate) const fn counted(&mut self) -> &mut ReplayStatus {
+        &mut self.state.statistics.counted
     }
 
     /// Transitions of the run that were stored, in all shards as far as heard.
     pub const fn inserted_total(&self) -> u64 {
         self.limiter.inserted_total()
-    }
-
-    /// Whether all transitions of the run are in.
-    pub(crate) fn all_in(&self) -> bool {
-        self.limiter.all_in()
     }
 
     /// What was counted here since the start of the run.
@@ -196,7 +176,7 @@ impl Replay {
             waiting: self.waiting(),
             affinity_version: self.state.affinity.version(),
             finished: self.limiter.all_in(),
-            ..self.state.statistics.status()
+            ..self.state.statistics.counted.clone()
         }
     }
 

@@ -1,5 +1,7 @@
-//! Draws the rows of a batch and puts it together: anchors by `rows`, each row by `assemble`, frames by `needed_frames`.
+//! Draws the rows of a batch and puts it together: anchors by `rows`, each row by `assemble`, and the frames that they need, each once.
 //! Whether a batch may be drawn is for the rate limiter.
+
+use std::collections::{HashMap, hash_map::Entry};
 
 use driml_protocol::{Batch, BatchHeader, Buffer, RunSpec, Sampling};
 use rand_chacha::ChaCha8Rng;
@@ -8,14 +10,13 @@ use super::{
     assemble::{Assembler, RowStates},
     episodes::{Episodes, Window},
     horizon::Affinity,
-    needed_frames::NeededFrames,
     packed_batch::{PackedBatch, PackedFrames},
-    rows::{
-        self,
-        sampler::{Held, RowSampler, RowsState},
-    },
+    rows::{Held, RowSampler, RowsState, prioritised::Priorities, uniform::Uniform},
 };
-use crate::storage::ring::{Link, Ring};
+use crate::{
+    config::reach,
+    storage::ring::{Link, Ring},
+};
 
 /// Everything that drawing needs beside the ring and the generator.
 pub(crate) struct BatchSampler {
@@ -29,9 +30,15 @@ pub(crate) struct BatchSampler {
 impl BatchSampler {
     /// The sampler of a ring of `capacity` transitions; an error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
+        let rows: Box<dyn RowSampler> = match *sampling {
+            Sampling::Uniform => Box::new(Uniform::default()),
+            Sampling::Prioritised { alpha, .. } => {
+                Box::new(Priorities::new(alpha, capacity, reach(spec))?)
+            }
+        };
         Ok(Self {
             episodes: Episodes::new(spec),
-            rows: rows::sampler(sampling, spec, capacity)?,
+            rows,
             assembler: Assembler::new(spec),
             window: Window::default(),
             frame_bytes: spec.frame_bytes(),
@@ -75,7 +82,7 @@ impl BatchSampler {
         let mut needed = NeededFrames::default();
         if let Some(stacked) = &mut header.stacked {
             needed = NeededFrames::of(ring, episodes, states.iter());
-            stacked.frames = needed.count() as u32;
+            stacked.frames = needed.indices.len() as u32;
         }
         let mut batch = Batch::of_rows(header, &scalars, memory);
         // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
@@ -127,5 +134,56 @@ impl BatchSampler {
     pub(crate) fn check_valid(&self, ring: &Ring) {
         let episodes = &self.episodes;
         self.rows.check_valid(Held { ring, episodes });
+    }
+}
+
+/// The distinct frames of stacked states, in the order in which rows need them: states of a row share them, and now and then rows do.
+/// A frame is known by where the ring holds it: two that look the same are two.
+#[derive(Default)]
+struct NeededFrames {
+    /// Indices in the ring.
+    indices: Vec<u64>,
+    /// How many are needed by the rows up to each.
+    row_ends: Vec<usize>,
+    /// The frames of each state, oldest first, by their place among `indices`: row by row, in the order of [`RowStates::indices`].
+    stacks: Vec<u32>,
+    frame_stack: usize,
+}
+
+impl NeededFrames {
+    fn of<'a>(ring: &Ring, episodes: &Episodes, rows: impl Iterator<Item = &'a RowStates>) -> Self {
+        let mut this = Self {
+            frame_stack: episodes.frame_stack(),
+            ..Self::default()
+        };
+        let mut places = HashMap::new();
+        for states in rows {
+            for state in states.indices() {
+                for index in episodes.stack(ring, state).frames() {
+                    let place = match places.entry(index) {
+                        Entry::Occupied(known) => *known.get(),
+                        Entry::Vacant(new) => {
+                            this.indices.push(index);
+                            *new.insert(this.indices.len() as u32 - 1)
+                        }
+                    };
+                    this.stacks.push(place);
+                }
+            }
+            this.row_ends.push(this.indices.len());
+        }
+        this
+    }
+
+    /// Those that `row` is the first to need, and their places.
+    fn first_in(&self, row: usize) -> impl Iterator<Item = (u64, usize)> {
+        let start = row.checked_sub(1).map_or(0, |before| self.row_ends[before]);
+        let places = start..self.row_ends[row];
+        self.indices[places.clone()].iter().copied().zip(places)
+    }
+
+    /// The places of each state's frames, oldest first.
+    fn stacks(&self) -> impl Iterator<Item = &[u32]> {
+        self.stacks.chunks_exact(self.frame_stack.max(1))
     }
 }

@@ -5,6 +5,5 @@ pub(crate) mod assemble;
 pub(crate) mod batch;
 mod episodes;
 pub mod horizon;
-mod needed_frames;
 pub(crate) mod packed_batch;
 pub(crate) mod rows;

@@ -31,7 +31,6 @@ struct Account {
     /// Its newest life.
     alive: Alive,
     lives: u32,
-    is_connected: bool,
     /// When it was connected, or went.
     changed: Instant,
     heard: Option<Instant>,
@@ -67,7 +66,6 @@ impl Accounts {
         let account = Account {
             alive: who,
             lives: earlier.map_or(0, |account| account.lives) + 1,
-            is_connected: self.is_connected(who),
             changed: now,
             heard: None,
             weights_version: None,
@@ -76,17 +74,22 @@ impl Accounts {
         self.parts.insert(name(who), account);
     }
 
-    /// How often actors have joined, all together.
-    pub(super) fn actor_lives(&self) -> u32 {
-        let actors = self.parts.iter();
-        let actors = actors.filter(|(who, _)| **who != PartName::Learner);
-        actors.map(|(_, account)| account.lives).sum()
-    }
-
     /// The account of this life, if it takes part.
     fn of(&mut self, who: Alive) -> Option<&mut Account> {
         let account = self.parts.get_mut(&name(who))?;
         (account.alive == who).then_some(account)
+    }
+
+    /// The accounts of all actors, or of the learner.
+    fn all(&self, learner: bool) -> impl Iterator<Item = &Account> {
+        let parts = self.parts.iter();
+        let parts = parts.filter(move |(who, _)| (**who == PartName::Learner) == learner);
+        parts.map(|(_, account)| account)
+    }
+
+    /// How often actors have joined, all together.
+    pub(super) fn actor_lives(&self) -> u32 {
+        self.all(false).map(|account| account.lives).sum()
     }
 
     /// Whether this life of a part is connected, also if it has not joined.
@@ -96,23 +99,25 @@ impl Accounts {
 
     /// A part is connected, or no longer.
     pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
-        if !is_connected {
-            self.connected.remove(&who);
-        } else if self.connected.len() < CONNECTED_MAX {
-            self.connected.insert(who);
-        }
-        if let Some(account) = self.of(who)
-            && account.is_connected != is_connected
-        {
-            (account.is_connected, account.changed) = (is_connected, now);
+        let has_changed = match is_connected {
+            true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
+            false => self.connected.remove(&who),
+        };
+        if let Some(account) = self.of(who).filter(|_| has_changed) {
+            account.changed = now;
         }
     }
 
     /// Actors that are connected and have joined.
     pub(super) fn actors_connected(&self) -> u32 {
-        let actors = self.parts.iter();
-        let connected = actors.filter(|(who, it)| **who != PartName::Learner && it.is_connected);
+        let connected = self.all(false).filter(|it| self.is_connected(it.alive));
         connected.count() as u32
+    }
+
+    /// Parts that are connected and have joined.
+    pub(super) fn connected(&self) -> usize {
+        let parts = self.parts.values();
+        parts.filter(|it| self.is_connected(it.alive)).count()
     }
 
     /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
@@ -160,79 +165,58 @@ impl Accounts {
 
     /// Whether the learner said that it has learned from every batch, and has saved.
     pub(super) fn is_over(&self) -> bool {
-        let learner = self.parts.get(&PartName::Learner);
-        let report = learner.and_then(|account| account.report.as_ref());
-        report.is_some_and(|(report, _)| report.finished.is_some())
-    }
-
-    pub(super) fn connected(&self) -> usize {
-        let accounts = self.parts.values();
-        accounts.filter(|account| account.is_connected).count()
+        let mut reports = self.all(true).filter_map(|it| it.report.as_ref());
+        reports.any(|(report, _)| report.finished.is_some())
     }
 
     /// Which part the run cannot continue without and does not have, for a person; `finished` says whether all transitions are in.
     pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
-        let of = |learner: bool| {
-            let parts = self.parts.iter();
-            parts.filter(move |(who, _)| (**who == PartName::Learner) == learner)
+        let lacks = |learner, gone, not_yet| {
+            let mut parts = self.all(learner).peekable();
+            let missing = parts.peek().map_or(not_yet, |_| gone);
+            let is_there = parts.any(|it| self.is_connected(it.alive));
+            (!is_there).then_some(missing)
         };
-        let is_there = |learner| of(learner).any(|(_, account)| account.is_connected);
-        let has_joined = |learner| of(learner).next().is_some();
-        if !is_there(true) {
-            return Some(match has_joined(true) {
-                true => "the learner is gone",
-                false => "no learner has joined yet",
-            });
-        }
-        (!finished && !is_there(false)).then(|| match has_joined(false) {
-            true => "all actors are gone",
-            false => "no actor has joined yet",
-        })
+        let learner = lacks(true, "the learner is gone", "no learner has joined yet");
+        let actors = lacks(false, "all actors are gone", "no actor has joined yet");
+        learner.or(actors.filter(|_| !finished))
     }
 
-    /// All parts; `held_since` says since when a part's chunk or request has been waiting.
+    /// All parts; `held_since` says since when a part's chunk or request has been waiting. Of very many parts the newest warnings are
+    /// passed on.
     pub(super) fn parts(
         &self,
         now: Instant,
         held_since: impl Fn(PartName) -> Option<Instant>,
     ) -> Vec<PartStatus> {
-        let age = |(&who, account): (_, &Account)| Some((account.warning_age(now)?, who));
-        let mut ages: Vec<(f64, PartName)> = self.parts.iter().filter_map(age).collect();
-        ages.sort_by(|(one, _), (other, _)| one.total_cmp(other));
-        let newest: HashSet<_> = ages.iter().take(WARNINGS_MAX).map(|(_, who)| who).collect();
         let part = |(&who, account): (&PartName, &Account)| {
             let report = account.report.as_ref();
+            let report = report.map(|(report, at)| (report, seconds(now, *at)));
             PartStatus {
                 who,
-                connected: account.is_connected,
+                connected: self.is_connected(account.alive),
                 since_s: seconds(now, account.changed),
                 lives: account.lives,
                 heard_s: account.heard.map(|at| seconds(now, at)),
                 held_s: held_since(who).map(|at| seconds(now, at)),
                 weights_version: account.weights_version,
-                doing: report.map(|(report, at)| {
-                    let said = seconds(now, *at);
-                    (report.doing.clone(), report.since_s + said, said)
+                doing: report.map(|(it, said)| (it.doing.clone(), it.since_s + said, said)),
+                last_warning: report.and_then(|(report, said)| {
+                    let warning = report.last_warning.as_ref()?;
+                    Some(Warning::new(&warning.text, warning.age_s + said))
                 }),
-                last_warning: report
-                    .filter(|_| newest.contains(&who))
-                    .and_then(|(report, at)| {
-                        let warning = report.last_warning.as_ref()?;
-                        Some(Warning::new(
-                            &warning.text,
-                            warning.age_s + seconds(now, *at),
-                        ))
-                    }),
             }
         };
-        self.parts.iter().map(part).collect()
-    }
-}
-
-impl Account {
-    fn warning_age(&self, now: Instant) -> Option<f64> {
-        let (report, at) = self.report.as_ref()?;
-        Some(report.last_warning.as_ref()?.age_s + seconds(now, *at))
+        let mut parts: Vec<_> = self.parts.iter().map(part).collect();
+        let age = |part: &PartStatus| {
+            let warning = part.last_warning.as_ref();
+            warning.map_or(f64::INFINITY, |warning| warning.age_s)
+        };
+        let mut by_age: Vec<_> = parts.iter_mut().collect();
+        by_age.sort_by(|one, other| age(one).total_cmp(&age(other)));
+        let older = by_age.into_iter().skip(WARNINGS_MAX);
+        older.for_each(|part| part.last_warning = None);
+        parts
     }
 }
 
@@ -307,20 +291,22 @@ mod tests {
     fn what_is_missing_is_named() {
         let now = Instant::now();
         let mut accounts = Accounts::new(now);
-        assert_eq!(accounts.missing(false), Some("no learner has joined yet"));
-        let learner = Alive::learner(5);
-        for who in [learner, actor(1)] {
-            accounts.note_connected(who, true, now);
-        }
-        accounts.joined(learner, now);
-        assert_eq!(accounts.missing(false), Some("no actor has joined yet"));
-        assert_eq!(accounts.missing(true), None);
-        accounts.joined(actor(1), now);
-        assert_eq!(accounts.missing(false), None);
-        accounts.note_connected(actor(1), false, now);
-        assert_eq!(accounts.missing(false), Some("all actors are gone"));
-        accounts.note_connected(learner, false, now);
-        assert_eq!(accounts.missing(true), Some("the learner is gone"));
+        let mut check = |who, joins, connected, all_in, missing| {
+            accounts.note_connected(who, connected, now);
+            if joins {
+                accounts.joined(who, now);
+            }
+            assert_eq!(accounts.missing(all_in), missing);
+        };
+        let (learner, actor) = (Alive::learner(5), actor(1));
+        let nobody = Some("no learner has joined yet");
+        check(learner, false, true, false, nobody);
+        check(actor, false, true, false, nobody);
+        check(learner, true, true, false, Some("no actor has joined yet"));
+        check(learner, true, true, true, None);
+        check(actor, true, true, false, None);
+        check(actor, true, false, false, Some("all actors are gone"));
+        check(learner, true, false, true, Some("the learner is gone"));
     }
 
     #[test]
@@ -333,10 +319,7 @@ mod tests {
         accounts.note_waiting(warm_up(50), at(4));
         assert_eq!(accounts.waiting(at(5)), (warm_up(50), 4.0));
         accounts.note_waiting(Waiting::ActorsWaitForLearner, at(6));
-        assert_eq!(
-            accounts.waiting(at(6)),
-            (Waiting::ActorsWaitForLearner, 0.0)
-        );
+        assert_eq!(accounts.waiting(at(6)).1, 0.0);
     }
 
     #[test]

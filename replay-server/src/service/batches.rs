@@ -99,7 +99,7 @@ impl Service {
                 continue;
             };
             let waited = now.saturating_duration_since(parked.arrived);
-            state.replay.note_learner_waited(waited.as_secs_f64());
+            state.replay.counted().learner_waited_s += waited.as_secs_f64();
             drop(state);
             self.changed.notify_all();
             give_batch(parked.question, drawn);
@@ -130,25 +130,21 @@ impl State {
         now: Instant,
         memory: impl Fn(usize, bool) -> Buffer,
     ) -> Option<(Parked, Result<PackedBatch, Unready>)> {
-        let (mut waiting, mut found) = (Vec::new(), None);
-        while let Some(parked) = self.requests.pop() {
+        for at in 0..self.requests.line.len() {
+            let parked = &self.requests.line[at];
             let BatchRequest {
                 id,
                 rows,
                 shared_memory,
                 ..
             } = parked.request;
-            let drawn = self
-                .replay
-                .draw_for(id, rows, |bytes| memory(bytes, shared_memory));
-            if matches!(drawn, Err(Unready::Wait(_))) && !parked.left(now).is_zero() {
-                waiting.push(parked);
-            } else {
-                found = Some((parked, drawn));
-                break;
+            let memory = |bytes| memory(bytes, shared_memory);
+            let drawn = self.replay.draw_for(id, rows, memory);
+            if !matches!(drawn, Err(Unready::Wait(_))) || parked.left(now).is_zero() {
+                let parked = self.requests.line.remove(at);
+                return parked.map(|parked| (parked, drawn));
             }
         }
-        self.requests.put_back(waiting);
-        found
+        None
     }
 }

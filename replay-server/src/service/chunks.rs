@@ -53,12 +53,11 @@ impl Service {
     /// Weights that acted may be newer than those that are here, where this server was started anew, but not by any number.
     fn check_version(&self, header: &ChunkHeader) -> Result<(), CodecError> {
         let (acted, newest) = (header.weights_version, self.weights().version());
-        match acted.saturating_sub(newest) {
-            0..=VERSION_AHEAD_MAX => Ok(()),
-            _ => Err(CodecError::Header(format!(
-                "weights {acted} acted, and the newest are {newest}"
-            ))),
+        if acted.saturating_sub(newest) <= VERSION_AHEAD_MAX {
+            return Ok(());
         }
+        let why = format!("weights {acted} acted, and the newest are {newest}");
+        Err(CodecError::Header(why))
     }
 
     pub(super) fn claim(&self, incoming: Incoming<Claim>) {
@@ -107,45 +106,37 @@ impl State {
     /// Stores a chunk, or parks it until it may be stored.
     fn take_chunk(&mut self, packed: PackedChunk<'static>, question: Question) -> Answers {
         let header = packed.chunk.header;
-        let Question { arrived, .. } = question;
+        let (version, arrived) = (header.weights_version, question.arrived);
         let actor = Alive::actor(header.actor, header.incarnation);
-        self.accounts
-            .heard(actor, Some(header.weights_version), arrived);
-        let Self {
-            replay,
-            chunks,
-            timings,
-            said,
-            ..
-        } = self;
-        let reply = match replay.settle(&packed) {
+        self.accounts.heard(actor, Some(version), arrived);
+        let reply = match self.replay.settle(&packed) {
             Some(reply) => reply,
             // Those that came before go first.
-            None if !chunks.is_empty() && !header.leaving => replay.wait(false),
-            None => match replay.admit(&packed) {
-                stored @ InsertReply::Stored { .. } => {
-                    let now = Instant::now();
-                    timings.stored(header.weights_version, now - arrived, now);
-                    stored
+            None if !self.chunks.line.is_empty() && !header.leaving => self.replay.wait(false),
+            None => {
+                let reply = self.replay.admit(&packed);
+                if matches!(reply, InsertReply::Stored { .. }) {
+                    self.timings.stored(version, arrived, Instant::now());
                 }
-                reply => reply,
-            },
+                reply
+            }
         };
-        if let InsertReply::Refused { why } = &reply
-            && let Some(more) = said.due("chunk")
-        {
-            let actor = header.actor;
-            tracing::warn!("a chunk of actor {actor} was refused: {why}{more}");
-        }
         let mut answers = Answers::new();
-        if matches!(reply, InsertReply::Wait { .. }) {
-            let no_room = chunks.park(packed, question, arrived).err();
-            answers.extend(no_room.map(|question| (question, reply)));
-            return answers;
-        }
-        if matches!(reply, InsertReply::Stored { .. }) {
-            let older = chunks.take_copy(&header).and_then(|it| it.question);
-            answers.extend(older.map(|question| (question, reply.clone())));
+        match &reply {
+            InsertReply::Wait { .. } => {
+                let no_room = self.chunks.park(packed, question, arrived).err();
+                answers.extend(no_room.map(|question| (question, reply)));
+                return answers;
+            }
+            InsertReply::Stored { .. } => {
+                let older = self.chunks.take_copy(&header).and_then(|it| it.question);
+                answers.extend(older.map(|question| (question, reply.clone())));
+            }
+            InsertReply::Refused { why } => {
+                let line = format!("a chunk of actor {} was refused: {why}", header.actor);
+                self.say("chunk", &line);
+            }
+            InsertReply::OutOfOrder { .. } | InsertReply::Finished { .. } => {}
         }
         answers.push((question, reply));
         answers
@@ -162,37 +153,34 @@ impl State {
         let Some(parked) = self.chunks.claimed(claim) else {
             return vec![(question, self.replay.wait(false))];
         };
-        let asked = question.arrived;
-        parked.ask(question, asked);
+        // An older question about it was given up.
+        (parked.asked, parked.question) = (question.arrived, Some(question));
         if !claim.leaving {
             return Answers::new();
         }
         parked.chunk.chunk.to_mut().header.leaving = true;
         let parked = self.chunks.take(claim.actor);
-        parked
-            .and_then(|parked| {
-                let reply = self.replay.insert_packed(&parked.chunk);
-                self.leave_line(parked, reply)
-            })
-            .into_iter()
-            .collect()
+        let answer = parked.and_then(|parked| {
+            let reply = self.replay.insert_packed(&parked.chunk);
+            self.leave_line(parked, reply)
+        });
+        answer.into_iter().collect()
     }
 
     /// Deals with the parked chunks from the first on, up to one that still has to wait.
     fn admit(&mut self, now: Instant) -> Answers {
         let mut answers = Answers::new();
-        while let Some(parked) = self.chunks.first() {
+        while let Some(parked) = self.chunks.line.front() {
             // Its actor may have started anew meanwhile, or the run may have ended.
             let reply = self.replay.insert_packed(&parked.chunk);
             if matches!(reply, InsertReply::Wait { .. }) {
                 break;
             }
-            let Some(parked) = self.chunks.take_first() else {
-                break;
-            };
-            let waited = now.saturating_duration_since(parked.arrived);
-            self.replay.note_actors_waited(waited.as_secs_f64());
-            answers.extend(self.leave_line(parked, reply));
+            if let Some(parked) = self.chunks.line.pop_front() {
+                let waited = now.saturating_duration_since(parked.arrived);
+                self.replay.counted().actors_waited_s += waited.as_secs_f64();
+                answers.extend(self.leave_line(parked, reply));
+            }
         }
         answers
     }
@@ -205,10 +193,9 @@ impl State {
     ) -> Option<(Question, InsertReply)> {
         if let InsertReply::Stored { waited, .. } = &mut reply {
             *waited = true;
-            let version = parked.chunk.chunk.header.weights_version;
-            let now = Instant::now();
-            let waited = now.saturating_duration_since(parked.arrived);
-            self.timings.stored(version, waited, now);
+            let version = parked.header().weights_version;
+            let arrived = parked.arrived;
+            self.timings.stored(version, arrived, Instant::now());
         }
         parked.question.map(|question| (question, reply))
     }

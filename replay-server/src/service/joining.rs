@@ -3,7 +3,9 @@
 
 use std::time::Instant;
 
-use driml_protocol::{ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Responder};
+use driml_protocol::{
+    ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Request, Responder,
+};
 use zenoh::sample::SampleKind;
 
 use super::{
@@ -42,56 +44,51 @@ impl Service {
     }
 
     pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
-        if let Some(join) = self.read(&incoming) {
-            let reply = self.state().join_actor(join);
-            if !self.state().replay.is_ready() {
-                return;
-            }
-            self.welcome(incoming.into_responder(), reply);
-        }
+        self.join(incoming, State::join_actor);
     }
 
     pub(super) fn join_learner(&self, incoming: Incoming<LearnerJoin>) {
-        if let Some(join) = self.read(&incoming) {
-            let reply = self.state().join_learner(join);
-            if !self.state().replay.is_ready() {
-                return;
-            }
-            self.changed.notify_all();
-            self.welcome(incoming.into_responder(), reply);
-        }
+        self.join(incoming, State::join_learner);
     }
 
-    /// Answers a part that joins: how many lives it had before, or why it is not taken.
-    fn welcome(&self, responder: Responder<JoinReply>, joined: Result<u32, Rejection>) {
-        let reply = match joined {
-            Ok(earlier_incarnations) => JoinReply::Welcome {
-                inserted_total: self.state().replay.inserted_total(),
-                weights_version: self.weights().version(),
-                earlier_incarnations,
-            },
-            Err(Rejection::Taken(why)) => JoinReply::Taken { why },
-            Err(Rejection::Refused(why)) => {
-                let line = format!("a part was not let in: {why}");
-                self.state().refuse("join", &line);
-                JoinReply::Refused { why }
-            }
+    /// Answers a part that joins: how many lives it had before, or why it is not taken. No answer while the disk refuses to note it.
+    fn join<J: Request<Reply = JoinReply>>(
+        &self,
+        incoming: Incoming<J>,
+        join: impl Fn(&mut State, J) -> Result<u32, JoinReply>,
+    ) {
+        let Some(request) = self.read(&incoming) else {
+            return;
         };
-        responder.reply(&reply);
+        let weights_version = self.weights().version();
+        let mut state = self.state();
+        let joined = join(&mut state, request);
+        if !state.replay.is_ready() {
+            return;
+        }
+        let inserted_total = state.replay.inserted_total();
+        let reply = joined.map(|earlier_incarnations| JoinReply::Welcome {
+            inserted_total,
+            weights_version,
+            earlier_incarnations,
+        });
+        if let Err(JoinReply::Refused { why }) = &reply {
+            state.refuse("join", &format!("a part was not let in: {why}"));
+        }
+        drop(state);
+        self.changed.notify_all();
+        let reply = reply.unwrap_or_else(|rejected| rejected);
+        incoming.into_responder().reply(&reply);
     }
 }
 
-/// Why a part is not taken.
-enum Rejection {
-    /// Not yet: another process is connected that plays it.
-    Taken(String),
-    /// Never: this part cannot be taken at all.
-    Refused(String),
+fn refused(why: String) -> JoinReply {
+    JoinReply::Refused { why }
 }
 
 impl State {
     fn count_actors(&mut self) {
-        self.replay.set_actors(self.accounts.actors_connected());
+        self.replay.counted().actors = self.accounts.actors_connected();
     }
 
     /// Whether this life of a part is the one that takes part.
@@ -120,22 +117,21 @@ impl State {
     }
 
     /// Takes an actor that may take part; gives the number of its earlier lives.
-    fn join_actor(&mut self, join: ActorJoin) -> Result<u32, Rejection> {
+    fn join_actor(&mut self, join: ActorJoin) -> Result<u32, JoinReply> {
         let ActorJoin { actor, incarnation } = join;
-        let other = self
-            .replay
-            .actor_incarnation(actor)
-            .filter(|&other| other != incarnation);
+        let known = self.replay.actor_incarnation(actor);
+        let other = known.filter(|&other| other != incarnation);
         let accounts = &mut self.accounts;
         let is_connected = |actor, life| accounts.is_connected(Alive::actor(actor, life));
         if other.is_some_and(|life| is_connected(actor, life)) {
-            return Err(Rejection::Taken(format!(
+            let why = format!(
                 "another process is actor {actor} of this run: give each actor another number (--id)"
-            )));
+            );
+            return Err(JoinReply::Taken { why });
         }
         // Else a process that joins under one number after the other would use them up.
         self.replay.state.actors.forget_absent(is_connected);
-        let earlier_incarnations = self.replay.join_actor(join).map_err(Rejection::Refused)?;
+        let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
         accounts.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();
         if other.is_some() {
@@ -145,32 +141,31 @@ impl State {
         Ok(earlier_incarnations)
     }
 
-    fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, Rejection> {
-        let LearnerJoin {
-            learner, updates, ..
-        } = join;
-        let other = self.replay.learner().filter(|&other| other != learner);
+    fn join_learner(&mut self, join: LearnerJoin) -> Result<u32, JoinReply> {
+        let (learner, updates) = (join.learner, join.updates);
+        let served = self.replay.learner();
+        let other = served.filter(|&other| other != learner);
         if other.is_some() && self.accounts.is_over() {
             let done = self.replay.status().updates;
-            return Err(Rejection::Refused(format!(
+            return Err(refused(format!(
                 "the run is finished, with {done} updates; to train on, resume it with more --frames"
             )));
         }
         if other.is_some_and(|other| self.accounts.is_connected(Alive::learner(other))) {
-            let why = "another learner takes part in this run, which has one alone";
-            return Err(Rejection::Taken(why.into()));
+            let why = "another learner takes part in this run, which has one alone".into();
+            return Err(JoinReply::Taken { why });
         }
-        let is_new = self.replay.learner() != Some(learner);
-        let again = self.replay.join_learner(join).map_err(Rejection::Refused)?;
+        let again = self.replay.join_learner(join).map_err(refused)?;
         if again > 0 {
             tracing::warn!(
                 "the learner resumes from its checkpoint after {updates} updates: the {again} updates since then are learned again"
             );
         }
-        if is_new {
-            self.requests.keep_only(learner);
-            let learner = Alive::learner(learner);
-            self.accounts.joined(learner, Instant::now());
+        if served != Some(learner) {
+            let requests = &mut self.requests.line;
+            requests.retain(|it| it.request.learner == learner);
+            self.accounts
+                .joined(Alive::learner(learner), Instant::now());
         }
         Ok(0)
     }

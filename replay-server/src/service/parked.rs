@@ -22,44 +22,27 @@ pub(super) struct ParkedChunk<Q> {
     pub(super) question: Option<Q>,
     pub(super) arrived: Instant,
     /// When the question came.
-    asked: Instant,
+    pub(super) asked: Instant,
+}
+
+impl<Q> ParkedChunk<Q> {
+    pub(super) fn header(&self) -> &ChunkHeader {
+        &self.chunk.chunk.header
+    }
 }
 
 /// The chunks that wait, at most one an actor: the newest copy. They stand in the order in which their actors' first copies came.
 pub(super) struct ParkedChunks<Q> {
-    line: VecDeque<ParkedChunk<Q>>,
-    bytes: usize,
-}
-
-impl<Q> Default for ParkedChunks<Q> {
-    fn default() -> Self {
-        Self {
-            line: VecDeque::new(),
-            bytes: 0,
-        }
-    }
+    pub(super) line: VecDeque<ParkedChunk<Q>>,
 }
 
 impl<Q> ParkedChunks<Q> {
-    pub(super) fn len(&self) -> usize {
-        self.line.len()
-    }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.line.is_empty()
-    }
-
-    pub(super) const fn bytes(&self) -> usize {
-        self.bytes
-    }
-
-    /// Whose chunks wait.
-    pub(super) fn actors(&self) -> impl Iterator<Item = u32> {
-        self.line.iter().map(|it| it.header().actor)
+    pub(super) fn bytes(&self) -> usize {
+        self.line.iter().map(|it| it.chunk.bytes()).sum()
     }
 
     fn place(&self, actor: u32) -> Option<usize> {
-        self.actors().position(|it| it == actor)
+        self.line.iter().position(|it| it.header().actor == actor)
     }
 
     /// When the chunk of an actor came that waits.
@@ -76,23 +59,19 @@ impl<Q> ParkedChunks<Q> {
         now: Instant,
     ) -> Result<(), Q> {
         let place = self.place(chunk.chunk.header.actor);
-        let others = self.bytes - place.map_or(0, |at| self.line[at].chunk.bytes());
+        let others = self.bytes() - place.map_or(0, |at| self.line[at].chunk.bytes());
         // One chunk of any size is kept, or an actor with large ones would send for ever.
         if others > 0 && others + chunk.bytes() > CHUNK_BYTES_MAX {
             return Err(question);
         }
-        self.bytes = others + chunk.bytes();
-        let mut parked = ParkedChunk {
+        let parked = ParkedChunk {
             chunk,
             question: Some(question),
-            arrived: now,
+            arrived: place.map_or(now, |at| self.line[at].arrived),
             asked: now,
         };
         match place {
-            Some(at) => {
-                parked.arrived = self.line[at].arrived;
-                self.line[at] = parked;
-            }
+            Some(at) => self.line[at] = parked,
             None => self.line.push_back(parked),
         }
         Ok(())
@@ -100,11 +79,14 @@ impl<Q> ParkedChunks<Q> {
 
     /// The parked chunk that `claim` is about.
     pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
-        self.line.iter_mut().find(|parked| {
-            let header = parked.header();
-            (header.actor, header.incarnation, header.sequence)
-                == (claim.actor, claim.incarnation, claim.sequence)
-        })
+        let of = |it: &ChunkHeader| (it.actor, it.incarnation, it.sequence);
+        let claimed = (claim.actor, claim.incarnation, claim.sequence);
+        self.line.iter_mut().find(|it| of(it.header()) == claimed)
+    }
+
+    /// Takes an actor's chunk out of the line.
+    pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
+        self.line.remove(self.place(actor)?)
     }
 
     /// Takes the older copy of a chunk that has been stored out of the line; a later chunk of its actor stays.
@@ -115,30 +97,11 @@ impl<Q> ParkedChunks<Q> {
         is_copy.then(|| self.take(stored.actor)).flatten()
     }
 
-    /// The chunk that has waited longest.
-    pub(super) fn first(&self) -> Option<&ParkedChunk<Q>> {
-        self.line.front()
-    }
-
-    /// Takes an actor's chunk out of the line.
-    pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
-        let parked = self.line.remove(self.place(actor)?)?;
-        self.bytes -= parked.chunk.bytes();
-        Some(parked)
-    }
-
-    /// Takes the chunk that has waited longest out of the line.
-    pub(super) fn take_first(&mut self) -> Option<ParkedChunk<Q>> {
-        let actor = self.actors().next()?;
-        self.take(actor)
-    }
-
     /// Takes the questions that have been held for `hold_max`; the chunks stay.
     pub(super) fn overdue(&mut self, now: Instant, hold_max: Duration) -> Vec<Q> {
-        let late =
-            |parked: &&mut ParkedChunk<Q>| now.saturating_duration_since(parked.asked) >= hold_max;
-        let parked = self.line.iter_mut().filter(late);
-        parked.filter_map(|parked| parked.question.take()).collect()
+        let held = |it: &ParkedChunk<Q>| now.saturating_duration_since(it.asked);
+        let late = self.line.iter_mut().filter(|it| held(it) >= hold_max);
+        late.filter_map(|it| it.question.take()).collect()
     }
 
     /// How long until a question has been held for `hold_max`; none where none is.
@@ -146,17 +109,6 @@ impl<Q> ParkedChunks<Q> {
         let held = self.line.iter().filter(|it| it.question.is_some());
         let left = held.map(|it| hold_max.saturating_sub(now.saturating_duration_since(it.asked)));
         left.min()
-    }
-}
-
-impl<Q> ParkedChunk<Q> {
-    fn header(&self) -> &ChunkHeader {
-        &self.chunk.chunk.header
-    }
-
-    /// Takes another question about the same chunk; the older one was given up.
-    pub(super) fn ask(&mut self, question: Q, now: Instant) {
-        (self.question, self.asked) = (Some(question), now);
     }
 }
 
@@ -177,52 +129,24 @@ impl<Q> ParkedRequest<Q> {
 }
 
 /// The requests that wait, at most one a client: the newest attempt. The oldest is first.
-pub(super) struct ParkedRequests<Q>(VecDeque<ParkedRequest<Q>>);
-
-impl<Q> Default for ParkedRequests<Q> {
-    fn default() -> Self {
-        Self(VecDeque::new())
-    }
+pub(super) struct ParkedRequests<Q> {
+    pub(super) line: VecDeque<ParkedRequest<Q>>,
 }
 
 impl<Q> ParkedRequests<Q> {
     /// Keeps a request in the place of an older one of its client, which was given up.
     pub(super) fn park(&mut self, parked: ParkedRequest<Q>) {
-        let id = parked.request.id;
-        self.0.retain(|it| it.request.id.client_id != id.client_id);
-        if self.0.len() == REQUESTS_MAX {
-            self.0.pop_front();
+        let client_id = parked.request.id.client_id;
+        self.line.retain(|it| it.request.id.client_id != client_id);
+        if self.line.len() == REQUESTS_MAX {
+            self.line.pop_front();
         }
-        self.0.push_back(parked);
-    }
-
-    pub(super) fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    pub(super) fn oldest(&self) -> Option<Instant> {
-        self.0.iter().map(|it| it.arrived).min()
-    }
-
-    /// Forgets all but the requests of one learner.
-    pub(super) fn keep_only(&mut self, learner: u64) {
-        self.0.retain(|it| it.request.learner == learner);
-    }
-
-    pub(super) fn pop(&mut self) -> Option<ParkedRequest<Q>> {
-        self.0.pop_front()
-    }
-
-    /// Puts back what was popped and is not to be answered yet.
-    pub(super) fn put_back(&mut self, parked: impl IntoIterator<Item = ParkedRequest<Q>>) {
-        let newer = std::mem::take(&mut self.0);
-        self.0.extend(parked);
-        self.0.extend(newer);
+        self.line.push_back(parked);
     }
 
     /// How long until one has waited as long as it may.
     pub(super) fn due_in(&self, now: Instant) -> Option<Duration> {
-        self.0.iter().map(|it| it.left(now)).min()
+        self.line.iter().map(|it| it.left(now)).min()
     }
 }
 
@@ -235,7 +159,9 @@ mod tests {
     use super::*;
     use crate::{config::Compression, storage::frame_store::Packer};
 
-    fn chunk(actor: u32, sequence: u64, steps: u32, frame_bytes: u32) -> PackedChunk<'static> {
+    const SECOND: Duration = Duration::from_secs(1);
+
+    fn chunk(actor: u32, sequence: u64, frame_bytes: u32) -> PackedChunk<'static> {
         let chunk = Chunk::zeroed(ChunkHeader {
             actor,
             incarnation: 9,
@@ -244,7 +170,7 @@ mod tests {
             weights_version: 0,
             leaving: false,
             streams: 1,
-            steps,
+            steps: 1,
             frame_bytes,
         });
         let packer = Packer {
@@ -263,94 +189,92 @@ mod tests {
         }
     }
 
+    fn nothing<Q>() -> ParkedChunks<Q> {
+        ParkedChunks {
+            line: VecDeque::new(),
+        }
+    }
+
     #[test]
     fn one_chunk_an_actor_waits_in_the_order_of_arrival() {
-        let (mut parked, now) = (ParkedChunks::default(), Instant::now());
-        for (actor, question) in [(1, "a"), (2, "b"), (1, "a again")] {
-            parked.park(chunk(actor, 0, 1, 1), question, now).unwrap();
+        let (mut parked, now) = (nothing(), Instant::now());
+        let arrivals = [(1, 0, "a"), (2, 0, "b"), (1, 0, "a again"), (4, 7, "d")];
+        for (actor, sequence, question) in arrivals {
+            let chunk = chunk(actor, sequence, 1);
+            parked.park(chunk, question, now).unwrap();
         }
-        assert_eq!(parked.len(), 2);
-        let first = parked.first().unwrap().question;
+        let first = parked.line[0].question;
         assert_eq!(first, Some("a again"), "its place is kept");
-        assert!(parked.claimed(&claim(1, 1)).is_none(), "another chunk");
-        assert!(parked.claimed(&claim(3, 0)).is_none(), "another actor");
-        parked.park(chunk(4, 7, 1, 1), "d", now).unwrap();
-        let mut take_copy = |actor, sequence| {
-            let copy = parked.take_copy(&chunk(actor, sequence, 1, 1).chunk.header);
-            copy.and_then(|it| it.question)
-        };
-        assert_eq!(take_copy(3, 0), None);
-        assert_eq!(take_copy(4, 6), None, "a later one");
-        assert_eq!(take_copy(4, 7), Some("d"));
-        parked.claimed(&claim(1, 0)).unwrap().ask("claimed", now);
-        assert_eq!(parked.take_first().unwrap().question, Some("claimed"));
-        assert_eq!(parked.take(2).unwrap().question, Some("b"));
-        assert!(parked.take(2).is_none() && parked.take_first().is_none() && parked.is_empty());
-        assert_eq!(parked.bytes, 0);
+        for other in [claim(1, 1), claim(3, 0)] {
+            assert!(parked.claimed(&other).is_none(), "{other:?}");
+        }
+        assert!(parked.claimed(&claim(1, 0)).is_some());
+        // Of another actor, of an earlier one, and it.
+        for (actor, sequence, copy) in [(3, 0, None), (4, 6, None), (4, 7, Some("d"))] {
+            let taken = parked.take_copy(&chunk(actor, sequence, 1).chunk.header);
+            assert_eq!(taken.and_then(|it| it.question), copy);
+        }
+        for (actor, question) in [(2, Some("b")), (2, None), (1, Some("a again"))] {
+            let taken = parked.take(actor);
+            assert_eq!(taken.and_then(|it| it.question), question);
+        }
+        assert_eq!((parked.line.len(), parked.bytes()), (0, 0));
     }
 
     #[test]
     fn a_question_is_held_for_a_while_and_its_chunk_for_longer() {
-        let (mut parked, start) = (ParkedChunks::default(), Instant::now());
-        let (hold, second) = (Duration::from_secs(2), Duration::from_secs(1));
+        let (mut parked, start, hold) = (nothing(), Instant::now(), 2 * SECOND);
         assert_eq!(parked.due_in(start, hold), None);
-        parked.park(chunk(1, 0, 1, 1), "a", start).unwrap();
-        parked.park(chunk(2, 0, 1, 1), "b", start + second).unwrap();
-        assert_eq!(parked.due_in(start + second, hold), Some(second));
+        parked.park(chunk(1, 0, 1), "a", start).unwrap();
+        parked.park(chunk(2, 0, 1), "b", start + SECOND).unwrap();
+        assert_eq!(parked.due_in(start + SECOND, hold), Some(SECOND));
         let later = start + hold;
         assert_eq!(parked.overdue(later, hold), ["a"]);
         assert_eq!(parked.overdue(later, hold), [""; 0]);
-        assert_eq!(parked.due_in(later, hold), Some(second));
-        let claimed = parked.claimed(&claim(1, 0)).unwrap();
-        claimed.ask("a again", later);
-        assert_eq!(parked.overdue(start + 5 * second, hold).len(), 2);
-        assert_eq!(parked.len(), 2);
+        assert_eq!(parked.due_in(later, hold), Some(SECOND));
+        assert_eq!(parked.overdue(later + SECOND, hold), ["b"]);
+        assert_eq!(parked.line.len(), 2);
     }
 
     #[test]
     fn the_bytes_kept_are_bounded_and_one_chunk_always_fits() {
-        let (mut parked, now) = (ParkedChunks::default(), Instant::now());
-        let third = CHUNK_BYTES_MAX as u32 / 3;
-        parked.park(chunk(1, 0, 4, third), "a", now).unwrap();
-        assert_eq!(parked.park(chunk(2, 0, 1, 1), "b", now), Err("b"));
+        let (mut parked, now) = (nothing(), Instant::now());
+        let most = CHUNK_BYTES_MAX as u32;
+        let mut park = |actor, bytes, question| {
+            let parked = parked.park(chunk(actor, 0, bytes), question, now);
+            parked.map_or_else(|question| question, |()| "kept")
+        };
+        assert_eq!(park(1, most + 1, "a"), "kept");
+        assert_eq!(park(2, 1, "b"), "b");
         // A smaller copy makes room.
-        parked.park(chunk(1, 0, 2, third), "a", now).unwrap();
-        parked.park(chunk(2, 0, 1, 1), "b", now).unwrap();
-        assert_eq!(parked.park(chunk(3, 0, 1, third), "c", now), Err("c"));
-        parked.take(1);
-        parked.park(chunk(3, 0, 1, third), "c", now).unwrap();
+        assert_eq!(park(1, most / 2, "a"), "kept");
+        assert_eq!(park(2, 1, "b"), "kept");
+        assert_eq!(park(3, most / 2, "c"), "c");
     }
 
     #[test]
     fn one_request_an_asker_waits() {
-        let (mut parked, now) = (ParkedRequests::default(), Instant::now());
-        let request = |learner, client_id, question| ParkedRequest {
-            request: BatchRequest {
-                learner,
-                id: RequestId::first(client_id),
-                rows: 1,
-                shared_memory: false,
-                learned: Learned::default(),
-                other_shards: None,
-            },
-            question,
-            arrived: now,
-            hold_max: Duration::from_secs(client_id),
+        let now = Instant::now();
+        let mut parked = ParkedRequests {
+            line: VecDeque::new(),
         };
-        for (learner, client_id, question) in
-            [(1, 1, "a"), (1, 2, "b"), (1, 1, "a again"), (2, 3, "c")]
-        {
-            parked.park(request(learner, client_id, question));
+        for (client_id, question) in [(1, "a"), (2, "b"), (1, "a again"), (3, "c")] {
+            parked.park(ParkedRequest {
+                request: BatchRequest {
+                    learner: 1,
+                    id: RequestId::first(client_id),
+                    rows: 1,
+                    shared_memory: false,
+                    learned: Learned::default(),
+                    other_shards: None,
+                },
+                question,
+                arrived: now,
+                hold_max: client_id as u32 * SECOND,
+            });
         }
-        assert_eq!(parked.due_in(now), Some(Duration::from_secs(1)));
-        parked.keep_only(1);
-        let first = parked.pop().unwrap();
-        assert_eq!(first.question, "b");
-        parked.put_back([first]);
-        let order: Vec<_> = std::iter::from_fn(|| parked.pop())
-            .map(|it| it.question)
-            .collect();
-        assert_eq!(order, ["b", "a again"]);
-        assert_eq!(parked.due_in(now), None);
+        assert_eq!(parked.due_in(now), Some(SECOND));
+        let order: Vec<_> = parked.line.iter().map(|it| it.question).collect();
+        assert_eq!(order, ["b", "a again", "c"]);
     }
 }

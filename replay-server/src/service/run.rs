@@ -2,8 +2,9 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
-    path::{Path, PathBuf},
-    sync::{Arc, Condvar, Mutex},
+    collections::VecDeque,
+    path::PathBuf,
+    sync::{Arc, Condvar, Mutex, OnceLock},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
@@ -31,7 +32,7 @@ use crate::{
     config::Config,
     persist::{KeptReplay, PersistArgs, PersistError, Reading, shard_dir},
     replay::Replay,
-    sampling::rows::sampler::PriorityCounts,
+    sampling::rows::PriorityCounts,
 };
 
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -88,8 +89,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
     let incarnation = rand::random();
     let empty = Replay::shard(&spec, &config, batch_size, args.shard)?;
-    let dir = args.dir.as_ref();
-    let kept = dir.map(|dir| Kept::find(dir, args.shard, &spec, &config));
+    let kept = args.dir.as_ref().map(|dir| {
+        let args = PersistArgs {
+            dir: shard_dir(dir, args.shard, config.shards),
+            shard: args.shard,
+            segment_bytes: None,
+            mark: None,
+        };
+        KeptReplay::find(&args, &spec, &config)
+    });
     let kept = kept.transpose()?;
     let transport: TransportConfig = settings.table("transport")?;
     let batch = BatchHeader::of(&spec, batch_size).sampled_by(&config.sampling);
@@ -121,8 +129,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
-    let reading = Reading::begin(args.ending.clone());
-    let entrance = Arc::new(Entrance::closed(reading, args.config_toml.clone()));
+    let entrance = Arc::new(Entrance {
+        service: OnceLock::new(),
+        reading: Reading::begin(args.ending.clone()),
+        config_toml: args.config_toml.clone(),
+    });
     let Answers {
         queryables,
         mut threads,
@@ -134,20 +145,18 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         client.spec_hash()
     );
     let read = match kept {
-        Some(kept) => kept.read(empty, entrance.reading(), spec.hash()),
+        Some(kept) => read(kept, empty, &entrance.reading, spec.hash()),
         None => Ok((empty, WeightsStore::default())),
     };
     let (replay, weights) = match read {
         Ok(read) => read,
         Err(e) => {
             // So that those who wait for the replay notice at once that the server is gone.
-            drop(queryables);
-            let closed = client.session().close().wait();
-            join_within(threads, THREADS_END_MAX);
+            let closed = close(&client, queryables, threads);
             return match e {
                 PersistError::Stopped => {
                     tracing::info!("replay server stops: {e}");
-                    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+                    closed
                 }
                 e => Err(e.into()),
             };
@@ -166,8 +175,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         state: Mutex::new(State {
             replay,
             accounts: Accounts::new(Instant::now()),
-            chunks: ParkedChunks::default(),
-            requests: ParkedRequests::default(),
+            chunks: ParkedChunks {
+                line: VecDeque::new(),
+            },
+            requests: ParkedRequests {
+                line: VecDeque::new(),
+            },
             timings: Timings::default(),
             said: SeldomEach::default(),
         }),
@@ -178,7 +191,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     });
     let _alive = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
-    entrance.open(service.clone());
+    let opened = entrance.service.set(service.clone());
+    assert!(opened.is_ok(), "a replay is read back once");
     threads.extend(service.clone().start_working()?);
     service.wait_until_over(&args.ending, args.stay);
     // Its threads wait for that.
@@ -188,12 +202,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         "replay server stops with {} transitions stored",
         service.state().replay.inserted_total()
     );
-    // Without the queryables no more comes, without the session none is sent to a slow client: the threads end.
-    drop(queryables);
-    let closed = client.session().close().wait();
-    join_within(threads, THREADS_END_MAX);
+    let closed = close(&client, queryables, threads);
     let mut state = service.state();
-    state.replay.flush();
+    if let Some(log) = &mut state.replay.log {
+        log.flush();
+    }
     if let Some(PriorityCounts {
         set,
         gone,
@@ -204,63 +217,52 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             "priorities of {set} rows were set, {gone} came too late for their transition, {repeated} came twice"
         );
     }
-    drop(state);
+    closed
+}
+
+/// Ends the answers: without the queryables no more comes, without the session none is sent to a slow client, and the threads end.
+fn close(client: &RunClient, queryables: Queryables, threads: Threads) -> anyhow::Result<()> {
+    drop(queryables);
+    let closed = client.session().close().wait();
+    join_within(threads, THREADS_END_MAX);
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// A replay that is kept on disk, and its folder.
-struct Kept {
-    dir: PathBuf,
-    replay: KeptReplay,
-}
-
-impl Kept {
-    fn find(dir: &Path, shard: u32, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
-        let args = PersistArgs {
-            dir: shard_dir(dir, shard, config.shards),
-            shard,
-            segment_bytes: None,
-            mark: None,
-        };
-        let replay = KeptReplay::find(&args, spec, config)?;
-        let dir = args.dir;
-        Ok(Self { dir, replay })
+/// Reads what is kept into `empty`, with the newest weights that were handed over, and logs what was found.
+fn read(
+    kept: KeptReplay,
+    empty: Replay,
+    reading: &Reading,
+    spec_hash: u64,
+) -> Result<(Replay, WeightsStore), PersistError> {
+    let folder = kept.dir().to_owned();
+    let (replay, recovery) = kept.read(empty, reading)?;
+    let dir = folder.display();
+    for warning in &recovery.warnings {
+        tracing::warn!("{dir}: {warning}");
     }
-
-    /// Reads it into `empty`, with the newest weights that were handed over, and logs what was found.
-    fn read(
-        self,
-        empty: Replay,
-        reading: &Reading,
-        spec_hash: u64,
-    ) -> Result<(Replay, WeightsStore), PersistError> {
-        let (replay, recovery) = self.replay.read(empty, reading)?;
-        let dir = self.dir.display();
-        for warning in &recovery.warnings {
-            tracing::warn!("{dir}: {warning}");
-        }
-        if recovery.found {
-            let status = replay.status();
+    if recovery.found {
+        let status = replay.status();
+        tracing::info!(
+            "continues with the replay in {dir}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
+            status.transitions_inserted,
+            status.transitions_held,
+            status.rows_sampled,
+            recovery.bytes >> 20,
+            recovery.took.as_secs_f64()
+        );
+        if replay.priority_counts().is_some() {
             tracing::info!(
-                "continues with the replay in {dir}: {} transitions stored, {} held, {} rows served; {} MiB read in {:.1} s",
-                status.transitions_inserted,
-                status.transitions_held,
-                status.rows_sampled,
-                recovery.bytes >> 20,
-                recovery.took.as_secs_f64()
+                "priorities are those of the last checkpoint: each transition that came later has the highest one"
             );
-            if replay.priority_counts().is_some() {
-                tracing::info!(
-                    "priorities are those of the last checkpoint: each transition that came later has the highest one"
-                );
-            }
-        } else {
-            tracing::info!("keeps the replay in {dir}");
         }
-        Ok((replay, WeightsStore::kept_in(&self.dir, spec_hash)))
+    } else {
+        tracing::info!("keeps the replay in {dir}");
     }
+    Ok((replay, WeightsStore::kept_in(&folder, spec_hash)))
 }
 
+type Queryables = Vec<Queryable<()>>;
 type Threads = Vec<JoinHandle<()>>;
 
 /// Everything that the replay server answers: each kind of message by separate threads.
@@ -269,7 +271,7 @@ struct Answers<'a> {
     entrance: &'a Arc<Entrance>,
     limits: Limits,
     /// Dropping them ends the answers, and with them the threads.
-    queryables: Vec<Queryable<()>>,
+    queryables: Queryables,
     threads: Threads,
 }
 
@@ -322,7 +324,7 @@ impl<'a> Answers<'a> {
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
         let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
-        let answer = move |incoming: Incoming<R>| match entrance.service() {
+        let answer = move |incoming: Incoming<R>| match entrance.service.get() {
             Some(service) => answer(service, incoming),
             None => incoming.into_responder().put_off(&entrance.put_off()),
         };
@@ -337,7 +339,7 @@ impl<'a> Answers<'a> {
         give: fn(&Service, Responder<M>),
     ) -> zenoh::Result<()> {
         let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
-        let give = move |responder: Responder<M>| match entrance.service() {
+        let give = move |responder: Responder<M>| match entrance.service.get() {
             Some(service) => give(service, responder),
             None => responder.put_off(&entrance.put_off()),
         };
@@ -352,7 +354,7 @@ impl<'a> Answers<'a> {
         workers: QueryWorkers<M>,
     ) -> zenoh::Result<()> {
         let entrance = self.entrance.clone();
-        let refused = move |bytes| match entrance.service() {
+        let refused = move |bytes| match entrance.service.get() {
             Some(service) => service.refuse_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };

@@ -111,12 +111,12 @@ impl State {
     /// what they would note is noted here. Waking them costs six changes of threads a chunk.
     pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
         self.note_waiting(now);
-        !self.chunks.is_empty() || self.requests.len() > 0
+        !self.chunks.line.is_empty() || !self.requests.line.is_empty()
     }
 
     /// Counts a message that was refused, and logs a line of this kind.
     pub(super) fn refuse(&mut self, kind: &str, line: &str) {
-        self.replay.note_refused_message();
+        self.replay.counted().messages_refused += 1;
         self.say(kind, line);
     }
 
@@ -130,38 +130,15 @@ impl State {
 
 /// What stands between the questions and the service: until the replay is read back from disk everybody is told how far it is.
 pub(super) struct Entrance {
-    service: OnceLock<Arc<Service>>,
-    reading: Reading,
-    config_toml: String,
+    /// Set once the replay is there.
+    pub(super) service: OnceLock<Arc<Service>>,
+    /// How far the reading is.
+    pub(super) reading: Reading,
+    pub(super) config_toml: String,
 }
 
 impl Entrance {
-    /// Rejects every request until [`Entrance::open`].
-    pub(super) const fn closed(reading: Reading, config_toml: String) -> Self {
-        Self {
-            service: OnceLock::new(),
-            reading,
-            config_toml,
-        }
-    }
-
-    /// Lets everybody in, for good.
-    pub(super) fn open(&self, service: Arc<Service>) {
-        let opened = self.service.set(service);
-        assert!(opened.is_ok(), "a replay is read back once");
-    }
-
-    /// The service, once it is there.
-    pub(super) fn service(&self) -> Option<&Arc<Service>> {
-        self.service.get()
-    }
-
-    /// How far the reading is, and whether it need go on.
-    pub(super) const fn reading(&self) -> &Reading {
-        &self.reading
-    }
-
-    /// The answer to a request until then, with the run's settings.
+    /// The answer to a request until the service is there, with the run's settings.
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
             progress: self.reading.progress(),

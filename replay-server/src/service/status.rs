@@ -7,13 +7,14 @@ use std::{
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Responder, Shutdown, fault,
+    PriorityUpdate, ReplayStatus, Report, Request, Responder, Shutdown, fault,
 };
 
 use super::{
     accounts::own_warning,
     server::{Service, State},
 };
+use crate::persist::journal::Journal;
 
 /// How often it is looked whether somebody is missing.
 const LOOK: Duration = Duration::from_secs(1);
@@ -41,47 +42,43 @@ impl Service {
     }
 
     pub(super) fn affinity(&self, incoming: Incoming<AffinityUpdate>) {
-        let Some(update) = self.read(&incoming) else {
-            return;
-        };
-        let mut state = self.state();
-        let allowed = state.check_learner(update.learner);
-        let set = allowed.and_then(|()| state.replay.set_affinity(&update));
-        if let Err(why) = set {
-            let line = format!("an affinity matrix was refused: {why}");
-            return state.refuse("affinity", &line);
-        }
-        let is_ready = state.replay.is_ready();
-        drop(state);
-        if is_ready {
-            incoming.into_responder().reply(&Done);
-        }
+        self.take(incoming, "an affinity matrix was", |state, update| {
+            state.check_learner(update.learner)?;
+            state.replay.set_affinity(&update)
+        });
     }
 
     pub(super) fn priorities(&self, incoming: Incoming<PriorityUpdate>) {
+        let most = self.limits.batch_rows as usize;
+        self.take(incoming, "priorities were", |state, update| {
+            state.check_learner(update.learner)?;
+            // Those of a batch's rows.
+            if update.rows() > most {
+                return Err(format!(
+                    "of {} rows; a batch of this run has {most} (learner.batch_size)",
+                    update.rows()
+                ));
+            }
+            state.replay.set_priorities(&update)
+        });
+    }
+
+    /// Takes what the learner tells, or counts and logs why not.
+    fn take<R: Request<Reply = Done>>(
+        &self,
+        incoming: Incoming<R>,
+        what: &str,
+        take: impl FnOnce(&mut State, R) -> Result<(), String>,
+    ) {
         let Some(update) = self.read(&incoming) else {
             return;
         };
         let mut state = self.state();
-        let allowed = state.check_learner(update.learner);
-        let allowed = allowed.and_then(|()| self.check_priorities(update.rows()));
-        let set = allowed.and_then(|()| state.replay.set_priorities(&update));
-        if let Err(why) = set {
-            let line = format!("priorities were refused: {why}");
-            return state.refuse("priorities", &line);
+        if let Err(why) = take(&mut state, update) {
+            return state.refuse(what, &format!("{what} refused: {why}"));
         }
         drop(state);
         incoming.into_responder().reply(&Done);
-    }
-
-    /// Priorities are those of a batch's rows.
-    fn check_priorities(&self, rows: usize) -> Result<(), String> {
-        match self.limits.batch_rows as usize {
-            most if rows <= most => Ok(()),
-            most => Err(format!(
-                "of {rows} rows; a batch of this run has {most} (learner.batch_size)"
-            )),
-        }
     }
 
     pub(super) fn report(&self, incoming: Incoming<Report>) {
@@ -92,9 +89,7 @@ impl Service {
         let finished = report.finished;
         // That of a part which has been replaced, or is about to join.
         if state.accounts.reported(report, Instant::now()) {
-            if let Some(updates) = finished {
-                state.replay.note_updates(updates);
-            }
+            state.replay.note_updates(finished.unwrap_or(0));
         } else {
             tracing::debug!("a report of a part that does not take part");
         }
@@ -109,18 +104,18 @@ impl Service {
         let (up_s, weights_age_s) = state.accounts.ages(now);
         let held_since = |who| match who {
             PartName::Actor(actor) => state.chunks.arrived(actor),
-            PartName::Learner => state.requests.oldest(),
+            PartName::Learner => state.requests.line.iter().map(|it| it.arrived).min(),
         };
         let status = PartsStatus {
             up_s,
             waiting,
             waiting_s,
-            requests_waiting: state.requests.len() as u32,
-            chunks_waiting: state.chunks.len() as u32,
+            requests_waiting: state.requests.line.len() as u32,
+            chunks_waiting: state.chunks.line.len() as u32,
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
             weights_age_s,
-            log: state.replay.log_status(),
+            log: state.replay.log.as_ref().map(Journal::status),
             last_warning: own_warning(),
             parts: state.accounts.parts(now, held_since),
         };
@@ -136,7 +131,7 @@ impl Service {
         while !self.shutdown.wait_timeout(LOOK) {
             fault::point("missing");
             let state = self.state();
-            let now = state.accounts.missing(state.replay.all_in());
+            let now = state.accounts.missing(state.replay.limiter.all_in());
             drop(state);
             if now != missing.map(|(before, ..)| before) {
                 missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
@@ -195,7 +190,7 @@ impl Service {
         let mut status = state.replay.status();
         status.learner_finished = state.accounts.is_over();
         status.actors_acting = state.actors_acting();
-        status.actors_waiting = state.chunks.len() as u32;
+        status.actors_waiting = state.chunks.line.len() as u32;
         state.timings.report(&mut status);
         drop(state);
         responder.reply(&status);
@@ -206,7 +201,7 @@ impl State {
     /// Actors of which a chunk has come, those that have ended too.
     fn actors_acting(&self) -> u32 {
         let mut acting: HashSet<u32> = self.replay.state.actors.delivered().collect();
-        acting.extend(self.chunks.actors());
+        acting.extend(self.chunks.line.iter().map(|it| it.header().actor));
         acting.len() as u32
     }
 }

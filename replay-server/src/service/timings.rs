@@ -61,9 +61,9 @@ impl Timings {
         add(&mut self.answers, after);
     }
 
-    /// A chunk that weights of `version` chose was stored `after` its arrival.
-    pub(super) fn stored(&mut self, version: u64, after: Duration, now: Instant) {
-        add(&mut self.inserts, after);
+    /// A chunk that weights of `version` chose was stored.
+    pub(super) fn stored(&mut self, version: u64, arrived: Instant, now: Instant) {
+        add(&mut self.inserts, now.saturating_duration_since(arrived));
         let Some(&(_, newest_updates, _)) = self.versions.back() else {
             return;
         };
@@ -103,23 +103,22 @@ mod tests {
     fn weights_are_behind_from_when_newer_ones_came() {
         let (mut timings, start) = (Timings::default(), Instant::now());
         let at = |seconds| start + Duration::from_secs(seconds);
-        let report = |timings: &Timings| {
+        let stored = |timings: &mut Timings, version, after_ms, now| {
+            timings.stored(version, now - Duration::from_millis(after_ms), now);
             let mut status = ReplayStatus::default();
             timings.report(&mut status);
             status
         };
-        timings.stored(1, Duration::from_millis(7), start);
-        let behind = report(&timings).weights_behind_s;
+        let behind = stored(&mut timings, 1, 7, at(1)).weights_behind_s;
         assert_eq!(behind, None, "no weights came here");
         for version in 1..=3 {
             let weights = WeightsHeader::new(version, 8 * version, &[]);
             timings.weights_came(&weights, at(10 * version));
         }
         for _ in 0..99 {
-            timings.stored(3, Duration::from_millis(5), at(35));
+            stored(&mut timings, 3, 5, at(35));
         }
-        timings.stored(1, Duration::from_millis(500), at(35));
-        let found = report(&timings);
+        let found = stored(&mut timings, 1, 500, at(35));
         let behind = found.weights_behind_s.unwrap();
         assert_eq!(behind.p50, 0.0, "the newest");
         // Version 2 came 15 seconds before.
@@ -129,8 +128,7 @@ mod tests {
         let inserts = found.insert_ms.unwrap();
         let are_right = (4.9..5.1).contains(&inserts.p50) && inserts.max > 495.0;
         assert!(are_right, "{inserts:?}");
-        timings.stored(9, Duration::ZERO, at(36));
-        let updates = report(&timings).weights_behind_updates.unwrap();
-        assert_eq!(updates.p50, 0.0, "newer than all");
+        let newer = stored(&mut timings, 9, 0, at(36)).weights_behind_updates;
+        assert_eq!(newer.unwrap().p50, 0.0, "newer than all");
     }
 }

@@ -144,16 +144,6 @@ impl Ring {
         self.frames.forget_before(self.oldest);
     }
 
-    /// Takes the place of consecutive transitions that are gone, which hang together with nothing and cannot be anchors.
-    pub(crate) fn push_gone(&mut self, frames: Run<'_>, count: u64) {
-        let inserted = self.inserted + count;
-        let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
-        self.oldest = self.frames.push(frames, oldest);
-        for _ in 0..count {
-            self.push(Step::new(0, 0.0, End::Running, 0), Link::Lost);
-        }
-    }
-
     /// Stores consecutive transitions of one stream, over the oldest ones once the ring is full.
     ///
     /// `link` is the first one's; the result is the link of the one that will follow the last.

@@ -330,8 +330,8 @@ fn a_folder_is_one_servers_and_one_runs() {
     check_refused(&args(&file, 1000), spec, config, words);
 
     let text = fs::read_to_string(&file).unwrap();
-    fs::write(&file, text.replace("format = 3", "format = 4")).unwrap();
-    let words = "a replay of format 4, this version reads 3";
+    fs::write(&file, text.replace("format = 4", "format = 5")).unwrap();
+    let words = "a replay of format 5, this version reads 4";
     check_refused(own, spec, config, words);
 }
 

@@ -10,10 +10,7 @@ use std::collections::{BTreeMap, VecDeque};
 use driml_protocol::{Origin, PriorityPart, PriorityUpdate};
 use rand_chacha::ChaCha8Rng;
 
-use super::{
-    sampler::{Held, PriorityCounts, RowSampler, RowsState, SavedPriorities},
-    sum_tree::SumTree,
-};
+use super::{Held, PriorityCounts, RowSampler, RowsState, sum_tree::SumTree};
 use crate::{
     sampling::episodes::Window,
     storage::ring::{Link, Ring},
@@ -31,7 +28,7 @@ pub const CHANCE_ERROR: f64 = 6.1e-8;
 const FIRST_PRIORITY: f64 = 1.0;
 
 /// The priorities of the transitions held, those that can be anchors alone.
-pub(super) struct Priorities {
+pub(crate) struct Priorities {
     alpha: f64,
     capacity: u64,
     /// Steps that must follow an anchor in its episode.
@@ -52,7 +49,7 @@ pub(super) struct Priorities {
 impl Priorities {
     /// Those of an empty ring of `capacity` transitions, where `reach` steps must follow an anchor. An error gives the bytes that the
     /// system refuses to reserve.
-    pub(super) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
+    pub(crate) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
         Ok(Self {
             alpha,
             capacity,
@@ -72,16 +69,6 @@ impl Priorities {
 
     fn mass(&self, priority: f64) -> f64 {
         (priority + PRIORITY_MIN).powf(self.alpha)
-    }
-
-    /// Whether an update of this number comes from `learner` for the first time; if so, it is remembered as the last.
-    fn is_new(&mut self, learner: u64, number: u64) -> bool {
-        let last = self.last;
-        let is_new = last.is_none_or(|last| last.0 != learner || number > last.1);
-        if is_new {
-            self.last = Some((learner, number));
-        }
-        is_new
     }
 
     /// Sets the priorities of rows that were drawn from `ring`. Of one transition that was drawn twice the last counts.
@@ -189,7 +176,12 @@ impl RowSampler for Priorities {
                 ));
             }
         }
-        let is_new = self.is_new(update.learner, update.number);
+        let (learner, number) = (update.learner, update.number);
+        let last = self.last;
+        let is_new = last.is_none_or(|last| last.0 != learner || number > last.1);
+        if is_new {
+            self.last = Some((learner, number));
+        }
         for part in own() {
             let rows = part.transitions.len() as u64;
             if !is_new {
@@ -209,20 +201,26 @@ impl RowSampler for Priorities {
 
     fn state(&self, ring: &Ring) -> RowsState {
         let held = ring.oldest()..ring.inserted();
-        RowsState::Prioritised(SavedPriorities {
+        RowsState::Prioritised {
             highest: self.highest,
             masses: held.map(|i| self.masses.get(self.slot(i))).collect(),
             last: self.last,
             counts: self.counts,
-        })
+        }
     }
 
     fn restore(&mut self, Held { ring, episodes }: Held<'_>, oldest: u64, state: &RowsState) {
         // Of a run that drew by another rule: each transition keeps the highest.
-        let RowsState::Prioritised(saved) = state else {
+        let RowsState::Prioritised {
+            highest,
+            masses,
+            last,
+            counts,
+        } = state
+        else {
             return;
         };
-        for (index, &mass) in (oldest..).zip(&saved.masses) {
+        for (index, &mass) in (oldest..).zip(masses) {
             let slot = self.slot(index);
             if !(ring.oldest()..ring.inserted()).contains(&index) {
                 continue;
@@ -233,7 +231,7 @@ impl RowSampler for Priorities {
                 self.masses.set(slot, mass);
             }
         }
-        (self.highest, self.last, self.counts) = (saved.highest, saved.last, saved.counts);
+        (self.highest, self.last, self.counts) = (*highest, *last, *counts);
     }
 
     /// Exactly the anchors have a mass, but for those whose stack was cut.

@@ -4,7 +4,7 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::sampler::{Held, RowSampler, RowsState};
+use super::{Held, RowSampler, RowsState};
 use crate::{sampling::episodes::Window, storage::ring::Ring};
 
 /// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
@@ -12,7 +12,7 @@ const TRIES_MAX: u32 = 64;
 
 /// The list of all valid anchors, kept for as long as the ring does not change.
 #[derive(Default)]
-pub(super) struct Uniform {
+pub(crate) struct Uniform {
     valid: Vec<u64>,
     /// Transitions the ring had stored when `valid` was listed; 0 before the first.
     listed_at: u64,
