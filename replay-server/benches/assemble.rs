@@ -35,26 +35,18 @@ fn spec(frame_stack: u32) -> RunSpec {
 }
 
 /// A chunk of random frames, actions and rewards, whose episodes last 200 steps on average.
-fn chunk(sequence: u64) -> Chunk {
-    let mut rng = ChaCha8Rng::seed_from_u64(sequence);
+fn chunk() -> Chunk {
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut chunk = Chunk::zeroed(ChunkHeader {
-        actor: 0,
         incarnation: 1,
-        sequence,
-        first_transition: sequence * u64::from(STREAMS * STEPS),
-        weights_version: 1,
-        leaving: false,
         streams: STREAMS,
         steps: STEPS,
         frame_bytes: 64 * 64 * 3,
+        ..ChunkHeader::default()
     });
     for row in 0..(STREAMS * STEPS) as usize {
         rng.fill_bytes(chunk.frame_mut(row));
-        let end = if rng.random_bool(1.0 / 200.0) {
-            End::Terminal
-        } else {
-            End::Running
-        };
+        let end = [End::Running, End::Terminal][usize::from(rng.random_bool(1.0 / 200.0))];
         chunk.set(row, rng.random_range(0..15), rng.random(), end);
     }
     chunk
@@ -72,7 +64,7 @@ fn filled(frame_stack: u32) -> (Replay, Chunk) {
     let mut replay = Replay::new(&spec(frame_stack), &config, ROWS).unwrap();
     let (actor, incarnation) = (0, 1);
     replay.join_actor(ActorJoin { actor, incarnation }).unwrap();
-    let mut chunk = chunk(0);
+    let mut chunk = chunk();
     while replay.inserted_total() < CAPACITY + 1000 {
         insert_next(&mut replay, &mut chunk);
     }
@@ -93,43 +85,30 @@ fn bench(c: &mut Criterion) {
         b.iter(|| insert_next(&mut replay, &mut chunk))
     });
     group.finish();
+    drop(replay);
 
-    let mut group = c.benchmark_group("batch of 256");
+    let mut group = c.benchmark_group("batch of 256, 3 states of 64x64x3");
     group.throughput(Throughput::Elements(u64::from(ROWS)));
-    group.bench_function("sample, 3 states of 64x64x3", |b| {
-        b.iter(|| black_box(replay.sample(ROWS).unwrap()));
-    });
     let row = 64 * 64 * 3;
     let frames: Vec<u8> = (0..CAPACITY as usize * row).map(|i| i as u8).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(2);
-    // `stack` neighbouring frames from a random place, again and again.
-    let mut copy_into = |out: &mut [u8], stack: usize| {
-        for out in out.chunks_exact_mut(stack * row) {
-            let at = rng.random_range(0..CAPACITY as usize - stack) * row;
-            out.copy_from_slice(&frames[at..at + stack * row]);
-        }
-    };
-    let mut reused = vec![0; 3 * ROWS as usize * row];
-    group.bench_function("plain copy into one buffer", |b| {
-        b.iter(|| copy_into(black_box(&mut reused), 1))
-    });
-    for (stack, name) in [
-        (1, "plain copy into a new buffer"),
-        (4, "plain copy into a new buffer, stack of 4"),
-    ] {
-        group.bench_function(name, |b| {
+    for stack in [1, 4] {
+        // `stack` neighbouring frames from a random place, again and again.
+        group.bench_function(format!("plain copy, stack of {stack}"), |b| {
             b.iter(|| {
                 let mut out = vec![0; 3 * ROWS as usize * stack * row];
-                copy_into(black_box(&mut out), stack);
-                out
+                for out in out.chunks_exact_mut(stack * row) {
+                    let at = rng.random_range(0..CAPACITY as usize - stack) * row;
+                    out.copy_from_slice(&frames[at..at + stack * row]);
+                }
+                black_box(out)
             });
         });
+        let (mut replay, _) = filled(stack as u32);
+        group.bench_function(format!("sample, stack of {stack}"), |b| {
+            b.iter(|| black_box(replay.sample(ROWS).unwrap()));
+        });
     }
-    drop(frames);
-    let (mut stacked, _) = filled(4);
-    group.bench_function("sample, 3 states of 64x64x3, stack of 4", |b| {
-        b.iter(|| black_box(stacked.sample(ROWS).unwrap()));
-    });
     group.finish();
 }
 

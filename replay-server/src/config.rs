@@ -111,8 +111,17 @@ pub(crate) fn reach(spec: &RunSpec) -> u32 {
     spec.n_step.max(spec.horizon.k_max())
 }
 
-fn bad(key: &'static str, value: impl ToString, why: String) -> Result<(), ConfigError> {
-    let value = value.to_string();
+/// Checks what must be so for the value of a key; if it is not, `why` says what is wrong and what to do.
+fn check(
+    is_so: bool,
+    key: &'static str,
+    value: impl ToString,
+    why: impl FnOnce() -> String,
+) -> Result<(), ConfigError> {
+    if is_so {
+        return Ok(());
+    }
+    let (value, why) = (value.to_string(), why());
     Err(ConfigError::Key { key, value, why })
 }
 
@@ -123,20 +132,17 @@ impl Config {
     /// # Errors
     /// The first key that would have no effect.
     pub fn check_in_memory(&self, to_keep_it: &str) -> Result<(), ConfigError> {
-        let keys = [
+        for (key, set) in [
             ("replay.disk_bytes_max", self.disk_bytes_max),
             ("replay.fsync_ms", self.fsync_ms),
-        ];
-        match keys.into_iter().find_map(|(key, set)| Some((key, set?))) {
-            Some((key, value)) => Err(ConfigError::Key {
-                key,
-                value: value.to_string(),
-                why: format!(
+        ] {
+            check(set.is_none(), key, set.unwrap_or(0), || {
+                format!(
                     "this replay is in memory alone; add {to_keep_it} to keep it on disk, or leave the setting out"
-                ),
-            }),
-            None => Ok(()),
+                )
+            })?;
         }
+        Ok(())
     }
 
     /// Checks every value, alone and against `batch_size`, the rows of the learner's batches.
@@ -150,86 +156,72 @@ impl Config {
         spec.validate()?;
         let (ratio, capacity) = (self.replay_ratio, self.capacity_transitions);
         let (warmup, slack) = (self.warmup_transitions, self.slack_transitions);
-        if !(ratio.is_finite() && ratio > 0.0) {
-            return bad(
-                "replay.replay_ratio",
-                ratio,
-                "rows per transition must be a number above 0".into(),
-            );
-        }
+        let is_ratio = ratio.is_finite() && ratio > 0.0;
+        check(is_ratio, "replay.replay_ratio", ratio, || {
+            "rows per transition must be a number above 0".into()
+        })?;
         self.sampling.validate()?;
         let rows_max = rows_max(spec, &self.sampling);
-        if batch_size == 0 || batch_size > rows_max {
-            let why = format!("a batch of this run has 1 to {rows_max} rows");
-            return bad("learner.batch_size", batch_size, why);
-        }
-        if !(1..=SHARDS_MAX).contains(&self.shards) {
-            let why = format!("a replay has 1 to {SHARDS_MAX} shards");
-            return bad("replay.shards", self.shards, why);
-        }
+        let fits = (1..=rows_max).contains(&batch_size);
+        check(fits, "learner.batch_size", batch_size, || {
+            format!("a batch of this run has 1 to {rows_max} rows")
+        })?;
+        let fits = (1..=SHARDS_MAX).contains(&self.shards);
+        check(fits, "replay.shards", self.shards, || {
+            format!("a replay has 1 to {SHARDS_MAX} shards")
+        })?;
         let window = u64::from(reach(spec)) + u64::from(spec.frame_stack);
-        if capacity / u64::from(self.shards) < window {
-            let why = format!(
+        let fits = capacity / u64::from(self.shards) >= window;
+        check(fits, "replay.capacity_transitions", capacity, || {
+            format!(
                 "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each copy of the world"
-            );
-            return bad("replay.capacity_transitions", capacity, why);
-        }
-        if self
-            .capacity_transitions
-            .checked_mul(spec.frame_bytes() as u64)
-            .is_none_or(|b| b > isize::MAX as u64)
-        {
-            let why = "this many frames exceed any machine's address space; hold fewer".into();
-            return bad("replay.capacity_transitions", capacity, why);
-        }
+            )
+        })?;
+        let bytes = capacity.checked_mul(spec.frame_bytes() as u64);
+        let fits = bytes.is_some_and(|bytes| bytes <= isize::MAX as u64);
+        check(fits, "replay.capacity_transitions", capacity, || {
+            "this many frames exceed any machine's address space; hold fewer".into()
+        })?;
         if let Some(max) = self.compressed_bytes_max {
+            let key = "replay.compressed_bytes_max";
+            check(self.compression != Compression::None, key, max, || {
+                "nothing is compressed; use compression = \"lz4\", or capacity_transitions".into()
+            })?;
             let least = compressed_bytes_least(window, spec.frame_bytes()) * u64::from(self.shards);
-            let why = match self.compression {
-                Compression::None => Some(
-                    "nothing is compressed; use compression = \"lz4\", or capacity_transitions"
-                        .into(),
-                ),
-                Compression::Lz4 if max < least => Some(format!(
+            check(max >= least, key, max, || {
+                format!(
                     "one sample spans {window} transitions, which may not compress; use at least {least}"
-                )),
-                Compression::Lz4 => None,
-            };
-            if let Some(why) = why {
-                return bad("replay.compressed_bytes_max", max, why);
-            }
+                )
+            })?;
         }
         if let Some(max) = self.disk_bytes_max {
             let least = disk_bytes_least(spec, self);
-            if max < least {
-                let why = format!(
+            check(max >= least, "replay.disk_bytes_max", max, || {
+                format!(
                     "it must hold the transitions before the first batch twice, and some segments; use at least {least}"
-                );
-                return bad("replay.disk_bytes_max", max, why);
-            }
+                )
+            })?;
         }
-        if warmup > capacity {
-            let why = format!(
-                "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {}",
-                capacity
-            );
-            return bad("replay.warmup_transitions", warmup, why);
-        }
-        if (slack as f64) * ratio < f64::from(batch_size) {
-            let least = (f64::from(batch_size) / ratio).ceil();
-            let why = format!(
-                "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {least}"
-            );
-            return bad("replay.slack_transitions", slack, why);
-        }
+        let fits = warmup <= capacity;
+        check(fits, "replay.warmup_transitions", warmup, || {
+            format!(
+                "the first of them would be overwritten before any is sampled; use at most capacity_transitions = {capacity}"
+            )
+        })?;
+        let batch = (f64::from(batch_size) / ratio).ceil();
+        let fits = slack as f64 * ratio >= f64::from(batch_size);
+        check(fits, "replay.slack_transitions", slack, || {
+            format!(
+                "actors and learner would wait for each other; use at least learner.batch_size / replay_ratio = {batch_size} / {ratio} = {batch}"
+            )
+        })?;
         if let (Some(max), None) = (self.transitions_max, self.since) {
-            let batch = (f64::from(batch_size) / ratio).ceil();
             let least = warmup as f64 + batch;
-            if (max as f64) < least {
-                let why = format!(
+            check(max as f64 >= least, "replay.transitions_max", max, || {
+                format!(
                     "the run would end before its first batch; use at least warmup_transitions + learner.batch_size / replay_ratio = {least}"
-                );
-                return bad("replay.transitions_max", max, why);
-            }
+                )
+            })?;
         }
         Ok(())
     }

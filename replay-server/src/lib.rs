@@ -4,12 +4,9 @@
 //! Start at [`run`], a whole replay server process, or at [`Replay`], the same without network, clock and threads: chunks go in,
 //! batches come out. [`RateLimiter`] says which side has to wait, [`horizon`] how far ahead a positive lies.
 //!
-//! Which transitions are drawn is a setting, `replay.sampling`: each that can be an anchor equally likely (`{ rule = "uniform" }`), or in
-//! proportion to the C51 loss that it had when it was learned from last, to the power of alpha (`{ rule = "prioritised", alpha,
-//! beta_start, beta_end, beta_updates }`, [`Sampling`](driml_protocol::Sampling)). Then a batch says of each row which transition it is
-//! and how likely it was, the learner weights the row's loss by that, and [`Replay::set_priorities`] takes what it found. Losses come back
-//! while later batches are on their way, so a draw knows those of a few updates before. Of several shards each gives rows in
-//! proportion to what it holds, and priorities count within it: the learner's weights are by the chance that a row had in all.
+//! Which transitions are drawn is a setting, `replay.sampling`: each that can be an anchor equally likely, or in proportion to a power of
+//! the C51 loss that it had when it was learned from last. Then a batch says how likely each row was, the learner weights the row's loss
+//! by that, and [`Replay::set_priorities`] takes what it found. Of several shards each gives rows in proportion to what it holds.
 //!
 //! ```
 //! use driml_protocol::{ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
@@ -40,15 +37,11 @@
 //! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
 //!
 //! let mut chunk = Chunk::zeroed(ChunkHeader {
-//!     actor: 0,
 //!     incarnation: 1,
-//!     sequence: 0,
-//!     first_transition: 0,
-//!     weights_version: 0,
-//!     leaving: false,
 //!     streams: 1,
 //!     steps: 20,
 //!     frame_bytes: 1,
+//!     ..ChunkHeader::default()
 //! });
 //! for row in 0..20 {
 //!     chunk.frame_mut(row).fill(row as u8);

@@ -21,7 +21,7 @@ pub struct RateLimiter {
     transitions_max: Option<u64>,
     /// The point from which the ratio holds: no row for the transitions before it beyond those sampled then.
     since: Tally,
-    counts: Counts,
+    pub(crate) counts: Counts,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,15 +43,16 @@ impl RateLimiter {
         slack_transitions: u64,
         transitions_max: Option<u64>,
     ) -> Self {
+        let since = Tally {
+            inserted: warmup_transitions,
+            rows_sampled: 0,
+        };
         Self {
             replay_ratio,
             warmup_transitions,
             slack_transitions,
             transitions_max,
-            since: Tally {
-                inserted: warmup_transitions,
-                rows_sampled: 0,
-            },
+            since,
             counts: Counts::default(),
         }
     }
@@ -80,29 +81,14 @@ impl RateLimiter {
         self
     }
 
-    pub(crate) const fn counts(&self) -> Counts {
-        self.counts
-    }
-
-    pub(crate) const fn set_counts(&mut self, counts: Counts) {
-        self.counts = counts;
-    }
-
     /// Transitions stored in all shards.
-    pub const fn inserted_total(&self) -> u64 {
-        let here = self.counts.this_shard.inserted;
-        here.saturating_add(self.counts.other_shards.inserted)
+    pub fn inserted_total(&self) -> u64 {
+        (self.counts.this_shard + self.counts.other_shards).inserted
     }
 
     /// Rows sampled from all shards.
-    pub const fn rows_sampled_total(&self) -> u64 {
-        let here = self.counts.this_shard.rows_sampled;
-        here.saturating_add(self.counts.other_shards.rows_sampled)
-    }
-
-    /// Replaces the other shards' counts by those of a learner's checkpoint.
-    pub(crate) const fn adopt_other_shards(&mut self, others: Tally) {
-        self.counts.other_shards = others;
+    pub fn rows_sampled_total(&self) -> u64 {
+        (self.counts.this_shard + self.counts.other_shards).rows_sampled
     }
 
     /// Takes what the other shards have counted.
@@ -194,11 +180,6 @@ impl RateLimiter {
         *rows_sampled = rows_sampled.saturating_sub(rows);
     }
 
-    /// So many rows were sampled here since the start of the run.
-    pub(crate) const fn set_rows_sampled(&mut self, rows: u64) {
-        self.counts.this_shard.rows_sampled = rows;
-    }
-
     /// The run is resumed after `counted` in this shard, of which nothing is held any more: `refill` transitions come in before the
     /// next row is sampled, unless nothing is left to sample batches of `rows` rows for.
     pub(crate) fn resume_empty(&mut self, counted: Tally, refill: u64, rows: u32) {
@@ -220,18 +201,14 @@ impl RateLimiter {
             refill_left,
             ..
         } = self.counts;
+        let (have, need) = match refill_left {
+            0 => (self.inserted_total(), self.warmup_transitions),
+            left => (refilled, refilled + left),
+        };
         if self.finished(rows) {
             Waiting::Finished
-        } else if refill_left > 0 {
-            Waiting::WarmUp {
-                have: refilled,
-                need: refilled + refill_left,
-            }
-        } else if self.inserted_total() < self.warmup_transitions {
-            Waiting::WarmUp {
-                have: self.inserted_total(),
-                need: self.warmup_transitions,
-            }
+        } else if have < need {
+            Waiting::WarmUp { have, need }
         } else if !self.may_sample(rows) {
             Waiting::LearnerWaitsForActors
         } else if !self.may_insert() && !self.all_in() {

@@ -21,7 +21,8 @@ use driml_envs::{
     DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
 };
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Buffer, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling,
+    TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, SeedableRng};
@@ -145,7 +146,7 @@ fn insert_next(replay: &mut Replay, chunks: &mut [Chunk], sequence: &mut usize) 
 fn on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
     let make = |count| {
         for _ in 0..count {
-            let draft = replay.lock().unwrap().draw(ROWS).unwrap();
+            let draft = replay.lock().unwrap().draw(ROWS, Buffer::zeroed).unwrap();
             black_box(draft.unpack());
         }
     };
@@ -189,7 +190,7 @@ fn bench(criterion: &mut Criterion) {
             });
             group.throughput(Throughput::Elements(1));
             group.bench_function(BenchmarkId::new("draw 256 (locked)", &how), |b| {
-                b.iter(|| black_box(replay.draw(ROWS).unwrap()));
+                b.iter(|| black_box(replay.draw(ROWS, Buffer::zeroed).unwrap()));
             });
             group.bench_function(BenchmarkId::new("draw and unpack 256", &how), |b| {
                 b.iter(|| black_box(replay.sample(ROWS).unwrap()));

@@ -50,7 +50,7 @@ impl End {
 }
 
 /// What a chunk says of itself.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkHeader {
     /// Which actor, unique in the run.
     pub actor: u32,

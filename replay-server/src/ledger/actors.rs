@@ -33,16 +33,6 @@ struct Count {
     said_goodbye: bool,
 }
 
-impl Count {
-    /// Takes the last word of this life and gives the difference that it reveals; a second one reveals nothing.
-    fn goodbye(&mut self, produced: u64) -> Difference {
-        if std::mem::replace(&mut self.said_goodbye, true) {
-            return Difference::default();
-        }
-        Difference::between(produced, std::mem::replace(&mut self.produced, produced))
-    }
-}
-
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Actor {
     current: Count,
@@ -72,8 +62,6 @@ pub(crate) enum Verdict {
     Retried,
     /// Chunks before this one are missing.
     OutOfOrder { expected: u64 },
-    /// Not to be stored, ever.
-    Refused(String),
 }
 
 /// How two counts of the same transitions differ.
@@ -100,52 +88,41 @@ pub(crate) struct Actors {
     actors: BTreeMap<u32, Actor>,
     /// This is what was read from disk: what was stored last may have been lost with the machine's power.
     #[serde(skip)]
-    restored: bool,
+    pub(crate) restored: bool,
 }
 
 impl Actors {
-    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again. One actor more than a run may have,
-    /// or a life that another one has replaced, is an error: the reason, for a person.
-    pub(crate) fn join(&mut self, join: ActorJoin) -> Result<(), String> {
+    /// Makes `join.incarnation` the life that counts of its actor; the same one may be named again. Gives the number of its earlier lives.
+    /// One actor more than a run may have, or a life that another one has replaced, is an error: the reason, for a person.
+    pub(crate) fn join(&mut self, join: ActorJoin) -> Result<u32, String> {
         let ActorJoin { actor, incarnation } = join;
         let current = Count {
             incarnation,
             ..Count::default()
         };
-        if let Some(known) = self.actors.get_mut(&actor) {
-            if known.current.incarnation == incarnation {
-                return Ok(());
-            }
-            if known.is_past(incarnation) {
-                return Err(replaced(actor));
-            }
-            if known.past.len() == PAST_INCARNATIONS_MAX {
-                known.past.pop_front();
-            }
-            known.past.push_back(known.current);
-            known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
-            (known.current, known.expected) = (current, 0);
-            known.streams.clear();
-            return Ok(());
-        }
-        if self.actors.len() >= ACTORS_MAX {
+        if !self.actors.contains_key(&actor) && self.actors.len() >= ACTORS_MAX {
             return Err(format!(
                 "actor {actor} is one more than the {ACTORS_MAX} that a run may have: use the numbers of actors that have ended"
             ));
         }
-        let fresh = Actor {
+        let known = self.actors.entry(actor).or_insert_with(|| Actor {
             current,
             ..Actor::default()
-        };
-        self.actors.insert(actor, fresh);
-        Ok(())
-    }
-
-    /// Lives of `actor` before the one that counts.
-    pub(crate) fn earlier_incarnations(&self, actor: u32) -> u32 {
-        self.actors
-            .get(&actor)
-            .map_or(0, |it| it.earlier_incarnations)
+        });
+        if known.current.incarnation == incarnation {
+            return Ok(known.earlier_incarnations);
+        }
+        if known.is_past(incarnation) {
+            return Err(replaced(actor));
+        }
+        if known.past.len() == PAST_INCARNATIONS_MAX {
+            known.past.pop_front();
+        }
+        known.past.push_back(known.current);
+        known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
+        (known.current, known.expected) = (current, 0);
+        known.streams.clear();
+        Ok(known.earlier_incarnations)
     }
 
     /// The life of `actor` that counts; none before the first.
@@ -165,41 +142,32 @@ impl Actors {
         }
     }
 
-    /// Judges a chunk without changing anything.
-    pub(crate) fn judge(&self, header: &ChunkHeader) -> Verdict {
-        let actor = match self.living(header.actor, header.incarnation) {
-            Ok(actor) => actor,
-            Err(why) => return Verdict::Refused(why),
-        };
-        if header.streams > STREAMS_MAX {
-            return Verdict::Refused(format!(
-                "{} streams in one chunk; an actor has at most {STREAMS_MAX}",
-                header.streams
+    /// Judges a chunk without changing anything; an error says why it is never to be stored.
+    pub(crate) fn judge(&self, header: &ChunkHeader) -> Result<Verdict, String> {
+        let (number, streams) = (header.actor, header.streams);
+        let actor = self.living(number, header.incarnation)?;
+        if streams > STREAMS_MAX {
+            return Err(format!(
+                "{streams} streams in one chunk; an actor has at most {STREAMS_MAX}"
             ));
         }
-        if header.sequence < actor.expected {
-            return Verdict::Retried;
+        let expected = actor.expected;
+        if header.sequence < expected {
+            return Ok(Verdict::Retried);
         }
         if actor.current.said_goodbye {
-            return Verdict::Refused(format!(
-                "actor {} said goodbye before this chunk",
-                header.actor
-            ));
+            return Err(format!("actor {number} said goodbye before this chunk"));
         }
-        if header.sequence > actor.expected {
-            return Verdict::OutOfOrder {
-                expected: actor.expected,
-            };
+        if header.sequence > expected {
+            return Ok(Verdict::OutOfOrder { expected });
         }
-        if header.sequence > 0 && header.streams as usize != actor.streams.len() {
-            return Verdict::Refused(format!(
-                "actor {} sends {} streams after {}; their number must not change before it starts anew",
-                header.actor,
-                header.streams,
+        if header.sequence > 0 && streams as usize != actor.streams.len() {
+            return Err(format!(
+                "actor {number} sends {streams} streams after {}; their number must not change before it starts anew",
                 actor.streams.len()
             ));
         }
-        Verdict::Next
+        Ok(Verdict::Next)
     }
 
     /// Checks that a chunk can be counted: it is of a life that counts, and has its streams. If not, the error says why.
@@ -209,11 +177,6 @@ impl Actors {
             return Ok(());
         }
         Err(format!("{} streams after {streams}", header.streams))
-    }
-
-    /// What follows was read from disk.
-    pub(crate) const fn note_restored(&mut self) {
-        self.restored = true;
     }
 
     /// Whether a chunk that was judged out of order is to be stored all the same: those before it were stored by an earlier life of
@@ -258,10 +221,9 @@ impl Actors {
 
     /// Actors of which a chunk has come.
     pub(crate) fn delivered(&self) -> impl Iterator<Item = u32> {
-        let delivered = |actor: &Actor| actor.expected > 0 || actor.earlier_incarnations > 0;
         let all = self.actors.iter();
-        all.filter(move |(_, actor)| delivered(actor))
-            .map(|(&number, _)| number)
+        let delivered = all.filter(|(_, it)| it.expected > 0 || it.earlier_incarnations > 0);
+        delivered.map(|(&number, _)| number)
     }
 
     /// Whether a chunk is stored; an error says why it is not of a life that counts.
@@ -301,13 +263,20 @@ impl Actors {
     /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
     /// reveals nothing. A life that never joined is an error: the reason, for a person.
     pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
-        let actor = self.actors.get_mut(&goodbye.actor);
-        let mut lives = actor
-            .into_iter()
-            .flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
-        let life = lives.find(|life| life.incarnation == goodbye.incarnation);
-        life.map(|life| life.goodbye(goodbye.produced))
-            .ok_or_else(|| format!("no such life of actor {} has joined", goodbye.actor))
+        let &Goodbye {
+            actor,
+            incarnation,
+            produced,
+        } = goodbye;
+        let known = self.actors.get_mut(&actor).into_iter();
+        let mut lives = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
+        let life = lives.find(|life| life.incarnation == incarnation);
+        let life = life.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
+        if std::mem::replace(&mut life.said_goodbye, true) {
+            return Ok(Difference::default());
+        }
+        let stored = std::mem::replace(&mut life.produced, produced);
+        Ok(Difference::between(produced, stored))
     }
 
     /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors.

@@ -156,53 +156,45 @@ impl Statistics {
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::Played;
-
     use super::*;
-
-    fn ended(n: u64) -> EndedEpisode {
-        EndedEpisode {
-            frames: n,
-            actor: 0,
-            copy: 0,
-            played: Some(Played::default()),
-        }
-    }
 
     #[test]
     fn episodes_are_handed_out_once_and_in_order_and_the_oldest_are_let_go() {
         let mut statistics = Statistics::new(1, 1);
         assert_eq!(statistics.episodes_since(0), EpisodesReply::default());
-        for n in 0..EPISODES_MAX as u64 + 5 {
-            statistics.episode_ended(ended(n));
-        }
+        let end = |statistics: &mut Statistics, frames| {
+            statistics.episode_ended(EndedEpisode {
+                frames,
+                actor: 0,
+                copy: 0,
+                played: None,
+            });
+        };
+        let most = EPISODES_MAX as u64;
+        (0..most + 5).for_each(|n| end(&mut statistics, n));
         let first = statistics.episodes_since(0);
         assert_eq!((first.before, first.episodes.len()), (0, EPISODES_MAX));
         let second = statistics.episodes_since(first.up_to());
         let frames = second.episodes.iter().map(|it| it.frames);
-        let most = EPISODES_MAX as u64;
         assert!(frames.eq(most..most + 5));
         assert_eq!(second.up_to(), second.ended);
-        let third = statistics.episodes_since(second.up_to());
-        assert_eq!(third.episodes, []);
+        assert_eq!(statistics.episodes_since(second.up_to()).episodes, []);
         // One who knows of more knows another server's.
         assert_eq!(statistics.episodes_since(u64::MAX).before, most + 5);
 
-        for n in most + 5..EPISODES_KEPT_MAX as u64 + 7 {
-            statistics.episode_ended(ended(n));
-        }
+        let all = EPISODES_KEPT_MAX as u64 + 7;
+        (most + 5..all).for_each(|n| end(&mut statistics, n));
         let late = statistics.episodes_since(0);
         assert_eq!((late.before, late.episodes[0].frames), (7, 7));
-        assert_eq!(statistics.counted.episodes, EPISODES_KEPT_MAX as u64 + 7);
+        assert_eq!(statistics.counted.episodes, all);
         for (recorded, logged) in [
             (None, 0),
             (Some(9), EPISODES_LOGGED_MAX),
-            (Some(statistics.counted.episodes - 3), 3),
+            (Some(all - 3), 3),
         ] {
             statistics.recorded = recorded;
             let reply = statistics.logged().episodes_since(0);
-            assert_eq!(reply.up_to(), statistics.episodes);
-            assert_eq!(reply.episodes.len(), logged);
+            assert_eq!((reply.up_to(), reply.episodes.len()), (all, logged));
         }
     }
 }

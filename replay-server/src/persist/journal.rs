@@ -96,13 +96,8 @@ impl Journal {
         let syncer = File::open(&folder.path)
             .and_then(|opened| Syncer::start(opened, limits.fsync))
             .map_err(io_error("opening", &folder.path))?;
-        let Place {
-            mut segments,
-            number,
-            ordinal,
-            mark,
-        } = place;
-        let begun = begin_segment(&folder, id, number, ordinal, snapshot);
+        let (number, mut segments) = (place.number, place.segments);
+        let begun = begin_segment(&folder, id, number, place.ordinal, snapshot);
         let (segment, file) = begun.map_err(io_error("writing", &folder.segment(number)))?;
         segments.push_back(segment);
         syncer.opened(number, file.clone());
@@ -111,13 +106,13 @@ impl Journal {
             id,
             segments,
             file,
-            ordinal: ordinal + 1,
+            ordinal: place.ordinal + 1,
             limits,
             largest: 0,
             syncer,
             pending: Vec::new(),
             failing: None,
-            marks: mark.into_iter().collect(),
+            marks: place.mark.into_iter().collect(),
         })
     }
 
@@ -172,13 +167,11 @@ impl Journal {
         self.is_ready();
     }
 
-    /// Appends a chunk that is to be stored. `false`: the disk refuses, and it must not be. The error says why it makes no message.
+    /// Appends a chunk that is to be stored. `false`: the disk refuses, and it must not be. An error: it makes no message.
     pub(crate) fn append_chunk(&mut self, packed: &PackedChunk<'_>) -> Result<bool, String> {
-        let chunk = &packed.chunk;
-        let sealed = packed.sealed.as_ref();
-        let sealed = sealed.expect("the packer of a replay with a log seals");
-        let head = sealed.as_ref().map_err(ToString::to_string)?;
-        let payload = chunk.payload();
+        let head = packed.sealed.as_ref();
+        let head = head.ok_or("the chunk is larger than a message may be")?;
+        let payload = packed.chunk.payload();
         let record = record::head(RecordKind::Chunk, self.ordinal, head, payload.len());
         let is_written = self.is_ready() && self.write(&record, payload);
         self.ordinal += u64::from(is_written);

@@ -95,7 +95,7 @@ impl Replay {
             inserted: self.ring.inserted(),
             oldest: self.ring.oldest(),
             capacity: self.ring.capacity(),
-            counts: self.limiter.counts(),
+            counts: self.limiter.counts,
             rows: self.sampler.rows.state(&self.ring),
             state: State {
                 statistics: self.state.statistics.logged(),
@@ -132,9 +132,11 @@ impl Replay {
             self.push_gone(inserted - stored);
         }
         self.forget_before(oldest);
-        self.limiter.set_counts(snapshot.counts);
-        self.sampler.restore(&self.ring, oldest, &snapshot.rows);
-        state.actors.note_restored();
+        self.limiter.counts = snapshot.counts;
+        self.sampler
+            .rows
+            .restore(&self.ring, oldest, &snapshot.rows);
+        state.actors.restored = true;
         let statistics = &mut state.statistics;
         statistics.keep_newest_of(&mut self.state.statistics);
         self.state = state;
@@ -144,15 +146,10 @@ impl Replay {
     /// Takes the place of `count` transitions that are gone, which hang together with nothing and cannot be anchors.
     fn push_gone(&mut self, count: u64) {
         let chunk = Chunk::zeroed(ChunkHeader {
-            actor: 0,
-            incarnation: 0,
-            sequence: 0,
-            first_transition: 0,
-            weights_version: 0,
-            leaving: false,
             streams: 1,
             steps: 1,
             frame_bytes: self.spec.frame_bytes() as u32,
+            ..ChunkHeader::default()
         });
         let packed = self.packer().pack(Cow::Owned(chunk));
         for run in (0..count).flat_map(|_| packed.runs()) {

@@ -27,11 +27,11 @@ impl Replay {
     /// Too many actors, or a life that another one has replaced; the reason, for a person.
     pub fn join_actor(&mut self, join: ActorJoin) -> Result<u32, String> {
         let before = self.actor_incarnation(join.actor);
-        self.state.actors.join(join)?;
+        let earlier_incarnations = self.state.actors.join(join)?;
         if before != Some(join.incarnation) {
             self.note(Note::ActorJoined(join));
         }
-        Ok(self.state.actors.earlier_incarnations(join.actor))
+        Ok(earlier_incarnations)
     }
 
     /// The life of `actor` whose chunks are stored; none before it joins.
@@ -63,20 +63,18 @@ impl Replay {
     /// A retry is answered `Stored`, whatever the limiter says; a chunk that is not next is never stored.
     pub(crate) fn settle(&mut self, packed: &PackedChunk<'_>) -> Option<InsertReply> {
         let chunk = &*packed.chunk;
-        let verdict = match self.check_chunk(chunk) {
-            Ok(()) => self.state.actors.judge(&chunk.header),
-            Err(why) => Verdict::Refused(why),
-        };
+        let verdict = self.check_chunk(chunk);
+        let verdict = verdict.and_then(|()| self.state.actors.judge(&chunk.header));
         match verdict {
-            Verdict::Refused(why) => Some(self.refused(why)),
-            Verdict::Retried => {
+            Err(why) => Some(self.refused(why)),
+            Ok(Verdict::Retried) => {
                 self.counted().chunks_retried += 1;
                 Some(self.stored())
             }
-            _ if self.limiter.all_in() => Some(self.run_is_full()),
-            Verdict::OutOfOrder { .. } if self.state.actors.insists(&chunk.header) => None,
-            Verdict::OutOfOrder { expected } => Some(InsertReply::OutOfOrder { expected }),
-            Verdict::Next => None,
+            Ok(_) if self.limiter.all_in() => Some(self.run_is_full()),
+            Ok(Verdict::OutOfOrder { .. }) if self.state.actors.insists(&chunk.header) => None,
+            Ok(Verdict::OutOfOrder { expected }) => Some(InsertReply::OutOfOrder { expected }),
+            Ok(Verdict::Next) => None,
         }
     }
 
@@ -111,7 +109,7 @@ impl Replay {
     }
 
     /// The answer that a chunk has to wait; `kept` says whether it waits here.
-    pub(crate) const fn wait(&self, kept: bool) -> InsertReply {
+    pub(crate) fn wait(&self, kept: bool) -> InsertReply {
         InsertReply::Wait {
             inserted_total: self.inserted_total(),
             kept,
@@ -132,7 +130,7 @@ impl Replay {
         }
     }
 
-    const fn run_is_full(&self) -> InsertReply {
+    fn run_is_full(&self) -> InsertReply {
         InsertReply::Finished {
             inserted_total: self.inserted_total(),
         }
@@ -203,7 +201,7 @@ impl Replay {
             };
             let (link, first) = (stream.link, self.ring.inserted());
             stream.link = self.ring.push_run(run, rows.clone().map(step), link);
-            self.sampler.stored(&self.ring, first, link);
+            self.sampler.rows.stored(&self.ring, first, link);
             for step in rows.map(step) {
                 statistics.counted.action_histogram[usize::from(step.action)] += 1;
                 if let Some(episode) = &mut stream.episode {

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, PriorityUpdate, RequestId,
-    Waiting,
+    Tally, Waiting,
 };
 
 use super::{Replay, Unready};
@@ -29,8 +29,11 @@ impl Replay {
     /// # Errors
     /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
     pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
-        let counts = [join.tally, join.other_shards].map(|it| it.inserted.max(it.rows_sampled));
-        if join.updates.max(counts[0]).max(counts[1]) > LEARNED_MAX {
+        let Tally {
+            inserted,
+            rows_sampled,
+        } = join.tally + join.other_shards;
+        if join.updates.max(inserted).max(rows_sampled) > LEARNED_MAX {
             return Err(format!(
                 "a learner after {} updates, {:?} and {:?}: counts that no run reaches",
                 join.updates, join.tally, join.other_shards
@@ -55,7 +58,7 @@ impl Replay {
         let again = done.saturating_sub(join.updates);
         self.limiter.refund(unlearned);
         self.set_rows_sampled(learned);
-        self.limiter.adopt_other_shards(join.other_shards);
+        self.limiter.counts.other_shards = join.other_shards;
         let state = &mut self.state;
         state.statistics.counted.rows_unlearned += unlearned;
         state.statistics.counted.updates_relearned += again;
@@ -80,7 +83,7 @@ impl Replay {
         let shards = u64::from(self.config.shards);
         let refill = self.config.warmup_transitions.div_ceil(shards);
         // All shards' credit decides whether anything is left to fill it for.
-        self.limiter.adopt_other_shards(join.other_shards);
+        self.limiter.counts.other_shards = join.other_shards;
         self.limiter
             .resume_empty(join.tally, refill, self.batch_size);
         self.state.inserted_before = join.tally.inserted;
@@ -93,7 +96,7 @@ impl Replay {
     fn set_rows_sampled(&mut self, rows: u64) {
         let counted = self.tally().rows_sampled;
         self.state.rows_before += rows as i64 - counted as i64;
-        self.limiter.set_rows_sampled(rows);
+        self.limiter.counts.this_shard.rows_sampled = rows;
     }
 
     /// The learner that is served.
@@ -111,11 +114,8 @@ impl Replay {
     /// # Errors
     /// Counts that no run reaches; the reason, for a person.
     pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
-        let Learned {
-            updates,
-            saved_updates,
-            rows_received,
-        } = learned;
+        let (updates, saved_updates) = (learned.updates, learned.saved_updates);
+        let rows_received = learned.rows_received;
         if updates.max(saved_updates).max(rows_received) > LEARNED_MAX {
             return Err(format!(
                 "a learner with {updates} updates and {rows_received} rows, counts that no run reaches"
@@ -180,20 +180,11 @@ impl Replay {
     /// # Errors
     /// As [`Replay::draw`].
     pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
-        self.draw(rows).map(PackedBatch::unpack)
+        self.draw(rows, Buffer::zeroed).map(PackedBatch::unpack)
     }
 
-    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
-    /// compression its frames are left to be unpacked, which needs the replay no more.
-    ///
-    /// # Errors
-    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
-    pub fn draw(&mut self, rows: u32) -> Result<PackedBatch, Unready> {
-        self.draw_in(rows, Buffer::zeroed)
-    }
-
-    /// [`Replay::draw_in`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it
-    /// does not count as sampled.
+    /// [`Replay::draw`] for request `id`. What an earlier attempt at this request was given did not arrive: from now on it does not
+    /// count as sampled.
     ///
     /// # Errors
     /// As [`Replay::draw`]; a request that its client has given up is told to wait.
@@ -211,16 +202,18 @@ impl Replay {
             self.limiter.refund(lost.len() as u64);
             self.state.statistics.refund(&lost);
         }
-        let draft = self.draw_in(rows, memory)?;
+        let draft = self.draw(rows, memory)?;
         self.requests.complete(id.client_id, draft.ks.clone());
         Ok(draft)
     }
 
-    /// [`Replay::draw`] into memory that `memory` gives, so many bytes, all of which are written by the time it is unpacked.
+    /// A batch of `rows` rows, anchors drawn with replacement by the rule of `replay.sampling`, or why there is none. With
+    /// compression its frames are left to be unpacked, which needs the replay no more. `memory` gives so many bytes, all of which are
+    /// written by then.
     ///
     /// # Errors
-    /// As [`Replay::draw`].
-    pub fn draw_in(
+    /// The limiter or the lack of any valid anchor asks to wait; the run is over; `rows` can never be served.
+    pub fn draw(
         &mut self,
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
@@ -241,8 +234,9 @@ impl Replay {
             return Err(Unready::Wait(self.limiter.waiting(rows)));
         }
         let is_prioritised = self.config.sampling.is_prioritised();
+        let held = self.ring.inserted() - self.ring.oldest();
         let header = BatchHeader {
-            held: self.ring.inserted() - self.ring.oldest(),
+            held,
             origin: is_prioritised.then_some(self.origin),
             ..BatchHeader::of(&self.spec, rows)
         };
@@ -250,7 +244,14 @@ impl Replay {
         let (affinity, rng) = (&state.affinity, &mut state.rng);
         let drawn = self.sampler.draw(&self.ring, affinity, rng, header, memory);
         let Some(mut drawn) = drawn else {
-            return Err(self.no_anchor());
+            if self.limiter.all_in() {
+                let why = format!(
+                    "none of the {held} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies"
+                );
+                return Err(Unready::Refused { why });
+            }
+            state.starving = true;
+            return Err(Unready::Wait(Waiting::LearnerWaitsForActors));
         };
         self.limiter.sampled(rows);
         drawn.batch.header.tally = self.limiter.tally();
@@ -258,17 +259,5 @@ impl Replay {
         state.statistics.served(&drawn.ks);
         state.starving = false;
         Ok(drawn)
-    }
-
-    fn no_anchor(&mut self) -> Unready {
-        if self.limiter.all_in() {
-            let why = format!(
-                "none of the {} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies",
-                self.ring.inserted() - self.ring.oldest()
-            );
-            return Unready::Refused { why };
-        }
-        self.state.starving = true;
-        Unready::Wait(Waiting::LearnerWaitsForActors)
     }
 }

@@ -50,7 +50,8 @@ pub struct Replay {
     pub(crate) sampler: BatchSampler,
     pub(crate) state: State,
     requests: Requests,
-    /// Who draws, as batches say it that are drawn by priority.
+    /// Who draws, as batches say it that are drawn by priority: priorities of rows that another one drew change nothing. A replay server
+    /// that is started again numbers its transitions anew, or has lost some, and so draws another incarnation.
     pub(crate) origin: Origin,
     /// It is being read back: what is counted was logged when it happened.
     pub(crate) quiet: bool,
@@ -116,14 +117,6 @@ impl Replay {
             log: None,
         })
     }
-
-    /// The same, drawing under this number: priorities of rows that were drawn under another one are counted and change nothing.
-    /// A replay server that is started again numbers its transitions anew, or has lost some, and so draws another number.
-    #[must_use]
-    pub(crate) const fn with_incarnation(mut self, incarnation: u64) -> Self {
-        self.origin.incarnation = incarnation;
-        self
-    }
 }
 
 /// What it says of itself, and what the service around it tells it to count.
@@ -134,7 +127,7 @@ impl Replay {
     }
 
     /// Transitions of the run that were stored, in all shards as far as heard.
-    pub const fn inserted_total(&self) -> u64 {
+    pub fn inserted_total(&self) -> u64 {
         self.limiter.inserted_total()
     }
 
@@ -164,7 +157,7 @@ impl Replay {
 
     /// The account of itself; what the service alone knows is left at its default.
     pub fn status(&self) -> ReplayStatus {
-        let counts = self.limiter.counts();
+        let counts = self.limiter.counts;
         ReplayStatus {
             transitions_inserted: counts.this_shard.inserted,
             transitions_refilled: counts.refilled,
@@ -193,7 +186,7 @@ impl Replay {
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.
     pub fn check_valid(&self) {
         self.ring.check_valid();
-        self.sampler.check_valid(&self.ring);
+        self.sampler.rows.check_valid(&self.ring);
         assert_eq!(self.snapshot().unfit(&self.state), None);
     }
 }

@@ -170,8 +170,6 @@ fn return_f32(sum: f64) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
 
     /// Rewards at the limit that the replay server sets, whose sum rounds to more than a float can be for some n.
@@ -191,66 +189,5 @@ mod tests {
             (f32::MAX, f32::MIN)
         );
         assert_eq!((return_f32(0.1), return_f32(1e-300)), (0.1, 0.0));
-    }
-
-    /// x + y as their rounded sum and what was lost by rounding, exactly.
-    fn two_sum(x: f64, y: f64) -> (f64, f64) {
-        let sum = x + y;
-        let back = sum - x;
-        (sum, (x - (sum - back)) + (y - back))
-    }
-
-    proptest! {
-        /// Rewards over all of an f32's range up to the replay's limit, against a sum that loses nothing to cancellation.
-        #[test]
-        fn a_return_is_the_sum_of_its_rewards(
-            rewards in prop::collection::vec(
-                prop_oneof![
-                    -10.0f32..10.0,
-                    prop::num::f32::NORMAL | prop::num::f32::SUBNORMAL | prop::num::f32::ZERO,
-                    prop::sample::select(vec![0.0, 1e-45, f32::MIN_POSITIVE, 1e30, -1e30, f32::MAX, f32::MIN]),
-                ],
-                1..60,
-            ),
-            gamma in prop_oneof![
-                0.0f64..=1.0,
-                prop::sample::select(vec![0.0, 1e-320, 0.99, 1.0 - 1e-12, 1.0]),
-            ],
-            end in prop::option::of((0usize..60, prop::sample::select(vec![End::Terminal, End::TimedOut]))),
-            timeout in prop::sample::select(vec![TimeoutRule::Terminal, TimeoutRule::Bootstrap]),
-        ) {
-            let n = rewards.len();
-            let limit = f32::MAX / n as f32;
-            let end = end.map(|(at, end)| (at % n, end));
-            let end_of = |i| end.filter(|(at, _)| *at == i).map_or(End::Running, |(_, end)| end);
-            let step = |(i, reward): (usize, &f32)| Step::new(0, reward.clamp(-limit, limit), end_of(i), 0);
-            let steps: Vec<Step> = rewards.iter().enumerate().map(step).collect();
-            let discounts: Vec<f64> = (0..=n as i32).map(|i| gamma.powi(i)).collect();
-            let (found, follows) = n_step_return(&discounts, timeout, steps.iter());
-
-            let bootstraps = timeout == TimeoutRule::Bootstrap;
-            let (counted, expected_follows) = match end {
-                None => (n, Some(n)),
-                Some((at, End::TimedOut)) if bootstraps => (at, Some(at)),
-                Some((at, _)) => (at + 1, None),
-            };
-            prop_assert_eq!(follows, expected_follows);
-            let (mut sum, mut lost, mut sizes) = (0.0, 0.0, 0.0);
-            for (step, discount) in steps[..counted].iter().zip(&discounts) {
-                let term = discount * f64::from(step.reward);
-                let rest;
-                (sum, rest) = two_sum(sum, term);
-                lost += rest;
-                sizes += term.abs();
-            }
-            let expected = sum + lost;
-            let error = (found - expected).abs();
-            prop_assert!(error <= return_sum_error(n) * sizes, "{found:e}, {expected:e}");
-            let sent = return_f32(found);
-            prop_assert!(sent.is_finite());
-            let error = (f64::from(sent) - expected).abs();
-            let scale = expected.abs().max(f32::MIN_POSITIVE.into());
-            prop_assert!(error <= RETURN_ERROR * scale + return_sum_error(n) * sizes, "{sent:e}, {expected:e}");
-        }
     }
 }

@@ -11,12 +11,9 @@ use super::{
     episodes::{Episodes, Window},
     horizon::Affinity,
     packed_batch::{PackedBatch, PackedFrames},
-    rows::{Held, RowSampler, RowsState, prioritised::Priorities, uniform::Uniform},
+    rows::{RowSampler, prioritised::Priorities, uniform::Uniform},
 };
-use crate::{
-    config::reach,
-    storage::ring::{Link, Ring},
-};
+use crate::storage::ring::Ring;
 
 /// Everything that drawing needs beside the ring and the generator.
 pub(crate) struct BatchSampler {
@@ -30,25 +27,20 @@ pub(crate) struct BatchSampler {
 impl BatchSampler {
     /// The sampler of a ring of `capacity` transitions; an error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
+        let episodes = Episodes::new(spec);
         let rows: Box<dyn RowSampler> = match *sampling {
-            Sampling::Uniform => Box::new(Uniform::default()),
+            Sampling::Uniform => Box::new(Uniform::new(episodes)),
             Sampling::Prioritised { alpha, .. } => {
-                Box::new(Priorities::new(alpha, capacity, reach(spec))?)
+                Box::new(Priorities::new(alpha, capacity, episodes)?)
             }
         };
         Ok(Self {
-            episodes: Episodes::new(spec),
+            episodes,
             rows,
             assembler: Assembler::new(spec),
             window: Window::default(),
             frame_bytes: spec.frame_bytes(),
         })
-    }
-
-    /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
-    pub(crate) fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
-        let episodes = &self.episodes;
-        self.rows.stored(Held { ring, episodes }, first, link);
     }
 
     /// A batch of as many rows as `header` says, whose mean age and weights are filled in here; none if there is no anchor.
@@ -64,10 +56,8 @@ impl BatchSampler {
         let mut scalars = Vec::with_capacity(rows);
         let mut states: Vec<RowStates> = Vec::with_capacity(rows);
         let mut age_total = 0;
-        let episodes = &self.episodes;
         for _ in 0..rows {
-            let held = Held { ring, episodes };
-            if !self.rows.draw(held, rng, &mut self.window) {
+            if !self.rows.draw(ring, rng, &mut self.window) {
                 return None;
             }
             let row = self.assembler.row(affinity, &self.window, rng);
@@ -81,7 +71,7 @@ impl BatchSampler {
         header.mean_age = age_total as f64 / rows as f64;
         let mut needed = NeededFrames::default();
         if let Some(stacked) = &mut header.stacked {
-            needed = NeededFrames::of(ring, episodes, states.iter());
+            needed = NeededFrames::of(ring, &self.episodes, states.iter());
             stacked.frames = needed.indices.len() as u32;
         }
         let mut batch = Batch::of_rows(header, &scalars, memory);
@@ -123,17 +113,6 @@ impl BatchSampler {
             packed.write_or_take_row(ring, needed.first_in(row), &mut places);
         }
         packed
-    }
-
-    /// [`RowSampler::restore`].
-    pub(crate) fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState) {
-        let episodes = &self.episodes;
-        self.rows.restore(Held { ring, episodes }, oldest, state);
-    }
-
-    pub(crate) fn check_valid(&self, ring: &Ring) {
-        let episodes = &self.episodes;
-        self.rows.check_valid(Held { ring, episodes });
     }
 }
 

@@ -32,8 +32,10 @@ impl Window {
 }
 
 /// What a transition needs around it to be an anchor, and how its states are put together.
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Episodes {
-    reach: usize,
+    /// Steps that must follow an anchor in its episode.
+    pub(crate) reach: usize,
     frame_stack: usize,
     timeout: TimeoutRule,
 }

@@ -1,25 +1,15 @@
 //! Requests for batches as they arrive: parked until the limiter allows them, then served, several at a time.
 //! Which rows a batch has is the core's choice.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
 
 use super::{
-    parked::ParkedRequest,
+    parked::{ParkedRequest, park_request},
     server::{Service, State},
 };
-use crate::{
-    replay::{Replay, Unready},
-    sampling::packed_batch::PackedBatch,
-};
-
-/// How long a request waits before it is told to come back: far below every learner's time-out.
-const HOLD_MAX: Duration = Duration::from_secs(1);
-/// The same for a part of a batch: what another shard counts meanwhile is not heard of here.
-const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
-/// How long a thread sleeps when nothing is parked; it is woken when something is.
-const IDLE: Duration = Duration::from_secs(60);
+use crate::{replay::Unready, sampling::packed_batch::PackedBatch};
 
 /// A request that waits, and who for.
 type Parked = ParkedRequest<Responder<BatchReply>>;
@@ -33,44 +23,35 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
-        let is_allowed = state.check_learner(request.learner);
-        let is_allowed = is_allowed.and_then(|()| self.check_rows(request.rows));
-        let heard = is_allowed.and_then(|()| self.hear_learner(&mut state.replay, &request));
+        let heard = self.hear_learner(&mut state, &request);
         if let Err(why) = heard {
             let line = format!("a request for a batch was refused: {why}");
             state.refuse("batch", &line);
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }
-        let hold_max = match request.other_shards {
-            Some(_) => SHARD_HOLD_MAX,
-            None => HOLD_MAX,
-        };
         let learner = Alive::learner(request.learner);
         state.accounts.heard(learner, None, Instant::now());
-        state.requests.park(ParkedRequest {
+        let parked = ParkedRequest {
             request,
             question: responder,
             arrived: Instant::now(),
-            hold_max,
-        });
+        };
+        park_request(&mut state.requests, parked);
         drop(state);
         self.changed.notify_all();
     }
 
-    /// A batch is as long as the run's are, or a part of one.
-    fn check_rows(&self, rows: u32) -> Result<(), String> {
-        match self.limits.batch_rows {
-            most if (1..=most).contains(&rows) => Ok(()),
-            most => Err(format!(
+    /// Takes what the learner says of itself and of the other shards; an error says why it gets no batch.
+    fn hear_learner(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
+        state.check_learner(request.learner)?;
+        let (rows, most) = (request.rows, self.limits.batch_rows);
+        if !(1..=most).contains(&rows) {
+            return Err(format!(
                 "a batch of {rows} rows; those of this run have {most} (learner.batch_size)"
-            )),
+            ));
         }
-    }
-
-    /// Takes what the learner says of itself and of the other shards.
-    fn hear_learner(&self, replay: &mut Replay, request: &BatchRequest) -> Result<(), String> {
-        replay.note_learned(request.learned)?;
+        state.replay.note_learned(request.learned)?;
         let (_, shards) = self.shard;
         match request.other_shards {
             None if shards > 1 => Err(format!(
@@ -79,7 +60,7 @@ impl Service {
             Some(_) if shards == 1 => {
                 Err("a part of a batch; this replay has one shard alone".into())
             }
-            Some(other_shards) => replay.set_other_shards(other_shards),
+            Some(other_shards) => state.replay.set_other_shards(other_shards),
             None => Ok(()),
         }
     }
@@ -94,32 +75,23 @@ impl Service {
                 true => self.pool.take(bytes),
                 false => self.pool.take_own(bytes),
             }) else {
-                let due_in = state.requests.due_in(now).unwrap_or(IDLE);
-                drop(self.wait(state, due_in));
+                let due_in = state.requests.iter().map(|it| it.left(now)).min();
+                self.wait(state, due_in);
                 continue;
             };
             let waited = now.saturating_duration_since(parked.arrived);
             state.replay.counted().learner_waited_s += waited.as_secs_f64();
             drop(state);
             self.changed.notify_all();
-            give_batch(parked.question, drawn);
+            match drawn.map(PackedBatch::unpack) {
+                Ok(batch) => {
+                    let (header, payload) = batch.into_payload();
+                    let (reply, payload) = (BatchReply::of(header), payload.freeze());
+                    parked.question.reply_with(&reply, payload);
+                }
+                Err(unready) => parked.question.reply(&unready.into()),
+            }
         }
-    }
-}
-
-fn give_batch(responder: Responder<BatchReply>, drawn: Result<PackedBatch, Unready>) {
-    match drawn {
-        Ok(draft) => {
-            let (header, payload) = draft.unpack().into_payload();
-            tracing::debug!(
-                "a batch goes out: {} rows, {} sampled so far of {} transitions stored",
-                header.rows,
-                header.tally.rows_sampled,
-                header.tally.inserted
-            );
-            responder.reply_with(&BatchReply::of(header), payload.freeze());
-        }
-        Err(unready) => responder.reply(&unready.into()),
     }
 }
 
@@ -130,8 +102,8 @@ impl State {
         now: Instant,
         memory: impl Fn(usize, bool) -> Buffer,
     ) -> Option<(Parked, Result<PackedBatch, Unready>)> {
-        for at in 0..self.requests.line.len() {
-            let parked = &self.requests.line[at];
+        for at in 0..self.requests.len() {
+            let parked = &self.requests[at];
             let BatchRequest {
                 id,
                 rows,
@@ -141,7 +113,7 @@ impl State {
             let memory = |bytes| memory(bytes, shared_memory);
             let drawn = self.replay.draw_for(id, rows, memory);
             if !matches!(drawn, Err(Unready::Wait(_))) || parked.left(now).is_zero() {
-                let parked = self.requests.line.remove(at);
+                let parked = self.requests.remove(at);
                 return parked.map(|parked| (parked, drawn));
             }
         }

@@ -1,10 +1,7 @@
 //! Chunks as they arrive: stored at once, or parked until the limiter opens, and answered either way.
 //! What is stored is the core's decision; the order of those that wait is the order in which they came.
 
-use std::{
-    borrow::Cow,
-    time::{Duration, Instant},
-};
+use std::{borrow::Cow, time::Instant};
 
 use driml_protocol::{Alive, Chunk, ChunkHeader, Claim, CodecError, Incoming, InsertReply, fault};
 
@@ -13,9 +10,6 @@ use super::{
     server::{Question, Service, State},
 };
 use crate::storage::frame_store::PackedChunk;
-
-/// How long the thread sleeps when nothing is parked; it is woken when something is.
-const IDLE: Duration = Duration::from_secs(60);
 
 /// How far the version that acted may be ahead of the newest that is here.
 const VERSION_AHEAD_MAX: u64 = 1 << 32;
@@ -84,8 +78,8 @@ impl Service {
                 answers.push((question, state.replay.wait(true)));
             }
             if answers.is_empty() {
-                let due_in = state.chunks.due_in(now, self.hold_max).unwrap_or(IDLE);
-                drop(self.wait(state, due_in));
+                let due_in = state.chunks.due_in(now, self.hold_max);
+                self.wait(state, due_in);
                 continue;
             }
             drop(state);

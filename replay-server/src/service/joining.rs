@@ -27,19 +27,16 @@ impl Service {
 
     pub(super) fn hello(&self, responder: Responder<Hello>) {
         let state = self.state();
-        let inserted_total = state.replay.inserted_total();
-        let has_learner = state.replay.learner().is_some();
-        let after_updates = state.replay.resumed_after();
-        let shared_memory = self.shared_memory && state.accounts.actor_lives() < SHARED_LIVES_MAX;
-        drop(state);
+        let lives = state.accounts.actor_lives();
         let hello = Hello {
             config_toml: self.config_toml.clone(),
-            inserted_total,
-            has_learner,
-            after_updates,
+            inserted_total: state.replay.inserted_total(),
+            has_learner: state.replay.learner().is_some(),
+            after_updates: state.replay.resumed_after(),
             shard: self.shard,
-            shared_memory,
+            shared_memory: self.shared_memory && lives < SHARED_LIVES_MAX,
         };
+        drop(state);
         responder.reply(&hello);
     }
 
@@ -93,16 +90,14 @@ impl State {
 
     /// Whether this life of a part is the one that takes part.
     fn takes_part(&self, who: Alive) -> bool {
-        match who {
+        let known = match who {
             Alive::Actor { actor, .. } => {
                 let life = self.replay.actor_incarnation(actor);
-                life.is_some_and(|life| Alive::actor(actor, life) == who)
+                life.map(|life| Alive::actor(actor, life))
             }
-            Alive::Learner { .. } => {
-                let learner = self.replay.learner();
-                learner.is_some_and(|learner| Alive::learner(learner) == who)
-            }
-        }
+            Alive::Learner { .. } => self.replay.learner().map(Alive::learner),
+        };
+        known == Some(who)
     }
 
     /// Checks that `learner` is the one that is served; if not, the error says to a person what happened.
@@ -162,7 +157,7 @@ impl State {
             );
         }
         if served != Some(learner) {
-            let requests = &mut self.requests.line;
+            let requests = &mut self.requests;
             requests.retain(|it| it.request.learner == learner);
             self.accounts
                 .joined(Alive::learner(learner), Instant::now());

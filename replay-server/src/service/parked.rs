@@ -15,6 +15,11 @@ const CHUNK_BYTES_MAX: usize = 1 << 28;
 /// Requests kept; the one that has waited longest gives way to one more, and its client asks again.
 const REQUESTS_MAX: usize = 1024;
 
+/// How long a request waits before it is told to come back: far below every learner's time-out.
+const HOLD_MAX: Duration = Duration::from_secs(1);
+/// The same for a part of a batch: what another shard counts meanwhile is not heard of here.
+const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
+
 /// A chunk that is stored as soon as the limiter lets it pass.
 pub(super) struct ParkedChunk<Q> {
     pub(super) chunk: PackedChunk<'static>,
@@ -117,37 +122,25 @@ pub(super) struct ParkedRequest<Q> {
     pub(super) request: BatchRequest,
     pub(super) question: Q,
     pub(super) arrived: Instant,
-    /// How long it may wait.
-    pub(super) hold_max: Duration,
 }
 
 impl<Q> ParkedRequest<Q> {
+    /// How long it may wait from now on.
     pub(super) fn left(&self, now: Instant) -> Duration {
-        let held = now.saturating_duration_since(self.arrived);
-        self.hold_max.saturating_sub(held)
+        let is_part = self.request.other_shards.is_some();
+        let hold_max = if is_part { SHARD_HOLD_MAX } else { HOLD_MAX };
+        hold_max.saturating_sub(now.saturating_duration_since(self.arrived))
     }
 }
 
-/// The requests that wait, at most one a client: the newest attempt. The oldest is first.
-pub(super) struct ParkedRequests<Q> {
-    pub(super) line: VecDeque<ParkedRequest<Q>>,
-}
-
-impl<Q> ParkedRequests<Q> {
-    /// Keeps a request in the place of an older one of its client, which was given up.
-    pub(super) fn park(&mut self, parked: ParkedRequest<Q>) {
-        let client_id = parked.request.id.client_id;
-        self.line.retain(|it| it.request.id.client_id != client_id);
-        if self.line.len() == REQUESTS_MAX {
-            self.line.pop_front();
-        }
-        self.line.push_back(parked);
+/// Keeps a request in the place of an older one of its client, which was given up; the oldest is first.
+pub(super) fn park_request<Q>(line: &mut VecDeque<ParkedRequest<Q>>, parked: ParkedRequest<Q>) {
+    let client_id = parked.request.id.client_id;
+    line.retain(|it| it.request.id.client_id != client_id);
+    if line.len() == REQUESTS_MAX {
+        line.pop_front();
     }
-
-    /// How long until one has waited as long as it may.
-    pub(super) fn due_in(&self, now: Instant) -> Option<Duration> {
-        self.line.iter().map(|it| it.left(now)).min()
-    }
+    line.push_back(parked);
 }
 
 #[cfg(test)]
@@ -166,12 +159,10 @@ mod tests {
             actor,
             incarnation: 9,
             sequence,
-            first_transition: 0,
-            weights_version: 0,
-            leaving: false,
             streams: 1,
             steps: 1,
             frame_bytes,
+            ..ChunkHeader::default()
         });
         let packer = Packer {
             compression: Compression::None,
@@ -255,26 +246,25 @@ mod tests {
     #[test]
     fn one_request_an_asker_waits() {
         let now = Instant::now();
-        let mut parked = ParkedRequests {
-            line: VecDeque::new(),
-        };
+        let mut line = VecDeque::new();
         for (client_id, question) in [(1, "a"), (2, "b"), (1, "a again"), (3, "c")] {
-            parked.park(ParkedRequest {
-                request: BatchRequest {
-                    learner: 1,
-                    id: RequestId::first(client_id),
-                    rows: 1,
-                    shared_memory: false,
-                    learned: Learned::default(),
-                    other_shards: None,
-                },
+            let request = BatchRequest {
+                learner: 1,
+                id: RequestId::first(client_id),
+                rows: 1,
+                shared_memory: false,
+                learned: Learned::default(),
+                other_shards: None,
+            };
+            let parked = ParkedRequest {
+                request,
                 question,
                 arrived: now,
-                hold_max: client_id as u32 * SECOND,
-            });
+            };
+            assert_eq!(parked.left(now), HOLD_MAX);
+            park_request(&mut line, parked);
         }
-        assert_eq!(parked.due_in(now), Some(SECOND));
-        let order: Vec<_> = parked.line.iter().map(|it| it.question).collect();
+        let order: Vec<_> = line.iter().map(|it| it.question).collect();
         assert_eq!(order, ["b", "a again", "c"]);
     }
 }

@@ -23,7 +23,7 @@ use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 use super::{
     accounts::Accounts,
     limits::{Limits, number, shared_memory_bytes},
-    parked::{ParkedChunks, ParkedRequests},
+    parked::ParkedChunks,
     server::{Entrance, Service, State},
     timings::Timings,
     weights_store::WeightsStore,
@@ -86,8 +86,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let config: Config = settings.table("replay")?;
     let batch_size = number(&settings, "learner", "batch_size")?;
     let ack_timeout = Duration::from_millis(number(&settings, "actor", "ack_timeout_ms")?.into());
-    // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
-    let incarnation = rand::random();
     let empty = Replay::shard(&spec, &config, batch_size, args.shard)?;
     let kept = args.dir.as_ref().map(|dir| {
         let args = PersistArgs {
@@ -148,7 +146,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         Some(kept) => read(kept, empty, &entrance.reading, spec.hash()),
         None => Ok((empty, WeightsStore::default())),
     };
-    let (replay, weights) = match read {
+    let (mut replay, weights) = match read {
         Ok(read) => read,
         Err(e) => {
             // So that those who wait for the replay notice at once that the server is gone.
@@ -162,7 +160,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             };
         }
     };
-    let replay = replay.with_incarnation(incarnation);
+    // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
+    replay.origin.incarnation = rand::random();
     let service = Arc::new(Service {
         num_actions: spec.num_actions,
         limits,
@@ -178,9 +177,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             chunks: ParkedChunks {
                 line: VecDeque::new(),
             },
-            requests: ParkedRequests {
-                line: VecDeque::new(),
-            },
+            requests: VecDeque::new(),
             timings: Timings::default(),
             said: SeldomEach::default(),
         }),
@@ -207,12 +204,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     if let Some(log) = &mut state.replay.log {
         log.flush();
     }
-    if let Some(PriorityCounts {
-        set,
-        gone,
-        repeated,
-    }) = state.replay.priority_counts()
-    {
+    if let Some(counts) = state.replay.priority_counts() {
+        let PriorityCounts {
+            set,
+            gone,
+            repeated,
+        } = counts;
         tracing::info!(
             "priorities of {set} rows were set, {gone} came too late for their transition, {repeated} came twice"
         );
@@ -290,28 +287,24 @@ impl<'a> Answers<'a> {
             queryables: Vec::new(),
             threads: Threads::new(),
         };
+        let small = limits.small;
         this.answer("insert", 1, limits.chunk, Service::insert)?;
-        this.answer("claim", 1, limits.small, Service::claim)?;
-        this.answer("request", 1, limits.small, Service::request)?;
+        this.answer("claim", 1, small, Service::claim)?;
+        this.answer("request", 1, small, Service::request)?;
         this.answer("affinity", 1, limits.affinity, Service::affinity)?;
         if sampling.is_prioritised() {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
         this.offer("hello", Service::hello)?;
-        this.answer("join-actor", 1, limits.small, Service::join_actor)?;
-        this.answer("join-learner", 1, limits.small, Service::join_learner)?;
-        this.answer("goodbye", 1, limits.small, Service::goodbye)?;
+        this.answer("join-actor", 1, small, Service::join_actor)?;
+        this.answer("join-learner", 1, small, Service::join_learner)?;
+        this.answer("goodbye", 1, small, Service::goodbye)?;
         this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
-        this.answer(
-            "weights",
-            WEIGHTS_THREADS,
-            limits.small,
-            Service::give_weights,
-        )?;
-        this.answer("report", 1, limits.small, Service::report)?;
+        this.answer("weights", WEIGHTS_THREADS, small, Service::give_weights)?;
+        this.answer("report", 1, small, Service::report)?;
         this.offer("status", Service::status)?;
         this.offer("parts", Service::parts)?;
-        this.answer("episodes", 1, limits.small, Service::episodes)?;
+        this.answer("episodes", 1, small, Service::episodes)?;
         Ok(this)
     }
 

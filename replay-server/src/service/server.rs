@@ -2,6 +2,7 @@
 //! What each message does is in the file named for it.
 
 use std::{
+    collections::VecDeque,
     sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError},
     time::{Duration, Instant},
 };
@@ -14,11 +15,14 @@ use driml_protocol::{
 use super::{
     accounts::Accounts,
     limits::Limits,
-    parked::{ParkedChunks, ParkedRequests},
+    parked::{ParkedChunks, ParkedRequest},
     timings::Timings,
     weights_store::WeightsStore,
 };
 use crate::{persist::Reading, replay::Replay, storage::frame_store::Packer};
+
+/// How long a thread sleeps when nothing is parked; it is woken when something is.
+const IDLE: Duration = Duration::from_secs(60);
 
 /// What all threads share.
 pub(super) struct Service {
@@ -47,7 +51,8 @@ pub(super) struct State {
     pub(super) replay: Replay,
     pub(super) accounts: Accounts,
     pub(super) chunks: ParkedChunks<Question>,
-    pub(super) requests: ParkedRequests<Responder<BatchReply>>,
+    /// At most one a client: the newest attempt.
+    pub(super) requests: VecDeque<ParkedRequest<Responder<BatchReply>>>,
     pub(super) timings: Timings,
     /// Lines about what was refused, which a stranger could make come at any rate.
     pub(super) said: SeldomEach,
@@ -86,17 +91,11 @@ impl Service {
             .ok()
     }
 
-    /// Waits until something has changed, or for `wait_max`.
-    pub(super) fn wait<'a>(
-        &'a self,
-        mut state: MutexGuard<'a, State>,
-        wait_max: Duration,
-    ) -> MutexGuard<'a, State> {
+    /// Waits until something has changed, or for `due_in`, after which something that is parked is due.
+    pub(super) fn wait(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
         state.note_waiting(Instant::now());
-        self.changed
-            .wait_timeout(state, wait_max)
-            .unwrap_or_else(PoisonError::into_inner)
-            .0
+        let waited = self.changed.wait_timeout(state, due_in.unwrap_or(IDLE));
+        drop(waited.unwrap_or_else(PoisonError::into_inner));
     }
 }
 
@@ -111,7 +110,7 @@ impl State {
     /// what they would note is noted here. Waking them costs six changes of threads a chunk.
     pub(super) fn is_awaited(&mut self, now: Instant) -> bool {
         self.note_waiting(now);
-        !self.chunks.line.is_empty() || !self.requests.line.is_empty()
+        !self.chunks.line.is_empty() || !self.requests.is_empty()
     }
 
     /// Counts a message that was refused, and logs a line of this kind.

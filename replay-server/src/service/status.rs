@@ -7,13 +7,11 @@ use std::{
 
 use driml_protocol::{
     AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Request, Responder, Shutdown, fault,
+    PriorityUpdate, ReplayStatus, Report, Request, Responder, Shutdown, Warning, fault,
+    last_warning,
 };
 
-use super::{
-    accounts::own_warning,
-    server::{Service, State},
-};
+use super::server::{Service, State};
 use crate::persist::journal::Journal;
 
 /// How often it is looked whether somebody is missing.
@@ -104,19 +102,20 @@ impl Service {
         let (up_s, weights_age_s) = state.accounts.ages(now);
         let held_since = |who| match who {
             PartName::Actor(actor) => state.chunks.arrived(actor),
-            PartName::Learner => state.requests.line.iter().map(|it| it.arrived).min(),
+            PartName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
         let status = PartsStatus {
             up_s,
             waiting,
             waiting_s,
-            requests_waiting: state.requests.line.len() as u32,
+            requests_waiting: state.requests.len() as u32,
             chunks_waiting: state.chunks.line.len() as u32,
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
             weights_age_s,
             log: state.replay.log.as_ref().map(Journal::status),
-            last_warning: own_warning(),
+            last_warning: last_warning::get()
+                .map(|(text, age)| Warning::new(&text, age.as_secs_f64())),
             parts: state.accounts.parts(now, held_since),
         };
         drop(state);

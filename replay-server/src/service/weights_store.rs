@@ -1,16 +1,14 @@
 //! The newest weights and the older ones that actors still pull, whole, as they came.
 
 use std::{
-    fs::{self, File},
-    io::{self, Write},
+    fs, io,
     path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    CodecError, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
-    codec,
+    PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, codec,
 };
 
 /// The file with the newest weights.
@@ -39,15 +37,20 @@ impl WeightsStore {
     /// the learner publishes again.
     pub(super) fn kept_in(dir: &Path, spec_hash: u64) -> Self {
         let path = dir.join(FILE);
+        let read = |bytes: &[u8]| {
+            let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;
+            anyhow::Ok(Weights {
+                header: upload.weights,
+                safetensors: safetensors.to_vec(),
+            })
+        };
         let newest = match fs::read(&path) {
-            Ok(bytes) => read(&bytes, spec_hash)
+            Err(e) if e.kind() == io::ErrorKind::NotFound => None,
+            found => found
+                .map_err(anyhow::Error::from)
+                .and_then(|bytes| read(&bytes))
                 .inspect_err(|e| tracing::warn!("{} is not used: {e}", path.display()))
                 .ok(),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => None,
-            Err(e) => {
-                tracing::warn!("{} is not used: {e}", path.display());
-                None
-            }
         };
         Self {
             file: Some((path, spec_hash)),
@@ -125,17 +128,16 @@ impl WeightsStore {
         let newest = self.newest.as_ref();
         let newest = newest.filter(|it| it.header.version > version);
         let newest = newest.ok_or(WeightsReply::NoneNewer)?;
-        let last = |pulled: &[(Arc<Weights>, Instant)]| {
-            pulled.last().map_or(0, |(it, _)| it.header.version)
-        };
-        if last(&self.pulled) == newest.header.version {
-            return Ok(newest.header.version);
+        let last = self.pulled.last();
+        let last = last.map_or(0, |(it, _)| it.header.version);
+        if last == newest.header.version {
+            return Ok(last);
         }
         self.pulled
             .retain(|(_, asked)| now.saturating_duration_since(*asked) < KEPT_FOR);
         if self.pulled.len() == KEPT_MAX {
-            if last(&self.pulled) > version {
-                return Ok(last(&self.pulled));
+            if last > version {
+                return Ok(last);
             }
             let idle = (0..KEPT_MAX).min_by_key(|&at| self.pulled[at].1);
             idle.map(|at| self.pulled.remove(at));
@@ -145,15 +147,6 @@ impl WeightsStore {
     }
 }
 
-/// Reads weights that were kept.
-fn read(bytes: &[u8], spec_hash: u64) -> Result<Weights, CodecError> {
-    let (upload, safetensors) = codec::decode::<WeightsUpload>(bytes, Some(spec_hash))?;
-    Ok(Weights {
-        header: upload.weights,
-        safetensors: safetensors.to_vec(),
-    })
-}
-
 /// Writes weights in the place of those that are kept. They are not flushed: what a power cut leaves of them has a checksum, and the
 /// learner hands over newer ones.
 fn keep(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
@@ -161,11 +154,11 @@ fn keep(path: &Path, spec_hash: u64, weights: &Weights) -> anyhow::Result<()> {
         learner: 0,
         weights: weights.header,
     };
-    let head = codec::seal(spec_hash, &upload, &weights.safetensors)?;
     let beside = path.with_extension("new");
-    let mut file = File::create(&beside)?;
-    file.write_all(&head)?;
-    file.write_all(&weights.safetensors)?;
+    fs::write(
+        &beside,
+        codec::encode(spec_hash, &upload, &weights.safetensors)?,
+    )?;
     fs::rename(&beside, path)?;
     Ok(())
 }
@@ -183,6 +176,22 @@ mod tests {
         WeightsRequest::Piece { version, offset }
     }
 
+    const fn newer(version: u64) -> WeightsRequest {
+        WeightsRequest::NewerThan(version)
+    }
+
+    impl WeightsStore {
+        /// What comes of a request: the version and the offset.
+        fn found(
+            &mut self,
+            request: WeightsRequest,
+            now: Instant,
+        ) -> Result<(u64, usize), WeightsReply> {
+            let found = self.find(request, now);
+            found.map(|(weights, offset)| (weights.header.version, offset))
+        }
+    }
+
     #[test]
     fn versions_rise_by_sane_steps() {
         let mut store = WeightsStore::default();
@@ -196,39 +205,25 @@ mod tests {
         assert_eq!(store.version(), 3);
     }
 
-    /// What comes of a request after so many seconds: the version and the offset.
-    fn found(
-        store: &mut WeightsStore,
-        request: WeightsRequest,
-        now: Instant,
-    ) -> Result<(u64, usize), WeightsReply> {
-        let found = store.find(request, now);
-        found.map(|(weights, offset)| (weights.header.version, offset))
-    }
-
     #[test]
     fn a_slow_actor_gets_what_it_began_with_while_others_get_the_newest() {
         let (mut store, start) = (WeightsStore::default(), Instant::now());
-        let newer = WeightsRequest::NewerThan;
+        let at = |seconds| start + Duration::from_secs(seconds);
         let file = vec![7; 3 * PIECE_BYTES];
         let none = Err(WeightsReply::NoneNewer);
-        assert_eq!(found(&mut store, newer(0), start), none);
-        store.put(header(1), &file).unwrap();
-        assert_eq!(found(&mut store, newer(0), start), Ok((1, 0)));
-        for version in 2..20 {
-            let now = start + Duration::from_secs(version);
+        assert_eq!(store.found(newer(0), start), none);
+        for version in 1..20 {
+            let now = at(version);
             store.put(header(version), &file).unwrap();
-            let next = found(&mut store, newer(version - 1), now);
-            assert_eq!(next, Ok((version, 0)));
-            let slow = found(&mut store, piece(1, PIECE_BYTES), now);
+            assert_eq!(store.found(newer(version - 1), now), Ok((version, 0)));
+            let slow = store.found(piece(1, PIECE_BYTES), now);
             assert_eq!(slow, Ok((1, PIECE_BYTES)));
             assert!(store.pulled.len() <= KEPT_MAX);
         }
-        let now = start + Duration::from_secs(20);
-        assert_eq!(found(&mut store, newer(19), now), none);
+        assert_eq!(store.found(newer(19), at(20)), none);
         // One that was pulled to the end, one that never was, and places where no piece begins.
         for (version, offset) in [(2, 0), (99, 0), (19, 1), (19, 3 * PIECE_BYTES)] {
-            let gone = found(&mut store, piece(version, offset), now);
+            let gone = store.found(piece(version, offset), at(20));
             assert_eq!(gone, Err(WeightsReply::Gone), "{version}, {offset}");
         }
     }
@@ -239,20 +234,18 @@ mod tests {
         let last = KEPT_MAX as u64;
         for version in 1..=last + 5 {
             store.put(header(version), &[7]).unwrap();
-            let begun = found(&mut store, WeightsRequest::NewerThan(0), now).unwrap();
-            assert_eq!(begun.0, version.min(last), "the newest that is pulled");
-        }
-        for version in 1..=last {
-            assert_eq!(found(&mut store, piece(version, 0), now), Ok((version, 0)));
+            let begun = store.found(newer(0), now);
+            let newest_pulled = version.min(last);
+            assert_eq!(begun, Ok((newest_pulled, 0)));
         }
         // One that has it already gets the newest, in the place of the one that was asked for longest ago.
         let later = now + Duration::from_secs(1);
         for version in 2..=last {
-            found(&mut store, piece(version, 0), later).unwrap();
+            let pulled = store.found(piece(version, 0), later);
+            assert_eq!(pulled, Ok((version, 0)));
         }
-        let newer = WeightsRequest::NewerThan(last);
-        assert_eq!(found(&mut store, newer, later), Ok((last + 5, 0)));
-        let gone = found(&mut store, piece(1, 0), later);
+        assert_eq!(store.found(newer(last), later), Ok((last + 5, 0)));
+        let gone = store.found(piece(1, 0), later);
         assert_eq!(gone, Err(WeightsReply::Gone));
     }
 }

@@ -4,8 +4,7 @@
 use std::collections::{HashMap, HashSet};
 
 use driml_protocol::{
-    Batch, BatchHeader, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
-    Waiting,
+    Batch, BatchHeader, Chunk, ChunkHeader, Horizon, InsertReply, RunSpec, TimeoutRule, Waiting,
 };
 use driml_replay_server::{Compression, PackedBatch, Replay, Unready};
 use proptest::prelude::*;
@@ -13,7 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{header, join, last_word, small_spec, stored},
+    calls::{Actor, is_refused, join, stored},
     history::{History, identity, spec, unlimited},
 };
 
@@ -127,12 +126,6 @@ fn check_frames(batch: &Batch, spec: &RunSpec) {
     );
 }
 
-/// What an actor knows of itself.
-struct Actor {
-    next: ChunkHeader,
-    part: u8,
-}
-
 fn horizons() -> impl Strategy<Value = Horizon> {
     prop_oneof![
         Just(Horizon::None),
@@ -169,54 +162,46 @@ proptest! {
         }
         let mut replay = Replay::new(&spec, &config, 8).unwrap();
         let mut history = History::new(&spec, capacity);
-        let mut known: HashMap<u32, Actor> = HashMap::new();
+        // With the part of its life, which ends where transitions are lost.
+        let mut known: HashMap<u32, (Actor, u8)> = HashMap::new();
         let (mut lost, mut retried, mut refused, mut rows_sampled) = (0, 0, 0, 0);
         for _ in 0..150 {
             let number = rng.random_range(0..actors);
-            let fresh = |incarnation| Actor {
-                next: ChunkHeader { streams, steps: 1, frame_bytes: spec.frame_bytes() as u32, ..header(number, incarnation, 0, 0) },
-                part: 0,
+            let fresh = |incarnation| {
+                let mut actor = Actor::new(number, incarnation);
+                actor.next.frame_bytes = spec.frame_bytes() as u32;
+                (actor, 0)
             };
-            let actor = known.entry(number).or_insert_with(|| fresh(1));
+            let (actor, part) = known.entry(number).or_insert_with(|| fresh(1));
             join(&mut replay, number, actor.next.incarnation);
             match rng.random_range(0..20) {
                 // The actor dies and starts anew; a straggler of its former life is refused.
                 0 => {
                     let old = actor.next;
-                    *actor = fresh(old.incarnation + 1);
+                    (*actor, *part) = fresh(old.incarnation + 1);
                     join(&mut replay, number, actor.next.incarnation);
-                    let chunk = history.next_chunk(actor.next, 0, &mut rng);
-                    let stored = stored(history.inserted);
-                    prop_assert_eq!(replay.insert(&chunk), stored);
-                    actor.next.sequence = 1;
-                    actor.next.first_transition = u64::from(streams);
+                    let chunk = history.next_chunk(actor.send(streams, 1), 0, &mut rng);
+                    prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                     if old.sequence > 0 {
-                        let stray = Chunk::zeroed(old);
-                        let answer = replay.insert(&stray);
-                        prop_assert!(matches!(answer, InsertReply::Refused { .. }), "{:?}", answer);
+                        let answer = replay.insert(&Chunk::zeroed(old));
+                        prop_assert!(is_refused(&answer), "{:?}", answer);
                         refused += 1;
                     }
                 }
                 // Transitions get lost before the next chunk.
-                1 => {
+                1 if actor.next.sequence > 0 && *part < 200 => {
                     let count = rng.random_range(1..9);
-                    if actor.next.sequence > 0 && actor.part < 200 {
-                        actor.next.first_transition += count;
-                        actor.part += 1;
-                        lost += count;
-                        let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
-                        let stored = stored(history.inserted);
-                        prop_assert_eq!(replay.insert(&chunk), stored);
-                        actor.next.sequence += 1;
-                        actor.next.first_transition += chunk.header.transitions() as u64;
-                    }
+                    actor.next.first_transition += count;
+                    *part += 1;
+                    lost += count;
+                    let chunk = history.next_chunk(actor.send(streams, 1), *part, &mut rng);
+                    prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                 }
                 // A retry of a stored chunk.
                 2 if actor.next.sequence > 0 => {
                     let sequence = rng.random_range(0..actor.next.sequence);
                     let chunk = Chunk::zeroed(ChunkHeader { sequence, ..actor.next });
-                    let stored = stored(history.inserted);
-                    prop_assert_eq!(replay.insert(&chunk), stored);
+                    prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                     retried += 1;
                 }
                 // A chunk that is ahead of its time.
@@ -227,18 +212,14 @@ proptest! {
                     prop_assert_eq!(replay.insert(&chunk), expected);
                 }
                 4..12 => {
-                    actor.next.steps = rng.random_range(1..6);
                     actor.next.weights_version += rng.random_range(0..2);
-                    let chunk = history.next_chunk(actor.next, actor.part, &mut rng);
-                    let stored = stored(history.inserted);
-                    prop_assert_eq!(replay.insert(&chunk), stored);
-                    actor.next.sequence += 1;
-                    actor.next.first_transition += chunk.header.transitions() as u64;
-                    actor.next.steps = 1;
+                    let header = actor.send(streams, rng.random_range(1..6));
+                    let chunk = history.next_chunk(header, *part, &mut rng);
+                    prop_assert_eq!(replay.insert(&chunk), stored(history.inserted));
                 }
                 _ if history.inserted == 0 => {}
                 // Memory that held something else: whatever is not written shows.
-                _ => match replay.draw_in(8, |bytes| vec![0xAB; bytes].into()).map(PackedBatch::unpack) {
+                _ => match replay.draw(8, |bytes| vec![0xAB; bytes].into()).map(PackedBatch::unpack) {
                     Ok(batch) => {
                         check_batch(&batch, &history);
                         rows_sampled += 8;
@@ -251,10 +232,8 @@ proptest! {
             }
             replay.check_valid();
         }
-        for (&actor, Actor { next, .. }) in &known {
-            if next.sequence > 0 {
-                replay.goodbye(&last_word(actor, next.incarnation, next.first_transition));
-            }
+        for (actor, _) in known.values().filter(|(it, _)| it.next.sequence > 0) {
+            replay.goodbye(&actor.last_word());
         }
         let status = replay.status();
         let (episodes, mean_return) = history.episodes();
@@ -270,31 +249,4 @@ proptest! {
         };
         prop_assert!(same, "{found:?} is not {mean_return:?}");
     }
-}
-
-/// The same seed and the same calls give the same batches; another seed gives others.
-#[test]
-fn batches_follow_from_the_seed() {
-    let batches = |seed| {
-        let spec = RunSpec {
-            seed,
-            horizon: Horizon::Uniform { k_max: 3 },
-            ..small_spec()
-        };
-        let mut replay = Replay::new(&spec, &unlimited(1000), 8).unwrap();
-        join(&mut replay, 0, 1);
-        let mut chunk = Chunk::zeroed(ChunkHeader {
-            steps: 100,
-            ..header(0, 1, 0, 0)
-        });
-        for row in 0..200 {
-            chunk.set(row, (row % 5) as u8, row as f32, End::Running);
-        }
-        replay.insert(&chunk);
-        [replay.sample(32).unwrap(), replay.sample(32).unwrap()]
-    };
-    assert_eq!(batches(1), batches(1));
-    assert_ne!(batches(1), batches(2));
-    let [first, second] = batches(1);
-    assert_ne!(first, second);
 }

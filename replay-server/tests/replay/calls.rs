@@ -29,11 +29,41 @@ pub(crate) fn header(
         incarnation,
         sequence,
         first_transition,
-        weights_version: 0,
-        leaving: false,
         streams: 2,
         steps: 3,
         frame_bytes: small_spec().frame_bytes() as u32,
+        ..ChunkHeader::default()
+    }
+}
+
+/// An actor, by the header of its next chunk.
+pub(crate) struct Actor {
+    pub(crate) next: ChunkHeader,
+}
+
+impl Actor {
+    pub(crate) fn new(actor: u32, incarnation: u64) -> Self {
+        let next = header(actor, incarnation, 0, 0);
+        Self { next }
+    }
+
+    /// The header of its next chunk, which counts as sent.
+    pub(crate) fn send(&mut self, streams: u32, steps: u32) -> ChunkHeader {
+        (self.next.streams, self.next.steps) = (streams, steps);
+        let sent = self.next;
+        self.next.sequence += 1;
+        self.next.first_transition += sent.transitions() as u64;
+        sent
+    }
+
+    pub(crate) const fn last_word(&self) -> Goodbye {
+        let ChunkHeader {
+            actor,
+            incarnation,
+            first_transition,
+            ..
+        } = self.next;
+        last_word(actor, incarnation, first_transition)
     }
 }
 
@@ -109,11 +139,15 @@ pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> L
         learner,
         run: 1,
         updates,
-        tally: Tally {
-            inserted,
-            rows_sampled: rows,
-        },
+        tally: tally(inserted, rows),
         other_shards: Tally::default(),
         restart: false,
+    }
+}
+
+pub(crate) const fn tally(inserted: u64, rows_sampled: u64) -> Tally {
+    Tally {
+        inserted,
+        rows_sampled,
     }
 }

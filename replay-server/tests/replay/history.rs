@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, Sampling, TimeoutRule};
-use driml_replay_server::{Compression, Config};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
+use driml_replay_server::Config;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -66,19 +66,23 @@ pub(crate) fn spec(
 
 /// Settings under which neither side ever waits.
 pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
-    Config {
-        capacity_transitions,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
-        disk_bytes_max: None,
-        fsync_ms: None,
-        since: None,
-        replay_ratio: 1e6,
-        warmup_transitions: 0,
-        slack_transitions: 1 << 40,
-        transitions_max: None,
+    let text = format!(
+        "capacity_transitions = {capacity_transitions}
+         shards = 1
+         replay_ratio = 1e6
+         warmup_transitions = 0
+         slack_transitions = {}",
+        1_u64 << 40
+    );
+    toml::from_str(&text).unwrap()
+}
+
+pub(crate) fn random_end(rng: &mut ChaCha8Rng) -> End {
+    match rng.random_range(0..20) {
+        0 => End::Terminal,
+        1 => End::TimedOut,
+        2 => End::LevelChange,
+        _ => End::Running,
     }
 }
 
@@ -142,13 +146,8 @@ impl History {
             let records = self.streams.entry(key).or_default();
             for step in 0..header.steps {
                 let row = (stream * header.steps + step) as usize;
-                let end = match rng.random_range(0..20) {
-                    _ if !self.ends => End::Running,
-                    0 => End::Terminal,
-                    1 => End::TimedOut,
-                    2 => End::LevelChange,
-                    _ => End::Running,
-                };
+                let end = random_end(rng);
+                let end = if self.ends { end } else { End::Running };
                 let record = Record {
                     index: self.inserted,
                     action: rng.random_range(0..self.spec.num_actions as u8),

@@ -2,16 +2,16 @@
 
 use std::collections::HashMap;
 
-use driml_protocol::{AffinityUpdate, ChunkHeader, Horizon};
+use driml_protocol::{AffinityUpdate, Horizon};
 use driml_replay_server::{
-    Replay,
-    horizon::{Affinity, draw_k, nhg},
+    Config, Replay,
+    horizon::{Affinity, draw_k},
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    calls::{affinity, header, join},
+    calls::{Actor, affinity, join},
     history::{History, identity, spec, unlimited},
     law::ChiSquare,
     rows::prioritised,
@@ -47,86 +47,25 @@ fn nhg_law(update: &AffinityUpdate, actions: &[u8]) -> Vec<f64> {
     (1..=h).map(|i| stops(i) * reached(i)).collect()
 }
 
-fn count(h: usize, draws: u32, mut draw: impl FnMut() -> u32) -> Vec<u64> {
-    let mut counts = vec![0; h];
-    for _ in 0..draws {
-        counts[draw() as usize - 1] += 1;
-    }
-    counts
-}
-
-#[test]
-fn nhg_follows_its_law() {
-    let mut rng = ChaCha8Rng::seed_from_u64(11);
-    let mut chi = ChiSquare::default();
-    for _ in 0..100 {
-        let num_actions = rng.random_range(1..16);
-        let spread = rng.random_range(0.0..6.0);
-        let update = random_affinity(num_actions, spread, &mut rng);
-        let affinity = taken(&update);
-        let h = rng.random_range(1..10);
-        let actions: Vec<u8> = (0..h)
-            .map(|_| rng.random_range(0..num_actions as u8))
-            .collect();
-        let counts = count(h, 5_000, || nhg::draw_k(&affinity, &actions, &mut rng));
-        chi.add(&counts, &nhg_law(&update, &actions));
-    }
-    chi.check("nhg");
-}
-
-#[test]
-fn uniform_follows_its_law() {
-    let mut rng = ChaCha8Rng::seed_from_u64(12);
-    let mut chi = ChiSquare::default();
-    let affinity = Affinity::uniform(1);
-    let mut draw = |k_max, steps_left| {
-        let horizon = Horizon::Uniform { k_max };
-        draw_k(horizon, &affinity, &vec![0; steps_left], &mut rng).unwrap()
-    };
-    for (k_max, steps_left) in [(5, 5), (5, 9), (5, 3), (2, 7), (9, 2)] {
-        let h = steps_left.min(k_max as usize);
-        let counts = count(h, 5_000, || draw(k_max, steps_left));
-        chi.add(&counts, &vec![1.0 / h as f64; h]);
-    }
-    chi.check("uniform");
-    assert_eq!(draw(5, 1), 1, "the end of the episode");
-}
-
-/// Action 1 always follows action 0, and never action 1: A = 1 walks to the end, A = 0 stops at once.
-#[test]
-fn certain_affinities_leave_no_choice() {
-    let affinity = taken(&affinity(1, 2, vec![0.0, 1.0, 1.0, 0.0]));
-    let rng = &mut ChaCha8Rng::seed_from_u64(13);
-    for _ in 0..200 {
-        let mut k = |actions: &[u8]| nhg::draw_k(&affinity, actions, rng);
-        assert_eq!(k(&[0, 0, 1, 0, 1]), 1, "A_1 = 0");
-        assert_eq!(k(&[0, 1, 0, 1, 0]), 5, "A_i = 1 up to H");
-        assert_eq!(k(&[0, 1, 0, 0, 1]), 3, "A_3 = 0");
-        assert_eq!(k(&[0]), 1, "one step left");
-    }
-}
-
 #[test]
 fn every_rule_stays_within_k_max_and_the_episode() {
     let affinity = taken(&affinity(1, 1, vec![1.0]));
     let rng = &mut ChaCha8Rng::seed_from_u64(14);
-    let nhg = Horizon::Nhg { k_max: 4 };
-    let mut cases = vec![
-        (Horizon::None, 3, None),
-        (nhg, 9, Some(4)),
-        (nhg, 2, Some(2)),
-    ];
+    let mut draw = |horizon, steps_left| draw_k(horizon, &affinity, &vec![0; steps_left], rng);
     for (k_max, steps_left, expected) in [(1, 1, 1), (1, 7, 1), (4, 9, 4), (4, 4, 4), (4, 1, 1)] {
-        let rules = [Horizon::Fixed { k: k_max }, Horizon::All { k_max }];
-        cases.extend(rules.map(|it| (it, steps_left, Some(expected))));
+        for horizon in [
+            Horizon::Fixed { k: k_max },
+            Horizon::All { k_max },
+            Horizon::Nhg { k_max },
+        ] {
+            assert_eq!(draw(horizon, steps_left), Some(expected), "{horizon:?}");
+        }
+        for _ in 0..20 {
+            let drawn = draw(Horizon::Uniform { k_max }, steps_left).unwrap();
+            assert!((1..=expected).contains(&drawn));
+        }
     }
-    for (horizon, steps_left, expected) in cases {
-        let k = draw_k(horizon, &affinity, &vec![0; steps_left], rng);
-        assert_eq!(k, expected, "{horizon:?}, {steps_left} left");
-    }
-    for _ in 0..100 {
-        assert!(draw_k(Horizon::Uniform { k_max: 4 }, &affinity, &[0; 9], rng).unwrap() <= 4);
-    }
+    assert_eq!(draw(Horizon::None, 3), None);
 }
 
 #[test]
@@ -149,30 +88,38 @@ fn an_older_or_broken_affinity_is_not_taken() {
 /// k as it leaves the server, anchor by anchor: the walk must read the actions that follow that anchor, by whatever rule it was drawn.
 #[test]
 fn the_k_served_follow_the_law() {
+    let mut rng = ChaCha8Rng::seed_from_u64(15);
     for config in [unlimited(150), prioritised(150, 0.5)] {
-        let mut rng = ChaCha8Rng::seed_from_u64(15);
-        let spec = spec(3, 1, 2, Horizon::Nhg { k_max: 5 });
-        let update = random_affinity(spec.num_actions, 2.0, &mut rng);
-        let mut replay = Replay::new(&spec, &config, 64).unwrap();
-        join(&mut replay, 0, 1);
-        let mut history = History::new(&spec, 150);
-        for sequence in 0..20 {
-            let header = ChunkHeader {
-                steps: 5,
-                ..header(0, 1, sequence, sequence * 10)
-            };
-            replay.insert(&history.next_chunk(header, 0, &mut rng));
-        }
-        check_ks(&mut replay, &history, &affinity(0, 5, vec![0.2; 25]));
+        let (mut replay, history) = filled(Horizon::Nhg { k_max: 5 }, &config, &mut rng);
+        let equal = affinity(0, 5, vec![0.2; 25]);
+        check_ks(&mut replay, &history, |actions| nhg_law(&equal, actions));
+        let update = random_affinity(5, 2.0, &mut rng);
         replay.set_affinity(&update).unwrap();
-        check_ks(&mut replay, &history, &update);
+        check_ks(&mut replay, &history, |actions| nhg_law(&update, actions));
         let status = replay.status();
         assert_eq!(status.affinity_version, 1);
         assert_eq!(status.k_histogram.iter().sum::<u64>(), status.rows_sampled);
     }
+    let (mut replay, history) = filled(Horizon::Uniform { k_max: 5 }, &unlimited(150), &mut rng);
+    let equal = |actions: &[u8]| vec![1.0 / actions.len() as f64; actions.len()];
+    check_ks(&mut replay, &history, equal);
 }
 
-fn check_ks(replay: &mut Replay, history: &History, law: &AffinityUpdate) {
+fn filled(horizon: Horizon, config: &Config, rng: &mut ChaCha8Rng) -> (Replay, History) {
+    let spec = spec(3, 1, 2, horizon);
+    let mut replay = Replay::new(&spec, config, 64).unwrap();
+    join(&mut replay, 0, 1);
+    let mut history = History::new(&spec, 150);
+    let mut actor = Actor::new(0, 1);
+    for _ in 0..20 {
+        let chunk = history.next_chunk(actor.send(2, 5), 0, rng);
+        replay.insert(&chunk);
+    }
+    (replay, history)
+}
+
+/// `law` gives the probability of each k from the actions that follow an anchor.
+fn check_ks(replay: &mut Replay, history: &History, law: impl Fn(&[u8]) -> Vec<f64>) {
     let mut counts: HashMap<_, Vec<u64>> = HashMap::new();
     for _ in 0..600 {
         let batch = replay.sample(64).unwrap();
@@ -191,7 +138,7 @@ fn check_ks(replay: &mut Replay, history: &History, law: &AffinityUpdate) {
     for ((key, t), counts) in counts {
         let records = history.streams[&key][t..t + counts.len()].iter();
         let actions: Vec<u8> = records.map(|record| record.action).collect();
-        chi.add(&counts, &nhg_law(law, &actions));
+        chi.add(&counts, &law(&actions));
     }
     chi.check("the k served");
 }

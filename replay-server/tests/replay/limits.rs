@@ -1,13 +1,16 @@
-//! What a replay refuses or lets wait, and where a run ends.
+//! What a replay refuses or lets wait, settings that cannot work, and where a run ends: neither side waits for ever.
 //! It does not look at rows, and no message is lost or repeated.
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Tally, Waiting};
-use driml_replay_server::{ACTORS_MAX, Config, Replay, STREAMS_MAX, Unready};
+use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Waiting};
+use driml_replay_server::{
+    ACTORS_MAX, Compression, Config, ConfigError, RateLimiter, Replay, STREAMS_MAX, Unready,
+};
+use proptest::prelude::*;
 
 use crate::{
     calls::{
         affinity, header, insert, is_refused, is_stored, join, last_word, life, small, small_spec,
-        stored, wait,
+        stored, tally, wait,
     },
     history::{spec, unlimited},
 };
@@ -194,10 +197,6 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     };
     let mut replay = small(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    let tally = |inserted, rows_sampled| Tally {
-        inserted,
-        rows_sampled,
-    };
     // Rows: 4 for each of the 106 transitions that are stored, of a capacity of 1000 and of a slack of 100.
     for (lie, bound) in [
         (tally(6001, 0), "at most 6000"),
@@ -231,4 +230,125 @@ fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
     assert_eq!(replay.status().affinity_version, 0);
     replay.set_affinity(&affinity(most)).unwrap();
     assert_eq!(replay.status().affinity_version, most);
+}
+
+proptest! {
+    #[test]
+    fn neither_side_waits_for_ever_and_the_ratio_is_kept(
+        ratio in 0.02f64..70.0,
+        rows in 1u32..600,
+        warmup in 0u64..3000,
+        extra in 0u64..200,
+        length in 0u64..5000,
+        moves in prop::collection::vec((any::<bool>(), 1u64..300), 1..400),
+    ) {
+        let batch = (f64::from(rows) / ratio).ceil() as u64 + 1;
+        let slack = 4 * batch + extra;
+        let max = warmup + batch + length;
+        let mut limiter = RateLimiter::new(ratio, warmup, slack, Some(max));
+        let (mut inserted, mut sampled) = (0u64, 0u64);
+        // Rows that the ratio has allowed, counted one transition at a time.
+        let mut allowed = 0.0;
+        let mut moves = moves.into_iter();
+        // The moves first, then whatever is possible to the end.
+        loop {
+            let next = moves.next();
+            let (insert, chunk) = next.unwrap_or((limiter.may_insert(), 50));
+            if insert && limiter.may_insert() {
+                limiter.inserted(chunk);
+                allowed += ratio * ((inserted + chunk).max(warmup) - inserted.max(warmup)) as f64;
+                inserted += chunk;
+            } else if limiter.may_sample(rows) {
+                limiter.sampled(rows);
+                sampled += u64::from(rows);
+            }
+            let (may_insert, may_sample) = (limiter.may_insert(), limiter.may_sample(rows));
+            prop_assert_eq!(limiter.finished(rows), inserted >= max && !may_sample);
+            prop_assert!(may_insert || may_sample || limiter.finished(rows), "both sides wait");
+            prop_assert!(sampled as f64 <= allowed + 1e-6, "{} rows of {}", sampled, allowed);
+            prop_assert!(sampled == 0 || inserted >= warmup);
+            let ahead = allowed - sampled as f64 - ratio * slack as f64;
+            prop_assert!(ahead <= ratio * 300.0 + 1e-6, "a chunk at most beyond the slack");
+            match limiter.waiting(rows) {
+                Waiting::Nobody => prop_assert!(may_sample && (may_insert || inserted >= max)),
+                Waiting::WarmUp { have, need } => prop_assert!(have < need && may_insert && !may_sample),
+                Waiting::LearnerWaitsForActors => prop_assert!(may_insert && !may_sample),
+                Waiting::ActorsWaitForLearner => prop_assert!(!may_insert && may_sample),
+                Waiting::Finished => {
+                    prop_assert!(!may_insert && !may_sample);
+                    if next.is_none() {
+                        break;
+                    }
+                }
+            }
+        }
+        prop_assert!(allowed - (sampled as f64) < f64::from(rows) + 1e-6, "less than a batch is left");
+        prop_assert_eq!(limiter.tally().rows_sampled, sampled);
+    }
+}
+
+fn good() -> Config {
+    Config {
+        replay_ratio: 8.0,
+        warmup_transitions: 1000,
+        slack_transitions: 32,
+        transitions_max: Some(1032),
+        ..unlimited(10_000)
+    }
+}
+
+fn refusal(config: &Config, spec: &RunSpec, batch_size: u32) -> String {
+    let refused = Replay::new(spec, config, batch_size).map(drop);
+    refused.unwrap_err().to_string()
+}
+
+#[test]
+fn each_fault_names_its_key_and_a_way_out() {
+    let spec = spec(3, 4, 7, Horizon::Nhg { k_max: 5 });
+    assert!(Replay::new(&spec, &good(), 256).is_ok());
+    type Spoil = fn(&mut Config);
+    let cases: [(Spoil, &str); 12] = [
+        (|it| it.replay_ratio = 0.0, "replay_ratio = 0"),
+        (|it| it.replay_ratio = f64::NAN, "replay_ratio = NaN"),
+        (|it| it.replay_ratio = f64::INFINITY, "replay_ratio = inf"),
+        (|it| it.capacity_transitions = 10, "spans 11 transitions"),
+        (|it| it.capacity_transitions = u64::MAX, "hold fewer"),
+        (|it| it.capacity_transitions = 1 << 57, "hold fewer"),
+        (|it| it.capacity_transitions = 1 << 50, "does not grant the"),
+        (
+            |it| it.compressed_bytes_max = Some(1 << 30),
+            "nothing is compressed",
+        ),
+        (
+            |it| (it.compression, it.compressed_bytes_max) = (Compression::Lz4, Some(1 << 20)),
+            "use at least 3146124",
+        ),
+        (
+            |it| it.warmup_transitions = 10_001,
+            "at most capacity_transitions = 10000",
+        ),
+        (|it| it.slack_transitions = 31, "256 / 8 = 32"),
+        (|it| it.transitions_max = Some(1031), "= 1032"),
+    ];
+    for (spoil, expected) in cases {
+        let mut config = good();
+        spoil(&mut config);
+        let text = refusal(&config, &spec, 256);
+        assert!(text.starts_with("replay."), "{text}");
+        assert!(text.contains(expected), "{text}");
+    }
+    assert!(refusal(&good(), &spec, 0).contains("learner.batch_size = 0"));
+    assert!(refusal(&good(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
+    let broken = RunSpec { gamma: 2.0, ..spec };
+    let refused = good().validate(&broken, 256).unwrap_err();
+    assert!(matches!(refused, ConfigError::RunSpec(_)), "{refused}");
+}
+
+#[test]
+fn unknown_and_missing_keys_are_refused() {
+    let text = "capacity_transitions = 10\nshards = 1\nreplay_ratio = 8\nwarmup_transitions = 1\nslack_transitions = 2\n";
+    let read = |text: &str| toml::from_str::<Config>(text);
+    assert_eq!(read(text).unwrap().transitions_max, None);
+    assert!(read(&format!("{text}slack = 3\n")).is_err());
+    assert!(read(&text.replace("warmup_transitions = 1\n", "")).is_err());
 }

@@ -5,7 +5,6 @@
 mod batches;
 mod calls;
 mod compression;
-mod config;
 mod exactly_once;
 mod history;
 mod horizon;
@@ -14,6 +13,5 @@ mod limits;
 mod persist;
 mod persist_damage;
 mod persist_marks;
-mod rate_limiter;
 mod resume;
 mod rows;

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{Batch, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, Shutdown};
+use driml_protocol::{Batch, Buffer, Chunk, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
     Compression, Config, KeptReplay, PersistArgs, PersistError, Reading, Recovery, Replay,
 };
@@ -16,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_batch,
-    calls::{self, affinity, header, is_stored, join, last_word, learned, learner},
+    calls::{self, Actor, affinity, header, is_stored, join, learned, learner},
     history::{History, spec, unlimited},
 };
 
@@ -33,8 +33,7 @@ pub(crate) struct Life {
     pub(crate) replay: Replay,
     pub(crate) history: History,
     pub(crate) rng: ChaCha8Rng,
-    /// By their numbers: incarnation, next chunk, transitions produced.
-    actors: Vec<(u64, u64, u64)>,
+    actors: [Actor; 2],
     requests: Vec<RequestId>,
     versions: u64,
 }
@@ -117,7 +116,7 @@ impl Life {
             replay,
             history,
             rng: ChaCha8Rng::seed_from_u64(seed),
-            actors: vec![(1, 0, 0); 2],
+            actors: [0, 1].map(|actor| Actor::new(actor, 1)),
             requests: (0..3).map(RequestId::first).collect(),
             versions: 0,
         }
@@ -125,29 +124,19 @@ impl Life {
 
     /// The next chunk of an actor.
     pub(crate) fn store(&mut self, actor: usize) {
-        let (incarnation, sequence, produced) = self.actors[actor];
-        let header = ChunkHeader {
-            weights_version: self.rng.random_range(0..9),
-            steps: self.rng.random_range(1..6),
-            ..header(actor as u32, incarnation, sequence, produced)
-        };
+        let actor = &mut self.actors[actor];
+        actor.next.weights_version = self.rng.random_range(0..9);
+        let header = actor.send(2, self.rng.random_range(1..6));
         let chunk = self.history.next_chunk(header, 0, &mut self.rng);
         let reply = self.replay.insert(&chunk);
         assert!(is_stored(&reply), "{reply:?}");
-        self.actors[actor] = (
-            incarnation,
-            sequence + 1,
-            produced + header.transitions() as u64,
-        );
     }
 
     /// A batch for a request of a client, or why there is none.
     pub(crate) fn draw(&mut self, client: usize) -> Option<Batch> {
         let id = self.requests[client];
-        self.replay
-            .draw_for(id, ROWS, Buffer::zeroed)
-            .ok()
-            .map(|it| it.unpack())
+        let drawn = self.replay.draw_for(id, ROWS, Buffer::zeroed);
+        drawn.ok().map(|it| it.unpack())
     }
 
     pub(crate) fn act(&mut self) {
@@ -181,11 +170,11 @@ impl Life {
             }
             17 => {
                 let actor = self.rng.random_range(0..2);
-                let (incarnation, _, produced) = self.actors[actor];
-                self.replay
-                    .goodbye(&last_word(actor as u32, incarnation, produced));
-                self.actors[actor] = (incarnation + 1, 0, 0);
-                join(&mut self.replay, actor as u32, incarnation + 1);
+                let left = &mut self.actors[actor as usize];
+                self.replay.goodbye(&left.last_word());
+                let incarnation = left.next.incarnation + 1;
+                *left = Actor::new(actor, incarnation);
+                join(&mut self.replay, actor, incarnation);
             }
             18 => {
                 let served = self.replay.tally().rows_sampled;
@@ -224,21 +213,17 @@ fn check_goes_on(life: &Life, mut replay: Replay) {
 }
 
 fn configs() -> impl Strategy<Value = Config> {
-    let capacity = 20u64..200;
-    (capacity, any::<bool>(), any::<bool>(), 0u64..3).prop_map(|(capacity, lz4, tight, bounded)| {
-        let compression = if lz4 {
-            Compression::Lz4
-        } else {
-            Compression::None
-        };
-        Config {
+    let compression = prop_oneof![Just(Compression::None), Just(Compression::Lz4)];
+    let replay_ratio = prop_oneof![Just(2.0), Just(1e6)];
+    (20u64..200, compression, replay_ratio, 0u64..3).prop_map(
+        |(capacity, compression, replay_ratio, bounded)| Config {
             compression,
-            replay_ratio: if tight { 2.0 } else { 1e6 },
+            replay_ratio,
             disk_bytes_max: (bounded == 0).then_some(4 << 20),
             fsync_ms: (bounded == 1).then_some(0),
             ..unlimited(capacity)
-        }
-    })
+        },
+    )
 }
 
 proptest! {

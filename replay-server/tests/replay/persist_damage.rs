@@ -26,7 +26,6 @@ struct Kept {
     config: Config,
     history: History,
     stored: Vec<u8>,
-    produced: u64,
 }
 
 impl Kept {
@@ -42,21 +41,12 @@ impl Kept {
             in_newest = if last == newest { in_newest + 1 } else { 0 };
             newest = last;
         }
-        let Life {
-            args,
-            config,
-            replay,
-            history,
-            ..
-        } = life;
-        let stored = stored(&replay);
         Self {
             _root: root,
-            args,
-            config,
-            produced: history.inserted,
-            history,
-            stored,
+            stored: stored(&life.replay),
+            args: life.args,
+            config: life.config,
+            history: life.history,
         }
     }
 
@@ -198,28 +188,24 @@ fn damage_costs_what_it_hits_and_is_said() {
     let gone = "are gone";
     let next = "is missing: the replay is what it was";
     let misplaced = "not the segment that belongs here";
+    let flip_late: Spoil = |it| flip(it, |length| length * 2 / 3);
+    let flip_early: Spoil = |it| flip(it, |_| 40);
+    let begin_one: Spoil = |it| copy_to(it, 999, 20);
+    let misplace: Spoil = |it| copy_to(it, 600, 1 << 20);
+    let forget_id: Spoil = |it| remove(&it.with_file_name("log.toml"));
+    let early = &["its beginning is damaged", "is now", gone];
     let cases: &[(usize, Spoil, &[&str], Left)] = &[
-        (
-            5,
-            |it| flip(it, |length| length * 2 / 3),
-            &["damaged at byte", gone],
-            Counts,
-        ),
-        (
-            4,
-            |it| flip(it, |_| 40),
-            &["its beginning is damaged", "is now", gone],
-            Counts,
-        ),
+        (5, flip_late, &["damaged at byte", gone], Counts),
+        (4, flip_early, early, Counts),
         (7, remove, &[gone, "missing"], Counts),
         (0, remove, &["the oldest segments are missing"], Counts),
         (last, remove, &[next], Beginning),
         (last, lengthen_a_record, &["are cut off"], Beginning),
         (last, append_zeros, &[], All),
         // One that was just begun, one under another's name, and who it is: that is in the segments, too.
-        (3, |it| copy_to(it, 999, 20), &[], All),
-        (3, |it| copy_to(it, 600, 1 << 20), &[misplaced], All),
-        (0, |it| remove(&it.with_file_name("log.toml")), &[], All),
+        (3, begin_one, &[], All),
+        (3, misplace, &[misplaced], All),
+        (0, forget_id, &[], All),
     ];
     for (number, (segment, spoil, words, left)) in cases.iter().enumerate() {
         let kept = Kept::new(10_000);
@@ -267,7 +253,7 @@ fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
     assert!(lost > 0);
     let header = |sequence| ChunkHeader {
         steps: 4,
-        ..header(0, 1, sequence, kept.produced)
+        ..header(0, 1, sequence, kept.history.inserted)
     };
     // Far beyond what came back.
     let sequence = 10_000;
@@ -348,4 +334,15 @@ fn a_run_may_go_on_with_another_capacity() {
         replay.check_valid();
         replay.sample(ROWS).unwrap();
     }
+    // Also where more is gone than it holds.
+    let kept = Kept::new(10_000);
+    let segments = kept.segments();
+    segments[1..segments.len() - 2]
+        .iter()
+        .for_each(|it| remove(it));
+    let (replay, recovery) = open(&kept.args, &unlimited(60)).unwrap();
+    assert!(recovery.warnings[0].contains("are gone"), "{recovery:?}");
+    replay.check_valid();
+    let status = replay.status();
+    assert_eq!(status.transitions_inserted, kept.history.inserted);
 }

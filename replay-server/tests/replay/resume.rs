@@ -1,11 +1,11 @@
 //! A run that is resumed from its learner's checkpoint with an empty replay: what it counts, and what it waits for.
 //! Resuming all processes together is an end-to-end test.
 
-use driml_protocol::{LearnerJoin, Tally};
+use driml_protocol::LearnerJoin;
 use driml_replay_server::{Config, Replay, Since, Unready};
 
 use crate::{
-    calls::{header, insert, is_stored, learner, small_spec},
+    calls::{header, insert, is_stored, learner, small_spec, tally},
     history::unlimited,
 };
 
@@ -49,10 +49,10 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         transitions_max: Some(100),
         ..config()
     };
-    let larger_batches = Config { since, ..config() };
+    let larger = Config { since, ..config() };
     let other_ratio = Config {
         replay_ratio: 2.0,
-        ..larger_batches.clone()
+        ..larger.clone()
     };
     let at = |updates, inserted| learner(1, updates, 8 * updates, inserted);
     let cases = [
@@ -64,14 +64,7 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         // 60 transitions allow 120 rows.
         ("another ratio", &other_ratio, at(29, 120), 8, (20, 15), 60),
         // 240 rows.
-        (
-            "larger ones",
-            &larger_batches,
-            at(29, 120),
-            16,
-            (20, 15),
-            60,
-        ),
+        ("larger ones", &larger, at(29, 120), 16, (20, 15), 60),
     ];
     for (what, config, join, rows, expected, refilled) in cases {
         let mut replay = Replay::new(&small_spec(), config, rows).unwrap();
@@ -98,17 +91,10 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
     };
     for (shard, refill) in [(0, 20), (2, 20)] {
         let mut replay = Replay::shard(&small_spec(), &config, 8, shard).unwrap();
-        let tally = Tally {
-            inserted: 30 + u64::from(shard),
-            rows_sampled: 80,
-        };
-        let other_shards = Tally {
-            inserted: 90 - u64::from(shard),
-            rows_sampled: 152,
-        };
+        let counted = 30 + u64::from(shard);
         let join = LearnerJoin {
-            tally,
-            other_shards,
+            tally: tally(counted, 80),
+            other_shards: tally(120 - counted, 152),
             ..learner(1, 29, 0, 0)
         };
         replay.join_learner(join).unwrap();
@@ -118,7 +104,7 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         }
         let status = replay.status();
         assert_eq!(status.transitions_refilled, refill);
-        assert_eq!(status.transitions_inserted, tally.inserted + 24 - refill);
+        assert_eq!(status.transitions_inserted, counted + 24 - refill);
     }
 }
 
@@ -132,22 +118,18 @@ fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
     };
     let mut replay = Replay::shard(&small_spec(), &config, 8, 0).unwrap();
     replay.join_learner(learner(1, 0, 0, 0)).unwrap();
-    let others = |inserted, rows_sampled| Tally {
-        inserted,
-        rows_sampled,
-    };
     for sequence in 0..15 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
     // All rows of 90 + 90 transitions were given by the other shard; the learner saved after 200 of them.
-    replay.set_other_shards(others(90, 480)).unwrap();
+    replay.set_other_shards(tally(90, 480)).unwrap();
     assert_eq!(replay.sample(8), Err(Unready::Finished));
     let join = LearnerJoin {
-        other_shards: others(80, 200),
+        other_shards: tally(80, 200),
         ..learner(2, 25, 0, 90)
     };
     replay.join_learner(join).unwrap();
-    replay.set_other_shards(others(90, 200)).unwrap();
+    replay.set_other_shards(tally(90, 200)).unwrap();
     let mut batches = 0;
     while replay.sample(8).is_ok() {
         batches += 1;

@@ -4,8 +4,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{
-    Batch, ChunkHeader, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, Sampling,
-    TimeoutRule,
+    Batch, Horizon, Origin, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Config, PRIORITY_MIN, PriorityCounts, Replay};
 use proptest::prelude::*;
@@ -14,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_rows,
-    calls::{header, join},
+    calls::{Actor, join},
     history::{History, StreamKey, identity, spec, unlimited},
     law::ChiSquare,
 };
@@ -47,8 +46,7 @@ struct Setup {
     first: HashMap<u64, f64>,
     highest: f64,
     updates: u64,
-    /// Of each actor its chunks and transitions so far.
-    produced: [(u64, u64); 4],
+    actors: [Actor; 4],
 }
 
 impl Setup {
@@ -71,19 +69,12 @@ impl Setup {
             first: HashMap::new(),
             highest: 1.0,
             updates: 0,
-            produced: [(0, 0); 4],
+            actors: [0, 1, 2, 3].map(|actor| Actor::new(actor, 1)),
         }
     }
 
     fn insert(&mut self, actor: u32, streams: u32, steps: u32) {
-        let (sequence, transitions) = &mut self.produced[actor as usize];
-        let header = ChunkHeader {
-            streams,
-            steps,
-            ..header(actor, 1, *sequence, *transitions)
-        };
-        *sequence += 1;
-        *transitions += u64::from(streams * steps);
+        let header = self.actors[actor as usize].send(streams, steps);
         let chunk = self.history.next_chunk(header, 0, &mut self.rng);
         self.replay.insert(&chunk);
         for index in self.anchors() {
@@ -231,25 +222,17 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
     let rows = u64::from(ROWS);
     assert_eq!(counts(&setup.replay).set, rows);
 
-    // The answer was lost, and the learner asks again: by then others are newer.
-    let law = setup.law();
-    let mut again = first.clone();
-    again.parts[0].priorities.fill(1e6);
-    setup.replay.set_priorities(&again).unwrap();
-    assert_eq!(counts(&setup.replay).repeated, rows);
-    assert_eq!(setup.law(), law);
-    setup.check_law("after a repetition");
-
-    // Of a life that is over, and of another shard.
+    let part = &first.parts[0];
     let of = |origin, number| PriorityUpdate {
         learner: LEARNER,
         number,
         parts: vec![PriorityPart {
             origin,
-            ..again.parts[0].clone()
+            transitions: part.transitions.clone(),
+            priorities: vec![1e6; part.priorities.len()],
         }],
     };
-    let own = first.parts[0].origin;
+    let own = part.origin;
     let earlier = Origin {
         incarnation: own.incarnation + 1,
         ..own
@@ -258,16 +241,23 @@ fn a_priority_counts_once_and_for_the_transition_that_was_drawn() {
         shard: own.shard + 1,
         ..own
     };
-    setup.replay.set_priorities(&of(earlier, 100)).unwrap();
-    assert_eq!(counts(&setup.replay).gone, rows);
-    setup.replay.set_priorities(&of(other, 101)).unwrap();
-    let so_far = PriorityCounts {
-        set: rows,
-        gone: rows,
-        repeated: rows,
-    };
-    assert_eq!(counts(&setup.replay), so_far);
-    setup.check_law("after what was for others");
+    let law = setup.law();
+    // The answer was lost, and the learner asks again; of a life that is over; of another shard.
+    for (update, gone, what) in [
+        (of(own, first.number), 0, "after a repetition"),
+        (of(earlier, 100), rows, "after what an earlier life drew"),
+        (of(other, 101), rows, "after what was for others"),
+    ] {
+        setup.replay.set_priorities(&update).unwrap();
+        let so_far = PriorityCounts {
+            set: rows,
+            gone,
+            repeated: rows,
+        };
+        assert_eq!(counts(&setup.replay), so_far, "{what}");
+        assert_eq!(setup.law(), law);
+        setup.check_law(what);
+    }
 
     // Every slot is another transition's by now.
     setup.insert(0, 1, 100);

@@ -1,11 +1,8 @@
-//! How far ahead a positive lies: one file a rule.
+//! How far ahead a positive lies: a line a rule, and a file for the adaptive one.
 //! It does not know the ring: the actions of one window come in, k comes out.
 
 pub mod affinity;
-pub mod all;
-pub mod fixed;
 pub mod nhg;
-pub mod uniform;
 
 use driml_protocol::Horizon;
 use rand::Rng;
@@ -27,13 +24,13 @@ pub fn draw_k(
     assert!(steps_left > 0, "an anchor with a positive has a successor");
     match horizon {
         Horizon::None => None,
-        Horizon::Fixed { k } => Some(fixed::draw_k(k, steps_left)),
-        Horizon::Uniform { k_max } => Some(uniform::draw_k(k_max, steps_left, rng)),
-        Horizon::Nhg { k_max } => Some(nhg::draw_k(
-            affinity,
-            &actions[..actions.len().min(k_max as usize)],
-            rng,
-        )),
-        Horizon::All { k_max } => Some(all::furthest(k_max, steps_left)),
+        // DRIML-fix, and CPC, which has a positive for each k up to the furthest.
+        Horizon::Fixed { k } | Horizon::All { k_max: k } => Some(k.min(steps_left)),
+        // DRIML-randk.
+        Horizon::Uniform { k_max } => Some(rng.random_range(1..=k_max.min(steps_left))),
+        Horizon::Nhg { k_max } => {
+            let walk = &actions[..actions.len().min(k_max as usize)];
+            Some(nhg::draw_k(affinity, walk, rng))
+        }
     }
 }

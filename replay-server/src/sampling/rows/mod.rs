@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    sampling::episodes::{Episodes, Window},
+    sampling::episodes::Window,
     storage::ring::{Link, Ring},
 };
 
@@ -25,23 +25,16 @@ pub struct PriorityCounts {
     pub repeated: u64,
 }
 
-/// The transitions held, and the episodes that they form.
-#[derive(Clone, Copy)]
-pub(crate) struct Held<'a> {
-    pub(crate) ring: &'a Ring,
-    pub(crate) episodes: &'a Episodes,
-}
-
 /// A rule by which anchors are drawn. What only rules with priorities do has a default.
 pub(crate) trait RowSampler: Send {
     /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
-    fn stored(&mut self, _held: Held<'_>, _first: u64, _link: Link) {}
+    fn stored(&mut self, _ring: &Ring, _first: u64, _link: Link) {}
 
     /// Transitions were let go.
     fn forget(&mut self, _ring: &Ring) {}
 
     /// Leaves the window of an anchor in `window`; false if there is none.
-    fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
+    fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool;
 
     /// The probability with which each draw gives the anchor `index`; none where all anchors are equally likely.
     fn probability(&self, _index: u64) -> Option<f64> {
@@ -68,10 +61,10 @@ pub(crate) trait RowSampler: Send {
     fn state(&self, ring: &Ring) -> RowsState;
 
     /// Takes back a state; of transitions that are no longer held, or were not, nothing. `oldest` is the oldest that was held.
-    fn restore(&mut self, held: Held<'_>, oldest: u64, state: &RowsState);
+    fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState);
 
     /// Panics at the first thing that is wrong. Slow: for tests.
-    fn check_valid(&self, _held: Held<'_>) {}
+    fn check_valid(&self, _ring: &Ring) {}
 }
 
 /// [`RowSampler::state`].

@@ -10,9 +10,9 @@ use std::collections::{BTreeMap, VecDeque};
 use driml_protocol::{Origin, PriorityPart, PriorityUpdate};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Held, PriorityCounts, RowSampler, RowsState, sum_tree::SumTree};
+use super::{PriorityCounts, RowSampler, RowsState, sum_tree::SumTree};
 use crate::{
-    sampling::episodes::Window,
+    sampling::episodes::{Episodes, Window},
     storage::ring::{Link, Ring},
 };
 
@@ -31,8 +31,7 @@ const FIRST_PRIORITY: f64 = 1.0;
 pub(crate) struct Priorities {
     alpha: f64,
     capacity: u64,
-    /// Steps that must follow an anchor in its episode.
-    reach: usize,
+    episodes: Episodes,
     /// By slot, the index modulo the capacity, (priority + [`PRIORITY_MIN`])^alpha; 0 where no anchor is.
     masses: SumTree,
     /// The highest priority seen.
@@ -47,13 +46,12 @@ pub(crate) struct Priorities {
 }
 
 impl Priorities {
-    /// Those of an empty ring of `capacity` transitions, where `reach` steps must follow an anchor. An error gives the bytes that the
-    /// system refuses to reserve.
-    pub(crate) fn new(alpha: f64, capacity: u64, reach: u32) -> Result<Self, u64> {
+    /// Those of an empty ring of `capacity` transitions. An error gives the bytes that the system refuses to reserve.
+    pub(crate) fn new(alpha: f64, capacity: u64, episodes: Episodes) -> Result<Self, u64> {
         Ok(Self {
             alpha,
             capacity,
-            reach: reach as usize,
+            episodes,
             masses: SumTree::new(capacity)?,
             highest: FIRST_PRIORITY,
             oldest: 0,
@@ -91,12 +89,9 @@ impl Priorities {
 
 impl RowSampler for Priorities {
     /// Whichever can be anchors now get the highest priority seen.
-    fn stored(&mut self, Held { ring, episodes }: Held<'_>, first: u64, link: Link) {
+    fn stored(&mut self, ring: &Ring, first: u64, link: Link) {
         self.forget(ring);
-        let waiting = match link {
-            Link::Within { after } | Link::LevelStart { after } => self.open.remove(&after),
-            Link::EpisodeStart | Link::Lost => None,
-        };
+        let waiting = link.after().and_then(|after| self.open.remove(&after));
         let mut waiting = waiting.unwrap_or_default();
         let mass = self.mass(self.highest);
         for index in first.max(ring.oldest())..ring.inserted() {
@@ -104,10 +99,10 @@ impl RowSampler for Priorities {
             let followed = if ring.step(index).end.is_episode_end() {
                 waiting.len()
             } else {
-                waiting.len().saturating_sub(self.reach)
+                waiting.len().saturating_sub(self.episodes.reach)
             };
             for anchor in waiting.drain(..followed) {
-                if anchor >= ring.oldest() && episodes.is_whole(ring, anchor) {
+                if anchor >= ring.oldest() && self.episodes.is_whole(ring, anchor) {
                     self.masses.set(self.slot(anchor), mass);
                 }
             }
@@ -133,16 +128,11 @@ impl RowSampler for Priorities {
         }
     }
 
-    fn draw(
-        &mut self,
-        Held { ring, episodes }: Held<'_>,
-        rng: &mut ChaCha8Rng,
-        window: &mut Window,
-    ) -> bool {
+    fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
         while let Some(slot) = self.masses.draw(rng) {
             let newest = ring.inserted() - 1;
             let behind = (self.slot(newest) + self.capacity as usize - slot) as u64 % self.capacity;
-            if episodes.walk(ring, newest - behind, window) {
+            if self.episodes.walk(ring, newest - behind, window) {
                 return true;
             }
             // The first frame of its stack was overwritten: it can never be an anchor again.
@@ -209,7 +199,7 @@ impl RowSampler for Priorities {
         }
     }
 
-    fn restore(&mut self, Held { ring, episodes }: Held<'_>, oldest: u64, state: &RowsState) {
+    fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState) {
         // Of a run that drew by another rule: each transition keeps the highest.
         let RowsState::Prioritised {
             highest,
@@ -226,7 +216,7 @@ impl RowSampler for Priorities {
                 continue;
             }
             // Where steps that followed it are gone, it cannot be an anchor any more.
-            let lacks_steps = self.masses.get(slot) == 0.0 && episodes.is_whole(ring, index);
+            let lacks_steps = self.masses.get(slot) == 0.0 && self.episodes.is_whole(ring, index);
             if !lacks_steps {
                 self.masses.set(slot, mass);
             }
@@ -235,8 +225,9 @@ impl RowSampler for Priorities {
     }
 
     /// Exactly the anchors have a mass, but for those whose stack was cut.
-    fn check_valid(&self, Held { ring, episodes }: Held<'_>) {
+    fn check_valid(&self, ring: &Ring) {
         self.masses.check_valid();
+        let episodes = self.episodes;
         let mut window = Window::default();
         let mut anchors = 0;
         for index in ring.oldest()..ring.inserted() {

@@ -107,34 +107,6 @@ mod tests {
     }
 
     proptest! {
-        /// Against a plain list that is summed from its first number on, after changes in any order. Numbers are whole, so that
-        /// sums are exact in either order and places agree to the last bit.
-        #[test]
-        fn equals_a_plain_loop(
-            capacity in 1usize..40,
-            changes in prop::collection::vec((any::<prop::sample::Index>(), 0u32..1000), 0..200),
-            share in 0.0f64..1.0,
-        ) {
-            let mut tree = SumTree::new(capacity as u64).unwrap();
-            let mut list = vec![0.0; capacity];
-            for (place, number) in changes {
-                let place = place.index(capacity);
-                tree.set(place, number.into());
-                list[place] = f64::from(number);
-                tree.check_valid();
-                prop_assert_eq!(tree.get(place), list[place]);
-            }
-            prop_assert_eq!(tree.total(), list.iter().sum::<f64>());
-            let mut rng = Fixed(share);
-            let drawn: f64 = rng.random();
-            let mut left_over = drawn * tree.total();
-            let found = list.iter().position(|&number| {
-                left_over -= number;
-                left_over < 0.0
-            });
-            prop_assert_eq!(tree.draw(&mut rng), found);
-        }
-
         /// Numbers of any size: what is drawn is never a 0, and sums do not drift from those of a tree that is new.
         #[test]
         fn never_draws_a_zero_and_never_drifts(

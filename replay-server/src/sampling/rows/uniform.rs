@@ -4,15 +4,18 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::{Held, RowSampler, RowsState};
-use crate::{sampling::episodes::Window, storage::ring::Ring};
+use super::{RowSampler, RowsState};
+use crate::{
+    sampling::episodes::{Episodes, Window},
+    storage::ring::Ring,
+};
 
 /// Draws that may hit an invalid transition before all valid ones are listed instead; either way the law is uniform.
 const TRIES_MAX: u32 = 64;
 
 /// The list of all valid anchors, kept for as long as the ring does not change.
-#[derive(Default)]
 pub(crate) struct Uniform {
+    episodes: Episodes,
     valid: Vec<u64>,
     /// Transitions the ring had stored when `valid` was listed; 0 before the first.
     listed_at: u64,
@@ -21,13 +24,22 @@ pub(crate) struct Uniform {
 }
 
 impl Uniform {
+    pub(crate) const fn new(episodes: Episodes) -> Self {
+        Self {
+            episodes,
+            valid: Vec::new(),
+            listed_at: 0,
+            listed_from: 0,
+        }
+    }
+
     /// Whether the list is that of the ring.
     const fn are_listed(&self, ring: &Ring) -> bool {
         self.listed_at == ring.inserted() && self.listed_from == ring.oldest()
     }
 
-    fn list(&mut self, Held { ring, episodes }: Held<'_>) {
-        let mut window = Window::default();
+    fn list(&mut self, ring: &Ring) {
+        let (episodes, mut window) = (self.episodes, Window::default());
         self.valid.clear();
         let held = ring.oldest()..ring.inserted();
         self.valid
@@ -38,8 +50,8 @@ impl Uniform {
 
 impl RowSampler for Uniform {
     /// By rejection; after [`TRIES_MAX`] misses by listing, which takes time proportional to the transitions held.
-    fn draw(&mut self, held: Held<'_>, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
-        let Held { ring, episodes } = held;
+    fn draw(&mut self, ring: &Ring, rng: &mut ChaCha8Rng, window: &mut Window) -> bool {
+        let episodes = self.episodes;
         if ring.oldest() == ring.inserted() {
             return false;
         }
@@ -50,7 +62,7 @@ impl RowSampler for Uniform {
                     return true;
                 }
             }
-            self.list(held);
+            self.list(ring);
         }
         if self.valid.is_empty() {
             return false;
@@ -67,9 +79,9 @@ impl RowSampler for Uniform {
         }
     }
 
-    fn restore(&mut self, held: Held<'_>, _: u64, state: &RowsState) {
+    fn restore(&mut self, ring: &Ring, _: u64, state: &RowsState) {
         if *state == (RowsState::Uniform { are_listed: true }) {
-            self.list(held);
+            self.list(ring);
         }
     }
 }

@@ -76,7 +76,7 @@ impl CompressedFrames {
             }
             self.blocks.push_back(Block {
                 first: self.blocks.back().map_or(oldest, Block::end),
-                start: self.log.append(stored).start,
+                start: self.log.append(stored),
                 part_ends: packed.part_ends,
                 frames: packed.frames as u32,
             });

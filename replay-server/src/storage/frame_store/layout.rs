@@ -59,29 +59,3 @@ impl Layout {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn parts_cover_a_block_without_overlap() {
-        for frame_bytes in [1, 1197, 12_288, 40_000] {
-            let layout = Layout::new(frame_bytes);
-            for frames in [1, 2, 3, 4, 5, 15, 16]
-                .into_iter()
-                .chain([layout.block_frames_max()])
-            {
-                let mut next = 0;
-                for part in 0..layout.parts(frames) {
-                    let range = layout.frames_of(part, frames);
-                    assert_eq!((range.start, range.is_empty()), (next, false));
-                    assert!(range.clone().all(|frame| layout.part_of(frame) == part));
-                    next = range.end;
-                }
-                assert_eq!(next, frames);
-            }
-        }
-        assert_eq!(Layout::new(64 * 64 * 3).block_frames_max(), 16);
-    }
-}

@@ -5,13 +5,11 @@ pub(crate) mod compressed;
 mod layout;
 pub(crate) mod log;
 mod pack;
-mod plain;
 
 use crate::config::Compression;
 use compressed::CompressedFrames;
 pub(crate) use pack::Run;
 pub use pack::{PackedChunk, Packer};
-use plain::PlainFrames;
 
 /// The frames of all transitions held.
 pub(crate) enum Frames {
@@ -52,7 +50,7 @@ impl Frames {
     /// Bytes of memory taken for frames.
     pub(crate) fn bytes_held(&self) -> u64 {
         match self {
-            Self::Plain(frames) => frames.bytes_held(),
+            Self::Plain(frames) => frames.bytes.len() as u64,
             Self::Compressed(frames) => frames.bytes_held(),
         }
     }
@@ -78,8 +76,67 @@ impl Frames {
     /// Checks that the transitions `oldest..inserted`, of those from `first` on, have their frames; panics if not. Slow: for tests.
     pub(crate) fn check_valid(&self, first: u64, oldest: u64, inserted: u64) {
         match self {
-            Self::Plain(frames) => frames.check_valid(inserted - first),
+            Self::Plain(frames) => {
+                // One frame a transition, until they are overwritten.
+                let held = (inserted - first).min(frames.capacity);
+                assert_eq!(self.bytes_held(), held * frames.frame_bytes as u64);
+            }
             Self::Compressed(frames) => frames.check_valid(oldest, inserted),
         }
+    }
+}
+
+/// The newest `capacity` frames as they came, in one buffer: number `i` since the start lies in slot `(i - first) % capacity`.
+pub(crate) struct PlainFrames {
+    capacity: u64,
+    frame_bytes: usize,
+    first: u64,
+    /// Where the next frame goes.
+    next: usize,
+    /// Grows into its reservation, so that memory is taken only as transitions come.
+    bytes: Vec<u8>,
+}
+
+impl PlainFrames {
+    /// An empty buffer for `capacity` frames. An error gives the bytes that the system refuses to reserve.
+    pub(crate) fn new(capacity: u64, frame_bytes: usize) -> Result<Self, u64> {
+        let asked = capacity.saturating_mul(frame_bytes as u64);
+        let length = usize::try_from(asked).map_err(|_| asked)?;
+        let mut bytes = Vec::new();
+        bytes.try_reserve_exact(length).map_err(|_| asked)?;
+        Ok(Self {
+            capacity,
+            frame_bytes,
+            first: 0,
+            next: 0,
+            bytes,
+        })
+    }
+
+    /// Lets go of all frames; the next one has the number `first`.
+    pub(crate) fn start_at(&mut self, first: u64) {
+        self.bytes.clear();
+        (self.first, self.next) = (first, 0);
+    }
+
+    /// Stores frames, over the oldest ones once the buffer is full.
+    pub(crate) fn push(&mut self, mut frames: &[u8]) {
+        let capacity_bytes = self.capacity as usize * self.frame_bytes;
+        while !frames.is_empty() {
+            let (now, rest) = frames.split_at(frames.len().min(capacity_bytes - self.next));
+            if self.next == self.bytes.len() {
+                self.bytes.extend_from_slice(now);
+            } else {
+                self.bytes[self.next..][..now.len()].copy_from_slice(now);
+            }
+            self.next = (self.next + now.len()) % capacity_bytes;
+            frames = rest;
+        }
+    }
+
+    /// Frame `index`, which must be held.
+    pub(crate) fn frame(&self, index: u64) -> &[u8] {
+        let at = ((index - self.first) % self.capacity) as usize * self.frame_bytes;
+        &self.bytes[at..at + self.frame_bytes]
     }
 }

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{Chunk, CodecError};
+use driml_protocol::Chunk;
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
 
 use super::layout::{Layout, PartEnds};
@@ -22,8 +22,8 @@ pub struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
     /// With compression: of each stream.
     packed: Vec<PackedRun>,
-    /// Where chunks are kept on disk: prefix and header of the message, or why there is no such message.
-    pub(crate) sealed: Option<Result<Vec<u8>, CodecError>>,
+    /// Where chunks are kept on disk: prefix and header of the message, if the chunk makes one.
+    pub(crate) sealed: Option<Vec<u8>>,
 }
 
 /// Consecutive frames of one stream as blocks, the first frame's first.
@@ -57,8 +57,8 @@ impl Packer {
                 .map(|run| PackedRun::new(run, Layout::new(chunk.header.frame_bytes as usize)))
                 .collect(),
         };
-        let seal = |spec_hash| chunk.seal(spec_hash).map(|(head, _)| head);
-        let sealed = self.seal_for.map(seal);
+        let sealed = self.seal_for.and_then(|hash| chunk.seal(hash).ok());
+        let sealed = sealed.map(|(head, _)| head);
         PackedChunk {
             chunk,
             packed,
