@@ -200,23 +200,22 @@ impl Actors {
         }
     }
 
-    /// Why these cannot be the actors of a replay that has stored `inserted` transitions; none if they can.
-    pub(crate) fn unfit(&self, inserted: u64) -> Option<&'static str> {
+    /// Checks that these can be the actors of a replay that has stored `inserted` transitions; the error says why not.
+    pub(crate) fn check(&self, inserted: u64) -> Result<(), &'static str> {
         let too_many = |it: &Actor| {
             it.streams.len() > STREAMS_MAX as usize || it.past.len() > PAST_INCARNATIONS_MAX
         };
         if self.actors.len() > ACTORS_MAX || self.actors.values().any(too_many) {
-            return Some("a state with more actors, lives or streams than a run may have");
+            return Err("a state with more actors, lives or streams than a run may have");
         }
         // No transition has two that follow it.
         let mut followed = BTreeSet::new();
         let streams = self.actors.values().flat_map(|it| &it.streams);
-        for after in streams.filter_map(|it| it.link.after()) {
-            if after >= inserted || !followed.insert(after) {
-                return Some("a state with streams that follow on nothing");
-            }
+        let mut after = streams.filter_map(|it| it.link.after());
+        match after.all(|after| after < inserted && followed.insert(after)) {
+            true => Ok(()),
+            false => Err("a state with streams that follow on nothing"),
         }
-        None
     }
 
     /// Actors of which a chunk has come.

@@ -130,14 +130,17 @@ impl Statistics {
         self.recorded = Some(episodes.min(self.counted.episodes));
     }
 
-    /// Why these cannot be the counts of a replay; none if they can.
-    pub(crate) fn unfit(&self) -> Option<&'static str> {
+    /// Checks that these can be the counts of a replay; the error says why not.
+    pub(crate) fn check(&self) -> Result<(), &'static str> {
         let (ended, returns) = (self.counted.episodes, &self.counted.returns);
         let fits = self.newest.len() <= EPISODES_KEPT_MAX
             && self.newest.len() as u64 <= ended
             && returns.newest.len() <= RETURNS_OF
             && returns.known <= ended;
-        (!fits).then_some("a state with more episodes than have ended")
+        match fits {
+            true => Ok(()),
+            false => Err("a state with more episodes than have ended"),
+        }
     }
 
     /// What a log keeps of a moment.

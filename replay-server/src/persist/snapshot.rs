@@ -88,9 +88,9 @@ pub(crate) struct Snapshot {
 }
 
 impl Snapshot {
-    /// Why this is none of a replay like `ours`, whatever its checksum says; none if it is. One that is taken can be counted on from:
-    /// no count overflows, and none becomes less than nothing.
-    pub(crate) fn unfit(&self, ours: &State) -> Option<&'static str> {
+    /// Checks that this is of a replay like `ours`, whatever its checksum says; the error says why not. One that is taken can be counted
+    /// on from: no count overflows, and none becomes less than nothing.
+    pub(crate) fn check(&self, ours: &State) -> Result<(), &'static str> {
         let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
         let (counted, expected) = (&state.statistics.counted, &ours.statistics.counted);
         let num_actions = expected.action_histogram.len();
@@ -98,7 +98,7 @@ impl Snapshot {
             && counted.action_histogram.len() == num_actions
             && counted.k_histogram.len() == expected.k_histogram.len();
         if !is_ours {
-            return Some("a state of a run with other actions or another horizon");
+            return Err("a state of a run with other actions or another horizon");
         }
         let sum = |counts: &[u64]| counts.iter().copied().fold(0, u64::saturating_add);
         let served = sum(&counted.k_histogram);
@@ -115,7 +115,7 @@ impl Snapshot {
             counts.refill_left,
         ];
         if all.iter().any(|&count| count > COUNT_MAX) {
-            return Some("a state with counts that no run reaches");
+            return Err("a state with counts that no run reaches");
         }
         let rows = counts.this_shard.rows_sampled + counted.rows_unlearned;
         let agrees = sum(&counted.action_histogram) == inserted
@@ -123,11 +123,10 @@ impl Snapshot {
             && state.rows_before + served as i64 == rows as i64
             && self.oldest <= inserted;
         if !agrees {
-            return Some("a state whose counts contradict each other");
+            return Err("a state whose counts contradict each other");
         }
-        let actors = state.actors.unfit(inserted);
-        actors
-            .or_else(|| state.statistics.unfit())
-            .or_else(|| self.rows.unfit(inserted - self.oldest))
+        state.actors.check(inserted)?;
+        state.statistics.check()?;
+        self.rows.check(inserted - self.oldest)
     }
 }

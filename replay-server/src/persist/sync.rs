@@ -122,10 +122,8 @@ impl Syncer {
     /// Something was written to segment `number`; where each write is flushed, the disk may refuse.
     pub(super) fn written(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
         let mut unflushed = self.shared.unflushed();
-        unflushed
-            .segments
-            .entry(number)
-            .or_insert_with(|| file.clone());
+        let segments = &mut unflushed.segments;
+        segments.entry(number).or_insert_with(|| file.clone());
         drop(unflushed);
         match self.thread {
             Some(_) => Ok(()),

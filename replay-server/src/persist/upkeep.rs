@@ -107,9 +107,7 @@ impl Replay {
     /// Takes back a snapshot. The transitions between what is stored and those that the snapshot knows are gone: they leave a gap, or,
     /// where it is larger than the ring, an empty ring. The error says for a person why the snapshot is not of this run.
     pub(super) fn restore(&mut self, snapshot: Snapshot) -> Result<(), String> {
-        if let Some(why) = snapshot.unfit(&self.state) {
-            return Err(why.into());
-        }
+        snapshot.check(&self.state)?;
         let Snapshot {
             inserted,
             oldest,
@@ -133,9 +131,8 @@ impl Replay {
         }
         self.forget_before(oldest);
         self.limiter.counts = snapshot.counts;
-        self.sampler
-            .rows
-            .restore(&self.ring, oldest, &snapshot.rows);
+        let rows = &mut self.sampler.rows;
+        rows.restore(&self.ring, oldest, &snapshot.rows);
         state.actors.restored = true;
         let statistics = &mut state.statistics;
         statistics.keep_newest_of(&mut self.state.statistics);

@@ -187,6 +187,6 @@ impl Replay {
     pub fn check_valid(&self) {
         self.ring.check_valid();
         self.sampler.rows.check_valid(&self.ring);
-        assert_eq!(self.snapshot().unfit(&self.state), None);
+        assert_eq!(self.snapshot().check(&self.state), Ok(()));
     }
 }

@@ -42,6 +42,11 @@ pub(super) struct ParkedChunks<Q> {
 }
 
 impl<Q> ParkedChunks<Q> {
+    pub(super) const fn new() -> Self {
+        let line = VecDeque::new();
+        Self { line }
+    }
+
     pub(super) fn bytes(&self) -> usize {
         self.line.iter().map(|it| it.chunk.bytes()).sum()
     }
@@ -180,15 +185,9 @@ mod tests {
         }
     }
 
-    fn nothing<Q>() -> ParkedChunks<Q> {
-        ParkedChunks {
-            line: VecDeque::new(),
-        }
-    }
-
     #[test]
     fn one_chunk_an_actor_waits_in_the_order_of_arrival() {
-        let (mut parked, now) = (nothing(), Instant::now());
+        let (mut parked, now) = (ParkedChunks::new(), Instant::now());
         let arrivals = [(1, 0, "a"), (2, 0, "b"), (1, 0, "a again"), (4, 7, "d")];
         for (actor, sequence, question) in arrivals {
             let chunk = chunk(actor, sequence, 1);
@@ -214,7 +213,7 @@ mod tests {
 
     #[test]
     fn a_question_is_held_for_a_while_and_its_chunk_for_longer() {
-        let (mut parked, start, hold) = (nothing(), Instant::now(), 2 * SECOND);
+        let (mut parked, start, hold) = (ParkedChunks::new(), Instant::now(), 2 * SECOND);
         assert_eq!(parked.due_in(start, hold), None);
         parked.park(chunk(1, 0, 1), "a", start).unwrap();
         parked.park(chunk(2, 0, 1), "b", start + SECOND).unwrap();
@@ -229,7 +228,7 @@ mod tests {
 
     #[test]
     fn the_bytes_kept_are_bounded_and_one_chunk_always_fits() {
-        let (mut parked, now) = (nothing(), Instant::now());
+        let (mut parked, now) = (ParkedChunks::new(), Instant::now());
         let most = CHUNK_BYTES_MAX as u32;
         let mut park = |actor, bytes, question| {
             let parked = parked.park(chunk(actor, 0, bytes), question, now);

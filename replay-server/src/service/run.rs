@@ -174,9 +174,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         state: Mutex::new(State {
             replay,
             accounts: Accounts::new(Instant::now()),
-            chunks: ParkedChunks {
-                line: VecDeque::new(),
-            },
+            chunks: ParkedChunks::new(),
             requests: VecDeque::new(),
             timings: Timings::default(),
             said: SeldomEach::default(),

@@ -188,19 +188,13 @@ impl Service {
         let state = self.state();
         let mut status = state.replay.status();
         status.learner_finished = state.accounts.is_over();
-        status.actors_acting = state.actors_acting();
+        // Actors of which a chunk has come, those that have ended too.
+        let mut acting: HashSet<u32> = state.replay.state.actors.delivered().collect();
+        acting.extend(state.chunks.line.iter().map(|it| it.header().actor));
+        status.actors_acting = acting.len() as u32;
         status.actors_waiting = state.chunks.line.len() as u32;
         state.timings.report(&mut status);
         drop(state);
         responder.reply(&status);
-    }
-}
-
-impl State {
-    /// Actors of which a chunk has come, those that have ended too.
-    fn actors_acting(&self) -> u32 {
-        let mut acting: HashSet<u32> = self.replay.state.actors.delivered().collect();
-        acting.extend(self.chunks.line.iter().map(|it| it.header().actor));
-        acting.len() as u32
     }
 }

@@ -38,7 +38,10 @@ impl Service {
                     state.timings.weights_came(&weights, now);
                     state.accounts.weights_came(now);
                     drop(state);
-                    self.announce(weights.version);
+                    let version = weights.version;
+                    if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
+                        tracing::warn!("weights {version} were not announced: {why}");
+                    }
                 }
                 incoming.into_responder().reply(&Done);
             }
@@ -46,12 +49,6 @@ impl Service {
                 let line = format!("weights were refused: {why}");
                 self.state().refuse("weights", &line);
             }
-        }
-    }
-
-    fn announce(&self, version: u64) {
-        if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
-            tracing::warn!("weights {version} were not announced: {why}");
         }
     }
 

@@ -89,17 +89,19 @@ impl RowsState {
         matches!(self, Self::Prioritised { .. })
     }
 
-    /// Why this cannot be the state of a replay that held `held` transitions; none if it can.
-    pub(crate) fn unfit(&self, held: u64) -> Option<&'static str> {
+    /// Checks that this can be the state of a replay that held `held` transitions; the error says why not.
+    pub(crate) fn check(&self, held: u64) -> Result<(), &'static str> {
         let Self::Prioritised {
             highest, masses, ..
         } = self
         else {
-            return None;
+            return Ok(());
         };
         let is_mass = |mass: &f64| mass.is_finite() && *mass >= 0.0;
         let are_masses = masses.iter().chain([highest]).all(is_mass);
-        let fits = masses.len() as u64 == held && are_masses;
-        (!fits).then_some("a state with priorities of other transitions, or with one below 0")
+        match masses.len() as u64 == held && are_masses {
+            true => Ok(()),
+            false => Err("a state with priorities of other transitions, or with one below 0"),
+        }
     }
 }
