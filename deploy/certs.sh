@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes the certificates for `--tls-dir`: an authority, and for each part a certificate whose common name is its role.
+# Makes the certificates for `--tls-dir`: an authority, and for each process a certificate whose common name is its role.
 # What is there already stays: a second call adds what is missing, to an existing authority.
 
 set -eu
@@ -9,18 +9,18 @@ usage() {
 Usage: deploy/certs.sh DIR [--actors N] [--host NAME_OR_ADDRESS]... [--days DAYS]
 
 Makes in DIR, with openssl, what is not there yet:
-  ca.pem, ca.key                          the authority, valid for ten times as long; its key stays on this machine
+  ca.pem, ca.key                          the authority, valid for ten times as long; keep its key on this machine
   replay-server.pem, replay-server.key    for the side that listens, under each --host
   learner.pem, learner.key                and observer.pem, observer.key
   actor-0.pem, actor-0.key, ...           for N actors, numbers 0 to N - 1
 
-  --actors N    actors that have a certificate in the end, at most 1024 [default: 1]
+  --actors N    number of actors with a certificate, at most 1024 [default: 1]
   --host H      a name or address by which others reach the replay server; may be given several times [default: localhost,
                 127.0.0.1 and ::1]. It counts when replay-server.pem is made: to change it, remove that file first
-  --days DAYS   how long certificates are valid; after it a part is cut off [default: 365]
+  --days DAYS   how long certificates are valid; then a process is disconnected [default: 365]
 
-Each part needs three files of DIR on its machine: ca.pem, ROLE.pem and ROLE.key. To make one anew, remove its .pem and .key and
-call this again. Whoever has a key plays its part; whoever has ca.key plays any.
+Each process needs three files of DIR on its machine: ca.pem, ROLE.pem and ROLE.key. To replace a certificate, remove its .pem and
+.key and run this again. A key gives its role to anyone who has it; ca.key gives every role.
 TEXT
 }
 

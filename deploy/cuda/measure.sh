@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Measures and trains on a machine with an NVIDIA GPU: driml doctor, parity and speed on the device, PyTorch on the same
-# device, then whole runs for so many minutes each. Steps that are done are not done again: a call with the same --out goes
-# on with the next, and a run that was cut off from its newest checkpoint, for the minutes that it lacks.
-# THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was written and checked on a machine that has none, where it ends at the start.
+# device, then whole runs for so many minutes each. A call with the same --out skips finished steps and resumes
+# an interrupted run from its newest checkpoint, for the remaining minutes.
+# THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was checked on a machine without one, where it exits at the start.
 
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)

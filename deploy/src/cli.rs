@@ -50,41 +50,42 @@ pub(crate) enum Command {
     Train(TrainArgs),
     /// Run one actor of a run whose replay server is at ENDPOINT
     Actor(ActorArgs),
-    /// Run the replay server; the other processes connect to it and take its settings
+    /// Run the replay server, to which the other processes connect and which has the settings
     ReplayServer(ReplayServerArgs),
     /// Run the learner of a run whose replay server is at ENDPOINT
     Learner(LearnerArgs),
-    /// Show a run's processes, what waits, and how to unblock it: `watch --once`
+    /// Show a run's processes, which one waits, and how to unblock it
     Status(StatusArgs),
     /// Monitor a run, local or remote, and record it in a folder
     Watch(WatchArgs),
-    /// Play whole episodes with the weights of a run or of a pretrained network, beside a random policy
+    /// Play episodes with the weights of a run or a pretrained network, beside a random policy
     Evaluate(EvaluateArgs),
-    /// Show what a configuration builds, computes and sends, beside the same with every feature on
+    /// Count the parameters, FLOPs and bytes of a configuration, without training
     Inspect(InspectArgs),
-    /// Check the learner's arithmetic against updates computed elsewhere in float64
+    /// Check the learner's arithmetic against float64 updates of another framework
     Parity(ParityArgs),
-    /// Draw what runs recorded over their frames: return, losses, k, speed; or their action affinity
+    /// Plot return, losses, k and speed of runs, or their action affinity
     Plot(PlotArgs),
-    /// Train with every combination of settings, several seeds each: a table and a plot
+    /// Train with every combination of settings and seeds; write a table and a plot
     #[command(visible_alias = "grid")]
     Sweep(SweepArgs),
     /// Run one of the paper's experiments: figures, data and a page
     #[command(subcommand)]
     Experiment(ExperimentCommand),
-    /// Measure what each setting that buys speed costs in accuracy: benches, short trainings, a page
+    /// Measure the speed that settings give and the return that they cost
     Tradeoff(TradeoffArgs),
-    /// Measure the speed of learner, policy, replay and whole runs, also beside PyTorch and Reverb
+    /// Measure the speed of learner, policy, replay, worlds and whole runs, also beside PyTorch, Reverb and gym3
     Bench(BenchArgs),
-    /// List presets, agents and what differs by game; or print the settings of one game and agent with their sources
+    /// List worlds, agents and presets, or print every setting of a combination with its source
     Presets(PresetsArgs),
-    /// Check this machine for training on the CPU and on a GPU
+    /// Check whether this machine can train on the CPU and on a GPU
     Doctor(DoctorArgs),
+    /// Install Procgen's engine
     #[command(subcommand)]
     Procgen(ProcgenCommand),
-    /// Print what a shell needs to complete driml's commands, such as `driml completions bash > driml.bash`
+    /// Print a shell completion script
     Completions(CompletionsArgs),
-    /// Write driml's manual pages, such as `driml man share/man/man1`
+    /// Write the manual pages
     Man(ManArgs),
 }
 

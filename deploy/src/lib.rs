@@ -37,7 +37,7 @@ pub fn main() -> ExitCode {
     let settled = process_env::settle(cli.command.purpose());
     console::log_to_stderr();
     if let Err(e) = settled {
-        tracing::warn!("this process goes on without the environment that makes it fast: {e}");
+        tracing::warn!("this process runs without the environment that makes it fast: {e}");
     }
     let ran = cli.command.run();
     panics::process_ends();

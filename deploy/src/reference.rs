@@ -70,7 +70,8 @@ fn commands() -> String {
     let mut found = Vec::new();
     leaves(&Cli::command(), "driml", &mut found);
     let mut uses = BTreeMap::<String, usize>::new();
-    for arg in found.iter().flat_map(|(_, it)| it.get_arguments()) {
+    let arguments = found.iter().flat_map(|(_, it)| it.get_arguments());
+    for arg in arguments.filter(|it| !it.is_hide_set()) {
         *uses.entry(entry(arg)).or_default() += 1;
     }
     let is_shared = |arg: &Arg| arg.get_long().is_some() && uses[&entry(arg)] > 1;

@@ -76,7 +76,7 @@ fn values_that_cannot_work() {
         error: 10 frames are no more than the warm-up of 500: ask for more --frames, or --set replay.warmup_transitions=1
     "#]].assert_eq(&usage(&["local", "--env", "chain", "--frames", "10"]));
     expect![[r#"
-        error: "localhost" is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH
+        error: "localhost" is not an endpoint: use tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH
     "#]]
     .assert_eq(&usage(&["local", "--listen", "localhost"]));
     expect![[r#"
@@ -98,8 +98,8 @@ fn values_that_cannot_work() {
 #[test]
 fn a_negative_number_is_a_number_out_of_range() {
     for (flag, why) in [
-        ("--seed", "\"-1\" is no whole number; write one as"),
-        ("--frames", "\"-1\" is no whole number; write one as"),
+        ("--seed", "\"-1\" is not a whole number; write one as"),
+        ("--frames", "\"-1\" is not a whole number; write one as"),
         ("--actors", "-1 is not in 1..=256"),
     ] {
         let text = usage(&["local", flag, "-1"]);

@@ -152,7 +152,7 @@ impl Patience {
             // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
             let why = match e {
                 SessionError::Nobody { key } => format!(
-                    "somebody listens there, and nobody answers at {key}: is it the replay server of this run, with the same --namespace?"
+                    "a process listens there, but does not answer at {key}: is it the replay server of this run, with the same --namespace?"
                 ),
                 other => other.to_string(),
             };

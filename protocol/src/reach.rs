@@ -33,7 +33,7 @@ pub enum Unreachable {
     },
     /// The machine is there, and nothing listens at the port.
     #[error(
-        "nobody listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
+        "nothing listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
          reached with quic/HOST:PORT, which is UDP, and --tls-dir"
     )]
     Refused {
@@ -42,7 +42,7 @@ pub enum Unreachable {
     },
     /// No socket of this name.
     #[error(
-        "nobody listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
+        "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
     )]
     NoSocket {
         /// The endpoint as it was given.
@@ -191,7 +191,7 @@ mod tests {
         let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
         assert!(look(&endpoint).is_ok());
         drop(listener);
-        assert!(said(&endpoint).contains("nobody listens on tcp/127.0.0.1:"));
+        assert!(said(&endpoint).contains("nothing listens on tcp/127.0.0.1:"));
         let unknown = said("tcp/no-such-host.invalid:7447");
         assert!(
             unknown.contains("the host of tcp/no-such-host.invalid:7447 is unknown: "),

@@ -140,10 +140,7 @@ fn the_first_error_is_the_one_shown() {
     // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
     let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
     let last = &ended.stderr[errors..];
-    assert!(
-        last.contains("learner ended with exit code 1"),
-        "{ended:#?}"
-    );
+    assert!(last.contains("learner exited with code 1"), "{ended:#?}");
     assert!(
         ended.stderr.contains("summary.json: No space left"),
         "{ended:#?}"

@@ -298,7 +298,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     let ended = process
         .wait()
         .expect_code(0)
-        .expect_said("replay-server was ended by signal 9 SIGKILL")
+        .expect_said("replay-server was killed by signal 9 SIGKILL")
         .expect_said(
             "replay-server is started again with what it has kept (3 of 8 times in a run)",
         );

@@ -42,7 +42,7 @@ fn a_second_interrupt_ends_at_once() {
     process
         .wait()
         .expect_code(1)
-        .expect_said("ended at once by a second interrupt: what was not saved is lost");
+        .expect_said("stopped at once by a second interrupt: what was not saved is lost");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -118,14 +118,11 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     let system = system();
     let process = launched(&system, 100);
     fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
-    let ended = process.wait().expect_code(1).expect_said(
-        "these are gone: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs",
-    );
-    assert!(
-        !ended.stderr.contains("goes on with it"),
-        "{}",
-        ended.stderr
-    );
+    let ended = process
+        .wait()
+        .expect_code(1)
+        .expect_said("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
+    assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
     assert_eq!(system.survivors(), []);
 }
 
@@ -138,9 +135,9 @@ fn dies(part: &str, name: &str) {
         .wait()
         .expect_code(1)
         .expect_said(&format!(
-            "error: {name} was ended by signal 9 SIGKILL (log: "
+            "error: {name} was killed by signal 9 SIGKILL (log: "
         ))
-        .expect_said("`driml train --resume run` goes on with it");
+        .expect_said("`driml train --resume run` resumes it");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -176,7 +173,7 @@ fn a_dead_actor_is_started_again() {
     process
         .wait()
         .expect_code(0)
-        .expect_said("was ended by signal 9 SIGKILL (log: ");
+        .expect_said("was killed by signal 9 SIGKILL (log: ");
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.actors_restarted, 2);
     assert_eq!(
@@ -208,7 +205,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     process
         .wait()
         .expect_code(1)
-        .expect_said("error: actor-0 was ended by signal 9 SIGKILL (log: ")
+        .expect_said("error: actor-0 was killed by signal 9 SIGKILL (log: ")
         .expect_said("actor-0 is not started again: the ghosts of this run change");
     assert_eq!(system.survivors(), []);
     assert_eq!(system.run_folder("run").summary().outcome, "failed");

@@ -60,11 +60,11 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
     if signal == Signal::SIGINT {
         ended
             .expect_code(130)
-            .expect_said("`driml train --resume run` goes on with it");
+            .expect_said("`driml train --resume run` resumes it");
     }
     let ended = system.run("local --resume run").expect_code(0);
     assert!(
-        ended.stdout.contains("all parts in lockstep"),
+        ended.stdout.contains("with everything in lockstep"),
         "{}",
         ended.stdout
     );

@@ -11,7 +11,7 @@ use super::repo_rules::{files, root};
 
 /// Lines of the README, which is to be read on two screens.
 const README_LINES_MAX: usize = 130;
-const README_WORDS_MAX: usize = 1_250;
+const README_WORDS_MAX: usize = 1_000;
 /// Of all Markdown, templates and generated pages included.
 const WORDS_MAX: usize = 25_000;
 /// Of a table's cell, beside links and code.

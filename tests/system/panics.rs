@@ -59,7 +59,7 @@ fn ends_the_run((part, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = panicking(&system, point, flags);
     assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
-    let said = format!("error: {part} was ended by signal 6 SIGABRT (log: ");
+    let said = format!("error: {part} was killed by signal 6 SIGABRT (log: ");
     assert!(ended.stderr.contains(&said), "{said:?} in {ended:#?}");
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -97,7 +97,7 @@ fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
         let ended = panicking(&system(), point, "");
         assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
         assert!(
-            ended.stderr.contains("was ended by signal 6 SIGABRT"),
+            ended.stderr.contains("was killed by signal 6 SIGABRT"),
             "{point}: {ended:#?}"
         );
     }

@@ -58,12 +58,12 @@ fn an_interrupted_run_goes_on() {
     system
         .run("local --resume run")
         .expect_code(64)
-        .expect_said("is still going on");
+        .expect_said("is still running");
     process.signal(Signal::SIGINT);
     process
         .wait()
         .expect_code(130)
-        .expect_said("`driml train --resume run` goes on with it");
+        .expect_said("`driml train --resume run` resumes it");
     let before = system.run_folder("run").summary();
     let summary = resumes(&system);
     // A few tens of episodes ended since, the short ones first; the mean return is of 100 all the same.
@@ -192,5 +192,5 @@ fn a_damaged_checkpoint_is_reported_once() {
         "{}",
         ended.stderr
     );
-    assert_eq!(times("goes on with it"), 0, "{}", ended.stderr);
+    assert_eq!(times("resumes it"), 0, "{}", ended.stderr);
 }

@@ -118,7 +118,7 @@ fn a_run_that_is_ending_is_no_riddle() {
     ));
     process.wait_for_stderr("playing the last checkpoint");
     let ended = system.run("status --run run").expect_code(0);
-    let said = "the run in run is ending: all frames are in";
+    let said = "the run in run is stopping: all frames are stored";
     assert!(ended.stdout.contains(said), "{}", ended.stdout);
     process.signal(Signal::SIGINT);
     process.wait().expect_code(0);
@@ -133,7 +133,7 @@ fn the_wrong_place_is_told_from_an_empty_one() {
     system
         .run(&format!("status --connect {endpoint}"))
         .expect_code(1)
-        .expect_said("nobody listens on");
+        .expect_said("nothing listens on");
     // A zenoh router that is none of ours.
     let _other = session::open(&Endpoints {
         listen: vec![endpoint.clone()],

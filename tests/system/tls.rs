@@ -414,9 +414,7 @@ fn the_doctor_looks_at_certificates() {
     said(&ended, "missing", "tls observer", "is the certificate of");
     said(&ended, "missing", "tls actor-1", "actor-1.key is not there");
     said(&ended, "note", "tls replay-server", "chmod 600");
-    ended.expect_said(
-        "with --tls-dir these parts cannot take part: tls learner, tls observer, tls actor-1",
-    );
+    ended.expect_said("these certificates cannot be used: tls learner, tls observer, tls actor-1");
     said(
         &doctor("nowhere").expect_code(1),
         "missing",

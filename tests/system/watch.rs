@@ -193,7 +193,8 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let look = format!("watch --connect {endpoint} --once");
     // Somebody is missing.
     let ended = system.run(&look).expect_code(1);
-    ended.expect_said("error: the run is not well: no learner has joined: start `driml learner");
+    ended
+        .expect_said("error: the run needs attention: no learner has joined: start `driml learner");
     let _parts = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_learner("the end", |it| it.finished);
 

@@ -10,28 +10,28 @@ use serde::de::DeserializeOwned;
 /// The paper's experiments.
 #[derive(Debug, Subcommand)]
 pub enum ExperimentCommand {
-    /// Fig. 1: InfoNCE learns the transition ratio of a biased random walk; does it converge with the spectral gap?
+    /// Fig. 1: InfoNCE learns the transition ratio of a biased random walk
     RandomWalk(ExperimentFlags),
     /// Fig. 2: local DIM finds the patch of an Ising model in noise
     Ising(ExperimentFlags),
-    /// Fig. 3: Ms. PacMan's ghosts, predictable or not, and one lethal ghost that changes; C51 beside DRIML
+    /// Fig. 3: Ms. PacMan with random ghosts, and with a lethal ghost that changes; C51 and DRIML
     Pacman(PacmanArgs),
-    /// Table 1: agents on Procgen's games, from a queue of whole runs
+    /// Table 1: agents on Procgen's games
     Procgen(ProcgenArgs),
-    /// Every numeric routine at the extremes of its range beside float64: what it promises, and the worst that was found
+    /// Error of every numeric routine at the extremes of its range, against float64
     Stability(ExperimentFlags),
 }
 
 /// What every experiment takes.
 #[derive(Clone, Debug, Args)]
 pub struct ExperimentFlags {
-    /// The same in seconds: shows that everything works, and nothing else
+    /// A test in seconds: shows only that the command works
     #[arg(long)]
     pub(crate) smoke: bool,
-    /// Where figures, data and page go; an experiment that was stopped resumes there [default: experiments/NAME]
+    /// Folder for figures, data and page; a stopped experiment resumes there [default: experiments/NAME]
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    /// Seeds 1 to N [default: as the experiment's settings say]
+    /// Seeds 1 to N [default: from the experiment's settings]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) seeds: Option<u32>,
 }
@@ -39,13 +39,13 @@ pub struct ExperimentFlags {
 /// What the experiments that are made of whole runs take.
 #[derive(Clone, Debug, Args)]
 pub struct QueueFlags {
-    /// Runs at once [default: as the experiment's settings say]
+    /// Runs at once [default: from the experiment's settings]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=256))]
     pub(crate) jobs: Option<u32>,
-    /// Start nothing: figures, data and page of the runs that are finished
+    /// Only write figures, data and page of finished runs
     #[arg(long)]
     pub(crate) report: bool,
-    /// One setting of every run, as `driml train` takes it; may be given several times
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub(crate) sets: Vec<String>,
 }
@@ -57,13 +57,13 @@ pub struct PacmanArgs {
     pub(crate) flags: ExperimentFlags,
     #[command(flatten)]
     pub(crate) queue: QueueFlags,
-    /// Agents of the continual tasks; the first is what the others are compared with [default: c51,driml-fix]
+    /// Agents of (b) and (c) [default: c51,driml-fix]; the others are compared with the first
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
-    /// Frames of each run with ghosts that move at random (a)
+    /// Frames per run of (a), random ghosts
     #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
-    /// Episodes until the next ghost is the lethal one (b, c); the paper's are 5000
+    /// Episodes per task of (b) and (c), changing ghost; the paper has 5000
     #[arg(long, value_name = "N", value_parser = whole_number::within(1..=10_000_000))]
     pub(crate) episodes_per_task: Option<u64>,
 }
@@ -75,19 +75,19 @@ pub struct ProcgenArgs {
     pub(crate) flags: ExperimentFlags,
     #[command(flatten)]
     pub(crate) queue: QueueFlags,
-    /// Games, such as bigfish,starpilot; or all [default: all]
+    /// Games, such as bigfish,starpilot, or all [default: all]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) games: Vec<String>,
-    /// Agents, driml-fix and driml-noact also with a k, as in driml-noact-k5; or all [default: c51,driml-ada]
+    /// Agents, or all [default: c51,driml-ada]; driml-fix and driml-noact also with a k, as in driml-noact-k5
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agents: Vec<String>,
-    /// Frames of each run; the paper's are 50000000 [default: 1000000]
+    /// Frames per run [default: 1000000]; the paper has 50000000
     #[arg(long, value_name = "N", value_parser = whole_number::within(500..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
-    /// Episodes played with each of a run's last three checkpoints, or three times as many with its averaged weights [default: 100]
+    /// Greedy episodes per checkpoint, for the last three of a run [default: 100]; three times as many with averaged weights
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
-    /// Named settings of every run; `driml presets` lists them [default: tuned]
+    /// Named settings; `driml presets` lists them [default: tuned]
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
 }
@@ -98,19 +98,19 @@ pub struct TradeoffArgs {
     /// World, such as mspacman, coinrun or chain
     #[arg(long, value_name = "WORLD", default_value = "mspacman")]
     pub(crate) env: String,
-    /// Minutes of this machine for the runs that are not there yet; it decides how many levels fit, each with all its seeds
+    /// Minutes for new runs; levels that do not fit with all their seeds are skipped
     #[arg(long, value_name = "MINUTES", default_value_t = 180, value_parser = clap::value_parser!(u32).range(0..=100_000))]
     pub(crate) budget: u32,
-    /// Dials, such as learner.precision,DIM [default: all that the world has; a wrong name lists them]
+    /// Settings to change, such as learner.precision,DIM [default: all]; a wrong name lists them
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) dials: Vec<String>,
-    /// Measure speeds and print the plan; run nothing
+    /// Only measure speeds and print the plan
     #[arg(long)]
     pub(crate) plan: bool,
-    /// Frames of each run [default: as the world's settings say, fewer where the budget is small]
+    /// Frames per run [default: by world, fewer if the budget is small]
     #[arg(long, value_name = "N", value_parser = whole_number::within(1_000..=1_000_000_000))]
     pub(crate) frames: Option<u64>,
-    /// Episodes played with each run's weights [default: 100]
+    /// Greedy episodes per run [default: 100]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) episodes: Option<u32>,
     #[command(flatten)]
@@ -128,26 +128,26 @@ pub struct SweepArgs {
     /// Agents, such as c51,driml-ada [default: as `driml train`]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     pub(crate) agent: Vec<String>,
-    /// Named settings of every run; `driml presets` lists them
+    /// Named settings; `driml presets` lists them
     #[arg(long, value_name = "NAME")]
     pub(crate) preset: Option<String>,
-    /// Frames of each run
+    /// Frames per run
     #[arg(long, value_name = "N", value_parser = whole_number::within(1..=i64::MAX as u64))]
     pub(crate) frames: Option<u64>,
-    /// A setting by its dotted path and the values that it is to have, such as learner.batch_size=64,256; may be given several times:
-    /// every combination is made
+    /// A setting by its dotted path and its values, such as learner.batch_size=64,256; may be given several times for every
+    /// combination
     #[arg(long = "set", value_name = "KEY=VALUE,..")]
     pub(crate) sets: Vec<String>,
-    /// Seeds 1 to N of every combination
+    /// Seeds 1 to N per combination
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) seeds: u32,
-    /// Runs at once, which share the cores
+    /// Runs at once; they share the cores
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub(crate) jobs: u32,
-    /// Start nothing: table and plot of the runs that are finished
+    /// Only write table and plot of finished runs
     #[arg(long)]
     pub(crate) report: bool,
-    /// Where runs, table and plot go; a sweep that was stopped resumes there [default: experiments/grid]
+    /// Folder for runs, table and plot [default: experiments/grid]; a stopped sweep resumes there
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
 }

@@ -25,10 +25,10 @@ pub enum Which {
 /// Which weights of a checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Weights {
-    /// The averaged ones where the run has them (learner.update.average_tau), else the online ones
+    /// Averaged weights if the run has them (learner.update.average_tau), else online weights
     #[default]
     Average,
-    /// Those of the last update
+    /// Weights of the last update
     Online,
 }
 
@@ -73,8 +73,8 @@ pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<
             let mut best = checkpoint::list(&folder.best())?;
             let (_, path) = best.pop().ok_or_else(|| {
                 usage!(
-                    "{} has no best checkpoint: none was played while it trained. Train with --evaluate-every UPDATES, or judge those \
-                     that are there with `driml evaluate {} --checkpoint UPDATES --keep`",
+                    "{} has no best checkpoint: none was evaluated. Train with --evaluate-every UPDATES, or evaluate one \
+                     with `driml evaluate {} --checkpoint UPDATES --keep`",
                     folder.display(),
                     folder.display()
                 )
@@ -85,7 +85,7 @@ pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<
     let mut all = checkpoint::list(&folder.checkpoints())?;
     let Some((newest, _)) = all.last() else {
         return Err(usage!(
-            "{} has no checkpoint yet: let the run go on",
+            "{} has no checkpoint yet: let the run continue",
             folder.display()
         )
         .into());
@@ -95,7 +95,7 @@ pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<
     let found = all.iter().position(|(updates, _)| *updates == wanted);
     let at = found.ok_or_else(|| {
         usage!(
-            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept says how many stay",
+            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
             folder.display(),
             known.join(", ")
         )

@@ -155,7 +155,7 @@ pub fn log_to_stderr() {
     let filter = wanted.map_or_else(usual, |wanted| {
         EnvFilter::try_new(wanted_filter(&wanted)).unwrap_or_else(|e| {
             line(&format!(
-                "DRIML_LOG={wanted} is no filter ({e}), so it is left out; take for example debug"
+                "DRIML_LOG={wanted} is not a filter ({e}) and is ignored; use for example debug"
             ));
             usual()
         })

@@ -33,7 +33,7 @@ pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
         check_endpoint(it, tls)?;
         if it.starts_with("quic/[") {
             return Err(usage!(
-                "{it}: zenoh looks for this address, with its brackets, in the certificate and does not find it: connect by a name"
+                "{it}: zenoh cannot match an IPv6 address with a certificate: connect by a name"
             ));
         }
         Ok(())
@@ -52,13 +52,13 @@ pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> 
         }
         if !guard.insecure_network {
             return Err(usage!(
-                "{endpoint} can be reached from other machines, and whoever reaches it can read the run, change what is learned, and \
-                 end it. Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, where every machine \
-                 that can connect is trusted, add --insecure-network"
+                "{endpoint} can be reached from other machines, and anyone who reaches it can read, change and stop the run. \
+                 Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, if you trust every machine \
+                 that can connect, add --insecure-network"
             ));
         }
         tracing::warn!(
-            "--insecure-network: whoever reaches {endpoint} can read the run, change what is learned, and end it"
+            "--insecure-network: anyone who reaches {endpoint} can read, change and stop the run"
         );
     }
     Ok(())
@@ -77,8 +77,8 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
         };
         if is_used {
             return Err(usage!(
-                "cannot listen on {endpoint}: another process listens there. End it, or choose another port or path: with --listen for this \
-                 command, and the same with --connect for all that connect to it"
+                "cannot listen on {endpoint}: another process listens there. Stop it, or choose another port or path, with --listen for this \
+                 command and --connect for all others"
             ));
         }
     }
@@ -101,7 +101,7 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
             "{endpoint} is not encrypted: with --tls-dir it is quic/{address}"
         )),
         Some(("tls", address)) if has_host(address) => Err(usage!(
-            "{endpoint}: TLS over TCP is not used, as zenoh's may break a connection or end the process \
+            "{endpoint}: TLS over TCP is not supported, because zenoh's may break a connection or crash the process \
              (https://github.com/eclipse-zenoh/zenoh/issues/2557): with --tls-dir it is quic/{address}, the TLS of QUIC over UDP"
         )),
         Some(("quic", address)) if !tls && has_host(address) => Err(usage!(
@@ -115,7 +115,7 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
         )),
         Some(("unixsock-stream", path)) if !path.is_empty() => Ok(()),
         _ => Err(usage!(
-            "{endpoint:?} is no endpoint: take tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH"
+            "{endpoint:?} is not an endpoint: use tcp/HOST:PORT, quic/HOST:PORT or unixsock-stream/PATH"
         )),
     }
 }

@@ -34,11 +34,11 @@ const POLICY_STREAM: u64 = u64::MAX;
 /// Which levels to play.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Levels {
-    /// Those trained on, as in the training: where an episode went on through completed levels, it does
+    /// Training levels, as in training: an episode may continue through several levels
     Train,
-    /// Those trained on, drawn at random, each an episode of its own (Procgen)
+    /// Training levels, drawn at random, one per episode (Procgen)
     TrainSingle,
-    /// Others of the same game, each an episode of its own (Procgen)
+    /// Levels not trained on, one per episode (Procgen)
     Unseen,
 }
 

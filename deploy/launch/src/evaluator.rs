@@ -123,7 +123,7 @@ impl Evaluator {
         let failed = process.end().is_some_and(|status| !status.success());
         let said = match (failed, Evaluated::all(&self.run_dir)) {
             (true, _) => format!(
-                "the run goes on without an evaluation: {}",
+                "the run continues without an evaluation: {}",
                 process.exit_report()
             ),
             (false, Ok(all)) => all.last().map(Evaluated::describe).unwrap_or_default(),

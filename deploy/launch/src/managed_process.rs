@@ -207,12 +207,12 @@ impl ManagedProcess {
         let how = match self.end {
             None => "is still running".into(),
             Some(status) => match (status.code(), status.signal()) {
-                (Some(code), _) => format!("ended with exit code {code}"),
+                (Some(code), _) => format!("exited with code {code}"),
                 (None, Some(signal)) => {
                     let name = Signal::try_from(signal).map_or("", Signal::as_str);
-                    format!("was ended by signal {signal} {name}")
+                    format!("was killed by signal {signal} {name}")
                 }
-                (None, None) => "ended".into(),
+                (None, None) => "exited".into(),
             },
         };
         let last = match (self.log.error(), self.log.tail()) {

@@ -491,7 +491,7 @@ mod tests {
             "/../docs/src/reference/metrics.md"
         );
         let page = format!(
-            "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row a second with these columns. `driml watch --once --json` has the same \
+            "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
              names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n{}",
             markdown()
         );

@@ -61,7 +61,7 @@ pub fn describe(
     let done = resume_point.updates as f64 / config.updates().max(1) as f64;
     let left = (1.0 - done).max(0.0);
     let processes = if lockstep {
-        "one, all parts in lockstep".into()
+        "one, with everything in lockstep".into()
     } else {
         let servers = match replay.shards {
             1 => "replay server".into(),

@@ -76,8 +76,7 @@ impl ProcessLog {
                 let line = String::from_utf8_lossy(&line).into_owned();
                 let shown = is_warning(&line).then(|| format!("{name}: {line}"));
                 let said = lock(&kept).add(line);
-                let said = said
-                    .map(|e| format!("the log of {name} cannot be written: {e}; the run goes on"));
+                let said = said.map(|e| format!("the log of {name} cannot be written: {e}"));
                 for line in shown.into_iter().chain(said) {
                     screen.line(&line);
                 }

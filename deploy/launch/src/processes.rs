@@ -123,7 +123,7 @@ mod tests {
         let killed = stopped("kill -TERM $$", false);
         assert!(killed[0].contains("signal 15 SIGTERM"), "{killed:?}");
         let failed = stopped("echo 'error: no room' >&2; exit 3", false);
-        let said = "script ended with exit code 3";
+        let said = "script exited with code 3";
         assert!(
             failed[0].starts_with(said) && failed[0].ends_with(".log): no room"),
             "{failed:?}"

@@ -49,7 +49,7 @@ fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(
-            "`driml train --resume {}` goes on with it",
+            "`driml train --resume {}` resumes it",
             folder.display()
         ));
     }
@@ -149,7 +149,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     let lockstep = is_in_lockstep(newest)?;
     if !lockstep && !config.world.is_resumable() {
         return Err(usage!(
-            "the ghosts of the run in {} change as episodes pass, and a checkpoint does not hold how far they are: start it again",
+            "the run in {} cannot be resumed, because a checkpoint does not save its position in world.lethal_schedule: start it again",
             folder.display()
         )
         .into());

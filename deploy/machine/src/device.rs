@@ -9,7 +9,7 @@ use crate::{doctor::cuda, error::Usage};
 /// What the learner computes on.
 #[derive(Clone, Copy, Debug, Args)]
 pub struct DeviceFlag {
-    /// What to compute on: cpu, cuda (the first GPU) or cuda:N
+    /// Device: cpu, cuda (the first GPU) or cuda:N
     #[arg(long, value_name = "DEVICE", default_value_t = DeviceName::Cpu)]
     pub device: DeviceName,
 }

@@ -8,7 +8,7 @@ use std::ops::RangeInclusive;
 /// # Errors
 /// A text that is none, or one of 2^64 and more; what to write, for a person.
 pub fn read(text: &str) -> Result<u64, String> {
-    let none = || format!("{text:?} is no whole number; write one as 1000000, 1_000_000 or 1e6");
+    let none = || format!("{text:?} is not a whole number; write one as 1000000, 1_000_000 or 1e6");
     let plain = text.replace('_', "");
     let (mantissa, exponent) = plain.split_once(['e', 'E']).unwrap_or((&plain, "0"));
     let (whole, part) = mantissa.split_once('.').unwrap_or((mantissa, ""));
@@ -79,7 +79,7 @@ mod tests {
         ] {
             let said = read(text).unwrap_err();
             assert!(
-                said.contains("is no whole number; write one as"),
+                said.contains("is not a whole number; write one as"),
                 "{text}: {said}"
             );
         }

@@ -292,7 +292,7 @@ impl RunConfig {
             learns_affinity,
         ) {
             (true, false) => Err(usage!(
-                "run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"
+                "run.horizon needs the action affinity, but learner.affinity.estimator is none: --set learner.affinity.estimator=learned"
             )),
             (false, true) => Err(usage!(
                 "learner.affinity.estimator keeps an affinity that run.horizon does not use: --set learner.affinity.estimator=none"

@@ -22,9 +22,8 @@ const AGENT: &str = "driml-ada";
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]
 pub struct RunFlags {
-    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them. Your own: "exec:COMMAND", a process that declares
-    /// itself, such as driml_env.py around a Gymnasium environment [default: procgen:coinrun, on which agents
-    /// learn within minutes]
+    /// World, such as procgen:coinrun or mspacman; `driml presets` lists them. "exec:COMMAND" is a process of yours, such as
+    /// driml_env.py around a Gymnasium environment [default: procgen:coinrun]
     #[arg(long, value_name = "WORLD")]
     pub env: Option<String>,
     /// Agent: c51, rainbow, driml-fix, driml-ada, driml-randk, driml-noact, cpc or curl [default: driml-ada]
@@ -33,7 +32,7 @@ pub struct RunFlags {
     /// Named settings; `driml presets` lists them [default: tuned on Procgen, paper elsewhere]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
-    /// Resolved settings of another run, its config.toml, instead of world, agent and preset
+    /// Settings of another run, its config.toml, instead of world, agent and preset
     #[arg(long, value_name = "FILE", conflicts_with_all = ["preset", "env", "agent"])]
     pub config: Option<PathBuf>,
     /// What applies over them.

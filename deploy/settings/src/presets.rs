@@ -83,21 +83,21 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: "split",
-        about: "`paper` with each of the 500 Procgen levels an episode of its own, and unseen ones to test on",
+        about: "`paper` with one of 500 Procgen levels per episode, and unseen levels to test on",
         layers: &[layer!("variant/split")],
         families: &["procgen"],
         price: None,
     },
     Preset {
         name: "exact",
-        about: "`paper`, with nothing given up for speed, whatever its own choices become",
+        about: "`paper` with products, weights and frames as exact as the program can compute them",
         layers: &[layer!("variant/exact")],
         families: &[],
         price: None,
     },
     Preset {
         name: "balanced",
-        about: "`exact` in the learner; actors and broadcasts give up what costs the least, and a run says what",
+        about: "`exact` in the learner; bf16 arithmetic and f16 weights in the actors",
         layers: &[layer!("variant/balanced")],
         families: &[],
         price: Some(
@@ -106,7 +106,7 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: "fast",
-        about: "bf16 in learner and actors, half the bytes of a broadcast; a run says what that costs",
+        about: "bf16 in learner and actors, f16 weights sent to actors",
         layers: &[layer!("variant/fast")],
         families: &[],
         price: Some(
@@ -115,7 +115,7 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: "smoke",
-        about: "a tiny network, batch and replay: shows within a minute that all parts work together",
+        about: "a tiny network, batch and replay: shows within a minute that all processes work together",
         layers: &[layer!("variant/smoke")],
         families: &[],
         price: None,
@@ -310,7 +310,7 @@ impl Layer {
     fn read(&self) -> (Table, Vec<Only>) {
         let bad = |e| -> ! {
             panic!(
-                "presets/{}.toml, or what a program has registered by that name, is no layer of settings: {e}",
+                "presets/{}.toml, or what a program has registered by that name, is not a layer of settings: {e}",
                 self.name
             )
         };

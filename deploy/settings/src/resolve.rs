@@ -30,19 +30,19 @@ pub enum Source {
 /// Flags over the source; `--set` applies after the others.
 #[derive(Clone, Debug, Default, Args)]
 pub struct Flags {
-    /// Actor processes [default: by cores]
+    /// Actor processes [default: by number of cores]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub actors: Option<u32>,
-    /// Replay servers among which the actors and the memory are spread [default: 1]
+    /// Replay servers, each with a share of the actors and memory [default: 1]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub replay_shards: Option<u32>,
-    /// Copies of the world in each actor [default: 16]
+    /// Copies of the world per actor [default: as the preset says]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub envs: Option<u32>,
-    /// Frames of the whole run; it ends when they are in and their updates done
+    /// Frames of the run; it is finished when they are stored and their updates are done
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = whole_number::within(1..=i64::MAX as u64))]
     pub frames: Option<u64>,
-    /// Seed of every generator of the run
+    /// Seed of the run
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = whole_number::within(0..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times

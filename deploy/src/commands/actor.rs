@@ -10,18 +10,18 @@ use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ActorArgs {
-    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; may be given several times
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; may be given several times
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
-    /// Which actor this is; unique in the run. env:NAME takes it from the environment, such as env:SLURM_PROCID or
+    /// Id of this actor, unique in the run; env:NAME takes it from the environment, such as env:SLURM_PROCID or
     /// env:JOB_COMPLETION_INDEX
     #[arg(long, value_name = "N", default_value = "0", value_parser = actor_id)]
     pub(crate) id: u32,
-    /// Copies of the world [default: as the run's settings say]
+    /// Copies of the world [default: from the run's settings]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
-    /// The run's world, where it is code of your own: exec:COMMAND or libenv:PATH:GAME as this machine has it. An actor
-    /// starts or loads no code because a replay server says so
+    /// Command or library of the run's world on this machine, if it is exec:COMMAND or libenv:PATH:GAME; an actor never runs what
+    /// a replay server sends
     #[arg(long, value_name = "WORLD")]
     pub(crate) env: Option<String>,
     #[command(flatten)]
@@ -42,7 +42,7 @@ fn actor_id(text: &str) -> Result<u32, String> {
             format!("the environment's {name} is {value:?}, and no number of an actor")
         }),
         Err(_) => Err(format!(
-            "the environment has no {name}: whoever starts this process has to set it"
+            "the environment has no {name}: set it before you start this process"
         )),
     }
 }

@@ -12,13 +12,13 @@ const NAME: &str = "driml";
 
 #[derive(Debug, Args)]
 pub(crate) struct CompletionsArgs {
-    /// The shell that is to complete: bash, zsh, fish, elvish or powershell
+    /// Shell
     shell: Shell,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct ManArgs {
-    /// Folder for the pages: driml.1 and one for each command; it is made
+    /// Folder for the pages, driml.1 and one per command; it is created
     #[arg(value_name = "DIR")]
     out: PathBuf,
 }
@@ -30,7 +30,7 @@ pub(crate) fn completions(
 ) -> anyhow::Result<()> {
     let mut script = Vec::new();
     generate(args.shell, &mut command, NAME, &mut script);
-    print(&String::from_utf8(script).context("a script that is no text")?)
+    print(&String::from_utf8(script).context("the script is not UTF-8")?)
 }
 
 /// Writes the pages.

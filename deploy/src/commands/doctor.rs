@@ -8,16 +8,16 @@ use driml_machine::doctor;
 
 #[derive(Debug, Args)]
 pub(crate) struct DoctorArgs {
-    /// Where runs go: the disk that is looked at
+    /// Folder of the runs, whose disk is checked
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub(crate) run_dir: PathBuf,
-    /// Look also at the certificates in DIR: whose there are, whether they are good, for which addresses and for how long
+    /// Check the certificates in DIR: roles, validity, addresses and dates
     #[arg(long, value_name = "DIR")]
     pub(crate) tls_dir: Option<PathBuf>,
-    /// Fail also where --device cuda would
+    /// Also exit with code 1 if --device cuda cannot work
     #[arg(long)]
     pub(crate) cuda: bool,
-    /// Print the facts as JSON
+    /// Print JSON
     #[arg(long)]
     pub(crate) json: bool,
 }

@@ -22,13 +22,13 @@ use driml_settings::{
 pub(crate) struct InspectArgs {
     #[command(flatten)]
     pub(crate) settings: RunFlags,
-    /// The settings of the run in this folder
+    /// Use the settings of the run in this folder
     #[arg(long, value_name = "DIR", conflicts_with_all = ["RunFlags", "Flags"])]
     pub(crate) run: Option<PathBuf>,
-    /// The agent in every world, one line each
+    /// Print one line per world
     #[arg(long, conflicts_with_all = ["env", "config", "run"])]
     pub(crate) worlds: bool,
-    /// Print it as JSON
+    /// Print JSON
     #[arg(long)]
     pub(crate) json: bool,
 }

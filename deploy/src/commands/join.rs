@@ -20,7 +20,7 @@ pub(crate) struct JoinFlags {
     /// Prefix of the run's keys
     #[arg(long, value_name = "NS", default_value = NAMESPACE)]
     pub(crate) namespace: String,
-    /// End when the process that started this one, which has this number, ends
+    /// Exit when the parent process PID exits
     #[arg(long, value_name = "PID", hide = true)]
     pub(crate) exit_with_parent: Option<u32>,
 }
@@ -28,7 +28,7 @@ pub(crate) struct JoinFlags {
 /// When a replay server or a learner ends.
 #[derive(Debug, Args)]
 pub(crate) struct StayFlag {
-    /// Keep answering when the run is over, until Ctrl-C or a signal
+    /// After the run, keep answering until Ctrl-C or a signal
     #[arg(long)]
     pub(super) stay: bool,
 }
@@ -36,9 +36,9 @@ pub(crate) struct StayFlag {
 /// With which certificate a process takes part.
 #[derive(Debug, Args)]
 pub(crate) struct TlsFlags {
-    /// Talk over mutual TLS (in QUIC, so over UDP), with the certificates in DIR that deploy/certs.sh makes: ca.pem, and ROLE.pem
-    /// and ROLE.key, where ROLE is actor-N (N is its --id), learner, replay-server or, to only look, observer. Endpoints are then
-    /// quic/HOST:PORT, or unix sockets, and the replay server lets each role do what it needs and no more
+    /// Use mutual TLS with the certificates in DIR, made by deploy/certs.sh; endpoints are then quic/HOST:PORT (over UDP) or unix
+    /// sockets. DIR has ca.pem, ROLE.pem and ROLE.key, where ROLE is actor-N (N is its --id), learner, replay-server or, for
+    /// status and watch, observer
     #[arg(long, value_name = "DIR")]
     pub(crate) tls_dir: Option<PathBuf>,
 }
@@ -46,8 +46,7 @@ pub(crate) struct TlsFlags {
 /// Whether everybody is trusted who can connect.
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
-    /// Listen also where other machines can connect without certificates: anyone who reaches the endpoint can read the run, change
-    /// what is learned, and end it
+    /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
     #[arg(long)]
     pub(crate) insecure_network: bool,
 }

@@ -11,13 +11,13 @@ use super::join::{JoinFlags, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
-    /// Endpoint of the replay server, such as quic/10.0.0.1:7447; once for each of the run's replay shards
+    /// Endpoint of the replay server, such as tcp/10.0.0.1:7447; once for each of the run's replay shards
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) connect: Vec<String>,
-    /// Where checkpoints go, DIR/checkpoints; a learner resumes from the newest one there
+    /// Folder of the checkpoints, DIR/checkpoints; a learner resumes from the newest one there
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: PathBuf,
-    /// Begin again from the first update, where an earlier learner has learned and its checkpoints are lost
+    /// Start from the first update, if an earlier learner's checkpoints are lost
     #[arg(long)]
     pub(crate) restart: bool,
     #[command(flatten)]

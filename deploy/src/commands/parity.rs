@@ -14,10 +14,10 @@ pub(crate) struct ParityArgs {
     pub(crate) files: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
-    /// In which numbers products are computed
+    /// Precision of products
     #[arg(long, value_name = "PRECISION", default_value_t = Precision::F32, conflicts_with = "stock")]
     pub(crate) precision: Precision,
-    /// With candle's own operations, as on a GPU, in place of this project's kernels
+    /// Use candle's operations, as on a GPU, instead of this project's kernels
     #[arg(long)]
     pub(crate) stock: bool,
 }

@@ -5,7 +5,7 @@ use driml_launch::console::{self, print};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ProcgenCommand {
-    /// Fetch the engine into the cache folder (DRIML_CACHE, or the user's own)
+    /// Download the engine into the cache folder (DRIML_CACHE, else the user's)
     Install,
 }
 

@@ -15,18 +15,17 @@ use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, jo
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
-    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. One that other machines reach is
+    /// Endpoint to listen on, such as tcp/127.0.0.1:7447; may be given several times. For other machines use
     /// quic/HOST:PORT, such as quic/0.0.0.0:7447, with --tls-dir
     #[arg(long, value_name = "ENDPOINT", required = true)]
     pub(crate) listen: Vec<String>,
-    /// Router to connect to as well; not with --tls-dir, as its rules would not be ours
+    /// Router to connect to as well; not with --tls-dir, because a router does not apply the rules for roles
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "tls_dir")]
     pub(crate) connect: Vec<String>,
-    /// Which of the run's --replay-shards this is
+    /// Number of this shard, from 0
     #[arg(long, value_name = "I", default_value_t = 0)]
     pub(crate) shard: u32,
-    /// Keep the replay on disk in this folder, and resume with the one that is there: a server that died is started again with the
-    /// same flags [default: in memory alone]
+    /// Keep the replay on disk in this folder [default: in memory only]; after a crash, start the server again with the same flags
     #[arg(long, value_name = "DIR")]
     pub(crate) replay_dir: Option<PathBuf>,
     #[command(flatten)]

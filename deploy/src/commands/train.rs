@@ -44,44 +44,44 @@ const RESUMED: [&str; 10] = [
 pub(crate) struct TrainArgs {
     #[command(flatten)]
     pub(crate) run: RunFlags,
-    /// Where settings, metrics, checkpoints, logs and summary go [default: runs/WORLD-AGENT-seedS-TIME]
+    /// Folder for settings, metrics, checkpoints, logs and summary [default: runs/WORLD-AGENT-seedS-TIME]
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
     /// Resume the run in this folder from its newest checkpoint, with its own settings; --frames, --device and --set may change
     #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
     pub(crate) resume: Option<PathBuf>,
-    /// What the learner computes on: cpu, cuda (the first GPU) or cuda:N [default: as the settings say, cpu]
+    /// Device of the learner: cpu, cuda (the first GPU) or cuda:N [default: cpu]
     #[arg(long, value_name = "DEVICE")]
     pub(crate) device: Option<DeviceName>,
-    /// Persist the replay in the run folder, so that a restarted server or --resume continues with it
+    /// Keep the replay on disk, in the run folder, for a restarted replay server or --resume
     #[arg(long)]
     pub(crate) durable: bool,
-    /// Write events for TensorBoard too, in the run folder: `tensorboard --logdir RUN`
+    /// Write TensorBoard events into the run folder
     #[arg(long)]
     pub(crate) tensorboard: bool,
-    /// Play the newest checkpoint every so many updates in a separate process, which takes a core meanwhile, and keep the best:
-    /// evaluations.csv, `driml evaluate RUN --checkpoint best`
+    /// Play a checkpoint every so many updates, in a separate process that takes a core, and keep the best; writes evaluations.csv.
+    /// `driml evaluate RUN --checkpoint best` plays it
     #[arg(long, value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) evaluate_every: Option<u64>,
-    /// Whole episodes of each of these evaluations
+    /// Episodes per evaluation
     #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every", allow_negative_numbers = true,
           value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) evaluate_episodes: u32,
-    /// Do not play the weights of the finished run beside a random policy, which takes about 30 s at most
+    /// Skip the greedy episodes after the run, which take about 30 s
     #[arg(long)]
     pub(crate) no_play: bool,
-    /// Run everything in one process in a fixed order: the same seed gives the same weights, also after a resume
+    /// Run everything in one process in a fixed order: the same seed gives the same weights
     #[arg(long, conflicts_with = "listen")]
     pub(crate) lockstep: bool,
-    /// Endpoint at which the processes connect [default: a unix socket in a fresh folder]; or, with --tls-dir, on which the replay server
-    /// listens for other machines, such as quic/0.0.0.0:7447, while the processes of this one use a unix socket
+    /// Endpoint of the replay server [default: a unix socket in a fresh folder]; with --tls-dir, one for other machines, such as
+    /// quic/0.0.0.0:7447, while local processes use a unix socket
     #[arg(long, value_name = "ENDPOINT")]
     pub(crate) listen: Option<String>,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
     pub(crate) network: NetworkFlag,
-    /// End as after Ctrl-C when the process that started this one, which has this number, ends
+    /// Stop as after Ctrl-C when the parent process PID exits
     #[arg(long, value_name = "PID", hide = true)]
     pub(crate) exit_with_parent: Option<u32>,
 }
@@ -131,7 +131,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     check_unused(args.listen.as_slice())?;
     if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
         return Err(usage!(
-            "--tls-dir is for parts of other machines, which need somewhere to connect to: add --listen quic/HOST:PORT"
+            "--tls-dir is for processes on other machines, which need an endpoint: add --listen quic/HOST:PORT"
         )
         .into());
     }

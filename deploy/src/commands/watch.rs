@@ -35,20 +35,20 @@ pub(crate) struct LookFlags {
 pub(crate) struct WatchArgs {
     #[command(flatten)]
     look: LookFlags,
-    /// Write settings, metrics and summary there, as `driml train` does; a folder that holds the same run is continued
+    /// Write settings, metrics and summary into this folder; a folder of the same run is continued
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
-    /// Write events for TensorBoard too, in that folder
+    /// Write TensorBoard events into that folder
     #[arg(long, requires = "run_dir")]
     pub(crate) tensorboard: bool,
-    /// Ask once, print the page of `driml status` and exit: with code 0 if nothing is missing, else 1
+    /// Print the page of `driml status` and exit: with code 0 if no process is missing, else 1
     #[arg(long, conflicts_with = "run_dir")]
     pub(crate) once: bool,
-    /// With --once: print one JSON object
+    /// With --once, print one JSON object
     #[arg(long, requires = "once")]
     pub(crate) json: bool,
-    /// Write the metrics into this file in Prometheus' text format at each answer, whole or not at all: for node_exporter's textfile
-    /// collector, which reads files named *.prom
+    /// Replace this file with the metrics in Prometheus' text format, once a second; for node_exporter's textfile collector, which
+    /// reads files named *.prom
     #[arg(long, value_name = "FILE")]
     pub(crate) prometheus: Option<PathBuf>,
 }
@@ -57,10 +57,10 @@ pub(crate) struct WatchArgs {
 pub(crate) struct StatusArgs {
     #[command(flatten)]
     look: LookFlags,
-    /// Ask every two seconds until the run is over or Ctrl-C
+    /// Repeat every two seconds until the run is over or Ctrl-C
     #[arg(long)]
     pub(crate) watch: bool,
-    /// Write JSON to stdout, an object for each answer
+    /// Print one JSON object per answer
     #[arg(long)]
     pub(crate) json: bool,
 }

@@ -57,7 +57,7 @@ impl Credentials {
         if read.is_key_open() {
             let key = read.key.display();
             tracing::warn!(
-                "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
+                "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
             );
         }
         Ok(read)

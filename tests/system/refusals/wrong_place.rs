@@ -53,7 +53,7 @@ fn nobody_is_told_from_a_host_that_is_not_known() {
     for command in COMMANDS {
         // Parts give the replay server some seconds to start, who only looks does not.
         refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&format!(
-            "nobody listens on {endpoint}: start the replay server first"
+            "nothing listens on {endpoint}: start the replay server first"
         ));
         let unknown = "tcp/no-such-host.invalid:7447";
         refused(&system, &format!("{command} {unknown}"), 10)
@@ -103,7 +103,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
         connect: Vec::new(),
     })
     .unwrap();
-    let words = "somebody listens there, and nobody answers at driml/hello";
+    let words = "a process listens there, but does not answer at driml/hello";
     for command in [COMMANDS[0], COMMANDS[1]] {
         let started = Instant::now();
         let mut part = system.start_part(&format!("{command} {endpoint}"));
@@ -126,7 +126,7 @@ fn a_part_that_waits_for_its_server_ends_when_it_is_told_to() {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nobody listens there.
             let mut part = system.start(&format!("{command} {}", system.endpoint()));
-            part.wait_for_stderr("waiting for 10 s: nobody listens on ");
+            part.wait_for_stderr("waiting for 10 s: nothing listens on ");
             part.signal(signal);
             part.wait().expect_code(0);
             // Somebody does, and says nothing.

@@ -166,8 +166,8 @@ pub fn run(
     print_wrapped(&summary.describe(run_dir), 2)?;
     written.with_context(|| {
         format!(
-            "the run is over and its checkpoint saved, but there is no summary of it: make room on the disk, then `driml train --resume {}` \
-             writes it",
+            "the run is over and its checkpoint saved, but the summary could not be written: make room on the disk, then run \
+             `driml train --resume {}`",
             run_dir.display()
         )
     })?;
@@ -302,7 +302,7 @@ impl Launch<'_> {
             }
             if view.replay.finished && view.learner.finished {
                 self.display
-                    .show_alone("all frames and updates are done: the processes end");
+                    .show_alone("all frames and updates are done: the processes exit");
                 return Ok(Outcome::Finished);
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);
@@ -374,7 +374,7 @@ impl Launch<'_> {
         let result = match ran {
             _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
-                "ended at once by a second interrupt: what was not saved is lost"
+                "stopped at once by a second interrupt: what was not saved is lost"
             )),
             Ok(_) if !others.is_empty() => Err(anyhow::anyhow!(
                 "at the end of the run, {}",

@@ -35,7 +35,7 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     // A part of it would do for a server that goes on, but not for a run that is to be the same.
     match recovery.warnings.first() {
         Some(why) if mark.is_some() => Err(usage!(
-            "the run cannot go on as it was: {why}. Start it anew, in another folder"
+            "the run cannot resume to the same weights: {why}. Start it again, in another folder"
         )
         .into()),
         _ => Ok(replay),
@@ -85,7 +85,7 @@ impl Lockstep {
         this.learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
         this.replay = open(config, run_dir, Some(saved.replay))?;
         this.take(saved)
-            .context("going on with the parts that the checkpoint holds")?;
+            .context("resuming the actors from the checkpoint")?;
         Ok(this)
     }
 
@@ -247,7 +247,7 @@ impl Lockstep {
                     Ok(batch) => self.learn(&batch)?,
                     Err(_) if self.replay.is_refused_by_disk() => {
                         bail!(
-                            "the run's folder cannot be written, as the log says: make room, then go on with --resume"
+                            "the run folder cannot be written (the log has the reason): make room, then use --resume"
                         )
                     }
                     Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
@@ -262,7 +262,7 @@ impl Lockstep {
                         chunk.header.sequence
                     )
                 }
-                InsertReply::Refused { why } => bail!("the replay refused a chunk: {why}"),
+                InsertReply::Refused { why } => bail!("the replay rejected a chunk: {why}"),
             }
         }
         loop {
@@ -270,7 +270,7 @@ impl Lockstep {
                 Ok(batch) => self.learn(&batch)?,
                 Err(Unready::Wait(_)) => return Ok(true),
                 Err(Unready::Finished) => return Ok(false),
-                Err(Unready::Refused { why }) => bail!("the replay refuses to sample: {why}"),
+                Err(Unready::Refused { why }) => bail!("the replay cannot sample: {why}"),
             }
         }
     }
@@ -286,7 +286,7 @@ impl Lockstep {
         if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
             let set = self.replay.set_priorities(&priorities);
             set.map_err(anyhow::Error::msg)
-                .context("the replay refused priorities")?;
+                .context("the replay rejected priorities")?;
         }
         self.learner.note(&report, &mut self.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER) {

@@ -63,11 +63,11 @@ impl SavedParts {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
         let bytes = checkpoint::companion(path)?
-            .with_context(|| format!("{} is not of a run in lockstep", path.display()))?;
-        let reading = || format!("reading the parts in {}", path.display());
+            .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
+        let reading = || format!("reading the lockstep state in {}", path.display());
         let Some(content) = bytes.strip_prefix(&FORMAT.to_le_bytes()) else {
             return Err(usage!(
-                "{} holds the processes of a run in lockstep in the form of another version of driml: resume it with that one",
+                "{} is a lockstep checkpoint of another version of driml: resume with that version",
                 path.display()
             )
             .into());

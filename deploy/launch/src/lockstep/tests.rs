@@ -221,12 +221,12 @@ fn what_cannot_go_on_says_why() {
     let (_folder, run_dir) = begun();
     std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
     let why = said(&run_dir);
-    assert!(why.contains("the run cannot go on as it was"), "{why}");
+    assert!(why.contains("cannot resume to the same weights"), "{why}");
     // A learner's own checkpoint.
     let (_folder, run_dir) = begun();
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();
     unkept.save(&run_dir.checkpoints()).unwrap();
     let why = said(&run_dir);
-    assert!(why.contains("is not of a run in lockstep"), "{why}");
+    assert!(why.contains("not a checkpoint of a lockstep run"), "{why}");
 }

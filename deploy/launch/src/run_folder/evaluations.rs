@@ -49,7 +49,7 @@ impl Evaluated {
     /// All that were kept in a run's folder, in the order in which they were played; none of a folder that has none.
     ///
     /// # Errors
-    /// A file that is no table of evaluations, or that cannot be read.
+    /// A file that is not a table of evaluations, or that cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
         let table = Table::read(&path)?;
@@ -67,7 +67,7 @@ impl Evaluated {
         });
         rows.collect::<Option<_>>().with_context(|| {
             usage!(
-                "{} is no table of evaluations: move it away",
+                "{} is not a table of evaluations: move it away",
                 path.display()
             )
         })
@@ -306,7 +306,7 @@ mod tests {
             Evaluated::all(&folder)
                 .unwrap_err()
                 .to_string()
-                .contains("is no table of evaluations")
+                .contains("is not a table of evaluations")
         );
     }
 

@@ -156,7 +156,7 @@ impl RunFolder {
             return Ok(());
         };
         let why = match access(there, AccessFlags::W_OK | AccessFlags::X_OK) {
-            _ if !there.is_dir() => "is no folder".to_owned(),
+            _ if !there.is_dir() => "is not a folder".to_owned(),
             Err(e) => format!("cannot be written: {}", e.desc()),
             Ok(()) => return Ok(()),
         };
@@ -177,7 +177,7 @@ impl RunFolder {
         let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
         lock.ok_or_else(|| {
             usage!(
-                "the run in {} is still going on: end it first, or wait",
+                "the run in {} is still running: stop it first, or wait",
                 self.display()
             )
             .into()
@@ -192,7 +192,7 @@ impl RunFolder {
         let gone: Vec<_> = gone.map(|it| it.display().to_string()).collect();
         anyhow::ensure!(
             files[..3].iter().all(|it| it.exists()),
-            "the run folder was removed or moved while the run was going on; these are gone: {}",
+            "the run folder was removed or moved during the run; missing: {}",
             gone.join(", ")
         );
         Ok(())
@@ -267,7 +267,10 @@ mod tests {
         let file = folder.path().join("file");
         fs::write(&file, "").unwrap();
         let said = refused(&file.join("runs/one"));
-        let why = format!("{} is no folder; choose another --run-dir", file.display());
+        let why = format!(
+            "{} is not a folder; choose another --run-dir",
+            file.display()
+        );
         assert!(said.contains(&why), "{said}");
         let closed = folder.path().join("closed");
         fs::create_dir(&closed).unwrap();

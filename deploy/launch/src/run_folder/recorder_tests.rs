@@ -168,7 +168,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         replay_is_kept: false,
     };
     let said = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap_err();
-    assert!(said.to_string().contains("is still going on"), "{said}");
+    assert!(said.to_string().contains("is still running"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &view(&replay, &learner));
     summary.write(&run).unwrap();
     drop(recorder);

@@ -39,7 +39,7 @@ fn in_use(folder: &RunFolder, e: anyhow::Error) -> anyhow::Error {
     match folder.lock() {
         Ok(_) => e,
         Err(_) => usage!(
-            "{} is written by `driml train` or by another `driml watch`: leave --run-dir out to look on, or choose another folder",
+            "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
             folder.display()
         )
         .into(),
@@ -84,7 +84,7 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
     );
     if after_updates == 0 && frames > now {
         return Err(usage!(
-            "the run in {} was at {frames} frames, and the one that is watched is at {now}: it was started anew, so choose another --run-dir",
+            "the run in {} had {frames} frames, and the watched run has {now}: it was restarted; choose another --run-dir",
             folder.display()
         )
         .into());

@@ -82,7 +82,7 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
     }
     match needed(&poller.view) {
         needed if needed.is_empty() => Ok(()),
-        needed => bail!("the run is not well: {}", needed.join("; ")),
+        needed => bail!("the run needs attention: {}", needed.join("; ")),
     }
 }
 

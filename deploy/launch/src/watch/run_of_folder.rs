@@ -41,12 +41,12 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         }
         let frames = progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
-            true => "is ending: all frames are in and its replay server has ended",
-            false => "is starting or ending: no replay server listens",
+            true => "is stopping: all frames are stored and its replay server has exited",
+            false => "is starting or stopping: no replay server listens",
         };
         let folder = folder.display();
         return Ok(Live::Over(format!(
-            "the run in {folder} {how}. Its launcher still runs; ask again in a moment\n"
+            "the run in {folder} {how}. Its launcher still runs; retry in a moment\n"
         )));
     }
     if Summary::is_finished(folder) {

@@ -77,7 +77,7 @@ impl Watched {
     pub(super) fn take(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
         if let Some(other) = poller.view.servers.iter().find(|it| it.is_another_run) {
             bail!(
-                "{} now serves a run with other settings: watch it anew, with another --run-dir",
+                "{} now serves a run with other settings: start `driml watch` again, with another --run-dir",
                 other.endpoint
             );
         }
@@ -113,7 +113,7 @@ impl Watched {
         let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
         if silent > silent_max {
             bail!(
-                "the replay server has not answered for {}, after which the learner gives it up too: the run has ended, or is cut off",
+                "the replay server has not answered for {}: the run has ended, or the network is interrupted",
                 duration(silent)
             );
         }

@@ -42,7 +42,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         }
     }
     if roles.is_empty() {
-        let text = format!("no part has one in {dir}: `deploy/certs.sh {dir}` makes them");
+        let text = format!("{dir} has none: `deploy/certs.sh {dir}` makes them");
         facts.push(Fact::missing("tls folder", text));
     }
     roles.sort_by_key(|role| match role {
@@ -74,7 +74,7 @@ fn complaint(credentials: &Credentials) -> Option<String> {
     let left = credentials.expires_in();
     if credentials.is_key_open() {
         Some(format!(
-            "{key} can be read by other users of this machine, who could play this part: chmod 600 {key}"
+            "{key} can be read by other users of this machine, who could take this role: chmod 600 {key}"
         ))
     } else if left < EXPIRES_SOON {
         Some(format!(
@@ -99,7 +99,7 @@ fn fact(role: Role, credentials: &Credentials) -> Fact {
     let mut text = good_until(credentials);
     if role == Role::ReplayServer {
         text += &format!(
-            ", for {}: whoever connects calls it by one of these",
+            ", for {}: connect to one of these names",
             credentials.hosts().join(", ")
         );
     }

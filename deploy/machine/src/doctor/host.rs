@@ -72,7 +72,7 @@ fn cores(cores: u32) -> Fact {
         machine.actors()
     );
     match cores {
-        0 | 1 => Fact::note("cores", format!("{text}; all parts take turns on it")),
+        0 | 1 => Fact::note("cores", format!("{text}; all processes share it")),
         _ => Fact::ok("cores", text),
     }
 }

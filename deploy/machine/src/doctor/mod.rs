@@ -61,15 +61,15 @@ impl Report {
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
         let missing = lacking(&self.cpu, |state| state == State::Missing);
         if !missing.is_empty() {
-            bail!("training on the CPU needs what is missing here: {missing}");
+            bail!("training on the CPU needs: {missing}");
         }
         let bad = lacking(&self.certificates, |state| state == State::Missing);
         if !bad.is_empty() {
-            bail!("with --tls-dir these parts cannot take part: {bad}");
+            bail!("these certificates cannot be used: {bad}");
         }
         if cuda && !cuda::is_ready(&self.cuda) {
             let missing = lacking(&self.cuda, |state| state != State::Ok);
-            bail!("--device cuda needs what is missing here: {missing}");
+            bail!("--device cuda needs: {missing}");
         }
         Ok(())
     }

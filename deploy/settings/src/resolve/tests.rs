@@ -217,7 +217,7 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect!["in the settings' [run] table: unknown variant `always`, expected one of `none`, `fixed`, `uniform`, `nhg`, `all`, in `horizon.rule`"].assert_eq(&said("driml-ada", "run.horizon.rule=always"));
     expect!["learner.update cannot work: objective = dim, but all lambdas are 0: set one above 0, or take the agent c51"].assert_eq(&said("driml-ada", "learner.update.lambda.4t4=0"));
     expect!["learner.update cannot work: objective = none computes no auxiliary loss, but lambda.4t4 is above 0: set it to 0, or take another agent"].assert_eq(&said("c51", "learner.update.lambda.4t4=1"));
-    expect!["run.horizon follows the action affinity, which nobody estimates: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
+    expect!["run.horizon needs the action affinity, but learner.affinity.estimator is none: --set learner.affinity.estimator=learned"].assert_eq(&said("driml-ada", "learner.affinity.estimator=none"));
     expect!["learner.affinity.alphabet = (missing) cannot work: the chosen estimator needs it: start from a preset"].assert_eq(&said("driml-fix", "learner.affinity.estimator=exact"));
     expect!["replay.replay_ratio = 0 cannot work: rows per transition must be a number above 0"]
         .assert_eq(&said("driml-ada", "replay.replay_ratio=0"));

@@ -34,12 +34,12 @@ use self::{
 
 #[derive(Debug, Args)]
 pub(crate) struct EvaluateArgs {
-    /// Folder of the run, a file that --export wrote, or pretrained:GAME for a network that is built in
+    /// Folder of a run, file written by --export, or pretrained:GAME for built-in weights
     #[arg(value_name = "RUN", required_unless_present = "run")]
     pub(crate) folder: Option<PathBuf>,
     #[arg(long, value_name = "DIR", conflicts_with = "folder", hide = true)]
     pub(crate) run: Option<PathBuf>,
-    /// Whole episodes to play
+    /// Episodes to play
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub(crate) episodes: u32,
     /// Which levels to play
@@ -48,25 +48,25 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
-    /// Play the checkpoint after so many updates, or the "best" of those that were played and kept [default: newest]
+    /// Checkpoint to play: a number of updates, or "best" for the best of evaluations.csv [default: newest]
     #[arg(long, value_name = "UPDATES")]
     pub(crate) checkpoint: Option<Which>,
-    /// Which of the checkpoint's weights to play [default: average]
+    /// Weights to play [default: average]
     #[arg(long, value_enum)]
     pub(crate) weights: Option<Weights>,
-    /// Write the weights that would be played into this file, as f16 with the run's settings, and play nothing
+    /// Write the weights as f16, with the run's settings, into this file, and play nothing
     #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["keep", "exact", "returns", "json", "record"])]
     pub(crate) export: Option<PathBuf>,
-    /// Add the agent's mean return to the run's evaluations.csv, and keep the checkpoint as the run's best if it earned most
+    /// Add the mean return to the run's evaluations.csv, and keep the checkpoint if it is the best
     #[arg(long, conflicts_with_all = ["levels", "seed", "weights", "exact", "returns", "json", "record"])]
     pub(crate) keep: bool,
-    /// Play with f32 weights and arithmetic, also where the run's actors played with bf16 or f16
+    /// Play with f32 weights and arithmetic, even if the run's actors used bf16 or f16
     #[arg(long)]
     pub(crate) exact: bool,
-    /// Write every episode's return into this file, as CSV: who played, number of the episode, return
+    /// Write every episode's return into this CSV file: policy, episode, return
     #[arg(long, value_name = "FILE")]
     pub(crate) returns: Option<PathBuf>,
-    /// Print one JSON object instead of lines for people
+    /// Print one JSON object
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

@@ -20,19 +20,19 @@ const PAUSE: f64 = 8.0;
 
 #[derive(Debug, Args)]
 pub(crate) struct RecordArgs {
-    /// Film what the agent plays, as an animated GIF at the game's own speed
+    /// Film the agent, as an animated GIF at the game's speed
     #[arg(long, value_name = "FILE.gif")]
     pub(crate) record: Option<PathBuf>,
-    /// Beside each frame: value, C51's distribution of the chosen action, the action's name, and where local DIM knows the next state
+    /// Show beside each frame the value, C51's distribution, the action and the scores of local DIM
     #[arg(long, requires = "record")]
     pub(crate) overlay: bool,
-    /// Copies of the world to film, beside each other
+    /// Copies of the world to film, side by side
     #[arg(long, value_name = "N", default_value_t = 1, requires = "record", value_parser = clap::value_parser!(u32).range(1..=8))]
     pub(crate) record_copies: u32,
-    /// Episodes of each of them to film; fewer if fewer are played
+    /// Episodes to film per copy; fewer if fewer are played
     #[arg(long, value_name = "N", default_value_t = 2, requires = "record", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) record_episodes: u32,
-    /// Steps after which the film ends in any case; a picture of Procgen is 5 to 10 kB
+    /// Steps to film at most; a Procgen frame takes 5 to 10 kB
     #[arg(long, value_name = "N", default_value_t = 600, requires = "record", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) record_steps: u32,
 }

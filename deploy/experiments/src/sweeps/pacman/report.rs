@@ -148,7 +148,7 @@ fn got_losses(results: &Results) -> Vec<String> {
     let lines = LOSSES.iter().filter_map(|(column, what)| {
         let (rank, runs) = order_of_epsilon(results, column)?;
         Some(format!(
-            "(a) Rank correlation of epsilon and the final {what} loss over {runs} runs: {rank:.2} (1 where each more random ghost costs more)."
+            "(a) Rank correlation of epsilon and the final {what} loss over {runs} runs: {rank:.2} (1 if the loss rises with epsilon)."
         ))
     });
     lines.collect()

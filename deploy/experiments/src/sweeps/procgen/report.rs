@@ -205,7 +205,7 @@ fn above_random(settings: &Settings, games: &BTreeMap<&str, Vec<&Scored>>) -> Ve
         let count = played.clone().count();
         let above = played.filter(|(_, runs)| of(runs, agent).all(Scored::is_above_random));
         let text = format!(
-            "`{agent}` plays better than at random, in every seed by {ERRORS} standard errors, on {} of {count} games.",
+            "`{agent}` is better than random, in every seed by {ERRORS} standard errors, on {} of {count} games.",
             above.count()
         );
         (count > 0).then_some(text)
