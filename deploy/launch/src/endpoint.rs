@@ -200,7 +200,7 @@ mod tests {
         assert!(refused("quic/[::1]:1", true).contains("connect by a name"));
         assert_eq!(listening("quic/[::]:1", TLS), Ok(()));
         assert!(refused("tcp/host:1", true).contains("it is quic/host:1"));
-        assert!(refused("quic/host:1#enable_mtls=false", true).contains("no endpoint"));
+        assert!(refused("quic/host:1#enable_mtls=false", true).contains("not an endpoint"));
         for tls in [false, true] {
             let said = refused("tls/host:1", tls);
             assert!(said.contains("with --tls-dir it is quic/host:1"), "{said}");
@@ -252,7 +252,7 @@ mod tests {
             for way_out in [
                 "--tls-dir DIR",
                 "--insecure-network",
-                "change what is learned",
+                "change and stop the run",
             ] {
                 assert!(said.contains(way_out), "{said}");
             }
