@@ -163,31 +163,6 @@ impl SweepArgs {
     }
 }
 
-#[cfg(test)]
-impl TradeoffArgs {
-    /// A call that names the world alone.
-    pub(crate) fn of(env: &str, smoke: bool) -> Self {
-        Self {
-            env: env.into(),
-            budget: 180,
-            dials: Vec::new(),
-            plan: false,
-            frames: None,
-            episodes: None,
-            flags: ExperimentFlags {
-                smoke,
-                out: None,
-                seeds: None,
-            },
-            queue: QueueFlags {
-                jobs: None,
-                report: false,
-                sets: Vec::new(),
-            },
-        }
-    }
-}
-
 /// The settings of an experiment, of its full or its smoke length; both are built in.
 pub(crate) fn settings<T: DeserializeOwned>(
     name: &str,

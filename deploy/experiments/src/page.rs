@@ -4,7 +4,10 @@
 use std::{collections::BTreeMap, fmt};
 
 use driml_machine::units::rough_duration;
-use minijinja::{Environment, UndefinedBehavior, Value};
+use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value};
+use serde::{Serialize, Serializer};
+
+use crate::stats::{Spread, difference, interval};
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
@@ -17,6 +20,11 @@ pub(crate) struct Table {
 }
 
 impl Table {
+    /// Rows of data below the names of a file's columns, parted by commas.
+    pub(crate) fn of(columns: &str, rows: impl IntoIterator<Item = Vec<String>>) -> Self {
+        Self::new(&columns.split(',').collect::<Vec<_>>(), rows)
+    }
+
     /// A table of these rows.
     pub(crate) fn new(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Self {
         Self {
@@ -62,26 +70,20 @@ pub(crate) fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
     value.map_or_else(|| "-".into(), text)
 }
 
+impl Serialize for Table {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
 /// What the names in a template stand for.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Values(BTreeMap<&'static str, Value>);
 
 impl Values {
-    /// A number or words, or a whole block.
-    pub(crate) fn set(&mut self, name: &'static str, value: impl fmt::Display) -> &mut Self {
-        self.0.insert(name, value.to_string().into());
-        self
-    }
-
-    /// Entries of a list.
-    pub(crate) fn items(&mut self, name: &'static str, items: Vec<String>) -> &mut Self {
-        self.0.insert(name, items.into());
-        self
-    }
-
-    /// Whether what hangs on it is on the page.
-    pub(crate) fn when(&mut self, name: &'static str, truth: bool) -> &mut Self {
-        self.0.insert(name, truth.into());
+    /// A number, words, a list, a whole table, or the settings: whatever the template reads.
+    pub(crate) fn set(&mut self, name: &'static str, value: impl Serialize) -> &mut Self {
+        self.0.insert(name, Value::from_serialize(value));
         self
     }
 }
@@ -119,7 +121,9 @@ impl Page {
             "time",
             format!("{time}{at_once} on a machine with {cores} cores."),
         );
-        fill(self.template, &values)
+        fill(self.template, &values).unwrap_or_else(|e| {
+            panic!("the template of the page is built in, and a test fills it: {e:#}")
+        })
     }
 }
 
@@ -131,22 +135,91 @@ pub(crate) fn summary(page: &str) -> String {
 
 /// The Markdown that `template` becomes. Blocks of which nothing is left are left out.
 ///
-/// # Panics
-/// The template, which is built in, is not one, or names a value that its experiment does not give.
-fn fill(template: &str, values: &Values) -> String {
+/// # Errors
+/// The template is not one, or names a value that its experiment does not give.
+fn fill(template: &str, values: &Values) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
     environment.add_function("figure", figure);
-    let text = environment
-        .render_str(template, &values.0)
-        .unwrap_or_else(|e| {
-            panic!("the template of the page is built in, and a test fills it: {e:#}")
-        });
+    environment.add_filter(
+        "fixed",
+        |value: Value, decimals: usize, unit: Option<f64>| {
+            written(&value, |it| {
+                format!("{:.decimals$}", it * unit.unwrap_or(1.0))
+            })
+        },
+    );
+    environment.add_filter("percent", |value: Value| {
+        written(&value, |it| format!("{:.1}%", 100.0 * it))
+    });
+    environment.add_filter("sci", |value: Value| {
+        written(&value, |it| format!("{it:.1e}"))
+    });
+    environment.add_filter("factor", |value: Value| {
+        written(&value, |it| format!("x{it:.2}"))
+    });
+    environment.add_filter("duration", |value: Value| written(&value, rough_duration));
+    environment.add_filter("mean", |list: Value| {
+        of_list(&list, |all| Some(Spread::of(all.iter().copied())?.mean))
+    });
+    environment.add_filter("spread", |list: Value| {
+        of_list(&list, |all| {
+            Some(Spread::of(all.iter().copied())?.to_string())
+        })
+    });
+    environment.add_filter("mean_and_sd", |list: Value, decimals: usize| {
+        of_list(&list, |all| mean_and_sd(all, decimals))
+    });
+    environment.add_filter("interval", |list: Value| {
+        of_list(&list, |all| Some(interval(all)?.to_string()))
+    });
+    environment.add_filter("minus", |to: Value, from: Value| {
+        let (to, from) = (list_of(&to)?, list_of(&from)?);
+        Ok::<_, Error>(cell(difference(&from, &to), |it| it.to_string()))
+    });
+    environment.add_filter("verdict", |to: Value, from: Value| {
+        let (to, from) = (list_of(&to)?, list_of(&from)?);
+        Ok::<_, Error>(difference(&from, &to).map_or("", |it| it.verdict()))
+    });
+    let text = environment.render_str(template, &values.0)?;
     let blocks = text.split("\n\n").map(str::trim);
     let blocks: Vec<_> = blocks.filter(|block| !block.is_empty()).collect();
-    blocks.join("\n\n") + "\n"
+    Ok(blocks.join("\n\n") + "\n")
+}
+
+/// A number as a template has it, a dash if it is none. One that its experiment does not give is a mistake.
+fn written(value: &Value, text: impl Fn(f64) -> String) -> Result<String, Error> {
+    match value.is_none() || value.as_str() == Some("-") {
+        true => Ok("-".into()),
+        false => f64::try_from(value.clone()).map(text),
+    }
+}
+
+/// The numbers of a list, those of runs and seeds that have one.
+fn list_of(list: &Value) -> Result<Vec<f64>, Error> {
+    if list.is_undefined() {
+        return Err(ErrorKind::UndefinedError.into());
+    }
+    let known = list.try_iter()?.filter(|it| !it.is_none());
+    known.map(f64::try_from).collect()
+}
+
+/// What follows from a list's numbers, a dash if nothing does.
+fn of_list<T: Into<Value>>(list: &Value, of: impl Fn(&[f64]) -> Option<T>) -> Result<Value, Error> {
+    Ok(of(&list_of(list)?).map_or_else(|| "-".into(), Into::into))
+}
+
+/// The mean, with the standard deviation of several values.
+fn mean_and_sd(values: &[f64], decimals: usize) -> Option<String> {
+    let Spread {
+        mean, sd, count, ..
+    } = Spread::of(values.iter().copied())?;
+    Some(match count {
+        1 => format!("{mean:.decimals$}"),
+        _ => format!("{mean:.decimals$} ± {sd:.decimals$}"),
+    })
 }
 
 /// A picture with its caption below it, and a link to the SVG.
@@ -166,8 +239,7 @@ mod tests {
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ table }}\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let mut values = Values::default();
         values.set("got", 0.5).set("table", table);
-        values.items("more", vec!["1".into(), "2".into()]);
-        values.when("no", false);
+        values.set("more", ["1", "2"]).set("no", false);
         let page = |smoke| Page::new(template, values.clone(), "driml experiment t", smoke);
         let text = page(true).text(130.0, 1);
         for part in [
@@ -190,8 +262,49 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "undefined")]
+    fn lists_of_numbers_become_what_a_page_says_of_them() {
+        let mut values = Values::default();
+        values.set("base", [0.0, 0.01, 0.02, 0.03]);
+        values
+            .set("none", Vec::<f64>::new())
+            .set("nil", None::<f64>);
+        for (list, template, expected) in [
+            (vec![1.0, 3.0], "{{ it | mean_and_sd(2) }}", "2.00 ± 1.41\n"),
+            (vec![1.0], "{{ it | mean_and_sd(1) }}", "1.0\n"),
+            (vec![1.0], "{{ it | interval }}", "1.00 (one seed)\n"),
+            (
+                vec![2.0],
+                "{{ it | mean | factor }} {{ none | mean | sci }}",
+                "x2.00 -\n",
+            ),
+            (vec![], "{{ it | minus(base) }}{{ nil | fixed(3) }}", "--\n"),
+            (vec![1.0], "{{ it | minus(base) }}", "+0.98 (one seed)\n"),
+            (
+                vec![1.0, 1.1, 1.2, 1.3],
+                "{{ it | minus(base) }}{{ it | verdict(base) }}",
+                "+1.13 [+0.94, +1.33], better than its base\n",
+            ),
+            (
+                vec![-1.0, -1.1, -1.2, -1.3],
+                "{{ it | verdict(base) }}",
+                ", worse than its base\n",
+            ),
+            (vec![-1.0, 1.0, 0.0], "{{ it | verdict(base) }}.", ".\n"),
+        ] {
+            values.set("it", list);
+            assert_eq!(fill(template, &values).unwrap(), expected, "{template}");
+        }
+    }
+
+    #[test]
     fn a_name_without_a_value_is_a_mistake() {
-        fill("{{ nothing }}", &Values::default());
+        for template in [
+            "{{ a }}",
+            "{{ a | fixed(2) }}",
+            "{{ a | mean }}",
+            "{{ a | minus([]) }}",
+        ] {
+            assert!(fill(template, &Values::default()).is_err(), "{template}");
+        }
     }
 }

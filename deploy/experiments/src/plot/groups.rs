@@ -3,6 +3,8 @@
 
 use std::collections::VecDeque;
 
+use driml_figure::Series;
+
 use super::{
     names,
     runs::{Over, Run, SPREAD_OF_K},
@@ -31,6 +33,25 @@ pub(super) struct Group<'a> {
 pub(crate) struct Curve {
     pub(crate) points: Vec<(f64, f64)>,
     pub(crate) band: Vec<(f64, f64, f64)>,
+}
+
+impl Curve {
+    /// The mean of the values at each x, and their range; nothing where there are none.
+    pub(crate) fn of_means(all: impl IntoIterator<Item = (f64, Vec<f64>)>) -> Self {
+        let mut curve = Self::default();
+        for (x, values) in all {
+            if let Some(spread) = Spread::of(values) {
+                curve.points.push((x, spread.mean));
+                curve.band.push((x, spread.min, spread.max));
+            }
+        }
+        curve
+    }
+
+    /// The curve in the colour of this index.
+    pub(crate) fn series(self, name: &str, index: usize) -> Series {
+        Series::line(name, index, self.points).banded(self.band)
+    }
 }
 
 /// The runs, those that differ in their seed alone together if `together`; in the order in which they were named.

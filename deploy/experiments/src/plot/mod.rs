@@ -212,9 +212,7 @@ fn absent(column: &str, runs: &[Run]) -> Vec<String> {
 fn series(groups: &[Group<'_>], curves: Vec<Curve>) -> Vec<Series> {
     let all = groups.iter().zip(curves).enumerate();
     all.filter(|(_, (_, curve))| !curve.points.is_empty())
-        .map(|(index, (group, curve))| {
-            Series::line(&group.name, index, curve.points).banded(curve.band)
-        })
+        .map(|(index, (group, curve))| curve.series(&group.name, index))
         .collect()
 }
 

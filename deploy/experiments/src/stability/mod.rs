@@ -289,7 +289,7 @@ fn page_of(results: &Results, command: &str, smoke: bool) -> Page {
     let mut values = Values::default();
     values
         .set("verdict", verdict(results))
-        .items("broken", broken)
+        .set("broken", broken)
         .set("refusals", refusals)
         .set(
             "nearest",
@@ -304,7 +304,7 @@ fn page_of(results: &Results, command: &str, smoke: bool) -> Page {
         .set("seeds", results.settings.seeds)
         .set("rows", rows)
         .set("refused", refused)
-        .when("all_refused", taken.is_empty());
+        .set("all_refused", taken.is_empty());
     Page::new(include_str!("page.md"), values, command, smoke)
 }
 

@@ -9,6 +9,8 @@ use driml_launch::stats::{self, mean_and_deviation, student_quantile};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::page::number;
+
 /// Mean and standard deviation (n - 1) over seeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Spread {
@@ -61,13 +63,15 @@ pub(crate) struct Interval {
     pub(crate) ends: Option<(f64, f64)>,
 }
 
-impl Interval {
-    /// Mean, low and high end as a file of data has them; empty where there is none.
-    pub(crate) fn cells(&self) -> [String; 3] {
-        let ends = self.ends;
-        let numbers = [Some(self.mean), ends.map(|it| it.0), ends.map(|it| it.1)];
-        numbers.map(|it| it.map_or(String::new(), |it| format!("{it:.4}")))
-    }
+/// Mean, low and high end as a file of data has them; empty where there is none.
+pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
+    let ends = of.and_then(|it| it.ends);
+    let numbers = [
+        of.map(|it| it.mean),
+        ends.map(|it| it.0),
+        ends.map(|it| it.1),
+    ];
+    numbers.map(|it| number(it, 4))
 }
 
 /// Student's interval of the mean; none of no value.
@@ -88,6 +92,28 @@ pub(crate) struct Difference {
     /// Whether 0 is outside of the interval, and the exact permutation test finds a chance of at most 5%: few values may coincide, and
     /// their interval is then too narrow. Of more than 20 values the interval alone decides.
     pub(crate) is_apart: bool,
+}
+
+impl Difference {
+    /// What it says, for the end of a sentence.
+    pub(crate) const fn verdict(&self) -> &'static str {
+        match (self.is_apart, self.interval.mean > 0.0) {
+            (false, _) => "",
+            (true, true) => ", better than its base",
+            (true, false) => ", worse than its base",
+        }
+    }
+}
+
+/// With its sign.
+impl fmt::Display for Difference {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Interval { mean, ends } = self.interval;
+        match ends {
+            None => write!(f, "{mean:+.2} (one seed)"),
+            Some((low, high)) => write!(f, "{mean:+.2} [{low:+.2}, {high:+.2}]"),
+        }
+    }
 }
 
 /// The mean of `to` minus that of `from`; none where either is empty.

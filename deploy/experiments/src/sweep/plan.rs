@@ -77,6 +77,19 @@ pub(crate) struct PlannedRun {
     pub(crate) units: u64,
 }
 
+impl PlannedRun {
+    /// A run of so many frames.
+    pub(crate) const fn new(name: String, call: Call, frames: u64) -> Self {
+        Self {
+            name,
+            call,
+            frames,
+            episodes: None,
+            units: frames,
+        }
+    }
+}
+
 /// A finished run.
 #[derive(Clone, Debug)]
 pub(crate) struct FinishedRun {

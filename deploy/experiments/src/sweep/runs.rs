@@ -146,15 +146,12 @@ mod tests {
         let runs = Runs {
             root: root.path().to_owned(),
         };
-        let plan = |frames: u64| PlannedRun {
-            name: "run".into(),
-            call: Call {
+        let plan = |frames: u64| {
+            let call = Call {
                 frames: Some(frames),
                 ..Call::default()
-            },
-            frames,
-            episodes: None,
-            units: frames,
+            };
+            PlannedRun::new("run".into(), call, frames)
         };
         let view = RunView::new(Plan::default());
         let folder = RunFolder::new(runs.root.join("run"));

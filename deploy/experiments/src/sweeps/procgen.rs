@@ -1,5 +1,5 @@
 //! Table 1: agents on Procgen's games beside a random policy and the paper's numbers.
-//! Runs are made by the engine in `sweep`; their table is in `results`, figure and page in `report`.
+//! Runs are made by the engine in `sweep`; what they gave is in `results`, figure and page in `report`.
 
 mod report;
 mod results;
@@ -8,7 +8,7 @@ mod settings;
 use driml_launch::evaluate::Levels;
 
 use self::{
-    results::Scored,
+    results::{Game, Scored},
     settings::{NAME, Settings, short},
 };
 use super::published::Published;
@@ -49,12 +49,18 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     }
     let published = Published::read();
     session.csv("table", &results::data(&scored, &published)?)?;
-    session.figure("curves", &report::figure(&settings, &scored, &published)?)?;
-    let over_games = report::over_games(&mut session, &settings, &scored, &published)?;
-    let page = report::page(&settings, &scored, &published, over_games, &missing);
+    let games = Game::all(&settings, &scored, &published);
+    session.figure("curves", &report::figure(&settings, &games)?)?;
+    let over_games = report::over_games(&mut session, &settings, &games, &published)?;
+    let mut values = report::page(&settings, &games, &missing);
+    values
+        .set("count", scored.len())
+        .set("planned", scored.len() + missing.len())
+        .set("over_games", over_games);
+    let template = include_str!("procgen.md");
     session.finish(&Page::new(
-        include_str!("procgen.md"),
-        page,
+        template,
+        values,
         &this_command(),
         args.flags.smoke,
     ))?;

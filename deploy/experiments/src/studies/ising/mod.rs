@@ -20,6 +20,7 @@ use crate::{
     cache::Session,
     flags::{self, ExperimentFlags, this_command},
     page::{Page, Table, Values},
+    plot::Curve,
     stats::Spread,
 };
 
@@ -72,63 +73,33 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &trained)?;
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
-    let command = this_command();
-    session.finish(&page(&task, &trained, &command, args.smoke))
+    session.finish(&page(&task, &trained, args.smoke))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
-    let seeds = || trained.iter().enumerate();
+    let seeds = || (1..).zip(trained);
+    let number = |number: f64| format!("{number:.4}");
     let checks = seeds().flat_map(|(seed, one)| {
-        one.checks.iter().map(move |(update, measured)| {
-            let numbers = [
-                measured.auc,
-                measured.auc_raw,
-                measured.auc_clear,
-                measured.auc_pairs,
-                measured.loss,
-            ];
-            let head = [(seed + 1).to_string(), update.to_string()];
-            let numbers = numbers.map(|number| format!("{number:.4}"));
-            head.into_iter().chain(numbers).collect()
+        one.checks.iter().map(move |(update, it)| {
+            let numbers = [it.auc, it.auc_raw, it.auc_clear, it.auc_pairs, it.loss];
+            let head = [seed.to_string(), update.to_string()];
+            head.into_iter().chain(numbers.map(number)).collect()
         })
     });
-    let header = [
-        "seed",
-        "updates",
-        "auc",
-        "auc_raw_score",
-        "auc_clear",
-        "auc_pairs",
-        "loss_nats",
-    ];
-    session.csv("auc", &Table::new(&header, checks))?;
-    let losses = seeds().flat_map(|(seed, one)| {
-        smoothed(&one.loss).map(move |(update, loss)| {
-            vec![
-                (seed + 1).to_string(),
-                format!("{update:.0}"),
-                format!("{loss:.4}"),
-            ]
-        })
+    let columns = "seed,updates,auc,auc_raw_score,auc_clear,auc_pairs,loss_nats";
+    session.csv("auc", &Table::of(columns, checks))?;
+    let losses = seeds().flat_map(|(seed, one): (u32, _)| {
+        smoothed(&one.loss)
+            .map(move |(update, loss)| vec![seed.to_string(), update.to_string(), number(loss)])
     });
-    session.csv(
-        "loss",
-        &Table::new(&["seed", "updates", "loss_nats"], losses),
-    )?;
-    let maps = trained[0].maps.iter().enumerate();
-    let maps = maps.flat_map(|(episode, map)| {
-        map.iter().enumerate().map(move |(location, score)| {
-            vec![
-                (episode + 1).to_string(),
-                location.to_string(),
-                format!("{score:.4}"),
-            ]
-        })
-    });
-    session.csv(
-        "maps",
-        &Table::new(&["episode", "location", "score_nats"], maps),
-    )
+    session.csv("loss", &Table::of("seed,updates,loss_nats", losses))?;
+    let maps = (1..)
+        .zip(&trained[0].maps)
+        .flat_map(|(episode, map): (u32, _)| {
+            let scores = map.iter().enumerate();
+            scores.map(move |(at, &score)| vec![episode.to_string(), at.to_string(), number(score)])
+        });
+    session.csv("maps", &Table::of("episode,location,score_nats", maps))
 }
 
 /// Means of `LOSS_WINDOW` updates each, at their end.
@@ -165,17 +136,13 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
             outline: Some(outline(episode)),
         })
     };
-    let values = || first.maps.iter().flatten().copied();
-    let range = (
-        values().fold(f64::INFINITY, f64::min),
-        values().fold(f64::NEG_INFINITY, f64::max),
-    );
+    let range = Spread::of(first.maps.iter().flatten().copied());
     let view = View::of(&task.model);
     let scores = |episode: usize| {
         let map = first.maps[episode].iter().map(|score| Some(*score));
         Panel::Heat(Heat {
             unit: "score [nats]".into(),
-            range: Some(range),
+            range: range.map(|it| (it.min, it.max)),
             field: Some(Field {
                 side: side as f64,
                 first: (view.side - view.step) as f64 / 2.0,
@@ -210,37 +177,26 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
 
 /// Loss and what the scores tell, over updates.
 fn learning(task: &Task, trained: &[Trained]) -> Figure {
-    let over = |name: &str, index: usize, value: &dyn Fn(&Measured) -> f64| {
-        let (mut points, mut band) = (Vec::new(), Vec::new());
-        for (at, (update, _)) in trained[0].checks.iter().enumerate() {
+    let over = |name: &str, index: usize, value: fn(&Measured) -> f64| {
+        let checks = trained[0].checks.iter().enumerate();
+        let means = checks.map(|(at, (update, _))| {
             let values = trained.iter().map(|one| value(&one.checks[at].1));
-            if let Some(spread) = Spread::of(values) {
-                points.push((*update as f64, spread.mean));
-                band.push((*update as f64, spread.min, spread.max));
-            }
-        }
-        Series::line(name, index, points).banded(band)
+            (*update as f64, values.collect())
+        });
+        Curve::of_means(means).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
+    let nothing = Series::line("nothing told", 0, ends).coloured(GREY);
+    let pairs = over("in the patch: true pair or other", 1, |it| it.auc_pairs);
     let areas = vec![
-        Series::line("nothing told", 0, ends)
-            .coloured(GREY)
-            .marked(Mark::Dashed),
-        over("patch or noise", 0, &|measured| measured.auc),
-        over("patch or noise, clear places", 2, &|measured| {
-            measured.auc_clear
-        }),
-        over("in the patch: true pair or other", 1, &|measured| {
-            measured.auc_pairs
-        })
-        .marked(Mark::Dashed),
+        nothing.marked(Mark::Dashed),
+        over("patch or noise", 0, |it| it.auc),
+        over("patch or noise, clear places", 2, |it| it.auc_clear),
+        pairs.marked(Mark::Dashed),
     ];
     let losses = trained.iter().enumerate().map(|(seed, one)| {
-        Series::line(
-            &format!("seed {}", seed + 1),
-            seed,
-            smoothed(&one.loss).collect(),
-        )
+        let name = format!("seed {}", seed + 1);
+        Series::line(&name, seed, smoothed(&one.loss).collect())
     });
     Figure {
         title: "What local DIM learns of the Ising world".into(),
@@ -267,39 +223,21 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     }
 }
 
-fn page(task: &Task, trained: &[Trained], command: &str, smoke: bool) -> Page {
-    let settings = &task.settings;
-    let over_seeds = |value: &dyn Fn(&Trained) -> f64| {
-        Spread::of(trained.iter().map(value)).map_or("none".to_owned(), |it| it.to_string())
-    };
-    let batch_size = settings.batch_size;
+fn page(task: &Task, trained: &[Trained], smoke: bool) -> Page {
+    let last: Vec<_> = trained.iter().map(|one| one.last).collect();
+    let untrained: Vec<_> = trained.iter().map(|one| one.checks[0].1.auc).collect();
+    let blind_loss = (task.settings.batch_size as f64).ln();
     let mut values = Values::default();
     values
-        .set("from_t", settings.from_t)
-        .set("next_t", settings.from_t + 1)
-        .set("late_t", settings.late_t)
+        .set("task", task)
+        .set("settings", &task.settings)
+        .set("seeds", trained.len())
         .set("view", View::of(&task.model).side)
-        .set("episodes", settings.episodes)
-        .set("updates", settings.updates)
+        .set("last", last)
+        .set("untrained", untrained)
+        .set("blind_loss", blind_loss)
         .set("loss_window", LOSS_WINDOW);
-    values
-        .set("auc", over_seeds(&|one| one.last.auc))
-        .set("auc_raw", over_seeds(&|one| one.last.auc_raw))
-        .set("auc_clear", over_seeds(&|one| one.last.auc_clear))
-        .set("auc_pairs", over_seeds(&|one| one.last.auc_pairs))
-        .set("untrained", over_seeds(&|one| one.checks[0].1.auc))
-        .set("loss", over_seeds(&|one| one.last.loss))
-        .set("batch_size", batch_size)
-        .set("blind_loss", format!("{:.2}", (batch_size as f64).ln()));
-    values
-        .set("lattice", task.world.lattice_size)
-        .set("patch", task.world.patch_size)
-        .set("temperature", task.world.temperature)
-        .set("episode_steps", task.world.episode_steps)
-        .set("rkhs", task.model.rkhs)
-        .set("lr", task.learner.adam.lr)
-        .set("seeds", trained.len());
-    Page::new(include_str!("page.md"), values, command, smoke)
+    Page::new(include_str!("page.md"), values, &this_command(), smoke)
 }
 
 #[cfg(test)]

@@ -1,22 +1,16 @@
 //! Local DIM on the Ising world: training on pairs of successive frames, and measuring what the scores tell.
 //! Network, loss and optimiser are the learner's own; there is no C51 part, as nothing is earned in this world.
 
-use candle_core::{DType, Device, Tensor};
+use anyhow::Context;
+use candle_core::{Device, Tensor};
 use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
-use driml_learner::{
-    LearnerSettings,
-    auxiliary::dim::{Dim, dots},
-    optimiser::{
-        adam::Adam,
-        gradients::{Gradients, clip_factor},
-    },
-};
-use driml_model::{Kernels, ModelConfig, Network, Parameters};
+use driml_learner::{LearnerSettings, auxiliary::dim::Dim};
+use driml_model::{Features, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::{progress::Progress, stats::auc};
+use crate::{progress::Progress, stats::auc, studies::dim::DimLearner};
 
 /// What one training depends on.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -60,18 +54,17 @@ pub(super) struct Measured {
 
 pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Trained> {
     let settings = &task.settings;
+    let LearnerSettings {
+        lambda,
+        tanh_clip,
+        adam,
+        max_grad_norm,
+        ..
+    } = task.learner;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let parameters = Parameters::init(&task.model, &mut rng, &Device::Cpu)?;
-    let network = Network::new(&task.model, &parameters)?;
-    let mut adam = Adam::new(task.learner.adam, &parameters, Kernels::FUSED)?;
-    let scorer = Scorer {
-        task,
-        network: &network,
-        dim: Dim {
-            lambda: task.learner.lambda,
-            tanh_clip: task.learner.tanh_clip,
-        },
-    };
+    let dim = Dim { lambda, tanh_clip };
+    let learner = DimLearner::new(&task.model, dim, adam, max_grad_norm, &mut rng)?;
+    let mut scorer = Scorer { task, learner };
     let mut pairs = Pairs::new(task, &mut rng)?;
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
     let period = (settings.updates / settings.checks.max(1)).max(1);
@@ -80,11 +73,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
             checks.push((update, scorer.measure(settings.check_episodes)?.0));
         }
         let (now, next) = pairs.batch(&mut rng)?;
-        let value = scorer.loss(&now, &next)?;
-        loss.push(value.to_scalar::<f32>()?);
-        let gradients = Gradients::of(&parameters, &value)?;
-        let factor = clip_factor(gradients.norm(Kernels::FUSED)?, task.learner.max_grad_norm);
-        adam.step(&parameters, &gradients, factor)?;
+        loss.push(scorer.learn(&now, &next)?);
         progress.advance(1)?;
     }
     let (last, maps) = scorer.measure(settings.episodes)?;
@@ -193,15 +182,14 @@ impl<'a> Pairs<'a> {
     }
 }
 
-/// The network with the objective.
+/// The network that learns, and what it is measured on.
 struct Scorer<'a> {
     task: &'a Task,
-    network: &'a Network,
-    dim: Dim,
+    learner: DimLearner,
 }
 
 impl Scorer<'_> {
-    fn tensor(&self, frames: &[u8]) -> anyhow::Result<Tensor> {
+    fn features(&self, frames: &[u8]) -> anyhow::Result<Features> {
         let ModelConfig {
             height,
             width,
@@ -210,34 +198,24 @@ impl Scorer<'_> {
         } = self.task.model;
         let rows = frames.len() / (height * width * channels);
         let shape = (rows, height, width, channels);
-        Ok(Tensor::from_slice(frames, shape, &Device::Cpu)?)
+        let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
+        Ok(self.learner.network.features(&frames)?)
     }
 
-    /// InfoNCE of a batch, with its graph.
-    fn loss(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Tensor> {
-        let features_t = self.network.features(&self.tensor(now)?)?;
-        let features_k = self.network.features(&self.tensor(next)?)?;
-        let rows = features_t.f4.dim(0)?;
-        let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
-        let valid = vec![1; rows];
-        let losses =
-            self.dim
-                .pair_losses(self.network, &features_t, &features_k, &action, &valid)?;
-        let [local, ..] = losses;
-        local.ok_or_else(|| anyhow::anyhow!("lambda.3t3 is 0, so there is no local DIM to learn"))
+    /// An update on pairs (s_t, s_{t+1}); gives InfoNCE's loss before it.
+    fn learn(&mut self, now: &[u8], next: &[u8]) -> anyhow::Result<f32> {
+        let (now, next) = (self.features(now)?, self.features(next)?);
+        let [local, ..] = self.learner.losses(&now, &next)?;
+        let local = local.context("lambda.3t3 is 0, so there is no local DIM to learn")?;
+        self.learner.step(&local)?;
+        Ok(local.to_scalar()?)
     }
 
     /// Clipped scores [L, B, B] of every anchor with every candidate, at each location.
     fn scores(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Vec<f64>> {
-        let features_t = self.network.features(&self.tensor(now)?)?;
-        let features_k = self.network.features(&self.tensor(next)?)?;
-        let action = Tensor::zeros(features_t.f4.dim(0)?, DType::U8, &Device::Cpu)?;
-        let wanted = [true, false, false, false];
-        let [local, ..] = dots(self.network, &features_t, &features_k, &action, wanted)?;
-        let local = local.expect("the first pair is wanted");
-        let scores = self.dim.scores(local.rkhs);
-        let values = local.dots.flatten_all()?.to_vec1::<f32>()?;
-        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+        let (now, next) = (self.features(now)?, self.features(next)?);
+        let local = [true, false, false, false];
+        self.learner.scores(&now, &next, local)
     }
 
     /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
@@ -262,22 +240,18 @@ impl Scorer<'_> {
             for location in 0..locations {
                 let place = (location / view.columns, location % view.columns);
                 let side = world.patch_size;
-                let cover: Vec<Cover> = played
-                    .origins
-                    .iter()
-                    .map(|origin| view.cover(place, *origin, side))
-                    .collect();
+                let origins = played.origins.iter();
+                let cover = origins.map(|origin| view.cover(place, *origin, side));
+                let cover: Vec<Cover> = cover.collect();
                 tally.add(location, &cover, &scores, &logs, rows);
             }
             if batch == 0 {
-                maps = (0..rows.min(3))
-                    .map(|row| {
-                        let at = |location: usize| logs[(location * rows + row) * rows + row];
-                        (0..locations)
-                            .map(|location| at(location) + (rows as f64).ln())
-                            .collect()
-                    })
-                    .collect();
+                let most = (rows as f64).ln();
+                let map = |row: usize| {
+                    let at = |location: usize| logs[(location * rows + row) * rows + row];
+                    (0..locations).map(|it| at(it) + most).collect()
+                };
+                maps = (0..rows.min(3)).map(map).collect();
             }
         }
         Ok((tally.measured(), maps))
@@ -355,56 +329,45 @@ impl View {
     }
 }
 
-/// Scores by what they belong to.
+/// Scores of those that are not and of those that are: in the patch, by log-softmax and raw, wholly in it, and a true pair.
 #[derive(Default)]
 struct Tally {
-    inside: Vec<f64>,
-    outside: Vec<f64>,
-    inside_raw: Vec<f64>,
-    outside_raw: Vec<f64>,
-    whole: Vec<f64>,
-    none: Vec<f64>,
-    true_pairs: Vec<f64>,
-    other_pairs: Vec<f64>,
+    inside: [Vec<f64>; 2],
+    inside_raw: [Vec<f64>; 2],
+    whole: [Vec<f64>; 2],
+    pairs: [Vec<f64>; 2],
 }
 
 impl Tally {
     /// Adds a location's true pairs, and inside the patch each anchor with the next episode as well.
     fn add(&mut self, location: usize, cover: &[Cover], scores: &[f64], logs: &[f64], rows: usize) {
-        for row in 0..rows {
+        for (row, here) in cover.iter().enumerate() {
             let at = (location * rows + row) * rows;
             let (raw, log) = (scores[at + row], logs[at + row]);
-            if cover[row].centre {
-                self.inside.push(log);
-                self.inside_raw.push(raw);
-            } else {
-                self.outside.push(log);
-                self.outside_raw.push(raw);
-            }
-            if cover[row].whole {
-                self.whole.push(log);
-            }
-            if cover[row].none {
-                self.none.push(log);
+            self.inside[usize::from(here.centre)].push(log);
+            self.inside_raw[usize::from(here.centre)].push(raw);
+            if here.whole || here.none {
+                self.whole[usize::from(here.whole)].push(log);
             }
             let other = (row + 1) % rows;
-            if other != row && cover[row].centre && cover[other].centre {
-                self.true_pairs.push(log);
-                self.other_pairs.push(logs[at + other]);
+            if other != row && here.centre && cover[other].centre {
+                self.pairs[1].push(log);
+                self.pairs[0].push(logs[at + other]);
             }
         }
     }
 
     /// 0.5 where a kind has no example, as only a very short measurement leaves it.
     fn measured(&self) -> Measured {
-        let area = |yes: &[f64], no: &[f64]| auc(yes, no).unwrap_or(0.5);
-        let all = self.inside.iter().chain(&self.outside);
-        let count = (self.inside.len() + self.outside.len()) as f64;
+        let area = |[no, yes]: &[Vec<f64>; 2]| auc(yes, no).unwrap_or(0.5);
+        let [outside, inside] = &self.inside;
+        let all = inside.iter().chain(outside);
+        let count = (inside.len() + outside.len()) as f64;
         Measured {
-            auc: area(&self.inside, &self.outside),
-            auc_raw: area(&self.inside_raw, &self.outside_raw),
-            auc_clear: area(&self.whole, &self.none),
-            auc_pairs: area(&self.true_pairs, &self.other_pairs),
+            auc: area(&self.inside),
+            auc_raw: area(&self.inside_raw),
+            auc_clear: area(&self.whole),
+            auc_pairs: area(&self.pairs),
             loss: -all.sum::<f64>() / count,
         }
     }
@@ -429,15 +392,18 @@ mod tests {
         let view = View::of(&model);
         assert_eq!((view.side, view.step, view.columns), (36, 8, 7));
         assert_eq!(6 * view.step + view.side, 84);
-        let cover = view.cover((0, 6), (0, 42), 42);
-        assert_eq!((cover.centre, cover.whole, cover.none), (true, true, false));
-        let cover = view.cover((6, 6), (0, 42), 42);
-        assert_eq!(
-            (cover.centre, cover.whole, cover.none),
-            (false, false, true)
-        );
-        let cover = view.cover((2, 6), (0, 42), 42);
-        assert_eq!((cover.centre, cover.whole), (true, false));
+        for (place, centre, whole, none) in [
+            ((0, 6), true, true, false),
+            ((6, 6), false, false, true),
+            ((2, 6), true, false, false),
+        ] {
+            let expected = Cover {
+                centre,
+                whole,
+                none,
+            };
+            assert_eq!(view.cover(place, (0, 42), 42), expected, "{place:?}");
+        }
     }
 
     #[test]

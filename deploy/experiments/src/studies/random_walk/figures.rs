@@ -8,21 +8,15 @@ use super::{
     results::{Measure, Results, Trained},
     training::Sampling,
 };
-use crate::stats::Spread;
+use crate::plot::Curve;
 
 /// The paper's four panels.
 pub(super) fn fig1(results: &Results) -> Figure {
     let settings = &results.settings;
     let alpha = settings.figure_alpha;
-    let chain = results.chain(alpha);
-    let (t, rho, k) = (chain.transitions(), chain.stationary(), settings.states);
-    let truth: Vec<f64> = (0..k * k).map(|at| t[at] / rho[at % k]).collect();
+    let k = settings.states;
+    let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let high = truth.iter().copied().fold(0.0, f64::max) * 1.1;
-    let learnt: Vec<_> = results.of(Sampling::Stationary, alpha).collect();
-    let learnt = (0..k * k).map(|at| {
-        let spread = Spread::of(learnt.iter().map(|one| one.learnt.ratio[at]));
-        spread.map(|spread| spread.mean)
-    });
     let heat = |title: &str, values: Vec<Option<f64>>| Heat {
         names: (1..=k).map(|state| state.to_string()).collect(),
         labels: ("next state".into(), "state".into()),
@@ -38,7 +32,7 @@ pub(super) fn fig1(results: &Results) -> Figure {
         )),
         Panel::Heat(heat(
             &format!("(b) Learnt ratio, mean of {} seeds", settings.seeds),
-            learnt.collect(),
+            learnt.iter().map(|it| Some(it.mean)).collect(),
         )),
         Panel::Chart(information(results)),
         Panel::Chart(inverse_gap(results)),
@@ -72,15 +66,11 @@ fn information(results: &Results) -> Chart {
         let t = results.chain(alpha).transitions();
         (alpha, super::chain::mutual_information_numerically(&t, k))
     });
-    let (mut learnt, mut band) = (Vec::new(), Vec::new());
-    for &alpha in alphas {
+    let learnt = alphas.iter().map(|&alpha| {
         let all = results.chain(alpha).mutual_information();
         let each = results.of(Sampling::Stationary, alpha);
-        if let Some(spread) = Spread::of(each.map(|one| all - one.final_excess())) {
-            learnt.push((alpha, spread.mean));
-            band.push((alpha, spread.min, spread.max));
-        }
-    }
+        (alpha, each.map(|one| all - one.final_excess()).collect())
+    });
     Chart::new(
         "(c) Mutual information of successive states",
         Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0]),
@@ -95,8 +85,8 @@ fn information(results: &Results) -> Chart {
             .marked(Mark::Dashed),
             Series::line("closed form", 0, curve(results, Chain::mutual_information)),
             Series::line("numerical", 0, numerical.collect()).marked(Mark::Rings),
-            Series::line("learnt", 1, learnt)
-                .banded(band)
+            Curve::of_means(learnt)
+                .series("learnt", 1)
                 .marked(Mark::Bars),
         ],
     )
@@ -182,57 +172,21 @@ fn over_alphas(
     x: impl Fn(&Chain) -> f64,
     value: impl Fn(&Trained) -> Option<f64>,
 ) -> Series {
-    let (mut points, mut band) = (Vec::new(), Vec::new());
-    for &alpha in &results.settings.alphas {
-        let x = x(&results.chain(alpha));
-        if let Some(spread) = Spread::of(results.of(sampling, alpha).filter_map(&value)) {
-            points.push((x, spread.mean));
-            band.push((x, spread.min, spread.max));
-        }
-    }
-    Series::line(sampling.name(), index, points)
-        .banded(band)
-        .marked(Mark::Bars)
-}
-
-/// The biases of the curves: the strongest below 0.5, one between, and the figure's.
-pub(super) fn shown(results: &Results) -> Vec<f64> {
-    let alphas = &results.settings.alphas;
-    let figure = alphas
-        .iter()
-        .position(|alpha| *alpha == results.settings.figure_alpha)
-        .unwrap_or(0);
-    let mut shown = vec![0, figure / 2, figure];
-    shown.dedup();
-    shown.into_iter().map(|at| alphas[at]).collect()
-}
-
-/// Total variation over updates, over the seeds of stationary sampling.
-pub(super) fn tv_curve(results: &Results, alpha: f64) -> Vec<(u64, Spread)> {
-    let each: Vec<_> = results.of(Sampling::Stationary, alpha).collect();
-    let updates = each.first().map_or(&[][..], |one| &one.learnt.updates[..]);
-    let points = updates.iter().enumerate();
-    points
-        .filter_map(|(i, update)| {
-            let spread = Spread::of(each.iter().map(|one| one.learnt.tv[i]))?;
-            Some((*update, spread))
-        })
-        .collect()
+    let means = results.settings.alphas.iter().map(|&alpha| {
+        let values = results.of(sampling, alpha).filter_map(&value);
+        (x(&results.chain(alpha)), values.collect())
+    });
+    let curve = Curve::of_means(means).series(sampling.name(), index);
+    curve.marked(Mark::Bars)
 }
 
 fn curves(results: &Results) -> Chart {
-    let series = shown(results)
-        .into_iter()
-        .enumerate()
-        .map(|(index, alpha)| {
-            let curve = tv_curve(results, alpha);
-            let at = |(update, spread): &(u64, Spread)| (*update as f64, spread.mean);
-            let band = |(update, spread): &(u64, Spread)| (*update as f64, spread.min, spread.max);
-            let gap = results.chain(alpha).spectral_gap();
-            let name = format!("\u{3b1} = {alpha}, gap {gap:.2}");
-            Series::line(&name, index, curve.iter().map(at).collect())
-                .banded(curve.iter().map(band).collect())
-        });
+    let shown = results.shown().into_iter().enumerate();
+    let series = shown.map(|(index, alpha)| {
+        let gap = results.chain(alpha).spectral_gap();
+        let name = format!("\u{3b1} = {alpha}, gap {gap:.2}");
+        results.tv_curve(alpha).series(&name, index)
+    });
     Chart::new(
         "Error on the way, stationary",
         Axis::log("updates"),

@@ -7,6 +7,8 @@ mod results;
 mod settings;
 mod training;
 
+use serde_json::json;
+
 use self::{
     chain::Chain,
     results::{Measure, Results, Trained},
@@ -16,7 +18,8 @@ use self::{
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values},
+    page::{Page, Table, Values, number},
+    plot::Curve,
     stats::Spread,
 };
 
@@ -36,239 +39,192 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut session = Session::open(NAME, args, &settings, units)?;
 
     let mut trained = Vec::with_capacity(pieces);
-    for sampling in Sampling::ALL {
-        for &alpha in &settings.alphas {
-            let chain = Chain {
-                states: settings.states,
-                alpha,
-            };
-            for seed in 1..=settings.seeds {
-                let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
-                let learnt = session.piece(&key, settings.updates, |progress| {
-                    train(&chain, &settings, sampling, seed.into(), progress)
-                })?;
-                trained.push(Trained {
-                    chain: chain.clone(),
-                    sampling,
-                    seed,
-                    learnt,
-                });
-            }
-        }
+    let grid = Sampling::ALL.into_iter().flat_map(|sampling| {
+        let alphas = settings.alphas.iter();
+        alphas.flat_map(move |&alpha| (1..=settings.seeds).map(move |seed| (sampling, alpha, seed)))
+    });
+    for (sampling, alpha, seed) in grid {
+        let states = settings.states;
+        let chain = Chain { states, alpha };
+        let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
+        let learnt = session.piece(&key, settings.updates, |progress| {
+            train(&chain, &settings, sampling, seed.into(), progress)
+        })?;
+        trained.push(Trained {
+            chain,
+            sampling,
+            seed,
+            learnt,
+        });
     }
     let results = Results { settings, trained };
     write_data(&session, &results)?;
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
-    let command = this_command();
-    session.finish(&page(&results, &command, args.smoke))
+    session.finish(&page(&results, args.smoke))
+}
+
+/// A number of the data.
+fn written(value: f64) -> String {
+    format!("{value:.6}")
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let k = results.settings.states;
-    let number = |value: f64| format!("{value:.6}");
     let laws = results.settings.alphas.iter().map(|&alpha| {
         let chain = results.chain(alpha);
         let t = chain.transitions();
-        let learnt = results.of(Sampling::Stationary, alpha);
-        let learnt = Spread::of(learnt.map(|one| chain.mutual_information() - one.final_excess()));
-        let learnt = learnt.map_or(String::new(), |spread| number(spread.mean));
-        let mut row = vec![alpha.to_string()];
-        row.extend([
-            number(chain.mutual_information()),
-            number(chain::mutual_information_numerically(&t, k)),
-            learnt,
-            number(chain.mutual_information_of_a_ring()),
-            number(chain.mutual_information_as_printed()),
-            number(chain.spectral_gap()),
-            number(chain::spectral_gap_numerically(&t, k)),
-        ]);
-        row
+        let numbers = [
+            chain.mutual_information(),
+            chain::mutual_information_numerically(&t, k),
+            results.learnt_information(alpha).mean,
+            chain.mutual_information_of_a_ring(),
+            chain.mutual_information_as_printed(),
+            chain.spectral_gap(),
+            chain::spectral_gap_numerically(&t, k),
+        ];
+        let head = std::iter::once(alpha.to_string());
+        head.chain(numbers.map(written)).collect()
     });
-    session.csv(
-        "alpha",
-        &Table::new(
-            &[
-                "alpha",
-                "mi_nats",
-                "mi_numerical_nats",
-                "mi_learnt_nats",
-                "mi_ring_nats",
-                "mi_as_printed_nats",
-                "gap",
-                "gap_numerical",
-            ],
-            laws,
-        ),
-    )?;
+    let columns = "alpha,mi_nats,mi_numerical_nats,mi_learnt_nats,mi_ring_nats,mi_as_printed_nats,gap,gap_numerical";
+    session.csv("alpha", &Table::of(columns, laws))?;
 
-    let alpha = results.settings.figure_alpha;
-    let chain = results.chain(alpha);
-    let (t, rho) = (chain.transitions(), chain.stationary());
-    let learnt: Vec<_> = results.of(Sampling::Stationary, alpha).collect();
-    let entries = (0..k * k).map(|at| {
-        let learnt = Spread::of(learnt.iter().map(|one| one.learnt.ratio[at]));
-        let (mean, sd) = learnt.map_or((f64::NAN, f64::NAN), |spread| (spread.mean, spread.sd));
+    let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
+    let entries = truth.iter().zip(&learnt).enumerate();
+    let entries = entries.map(|(at, (truth, learnt))| {
         let states = [at / k + 1, at % k + 1].map(|state| state.to_string());
-        let numbers = [t[at] / rho[at % k], mean, sd].map(number);
+        let numbers = [*truth, learnt.mean, learnt.sd].map(written);
         states.into_iter().chain(numbers).collect()
     });
-    let header = ["state", "next", "true_ratio", "learnt_mean", "learnt_sd"];
-    session.csv("ratio", &Table::new(&header, entries))?;
+    let columns = "state,next,true_ratio,learnt_mean,learnt_sd";
+    session.csv("ratio", &Table::of(columns, entries))?;
 
     let times = results.trained.iter().map(|one| {
-        let time = |measure| {
-            let time = results.time(one, measure);
-            time.map_or(String::new(), |updates| updates.to_string())
-        };
+        let time = |measure| number(results.time(one, measure).map(|it| it as f64), 0);
         vec![
             one.sampling.name().to_owned(),
             one.chain.alpha.to_string(),
             one.seed.to_string(),
-            number(one.chain.spectral_gap()),
+            written(one.chain.spectral_gap()),
             time(Measure::Tv),
             time(Measure::Share),
-            number(one.final_tv()),
-            number(one.final_excess()),
+            written(one.final_tv()),
+            written(one.final_excess()),
         ]
     });
-    let header = [
-        "sampling",
-        "alpha",
-        "seed",
-        "gap",
-        "updates_to_tv",
-        "updates_to_share",
-        "final_tv",
-        "final_excess_nats",
-    ];
-    session.csv("convergence", &Table::new(&header, times))?;
+    let columns =
+        "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
+    session.csv("convergence", &Table::of(columns, times))?;
 
-    let curves = figures::shown(results).into_iter().flat_map(|alpha| {
-        let points = figures::tv_curve(results, alpha);
-        points.into_iter().map(move |(updates, spread)| {
-            let numbers = [spread.mean, spread.min, spread.max];
+    let curves = results.shown().into_iter().flat_map(|alpha| {
+        let Curve { points, band } = results.tv_curve(alpha);
+        let rows = points.into_iter().zip(band);
+        rows.map(move |((updates, mean), (_, min, max))| {
+            let numbers = [mean, min, max].map(|it| format!("{it:.5}"));
             let head = [alpha.to_string(), updates.to_string()];
-            let numbers = numbers.map(|number| format!("{number:.5}"));
             head.into_iter().chain(numbers).collect()
         })
     });
-    let header = ["alpha", "updates", "tv_mean", "tv_min", "tv_max"];
-    session.csv("curves", &Table::new(&header, curves))
+    let columns = "alpha,updates,tv_mean,tv_min,tv_max";
+    session.csv("curves", &Table::of(columns, curves))
 }
 
-fn page(results: &Results, command: &str, smoke: bool) -> Page {
+fn page(results: &Results, smoke: bool) -> Page {
     let settings = &results.settings;
-    let alpha = settings.figure_alpha;
-    let chain = results.chain(alpha);
-    let (t, rho) = (chain.transitions(), chain.stationary());
-    let k = settings.states;
-    let error = |one: &Trained| {
-        let each = one.learnt.ratio.iter().enumerate();
-        let each = each.map(|(at, ratio)| (ratio - t[at] / rho[at % k]).abs());
-        (
-            each.clone().sum::<f64>() / (k * k) as f64,
-            each.fold(0.0, f64::max),
-        )
+    let truth = results.true_ratio();
+    let of_seed = |one: &Trained| {
+        let pairs = one.learnt.ratio.iter().zip(&truth);
+        Spread::of(pairs.map(|(learnt, truth)| (learnt - truth).abs()))
     };
-    let largest = (0..k * k).map(|at| t[at] / rho[at % k]).fold(0.0, f64::max);
-    let spread = |values: &dyn Fn(&Trained) -> f64| {
-        let at_figure = results.of(Sampling::Stationary, alpha);
-        Spread::of(at_figure.map(values)).map_or("none".to_owned(), |spread| spread.to_string())
-    };
-    let mut values = Values::default();
-    values
-        .set("alpha", alpha)
-        .set("mean_error", spread(&|one| error(one).0))
-        .set("largest_error", spread(&|one| error(one).1))
-        .set("largest_ratio", format!("{largest:.2}"))
-        .set("final_tv", spread(&|one| one.final_tv()))
-        .items("convergence", convergence(results));
+    let at_figure = || results.of(Sampling::Stationary, settings.figure_alpha);
+    let errors: Vec<Spread> = at_figure().filter_map(of_seed).collect();
     let holds = |measure| {
         let found = results.gap_correlations(Sampling::Stationary, measure);
         found.is_some_and(|spread| spread.mean > 0.5)
     };
-    let (absolute, relative) = (holds(Measure::Tv), holds(Measure::Share));
+    // What follows from the closed forms alone, at any length of the experiment.
+    let states = settings.states;
+    let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {
+        let chain = Chain { states, alpha };
+        json!({
+            "mi": chain.mutual_information(),
+            "ring": chain.mutual_information_of_a_ring(),
+            "printed": chain.mutual_information_as_printed(),
+        })
+    });
+    let mut values = Values::default();
     values
-        .when("holds", absolute && relative)
-        .when("holds_in_absolute_error_only", absolute && !relative)
-        .when("fails", !absolute);
-    closed_forms(k, &mut values);
-    values
-        .set("rkhs", settings.rkhs)
-        .set("batch_size", settings.batch_size)
-        .set("lr", settings.adam.lr)
-        .set("updates", settings.updates)
-        .set("seeds", settings.seeds);
-    Page::new(include_str!("page.md"), values, command, smoke)
+        .set("settings", settings)
+        .set("seeds", settings.seeds)
+        .set(
+            "mean_errors",
+            errors.iter().map(|it| it.mean).collect::<Vec<_>>(),
+        )
+        .set(
+            "largest_errors",
+            errors.iter().map(|it| it.max).collect::<Vec<_>>(),
+        )
+        .set("largest_ratio", truth.iter().copied().fold(0.0, f64::max))
+        .set(
+            "final_tv",
+            at_figure().map(Trained::final_tv).collect::<Vec<_>>(),
+        )
+        .set("convergence", convergence(results))
+        .set("absolute", holds(Measure::Tv))
+        .set("relative", holds(Measure::Share))
+        .set("closed_forms", closed_forms)
+        .set("most", (states as f64).ln());
+    Page::new(include_str!("page.md"), values, &this_command(), smoke)
 }
 
 /// How long each sampling takes, by either measure.
 fn convergence(results: &Results) -> Vec<String> {
     let settings = &results.settings;
     let alpha = settings.figure_alpha;
-    let time_at = |alpha: f64, sampling: Sampling, measure: Measure| {
-        let times = results.of(sampling, alpha);
-        let times = times.filter_map(|one| results.time(one, measure));
-        Spread::of(times.map(|time| time as f64))
-            .map_or("never".to_owned(), |spread| format!("{:.0}", spread.mean))
-    };
     let ends = [settings.alphas.first(), settings.alphas.last()];
     let [first, last] = ends.map(|end| end.copied().unwrap_or(alpha));
-    let mut lines = Vec::new();
-    for (measure, what) in [
+    let share = 100.0 * (1.0 - settings.share_reached);
+    let measures = [
         (
             Measure::Tv,
             format!("the total variation is {}", settings.tv_reached),
         ),
         (
             Measure::Share,
-            format!(
-                "{:.0}% of the mutual information is learnt",
-                100.0 * (1.0 - settings.share_reached)
-            ),
+            format!("{share:.0}% of the mutual information is learnt"),
         ),
-    ] {
-        for sampling in Sampling::ALL {
-            let late = results
-                .trained
-                .iter()
-                .filter(|one| one.sampling == sampling && results.time(one, measure).is_none());
-            let late = match late.count() {
-                0 => String::new(),
-                late => format!(" ({late} trainings never got there)"),
-            };
-            lines.push(format!(
-                "Updates until {what}, `{}`: {} at alpha = {first}, {} at {alpha}, {} at {last}{late}. Rank correlation \
-                 over alpha with the inverse spectral gap: {}.",
-                sampling.name(),
-                time_at(first, sampling, measure),
-                time_at(alpha, sampling, measure),
-                time_at(last, sampling, measure),
-                results
-                    .gap_correlations(sampling, measure)
-                    .map_or("none".to_owned(), |spread| format!("{spread:.2}")),
-            ));
-        }
-    }
-    lines
-}
-
-/// What follows from the closed forms alone, at any length of the experiment.
-fn closed_forms(states: usize, values: &mut Values) {
-    let at = |alpha: f64| Chain { states, alpha };
-    let (even, biased) = (at(0.5), at(0.9));
-    let nats = |value: f64| format!("{value:.3}");
-    let printed = |alpha: f64| format!("{:.1}", at(alpha).mutual_information_as_printed());
-    values
-        .set("mi_even", nats(even.mutual_information()))
-        .set("mi_biased", nats(biased.mutual_information()))
-        .set("ring_even", nats(even.mutual_information_of_a_ring()))
-        .set("ring_biased", nats(biased.mutual_information_of_a_ring()))
-        .set("printed_even", printed(0.5))
-        .set("printed_at_03", printed(0.3))
-        .set("most", format!("{:.2}", (states as f64).ln()))
-        .set("states", states);
+    ];
+    let all = measures
+        .iter()
+        .flat_map(|it| Sampling::ALL.map(|sampling| (it, sampling)));
+    let line = |((measure, what), sampling): (&(Measure, String), Sampling)| {
+        let time_at = |alpha: f64| {
+            let times = results.of(sampling, alpha);
+            let times = times.filter_map(|one| results.time(one, *measure));
+            let mean = Spread::of(times.map(|time| time as f64));
+            mean.map_or("never".to_owned(), |it| format!("{:.0}", it.mean))
+        };
+        let trained = results
+            .trained
+            .iter()
+            .filter(|one| one.sampling == sampling);
+        let late = trained.filter(|one| results.time(one, *measure).is_none());
+        let late = match late.count() {
+            0 => String::new(),
+            late => format!(" ({late} trainings never got there)"),
+        };
+        let correlation = results.gap_correlations(sampling, *measure);
+        format!(
+            "Updates until {what}, `{}`: {} at alpha = {first}, {} at {alpha}, {} at {last}{late}. Rank correlation \
+             over alpha with the inverse spectral gap: {}.",
+            sampling.name(),
+            time_at(first),
+            time_at(alpha),
+            time_at(last),
+            correlation.map_or("none".to_owned(), |spread| format!("{spread:.2}")),
+        )
+    };
+    all.map(line).collect()
 }
 
 #[cfg(test)]

@@ -5,7 +5,10 @@ use super::{
     settings::Settings,
     training::{Learnt, Sampling},
 };
-use crate::stats::{Spread, rank_correlation};
+use crate::{
+    plot::Curve,
+    stats::{Spread, rank_correlation},
+};
 
 /// One piece of the grid.
 pub(super) struct Trained {
@@ -43,6 +46,54 @@ impl Results {
             states: self.settings.states,
             alpha,
         }
+    }
+
+    /// T / rho at the figure's bias, [K, K].
+    pub(super) fn true_ratio(&self) -> Vec<f64> {
+        let chain = self.chain(self.settings.figure_alpha);
+        let (t, rho) = (chain.transitions(), chain.stationary());
+        let k = self.settings.states;
+        (0..k * k).map(|at| t[at] / rho[at % k]).collect()
+    }
+
+    /// Its entries as they were learnt, over the seeds of stationary sampling.
+    pub(super) fn learnt_ratio(&self) -> Vec<Spread> {
+        let of = || self.of(Sampling::Stationary, self.settings.figure_alpha);
+        let k = self.settings.states;
+        let entry = |at: usize| Spread::of(of().map(|one| one.learnt.ratio[at]));
+        (0..k * k).filter_map(entry).collect()
+    }
+
+    /// Mutual information as the scores of stationary sampling have it, in nats.
+    pub(super) fn learnt_information(&self, alpha: f64) -> Spread {
+        let all = self.chain(alpha).mutual_information();
+        let each = self.of(Sampling::Stationary, alpha);
+        let learnt = Spread::of(each.map(|one| all - one.final_excess()));
+        learnt.expect("each bias has a seed")
+    }
+
+    /// The biases of the curves: the strongest below 0.5, one between, and the figure's.
+    pub(super) fn shown(&self) -> Vec<f64> {
+        let Settings {
+            alphas,
+            figure_alpha,
+            ..
+        } = &self.settings;
+        let figure = alphas.iter().position(|alpha| alpha == figure_alpha);
+        let figure = figure.unwrap_or(0);
+        let mut shown = vec![0, figure / 2, figure];
+        shown.dedup();
+        shown.into_iter().map(|at| alphas[at]).collect()
+    }
+
+    /// Total variation over updates, over the seeds of stationary sampling.
+    pub(super) fn tv_curve(&self, alpha: f64) -> Curve {
+        let each: Vec<_> = self.of(Sampling::Stationary, alpha).collect();
+        let updates = each.iter().take(1).flat_map(|one| &one.learnt.updates);
+        Curve::of_means(updates.enumerate().map(|(at, &update)| {
+            let values = each.iter().map(|one| one.learnt.tv[at]);
+            (update as f64, values.collect())
+        }))
     }
 
     /// Updates until a training's error is small; none where it never was.

@@ -2,21 +2,14 @@
 //! Heads, loss and optimiser are the learner's own; there is no torso, action or return.
 
 use candle_core::{Device, Tensor};
-use driml_learner::{
-    Lambda,
-    auxiliary::dim::{Dim, dots},
-    optimiser::{
-        adam::Adam,
-        gradients::{Gradients, clip_factor},
-    },
-};
-use driml_model::{ConvLayer, Features, HeadConfig, Kernels, ModelConfig, Network, Parameters};
+use driml_learner::{Lambda, auxiliary::dim::Dim};
+use driml_model::{ConvLayer, Features, HeadConfig, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::{chain::Chain, settings::Settings};
-use crate::progress::Progress;
+use crate::{progress::Progress, studies::dim::DimLearner};
 
 /// Ratio between the updates of two measurements.
 const MEASURE_GROWTH: f64 = 1.04;
@@ -49,7 +42,7 @@ impl Sampling {
 }
 
 /// What a training left, measured without noise: from the scores of all K * K pairs.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct Learnt {
     /// When it was measured.
     pub(super) updates: Vec<u64>,
@@ -71,15 +64,7 @@ pub(super) fn train(
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut heads = Heads::new(chain.states, settings, &mut rng)?;
     let mut source = Source::new(chain, settings, sampling, &mut rng);
-    let (mut learnt, mut measure_next) = (
-        Learnt {
-            updates: vec![],
-            excess: vec![],
-            tv: vec![],
-            ratio: vec![],
-        },
-        0,
-    );
+    let (mut learnt, mut measure_next) = (Learnt::default(), 0);
     for update in 0..=settings.updates {
         if update >= measure_next || update == settings.updates {
             learnt.measure(update, chain, heads.scores()?);
@@ -135,13 +120,8 @@ impl Learnt {
 
 /// The heads Psi_4 and Phi_4 with their optimiser.
 struct Heads {
-    parameters: Parameters,
-    network: Network,
-    adam: Adam,
-    dim: Dim,
-    max_grad_norm: f64,
+    learner: DimLearner,
     states: usize,
-    rkhs: usize,
 }
 
 impl Heads {
@@ -173,18 +153,12 @@ impl Heads {
             dim: lambda.dim_heads(false),
             head: HeadConfig::PLAIN,
         };
-        let parameters = Parameters::init(&model, rng, &Device::Cpu)?;
+        let tanh_clip = settings.tanh_clip;
+        let dim = Dim { lambda, tanh_clip };
+        let norm_max = settings.max_grad_norm;
         Ok(Self {
-            network: Network::new(&model, &parameters)?,
-            adam: Adam::new(settings.adam, &parameters, Kernels::FUSED)?,
-            parameters,
-            dim: Dim {
-                lambda,
-                tanh_clip: settings.tanh_clip,
-            },
-            max_grad_norm: settings.max_grad_norm,
+            learner: DimLearner::new(&model, dim, settings.adam, norm_max, rng)?,
             states,
-            rkhs: settings.rkhs,
         })
     }
 
@@ -204,15 +178,8 @@ impl Heads {
     fn learn(&mut self, pairs: &[(usize, usize)]) -> anyhow::Result<()> {
         let now = self.features(pairs.iter().map(|pair| pair.0))?;
         let next = self.features(pairs.iter().map(|pair| pair.1))?;
-        let action = Tensor::zeros(pairs.len(), candle_core::DType::U8, &Device::Cpu)?;
-        let valid = vec![1; pairs.len()];
-        let losses = self
-            .dim
-            .pair_losses(&self.network, &now, &next, &action, &valid)?;
-        for loss in losses.iter().flatten() {
-            let gradients = Gradients::of(&self.parameters, loss)?;
-            let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
-            self.adam.step(&self.parameters, &gradients, factor)?;
+        for loss in self.learner.losses(&now, &next)?.iter().flatten() {
+            self.learner.step(loss)?;
         }
         Ok(())
     }
@@ -220,13 +187,7 @@ impl Heads {
     /// Scores [K, K] of each state with each.
     fn scores(&self) -> anyhow::Result<Vec<f64>> {
         let all = self.features(0..self.states)?;
-        let action = Tensor::zeros(self.states, candle_core::DType::U8, &Device::Cpu)?;
-        let wanted = self.dim.lambda.wanted();
-        let [_, _, _, global] = dots(&self.network, &all, &all, &action, wanted)?;
-        let global = global.expect("lambda_4t4 is above 0");
-        let values = global.dots.flatten_all()?.to_vec1::<f32>()?;
-        let scores = self.dim.scores(self.rkhs);
-        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+        self.learner.scores(&all, &all, [false, false, false, true])
     }
 }
 
@@ -266,30 +227,22 @@ impl Source {
     }
 
     fn batch(&mut self, chain: &Chain, rng: &mut ChaCha8Rng) -> Vec<(usize, usize)> {
-        match self.sampling {
-            Sampling::Stationary => (0..self.rows)
-                .map(|_| {
-                    let state = draw(&self.stationary, rng);
-                    (state, chain.step(state, rng))
-                })
-                .collect(),
-            Sampling::FromOneEnd => self
-                .walkers
-                .iter_mut()
-                .map(|walker| {
-                    let state = *walker;
-                    *walker = chain.step(state, rng);
-                    (state, *walker)
-                })
-                .collect(),
-            Sampling::OneWalker => {
-                self.walk(chain, self.steps_per_update, rng);
-                let all = &self.replay;
-                (0..self.rows)
-                    .map(|_| all[rng.random_range(0..all.len())])
-                    .collect()
-            }
+        if self.sampling == Sampling::OneWalker {
+            self.walk(chain, self.steps_per_update, rng);
         }
+        let mut pair = |row: usize| match self.sampling {
+            Sampling::Stationary => {
+                let state = draw(&self.stationary, rng);
+                (state, chain.step(state, rng))
+            }
+            Sampling::FromOneEnd => {
+                let state = self.walkers[row];
+                self.walkers[row] = chain.step(state, rng);
+                (state, self.walkers[row])
+            }
+            Sampling::OneWalker => self.replay[rng.random_range(0..self.replay.len())],
+        };
+        (0..self.rows).map(&mut pair).collect()
     }
 }
 
@@ -326,12 +279,7 @@ mod tests {
         let scores = (0..36)
             .map(|at| (t[at] / rho[at % 6]).max(1e-300).ln() + (at / 6) as f64)
             .collect();
-        let mut learnt = Learnt {
-            updates: vec![],
-            excess: vec![],
-            tv: vec![],
-            ratio: vec![],
-        };
+        let mut learnt = Learnt::default();
         learnt.measure(3, &chain, scores);
         assert!(learnt.excess[0] < 1e-12 && learnt.tv[0] < 1e-12);
         for (at, ratio) in learnt.ratio.iter().enumerate() {
@@ -347,12 +295,7 @@ mod tests {
             states: 6,
             alpha: 0.3,
         };
-        let mut learnt = Learnt {
-            updates: vec![],
-            excess: vec![],
-            tv: vec![],
-            ratio: vec![],
-        };
+        let mut learnt = Learnt::default();
         learnt.measure(0, &chain, vec![0.5; 36]);
         assert!((learnt.excess[0] - chain.mutual_information()).abs() < 1e-12);
     }

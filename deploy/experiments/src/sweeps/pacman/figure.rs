@@ -3,10 +3,7 @@
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_protocol::RETURNS_OF;
 
-use super::{
-    results::{LOSSES, Results, Trace},
-    settings::Continual,
-};
+use super::results::{LOSSES, Results};
 use crate::{
     plot::{over_seeds, smoothed},
     stats::Spread,
@@ -31,9 +28,7 @@ pub(super) fn figure(results: &Results) -> Figure {
                 points
             });
             let curve = over_seeds(&each.collect::<Vec<_>>());
-            series.push(
-                Series::line(&format!("epsilon {epsilon}"), index, curve.points).banded(curve.band),
-            );
+            series.push(curve.series(&format!("epsilon {epsilon}"), index));
         }
         panels.push(Panel::Chart(Chart::new(
             &format!("(a) DIM loss, {what} features"),
@@ -42,24 +37,14 @@ pub(super) fn figure(results: &Results) -> Figure {
             series,
         )));
     }
-    for (title, continual, traces) in [
-        (
-            "(b) One lethal ghost after another",
-            &settings.continual,
-            &results.ghosts,
-        ),
-        (
-            "(c) The same with Ising noise in the walls",
-            &settings.noise,
-            &results.noise,
-        ),
-    ] {
-        panels.push(Panel::Chart(Chart::new(
-            title,
-            Axis::linear("episodes"),
-            Axis::linear("mean return"),
-            task_series(results, continual, traces),
-        )));
+    let titles = [
+        "(b) One lethal ghost after another",
+        "(c) The same with Ising noise in the walls",
+    ];
+    for (part, title) in titles.into_iter().enumerate() {
+        let (x, y) = (Axis::linear("episodes"), Axis::linear("mean return"));
+        let series = task_series(results, part);
+        panels.push(Panel::Chart(Chart::new(title, x, y, series)));
     }
     Figure {
         title: "Ms. PacMan: what DIM finds, and what it is good for".into(),
@@ -75,39 +60,30 @@ pub(super) fn figure(results: &Results) -> Figure {
     }
 }
 
-fn task_series(results: &Results, continual: &Continual, traces: &[Trace]) -> Vec<Series> {
+fn task_series(results: &Results, part: usize) -> Vec<Series> {
+    let continual = results.settings.tasks(part);
     let mut series = Vec::new();
-    let values = || {
-        traces
-            .iter()
-            .flat_map(|trace| &trace.points)
-            .map(|point| point.1)
-    };
-    let (low, high) = (
-        values().fold(f64::INFINITY, f64::min),
-        values().fold(f64::NEG_INFINITY, f64::max),
-    );
+    let points = results.traces[part].iter().flat_map(|it| &it.points);
     let length = continual.episodes_per_task as f64;
-    if low <= high {
+    if let Some(Spread { min, max, .. }) = Spread::of(points.map(|point| point.1)) {
         for task in 1..continual.tasks {
             let x = length * task as f64;
-            let line = Series::line("", 0, vec![(x, low), (x, high)]);
+            let line = Series::line("", 0, vec![(x, min), (x, max)]);
             series.push(line.coloured(GREY).marked(Mark::Line));
         }
     }
     for (index, agent) in results.settings.agents.iter().enumerate() {
-        let own = || traces.iter().filter(|trace| trace.agent == *agent);
+        let own = || results.traces(part, agent);
         let each: Vec<_> = own().map(|trace| trace.points.clone()).collect();
         let curve = over_seeds(&each);
-        series.push(Series::line(agent, index, curve.points).banded(curve.band));
-        if index == 0 {
-            for task in 0..continual.tasks {
-                let ends = own().filter_map(|trace| trace.task(continual, task));
-                if let Some(end) = Spread::of(ends.map(|it| it.0)) {
-                    let x = length * task as f64;
-                    let line = vec![(x, end.mean), (x + length, end.mean)];
-                    series.push(Series::line("", 0, line).marked(Mark::Dashed));
-                }
+        series.push(curve.series(agent, index));
+        let tasks = if index == 0 { continual.tasks } else { 0 };
+        for task in 0..tasks {
+            let ends = own().filter_map(|trace| trace.task(continual, task));
+            if let Some(end) = Spread::of(ends.map(|it| it.0)) {
+                let x = length * task as f64;
+                let line = vec![(x, end.mean), (x + length, end.mean)];
+                series.push(Series::line("", 0, line).marked(Mark::Dashed));
             }
         }
     }

@@ -1,9 +1,9 @@
 //! What the runs of Fig. 3 left: their losses over frames, and their returns over episodes.
 
-use super::settings::{Continual, Point, Settings};
+use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
-    stats::Spread,
+    stats::{Spread, rank_correlation},
     sweep::plan::{Made, Swept},
 };
 
@@ -18,9 +18,10 @@ pub(super) type Points = Vec<(f64, f64)>;
 /// All there is to report.
 pub(super) struct Results {
     pub(super) settings: Settings,
+    /// Of (a).
     pub(super) losses: Vec<Loss>,
-    pub(super) ghosts: Vec<Trace>,
-    pub(super) noise: Vec<Trace>,
+    /// Of (b) and of (c).
+    pub(super) traces: [Vec<Trace>; PARTS],
     /// Of each epsilon the episodes of its runs.
     pub(super) episodes: Vec<(f64, f64)>,
     /// Runs that are missing.
@@ -49,22 +50,19 @@ impl Results {
     /// Reads the metrics of the finished runs.
     pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
         let mut results = Self {
-            settings,
             losses: Vec::new(),
-            ghosts: Vec::new(),
-            noise: Vec::new(),
+            traces: std::array::from_fn(|_| Vec::new()),
             episodes: Vec::new(),
             missing: swept.missing,
+            settings,
         };
         for Made { point, plan, run } in swept.made {
             let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
-            let settings = &results.settings;
             match point {
                 Point::Epsilon(epsilon) => {
-                    results
-                        .episodes
-                        .push((epsilon, run.summary.episodes as f64));
-                    let frames = settings.predictability.frames as f64;
+                    let episodes = run.summary.episodes as f64;
+                    results.episodes.push((epsilon, episodes));
+                    let frames = results.settings.predictability.frames as f64;
                     for (column, _) in LOSSES {
                         let points = metrics.values(column)?;
                         results.losses.push(Loss {
@@ -77,17 +75,9 @@ impl Results {
                         });
                     }
                 }
-                Point::Ghosts(agent) => {
-                    let points = trace(&metrics, &settings.continual)?;
-                    results.ghosts.push(Trace {
-                        agent,
-                        seed,
-                        points,
-                    });
-                }
-                Point::Noise(agent) => {
-                    let points = trace(&metrics, &settings.noise)?;
-                    results.noise.push(Trace {
+                Point::Tasks(part, agent) => {
+                    let points = trace(&metrics, results.settings.tasks(part))?;
+                    results.traces[part].push(Trace {
                         agent,
                         seed,
                         points,
@@ -100,8 +90,22 @@ impl Results {
 
     /// The losses of one column.
     pub(super) fn losses(&self, column: &str) -> impl Iterator<Item = &Loss> {
-        let column = column.to_owned();
         self.losses.iter().filter(move |it| it.column == column)
+    }
+
+    /// The traces of an agent, by seed.
+    pub(super) fn traces(&self, part: usize, agent: &str) -> impl Iterator<Item = &Trace> {
+        let all = self.traces[part].iter();
+        all.filter(move |it| it.agent == agent)
+    }
+
+    /// Rank correlation of epsilon and a final loss, and of how many runs it is.
+    pub(super) fn order_of_epsilon(&self, column: &str) -> Option<(f64, usize)> {
+        let pairs = self.losses(column);
+        let pairs: Points = pairs
+            .filter_map(|it| Some((it.epsilon, it.last?)))
+            .collect();
+        Some((rank_correlation(&pairs)?, pairs.len()))
     }
 }
 
@@ -131,6 +135,12 @@ impl Trace {
         let values: Vec<f64> = inside.map(|point| point.1).collect();
         Some((*values.last()?, Spread::of(values.iter().copied())?.mean))
     }
+
+    /// The mean over all tasks; none if the run lacks one.
+    pub(super) fn over_tasks(&self, continual: &Continual) -> Option<f64> {
+        let tasks = (0..continual.tasks).map(|task| Some(self.task(continual, task)?.1));
+        Spread::of(tasks.collect::<Option<Vec<_>>>()?).map(|spread| spread.mean)
+    }
 }
 
 #[cfg(test)]
@@ -151,8 +161,8 @@ mod tests {
             seed: 1,
             points: vec![(4.0, 1.0), (10.0, 3.0), (11.0, 0.0), (18.0, 5.0)],
         };
-        assert_eq!(trace.task(&continual, 0), Some((3.0, 2.0)));
-        assert_eq!(trace.task(&continual, 1), Some((5.0, 2.5)));
-        assert_eq!(trace.task(&continual, 2), None);
+        for (task, expected) in [(0, Some((3.0, 2.0))), (1, Some((5.0, 2.5))), (2, None)] {
+            assert_eq!(trace.task(&continual, task), expected);
+        }
     }
 }

@@ -71,27 +71,35 @@ impl Continual {
     }
 }
 
+/// (b) and (c).
+pub(super) const PARTS: usize = 2;
+/// As files name them.
+pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
+
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Point {
     /// (a): ghosts that move at random with this probability.
     Epsilon(f64),
-    /// (b), of this agent.
-    Ghosts(String),
-    /// (c), of this agent.
-    Noise(String),
+    /// (b) or (c), of this agent.
+    Tasks(usize, String),
 }
 
 impl Settings {
+    /// Those of (b) or (c).
+    pub(super) const fn tasks(&self, part: usize) -> &Continual {
+        [&self.continual, &self.noise][part]
+    }
+
     /// What there are runs for, with each seed.
     pub(super) fn points(&self) -> Vec<Point> {
         let epsilons = self.predictability.epsilons.iter();
         let epsilons = epsilons.map(|&epsilon| Point::Epsilon(epsilon));
-        let agents = || self.agents.iter().cloned();
-        let continual = agents()
-            .map(Point::Ghosts)
-            .chain(agents().map(Point::Noise));
-        epsilons.chain(continual).collect()
+        let agents = |part| {
+            let agents = self.agents.iter();
+            agents.map(move |agent| Point::Tasks(part, agent.clone()))
+        };
+        epsilons.chain((0..PARTS).flat_map(agents)).collect()
     }
 
     /// The run of a seed.
@@ -100,43 +108,29 @@ impl Settings {
             Point::Epsilon(epsilon) => {
                 let Predictability { agent, frames, .. } = &self.predictability;
                 let sets = [format!("world.epsilon={epsilon}")];
+                let call = self.call(agent, seed, *frames, &sets);
+                PlannedRun::new(format!("epsilon{epsilon}-seed{seed}"), call, *frames)
+            }
+            Point::Tasks(part, agent) => {
+                let continual = self.tasks(*part);
+                let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
+                let mut sets = continual.sets.clone();
+                sets.push(format!(
+                    "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",
+                    continual.episodes_per_task / continual.envs,
+                    order.join(",")
+                ));
+                sets.push("local.actors=1".into());
+                sets.push(format!("actor.envs={}", continual.envs));
+                let episodes = continual.episodes();
+                let frames = episodes * EPISODE_FRAMES_MAX;
+                let name = format!("{}-{agent}-seed{seed}", PART_NAMES[*part]);
                 PlannedRun {
-                    name: format!("epsilon{epsilon}-seed{seed}"),
-                    call: self.call(agent, seed, *frames, &sets),
-                    frames: *frames,
-                    episodes: None,
-                    units: *frames,
+                    episodes: Some(episodes),
+                    units: episodes * EPISODE_FRAMES,
+                    ..PlannedRun::new(name, self.call(agent, seed, frames, &sets), frames)
                 }
             }
-            Point::Ghosts(agent) => self.continual_plan("ghosts", &self.continual, agent, seed),
-            Point::Noise(agent) => self.continual_plan("noise", &self.noise, agent, seed),
-        }
-    }
-
-    fn continual_plan(
-        &self,
-        name: &str,
-        continual: &Continual,
-        agent: &str,
-        seed: u32,
-    ) -> PlannedRun {
-        let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
-        let mut sets = continual.sets.clone();
-        sets.push(format!(
-            "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",
-            continual.episodes_per_task / continual.envs,
-            order.join(",")
-        ));
-        sets.push("local.actors=1".into());
-        sets.push(format!("actor.envs={}", continual.envs));
-        let episodes = continual.episodes();
-        let frames = episodes * EPISODE_FRAMES_MAX;
-        PlannedRun {
-            name: format!("{name}-{agent}-seed{seed}"),
-            call: self.call(agent, seed, frames, &sets),
-            frames,
-            episodes: Some(episodes),
-            units: episodes * EPISODE_FRAMES,
         }
     }
 

@@ -1,23 +1,18 @@
 //! Figure and page of table 1, from finished runs.
 
-use std::collections::BTreeMap;
-
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_launch::evaluate::Levels;
 use driml_protocol::RETURNS_OF;
 
 use super::{
-    results::{ERRORS, Scored, by_game, of, training},
+    results::{ERRORS, Game},
     settings::{CHECKPOINTS, Settings},
 };
 use crate::{
     cache::Session,
-    page::{Table, Values, cell},
+    page::Values,
     plot::{Run, over_seeds},
-    stats::{
-        Spread,
-        over_games::{Scores, improvement, iqm},
-    },
+    stats::over_games::{Scores, improvement, iqm},
     sweep::results::mean,
     sweeps::published::Published,
 };
@@ -28,34 +23,28 @@ const PAPER_FRAMES: f64 = 50e6;
 const SEEDS_MIN: usize = 3;
 
 /// Training return over frames, a chart a game.
-pub(super) fn figure(
-    settings: &Settings,
-    scored: &[Scored],
-    published: &Published,
-) -> anyhow::Result<Figure> {
+pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
-    for (game, runs) in by_game(scored) {
+    for game in games {
         let level = |value: f64| vec![(0.0, value), (settings.frames as f64, value)];
         let mut series = Vec::new();
-        if let Some(random) = mean(&runs[0].random) {
+        if let Some(random) = mean(game.random) {
             series.push(Series::line("random", 0, level(random)).coloured(GREY));
         }
-        for (index, agent) in settings.agents.iter().enumerate() {
-            let mut each = Vec::new();
-            for it in of(&runs, agent) {
-                each.push(Run::read(&it.made.run.folder)?.values("mean_return")?);
-            }
-            let curve = over_seeds(&each);
+        for (index, (agent, of)) in settings.agents.iter().zip(&game.agents).enumerate() {
+            let each = of.runs.iter();
+            let each = each.map(|it| Ok(Run::read(&it.made.run.folder)?.values("mean_return")?));
+            let curve = over_seeds(&each.collect::<anyhow::Result<Vec<_>>>()?);
             if curve.points.is_empty() {
                 continue;
             }
-            series.push(Series::line(agent, index, curve.points).banded(curve.band));
-            if let Some(paper) = published.paper(game, agent) {
+            series.push(curve.series(agent, index));
+            if let Some(paper) = of.paper {
                 series.push(Series::line("", index, level(paper)).marked(Mark::Dashed));
             }
         }
         let (x, y) = (Axis::linear("frames"), Axis::linear("mean return"));
-        panels.push(Panel::Chart(Chart::new(game, x, y, series)));
+        panels.push(Panel::Chart(Chart::new(game.name, x, y, series)));
     }
     Ok(Figure {
         title: format!("Training return, {} frames", settings.frames),
@@ -73,29 +62,25 @@ pub(super) fn figure(
 pub(super) fn over_games(
     session: &mut Session,
     settings: &Settings,
-    scored: &[Scored],
+    games: &[Game<'_>],
     published: &Published,
 ) -> anyhow::Result<Vec<String>> {
-    let games = by_game(scored);
-    let has_seeds = |runs: &Vec<&Scored>| {
-        let mut agents = settings.agents.iter();
-        agents.all(|agent| of(runs, agent).count() >= SEEDS_MIN)
-    };
-    if !games.values().all(has_seeds) {
+    let mut all = games.iter().flat_map(|it| &it.agents);
+    if !all.all(|of| of.runs.len() >= SEEDS_MIN) {
         return Ok(Vec::new());
     }
     let mut lines = Vec::new();
     let play = settings.play(Levels::TrainSingle);
-    for agent in &settings.agents {
+    for (at, agent) in settings.agents.iter().enumerate() {
         let mut scores = Scores::new();
-        for (game, runs) in &games {
+        for game in games {
             let mut of_game = Vec::new();
-            for it in of(runs, agent) {
+            for it in &game.agents[at].runs {
                 session.work().1.again(play.units);
                 let key = format!("{}-single", it.made.plan.name);
                 let returns = play.greedy(session, &key, &it.made.run)?;
                 let returns = returns.and_then(|it| mean(&it));
-                of_game.extend(returns.and_then(|it| published.normalised(game, it)));
+                of_game.extend(returns.and_then(|it| published.normalised(game.name, it)));
             }
             if of_game.len() >= SEEDS_MIN {
                 scores.push(of_game);
@@ -108,51 +93,38 @@ pub(super) fn over_games(
             )
         }));
     }
-    if let Some((first, others)) = settings.agents.split_first() {
-        for agent in others {
-            let scores = |agent: &str| -> Scores {
-                games
-                    .values()
-                    .map(|runs| training(of(runs, agent)))
-                    .collect()
-            };
-            lines.extend(improvement(&scores(agent), &scores(first)).map(|it| {
-                format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
-            }));
-        }
+    let scores = |at: usize| -> Scores {
+        let trained = games.iter().map(|game| game.agents[at].training.clone());
+        trained.collect()
+    };
+    for (at, agent) in settings.agents.iter().enumerate().skip(1) {
+        let first = &settings.agents[0];
+        lines.extend(improvement(&scores(at), &scores(0)).map(|it| {
+            format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
+        }));
     }
     Ok(lines)
 }
 
 /// What the page says.
-pub(super) fn page(
-    settings: &Settings,
-    scored: &[Scored],
-    published: &Published,
-    over_games: Vec<String>,
-    missing: &[String],
-) -> Values {
-    let games = by_game(scored);
-    let has_seeds = scored.iter().any(|it| it.made.plan.call.seed > 1);
+pub(super) fn page(settings: &Settings, games: &[Game<'_>], missing: &[String]) -> Values {
+    let runs = games
+        .iter()
+        .flat_map(|it| &it.agents)
+        .flat_map(|it| &it.runs);
+    let has_seeds = runs.clone().any(|it| it.made.plan.call.seed > 1);
     let mut values = Values::default();
     values
-        .set("count", scored.len())
-        .set("planned", scored.len() + missing.len())
-        .set("frames", settings.frames)
+        .set("settings", settings)
+        .set("agents", &settings.agents)
+        .set("seeds", settings.seeds)
+        .set("games", games)
         .set("percent", percent(settings.frames as f64 / PAPER_FRAMES))
-        .items("above_random", above_random(settings, &games))
-        .items("over_games", over_games)
-        .when("some_missing", !missing.is_empty())
-        .set("missing", missing.join(", "))
-        .set("table", table(settings, &games, published))
+        .set("above_random", above_random(settings, games))
+        .set("missing", missing)
         .set("returns_of", RETURNS_OF)
         .set("episodes", CHECKPOINTS * settings.episodes)
-        .when("some_seeds", has_seeds)
-        .set("seeds", settings.seeds)
-        .set("preset", &settings.preset)
-        .when("has_sets", !settings.sets.is_empty())
-        .set("sets", settings.sets.join(", "))
-        .when("sequential", settings.preset != "split");
+        .set("some_seeds", has_seeds);
     values
 }
 
@@ -162,55 +134,21 @@ fn percent(share: f64) -> String {
     format!("{percent:.decimals$}")
 }
 
-/// A game a row; of each agent ours and the paper's.
-fn table(
-    settings: &Settings,
-    games: &BTreeMap<&str, Vec<&Scored>>,
-    published: &Published,
-) -> Table {
-    let mut header = vec!["game".to_owned(), "random".into()];
-    for agent in &settings.agents {
-        let columns = ["training", "greedy", "paper"];
-        header.extend(columns.map(|column| format!("{agent} {column}")));
-    }
-    let short_number = |value: Option<f64>| cell(value, |it| format!("{it:.2}"));
-    let spread = |values: Vec<f64>| {
-        cell(Spread::of(values), |it| match it.count {
-            1 => format!("{:.2}", it.mean),
-            _ => format!("{:.2} ± {:.2}", it.mean, it.sd),
-        })
-    };
-    let rows = games.iter().map(|(game, runs)| {
-        let mut row = vec![(*game).to_owned(), short_number(mean(&runs[0].random))];
-        for agent in &settings.agents {
-            row.push(spread(training(of(runs, agent))));
-            let greedy = of(runs, agent).filter_map(|it| mean(&it.greedy));
-            row.push(spread(greedy.collect()));
-            row.push(short_number(published.paper(game, agent)));
-        }
-        row
-    });
-    Table {
-        rows: rows.collect(),
-        header,
-    }
-}
-
 /// On how many of its games each agent plays better than at random.
-fn above_random(settings: &Settings, games: &BTreeMap<&str, Vec<&Scored>>) -> Vec<String> {
-    let line = |agent: &String| {
-        let played = games
-            .iter()
-            .filter(|(_, runs)| of(runs, agent).next().is_some());
-        let count = played.clone().count();
-        let above = played.filter(|(_, runs)| of(runs, agent).all(Scored::is_above_random));
+fn above_random(settings: &Settings, games: &[Game<'_>]) -> Vec<String> {
+    let agents = settings.agents.iter().enumerate();
+    let lines = agents.filter_map(|(at, agent)| {
+        let of_game = games.iter().map(|game| &game.agents[at]);
+        let played: Vec<_> = of_game.filter(|of| !of.runs.is_empty()).collect();
+        let above = played.iter().filter(|of| of.is_above_random);
         let text = format!(
-            "`{agent}` is better than random, in every seed by {ERRORS} standard errors, on {} of {count} games.",
-            above.count()
+            "`{agent}` is better than random, in every seed by {ERRORS} standard errors, on {} of {} games.",
+            above.count(),
+            played.len()
         );
-        (count > 0).then_some(text)
-    };
-    settings.agents.iter().filter_map(line).collect()
+        (!played.is_empty()).then_some(text)
+    });
+    lines.collect()
 }
 
 #[cfg(test)]

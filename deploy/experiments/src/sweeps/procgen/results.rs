@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 
 use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
+use serde::Serialize;
 
-use super::settings::{Point, short};
+use super::settings::{Point, Settings, short};
 use crate::{
     page::{Table, number},
     stats::Spread,
@@ -27,7 +28,7 @@ pub(super) struct Scored {
 
 impl Scored {
     /// Whether a run's greedy episodes are better than the random policy's.
-    pub(super) fn is_above_random(&self) -> bool {
+    fn is_above_random(&self) -> bool {
         let spreads = [&self.greedy, &self.random].map(|it| Spread::of(it.iter().copied()));
         let [Some(greedy), Some(random)] = spreads else {
             return false;
@@ -37,47 +38,67 @@ impl Scored {
     }
 }
 
-/// The games that have a run, and the runs of each.
-pub(super) fn by_game(scored: &[Scored]) -> BTreeMap<&str, Vec<&Scored>> {
-    let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
-    for it in scored {
-        games
-            .entry(short(&it.made.point.world))
-            .or_default()
-            .push(it);
+/// A game that has a run.
+#[derive(Serialize)]
+pub(super) struct Game<'a> {
+    pub(super) name: &'a str,
+    /// Returns of the random policy.
+    pub(super) random: &'a [f64],
+    /// Of each agent that is asked for, in that order.
+    pub(super) agents: Vec<OfAgent<'a>>,
+}
+
+/// What the runs of an agent in a game gave; nothing where none is finished.
+#[derive(Serialize)]
+pub(super) struct OfAgent<'a> {
+    #[serde(skip)]
+    pub(super) runs: Vec<&'a Scored>,
+    pub(super) training: Vec<f64>,
+    greedy: Vec<f64>,
+    pub(super) paper: Option<f64>,
+    /// Whether each of the runs plays better than at random.
+    pub(super) is_above_random: bool,
+}
+
+impl<'a> Game<'a> {
+    /// Those of all runs.
+    pub(super) fn all(
+        settings: &'a Settings,
+        scored: &'a [Scored],
+        published: &Published,
+    ) -> Vec<Self> {
+        let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
+        for it in scored {
+            let game = games.entry(short(&it.made.point.world));
+            game.or_default().push(it);
+        }
+        let of = |name: &str, runs: &[&'a Scored], agent: &String| {
+            let own = runs.iter().filter(|it| it.made.point.agent == *agent);
+            let runs: Vec<_> = own.copied().collect();
+            let training = runs.iter().filter_map(|it| it.made.run.summary.mean_return);
+            OfAgent {
+                training: training.collect(),
+                greedy: runs.iter().filter_map(|it| mean(&it.greedy)).collect(),
+                paper: published.paper(name, agent),
+                is_above_random: runs.iter().all(|it| it.is_above_random()),
+                runs,
+            }
+        };
+        let game = |(name, runs): (&'a str, Vec<&'a Scored>)| Self {
+            name,
+            random: &runs[0].random,
+            agents: settings
+                .agents
+                .iter()
+                .map(|it| of(name, &runs, it))
+                .collect(),
+        };
+        games.into_iter().map(game).collect()
     }
-    games
-}
-
-/// The runs of an agent among those of a game.
-pub(super) fn of<'a>(
-    game: &'a [&Scored],
-    agent: &'a str,
-) -> impl Iterator<Item = &'a Scored> + Clone {
-    let all = game.iter().copied();
-    all.filter(move |it| it.made.point.agent == agent)
-}
-
-pub(super) fn training<'a>(runs: impl Iterator<Item = &'a Scored>) -> Vec<f64> {
-    runs.filter_map(|it| it.made.run.summary.mean_return)
-        .collect()
 }
 
 /// A line a run.
 pub(super) fn data(scored: &[Scored], published: &Published) -> anyhow::Result<Table> {
-    let header = [
-        "game",
-        "agent",
-        "torso",
-        "seed",
-        "frames",
-        "training",
-        "greedy",
-        "random",
-        "paper",
-        "wall_seconds",
-        "commit",
-    ];
     let mut rows = Vec::new();
     for it in scored {
         let Made { point, plan, run } = &it.made;
@@ -95,7 +116,8 @@ pub(super) fn data(scored: &[Scored], published: &Published) -> anyhow::Result<T
             run.commit.clone(),
         ]);
     }
-    Ok(Table::new(&header, rows))
+    let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
+    Ok(Table::of(columns, rows))
 }
 
 /// The torso of a run's network, from its settings; those without a choice have the one of Nature's DQN.
@@ -105,8 +127,6 @@ fn torso(folder: &RunFolder) -> anyhow::Result<String> {
     let text = text.with_context(|| format!("reading {}", path.display()))?;
     let config: toml::Table = text.parse()?;
     let torso = config.get("model").and_then(|model| model.get("torso"));
-    Ok(torso
-        .and_then(toml::Value::as_str)
-        .unwrap_or("nature")
-        .to_owned())
+    let torso = torso.and_then(toml::Value::as_str);
+    Ok(torso.unwrap_or("nature").to_owned())
 }

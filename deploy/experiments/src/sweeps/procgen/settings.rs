@@ -85,23 +85,22 @@ impl Settings {
 
     /// What there are runs for, with each seed.
     pub(super) fn points(&self) -> Vec<Point> {
-        let of_game = |world: &String| {
-            let world = world.clone();
-            self.agents.iter().map(move |agent| Point {
-                world: world.clone(),
-                agent: agent.clone(),
-            })
+        let games = self.games.iter();
+        let pairs = games.flat_map(|game| self.agents.iter().map(move |agent| (game, agent)));
+        let point = |(world, agent): (&String, &String)| Point {
+            world: world.clone(),
+            agent: agent.clone(),
         };
-        self.games.iter().flat_map(of_game).collect()
+        pairs.map(point).collect()
     }
 
     /// The run of a seed.
     pub(super) fn plan(&self, point: &Point, seed: u32) -> PlannedRun {
         let (agent, k) = with_k(&point.agent);
         let k = k.map(|k| format!("run.horizon.k={k}"));
-        PlannedRun {
-            name: format!("{}-{}-seed{seed}", short(&point.world), point.agent),
-            call: Call {
+        PlannedRun::new(
+            format!("{}-{}-seed{seed}", short(&point.world), point.agent),
+            Call {
                 env: Some(point.world.clone()),
                 agent: Some(agent.to_owned()),
                 preset: Some(self.preset.clone()),
@@ -109,10 +108,8 @@ impl Settings {
                 frames: Some(self.frames),
                 sets: self.sets.iter().cloned().chain(k).collect(),
             },
-            frames: self.frames,
-            episodes: None,
-            units: self.frames,
-        }
+            self.frames,
+        )
     }
 
     /// How a run is played on these levels.
@@ -184,37 +181,38 @@ fn once(names: Vec<String>) -> Vec<String> {
 mod tests {
     use super::*;
 
-    fn names(list: &[&str]) -> Vec<String> {
-        list.iter().map(|&it| it.to_owned()).collect()
-    }
-
-    fn smoke() -> Settings {
-        sweep_settings(NAME, include_str!("../procgen.toml"), true)
+    fn settings(smoke: bool) -> Settings {
+        sweep_settings(NAME, include_str!("../procgen.toml"), smoke)
     }
 
     #[test]
     fn the_full_length_is_sixteen_games_of_two_agents() {
-        let full: Settings = sweep_settings(NAME, include_str!("../procgen.toml"), false);
+        let full = settings(false);
         assert_eq!(worlds(&full.games).unwrap().len(), 16);
         assert_eq!(agents(&full.agents).unwrap(), ["c51", "driml-ada"]);
-        for settings in [full, smoke()] {
+        for settings in [full, settings(true)] {
             assert!(presets::preset(&settings.preset).is_ok());
         }
     }
 
     #[test]
     fn games_and_agents_go_by_short_names() {
+        let found = |names: &str, of: fn(&[String]) -> Result<Vec<String>, Usage>| {
+            let names: Vec<_> = names.split(' ').map(String::from).collect();
+            of(&names).map(|it| it.join(" "))
+        };
+        let both = "driml-noact-k1 driml-noact-k5";
+        assert_eq!(found(both, agents).unwrap(), both);
+        assert_eq!(found("all", agents).unwrap().split(' ').count(), 7);
+        let worlds = |names| found(names, worlds);
         assert_eq!(
-            worlds(&names(&["chain", "bigfish", "chain"])).unwrap(),
-            ["chain", "procgen:bigfish"]
+            worlds("chain bigfish chain").unwrap(),
+            "chain procgen:bigfish"
         );
-        let said = worlds(&names(&["bigfihs"])).unwrap_err().to_string();
+        let said = worlds("bigfihs").unwrap_err().to_string();
         assert!(said.contains("did you mean"), "{said}");
-        assert_eq!(agents(&names(&["all"])).unwrap().len(), 7);
-        let both = ["driml-noact-k1", "driml-noact-k5"];
-        assert_eq!(agents(&names(&both)).unwrap(), both);
         for wrong in ["driml-ada-k5", "driml-noact-kx"] {
-            assert!(agents(&names(&[wrong])).is_err(), "{wrong}");
+            assert!(found(wrong, agents).is_err(), "{wrong}");
         }
     }
 
@@ -225,7 +223,7 @@ mod tests {
             world: "procgen:heist".into(),
             agent: "driml-noact-k5".into(),
         };
-        let plan = smoke().plan(&point, 2);
+        let plan = settings(true).plan(&point, 2);
         assert_eq!(plan.name, "heist-driml-noact-k5-seed2");
         assert_eq!(
             plan.call.args().join(" "),

@@ -3,30 +3,30 @@
 
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-const FILE: &str = include_str!("../tradeoff.toml");
 /// The agent of a dial that names none.
 const AGENT: &str = "c51";
 
 /// A dial in one world: a base and the levels that are compared with it.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Dial {
     pub(super) name: String,
     /// The name of the level that the settings of the world have.
     pub(super) base: String,
     /// What the other levels are expected to buy.
-    pub(super) buys: String,
+    buys: String,
     /// Why they are expected to cost accuracy.
-    pub(super) costs: String,
+    costs: String,
     /// The agent of its base.
     #[serde(default = "agent")]
-    pub(super) agent: String,
+    agent: String,
     /// Kinds of worlds that have it; all if it names none.
     #[serde(default)]
     worlds: Vec<String>,
-    pub(super) levels: Vec<Level>,
+    #[serde(skip_serializing)]
+    levels: Vec<Level>,
 }
 
 fn agent() -> String {
@@ -36,8 +36,8 @@ fn agent() -> String {
 /// A level of a dial.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Level {
-    pub(super) name: String,
+struct Level {
+    name: String,
     /// In the form of `--set`, over the settings of the world.
     #[serde(default)]
     sets: Vec<String>,
@@ -46,13 +46,29 @@ pub(super) struct Level {
 }
 
 /// One choice of all settings: what a run, of any seed, is made with.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Point {
     /// Names its runs and pieces.
     pub(super) key: String,
     pub(super) agent: String,
     /// Over the settings of the world.
     pub(super) sets: Vec<String>,
+}
+
+/// A level of a dial and its base.
+#[derive(Clone, Debug)]
+pub(super) struct LevelOf {
+    pub(super) dial: Dial,
+    pub(super) level: String,
+    pub(super) base: Point,
+    pub(super) point: Point,
+}
+
+impl LevelOf {
+    /// As the page has it.
+    pub(super) fn name(&self) -> String {
+        format!("{} = {}", self.dial.name, self.level)
+    }
 }
 
 impl Dial {
@@ -65,32 +81,32 @@ impl Dial {
         }
     }
 
-    /// What a level of it is made with.
-    pub(super) fn point(&self, level: &Level) -> Point {
-        let agent = level.agent.as_ref().unwrap_or(&self.agent);
-        let key = match level.sets.is_empty() {
-            true => agent.clone(),
-            false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
-        };
-        Point {
-            key,
-            agent: agent.clone(),
-            sets: level.sets.clone(),
-        }
+    /// Its levels, and what each is made with.
+    pub(super) fn level_points(&self) -> impl Iterator<Item = LevelOf> {
+        self.levels.iter().map(|level| {
+            let agent = level.agent.as_ref().unwrap_or(&self.agent);
+            let key = match level.sets.is_empty() {
+                true => agent.clone(),
+                false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
+            };
+            LevelOf {
+                dial: self.clone(),
+                level: level.name.clone(),
+                base: self.base_point(),
+                point: Point {
+                    key,
+                    agent: agent.clone(),
+                    sets: level.sets.clone(),
+                },
+            }
+        })
     }
 }
 
 /// A name as files have it: letters, digits, dots and single dashes.
 fn slug(name: &str) -> String {
-    let kept = |c: char| {
-        if c.is_ascii_alphanumeric() || c == '.' {
-            c
-        } else {
-            '-'
-        }
-    };
-    let parts: String = name.chars().map(kept).collect();
-    let parts = parts.split('-').filter(|part| !part.is_empty());
+    let parts = name.split(|c: char| !c.is_ascii_alphanumeric() && c != '.');
+    let parts = parts.filter(|part| !part.is_empty());
     parts.collect::<Vec<_>>().join("-")
 }
 
@@ -120,7 +136,7 @@ pub(super) struct Length {
 }
 
 fn file() -> File {
-    toml::from_str(FILE)
+    toml::from_str(include_str!("../tradeoff.toml"))
         .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"))
 }
 
@@ -152,17 +168,16 @@ pub(super) fn dials(world: WorldName) -> Vec<Dial> {
 
 /// What all runs in a world have.
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
-    let worlds = file().world;
-    let mut of_kind: Vec<_> = worlds.iter().filter(|it| it.kind == world.kind()).collect();
-    // A game's own before that of all.
-    of_kind.sort_by_key(|it| it.game.is_none());
-    let is_for = |it: &WorldBase| {
-        let game = it.game.as_ref();
-        game.is_none_or(|game| format!("{}:{game}", it.kind) == world.to_string())
+    let mut worlds = file().world;
+    let mut kinds: Vec<_> = worlds.iter().map(|it| it.kind.clone()).collect();
+    kinds.dedup();
+    // A game's entry comes before that of all.
+    worlds.sort_by_key(|it| it.game.is_none());
+    let is_for = |it: &WorldBase| match &it.game {
+        None => it.kind == world.kind(),
+        Some(game) => format!("{}:{game}", it.kind) == world.to_string(),
     };
-    of_kind.into_iter().find(|it| is_for(it)).cloned().ok_or_else(|| {
-        let mut kinds: Vec<_> = worlds.iter().map(|it| it.kind.as_str()).collect();
-        kinds.dedup();
+    worlds.into_iter().find(is_for).ok_or_else(|| {
         usage!(
             "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
             kinds.join(", ")
@@ -170,21 +185,20 @@ pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
     })
 }
 
-/// Those of `all` that are asked for by name, in the order of the menu; all if none are.
-pub(super) fn chosen(all: Vec<Dial>, names: &[String]) -> Result<Vec<Dial>, Usage> {
-    if let Some(unknown) = names
-        .iter()
-        .find(|name| all.iter().all(|dial| dial.name != **name))
-    {
-        let known: Vec<_> = all.iter().map(|dial| dial.name.as_str()).collect();
+/// The names of `all` that are asked for; all if none are.
+pub(super) fn chosen(all: &[Dial], names: &[String]) -> Result<Vec<String>, Usage> {
+    let known: Vec<_> = all.iter().map(|dial| dial.name.as_str()).collect();
+    if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
         return Err(usage!(
             "there is no dial {unknown:?} in this world{}; --dials takes {}",
             nearest(unknown, known.iter().copied()),
             known.join(", ")
         ));
     }
-    let asked = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
-    Ok(all.into_iter().filter(asked).collect())
+    Ok(match names {
+        [] => known.into_iter().map(String::from).collect(),
+        names => names.to_vec(),
+    })
 }
 
 #[cfg(test)]
@@ -192,17 +206,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_game_of_its_own_comes_before_its_kind() {
-        let frames = |name: &str| {
+    fn the_entry_of_a_game_comes_before_that_of_its_kind() {
+        for (name, sets) in [("fruitbot", 5), ("coinrun", 1)] {
             let world = driml_settings::presets::world(name).unwrap();
-            world_base(world).map(|base| (base.frames, base.sets.len()))
-        };
-        assert_eq!(frames("procgen:fruitbot").unwrap(), (30_000, 5));
-        assert_eq!(frames("procgen:coinrun").unwrap(), (30_000, 1));
-        let said = frames("ising").unwrap_err().to_string();
-        assert!(
-            said.ends_with("it has some for mspacman, procgen, chain"),
-            "{said}"
-        );
+            let base = world_base(world).unwrap();
+            assert_eq!((base.frames, base.sets.len()), (30_000, sets), "{name}");
+        }
     }
 }

@@ -25,18 +25,26 @@ const STATES_A_ROW: usize = 16;
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Exactness {
     /// Relative error of the total loss.
-    pub(super) loss: f64,
+    #[serde(rename = "loss_error", alias = "loss")]
+    loss: f64,
     /// Relative error of the gradient, and 1 - cosine of its angle to the reference.
-    pub(super) gradient: f64,
-    pub(super) angle: f64,
+    #[serde(rename = "gradient_error", alias = "gradient")]
+    gradient: f64,
+    #[serde(rename = "gradient_angle", alias = "angle")]
+    angle: f64,
     /// Of the learner's values, in units of return.
-    pub(super) q_rms: f64,
-    pub(super) q_max: f64,
+    #[serde(rename = "q_rms_error", alias = "q_rms")]
+    q_rms: f64,
+    #[serde(rename = "q_max_error", alias = "q_max")]
+    q_max: f64,
     /// Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
-    pub(super) same_learner: f64,
-    pub(super) same_actor: f64,
+    #[serde(rename = "same_action_learner", alias = "same_learner")]
+    same_learner: f64,
+    #[serde(rename = "same_action_actor", alias = "same_actor")]
+    same_actor: f64,
     /// Of the actor's values.
-    pub(super) actor_q_rms: f64,
+    #[serde(rename = "actor_q_rms_error", alias = "actor_q_rms")]
+    actor_q_rms: f64,
 }
 
 /// Of what the errors are made, beside a run's weights.
@@ -62,17 +70,6 @@ impl fmt::Display for Sizes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} rows, {} states", self.rows, self.states)
     }
-}
-
-/// An actor's values [B, A] of the rows' states.
-fn acted_values(
-    policy: &mut PolicyNetwork,
-    held: &HeldBatch,
-    num_actions: usize,
-) -> anyhow::Result<Vec<f32>> {
-    let mut values = vec![0.0; held.rows() * num_actions];
-    policy.q_values(&held.states_t, &mut values)?;
-    Ok(values)
 }
 
 /// Measures the newest checkpoint of a run of a level with `config`.
@@ -102,12 +99,11 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let published = agent.weights_as(config.learner.publish_as)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
     let held = HeldBatch::play(config, Some(&weights), states)?;
+    let mut acted = vec![0.0; held.rows() * model.num_actions];
+    policy.q_values(&held.states_t, &mut acted)?;
     let expected = reference.q_values_t(&held.batch())?;
-    let [learning, acting] = [
-        agent.q_values_t(&held.batch())?,
-        acted_values(&mut policy, &held, model.num_actions)?,
-    ]
-    .map(|values| QError::of(&values, &expected, model.num_actions));
+    let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
+        .map(|values| QError::of(&values, &expected, model.num_actions));
     Ok(Exactness {
         loss: found.loss,
         gradient: found.gradient,

@@ -2,8 +2,11 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
-use super::results::{Measure, PointResult, Results};
-use crate::plot::{Over, Run, over_seeds};
+use super::{
+    report::training_curves,
+    results::{FRAMES_PER_SECOND, Measure, PointResult, Results},
+};
+use crate::plot::over_seeds;
 
 /// Panels side by side.
 const COLUMNS: usize = 3;
@@ -34,10 +37,10 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
         .flat_map(|it| [it.ends.0, it.ends.1])
         .collect();
     let label = format!("{name} return");
-    let panel = |dial: &[Named<'_>]| {
+    let panels = by_dial(results).map(|(dial, named)| {
         let line = Series::line("", 0, front.clone());
         let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
-        for (index, (name, point)) in dial.iter().enumerate() {
+        for (index, (name, point)) in named.enumerate() {
             let Some(it) = place(point) else { continue };
             series.push(
                 Series::line(name, index, vec![(it.speed, it.value)])
@@ -46,10 +49,7 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
             );
         }
         let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
-        (x.showing(&speeds), y.showing(&values), series)
-    };
-    let panels = by_dial(results).into_iter().map(|(dial, named)| {
-        let (x, y, series) = panel(&named);
+        let (x, y) = (x.showing(&speeds), y.showing(&values));
         Panel::Chart(Chart::new(dial, x, y, series))
     });
     Figure {
@@ -72,7 +72,7 @@ fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -
     let value = point.mean(returns)?;
     let (low, high) = value.ends.unwrap_or((value.mean, value.mean));
     Some(Placed {
-        speed: point.mean(Measure::FramesPerSecond)?.mean,
+        speed: point.mean(FRAMES_PER_SECOND)?.mean,
         value: value.mean,
         ends: (low.max(least), high.min(greatest)),
     })
@@ -92,21 +92,17 @@ fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
     front.into_iter()
 }
 
-/// A point by the name of its level.
-type Named<'a> = (&'a str, &'a PointResult);
-
-/// The dials that have runs, each with its base and then its levels.
-fn by_dial(results: &Results) -> Vec<(&str, Vec<Named<'_>>)> {
-    let dials = results.by_dial().map(|levels| {
+/// The dials that have runs, each with its base and then its levels, by their names.
+fn by_dial(
+    results: &Results,
+) -> impl Iterator<Item = (&str, impl Iterator<Item = (&str, &PointResult)>)> {
+    results.by_dial().map(|levels| {
         let (dial, base) = (&levels[0].dial, &levels[0].base);
-        let base = (dial.base.as_str(), &results.points[&base.key]);
-        let others = levels
-            .iter()
-            .map(|of| (of.level.as_str(), &results.points[&of.point.key]));
-        let named = std::iter::once(base).chain(others);
-        (dial.name.as_str(), named.collect())
-    });
-    dials.collect()
+        let base = std::iter::once((dial.base.as_str(), results.at(base)));
+        let levels = levels.iter();
+        let levels = levels.map(|of| (of.level.as_str(), results.at(&of.point)));
+        (dial.name.as_str(), base.chain(levels))
+    })
 }
 
 /// Training return over seconds, a panel for each dial with its base.
@@ -114,15 +110,12 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
     for (dial, named) in by_dial(results) {
         let mut series = Vec::new();
-        for (index, (name, point)) in named.into_iter().enumerate() {
-            series.push(curve(name, index, point)?);
+        for (index, (name, point)) in named.enumerate() {
+            let curve = over_seeds(&training_curves(point)?);
+            series.push(curve.series(name, index));
         }
-        panels.push(Panel::Chart(Chart::new(
-            dial,
-            Axis::linear("seconds"),
-            Axis::linear("mean return"),
-            series,
-        )));
+        let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));
+        panels.push(Panel::Chart(Chart::new(dial, x, y, series)));
     }
     Ok(Figure {
         title: format!("{}: return against wall-clock time", results.settings.common.env),
@@ -134,15 +127,6 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
         panel_size: PANEL,
         panels,
     })
-}
-
-fn curve(name: &str, index: usize, point: &PointResult) -> anyhow::Result<Series> {
-    let mut each = Vec::new();
-    for it in &point.seeds {
-        each.push(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?);
-    }
-    let curve = over_seeds(&each);
-    Ok(Series::line(name, index, curve.points).banded(curve.band))
 }
 
 #[cfg(test)]

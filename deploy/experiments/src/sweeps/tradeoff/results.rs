@@ -2,34 +2,21 @@
 
 use std::collections::BTreeMap;
 
+use serde_json::{Map, Value};
+
 use super::{
-    dials::{Dial, Point},
+    dials::{LevelOf, Point},
     exactness::Exactness,
     settings::Settings,
     speed::Speed,
 };
 use crate::{
     stats::{Difference, Interval, Spread, difference, interval},
-    sweep::plan::FinishedRun,
+    sweep::{plan::FinishedRun, results::mean},
 };
 
-/// A level of a dial and its base.
-#[derive(Clone, Debug)]
-pub(super) struct LevelOf {
-    pub(super) dial: Dial,
-    pub(super) level: String,
-    pub(super) base: Point,
-    pub(super) point: Point,
-}
-
-impl LevelOf {
-    /// As the page has it.
-    pub(super) fn name(&self) -> String {
-        format!("{} = {}", self.dial.name, self.level)
-    }
-}
-
 /// What a point gave.
+#[derive(Default)]
 pub(super) struct PointResult {
     pub(super) speed: Option<Speed>,
     /// At the weights of its first seed.
@@ -62,92 +49,107 @@ pub(super) struct Results {
     pub(super) smoke: bool,
 }
 
-/// Which number of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Measure {
-    /// Mean of the greedily played episodes.
-    Greedy,
-    /// Mean of the last 100 training episodes.
-    Training,
-    FramesPerSecond,
-    WallSeconds,
-    /// Highest resident memory of all processes, MiB.
-    Memory,
-    /// Updates by which the weights that acted were behind, median.
-    Behind,
-    /// Seconds for which newer weights had been there, median.
-    BehindSeconds,
+/// A number of a run, and how the data calls it.
+#[derive(Clone, Copy)]
+pub(super) struct Measure {
+    pub(super) name: &'static str,
+    pub(super) of: fn(&SeedResult) -> Option<f64>,
 }
 
-impl SeedResult {
-    pub(super) fn value(&self, measure: Measure) -> Option<f64> {
-        let summary = &self.ran.summary;
-        match measure {
-            Measure::Greedy => Spread::of(self.greedy.iter().copied()).map(|it| it.mean),
-            Measure::Training => summary.mean_return,
-            Measure::FramesPerSecond => Some(summary.frames_per_second),
-            Measure::WallSeconds => Some(summary.wall_seconds),
-            Measure::Memory => {
-                let each = summary.rss_mib_max.values();
-                Some(each.filter_map(serde_json::Value::as_f64).sum())
-            }
-            Measure::Behind => summary.weights_behind_updates.map(|it| it.p50),
-            Measure::BehindSeconds => summary.weights_behind_s.map(|it| it.p50),
-        }
-    }
-}
+/// Mean of the greedily played episodes.
+pub(super) const GREEDY: Measure = Measure {
+    name: "greedy_return",
+    of: |it| mean(&it.greedy),
+};
+/// Mean of the last 100 training episodes.
+pub(super) const TRAINING: Measure = Measure {
+    name: "training_return",
+    of: |it| it.ran.summary.mean_return,
+};
+pub(super) const FRAMES_PER_SECOND: Measure = Measure {
+    name: "frames_per_second",
+    of: |it| Some(it.ran.summary.frames_per_second),
+};
+/// All measures, in the order of the data.
+pub(super) const MEASURES: [Measure; 7] = [
+    GREEDY,
+    TRAINING,
+    FRAMES_PER_SECOND,
+    Measure {
+        name: "wall_seconds",
+        of: |it| Some(it.ran.summary.wall_seconds),
+    },
+    // Highest resident memory of all processes.
+    Measure {
+        name: "rss_mib",
+        of: |it| {
+            let each = it.ran.summary.rss_mib_max.values();
+            Some(each.filter_map(Value::as_f64).sum())
+        },
+    },
+    // Updates by which the weights that acted were behind, median.
+    Measure {
+        name: "weights_behind_updates",
+        of: |it| Some(it.ran.summary.weights_behind_updates?.p50),
+    },
+    // Seconds for which newer weights had been there, median.
+    Measure {
+        name: "weights_behind_seconds",
+        of: |it| Some(it.ran.summary.weights_behind_s?.p50),
+    },
+];
 
 impl PointResult {
     /// What each run gave, by its seed.
     pub(super) fn values(&self, measure: Measure) -> Vec<f64> {
-        self.seeds
-            .iter()
-            .filter_map(|it| it.value(measure))
-            .collect()
+        self.seeds.iter().filter_map(measure.of).collect()
     }
 
     /// The mean over seeds, with its interval.
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
         interval(&self.values(measure))
     }
+
+    /// The bench and the errors by their names in the data.
+    pub(super) fn measured(&self) -> Map<String, Value> {
+        let both = [
+            serde_json::to_value(&self.speed),
+            serde_json::to_value(&self.exactness),
+        ];
+        let maps = both.into_iter().filter_map(|it| match it {
+            Ok(Value::Object(map)) => Some(map),
+            _ => None,
+        });
+        maps.flatten().collect()
+    }
 }
 
 impl Results {
+    /// What was measured at a point.
+    pub(super) fn at(&self, point: &Point) -> &PointResult {
+        &self.points[&point.key]
+    }
+
     /// The levels of each dial that has runs.
     pub(super) fn by_dial(&self) -> impl Iterator<Item = &[LevelOf]> {
         self.levels.chunk_by(|a, b| a.dial.name == b.dial.name)
     }
 
-    /// Fewest and most seeds of the bases, and of the other levels.
-    pub(super) fn seeds(&self) -> [Option<(usize, usize)>; 2] {
-        [true, false].map(|bases| {
-            let is_base = |key: &str| self.levels.iter().any(|of| of.base.key == key);
-            let all = self.points.iter();
-            let counts = all.filter(|(key, _)| is_base(key) == bases);
-            let counts: Vec<usize> = counts.map(|(_, point)| point.seeds.len()).collect();
-            Some((*counts.iter().min()?, *counts.iter().max()?))
-        })
-    }
-
     /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
     pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Difference> {
-        let [base, level] = [&of.base, &of.point].map(|it| self.points[&it.key].values(measure));
+        let [base, level] = [&of.base, &of.point].map(|it| self.at(it).values(measure));
         difference(&base, &level)
     }
 
-    /// The level's mean over the base's, of the seeds that both have: a base's further seeds run at another time, beside other runs.
-    pub(super) fn factor(&self, of: &LevelOf, measure: Measure) -> Option<f64> {
-        let [base, level] = [&of.base, &of.point].map(|it| &self.points[&it.key]);
+    /// The level's frames a second over the base's, of the seeds that both have: a base's further seeds run at another time, beside other
+    /// runs.
+    pub(super) fn frames_gain(&self, of: &LevelOf) -> Option<f64> {
+        let [base, level] = [&of.base, &of.point].map(|it| self.at(it));
         let mean = |point: &PointResult, other: &PointResult| {
             let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
             let values = point.seeds.iter().filter(both);
-            Spread::of(values.filter_map(|it| it.value(measure))).map(|it| it.mean)
+            Spread::of(values.filter_map(FRAMES_PER_SECOND.of)).map(|it| it.mean)
         };
         Some(mean(level, base)? / mean(base, level)?)
-    }
-
-    /// What a base earns in training more than the random policy, over seeds and over episodes of the latter.
-    pub(super) fn above_random(&self, base: &PointResult) -> Option<Difference> {
-        difference(&self.random, &base.values(Measure::Training))
     }
 }

@@ -32,7 +32,10 @@ pub(super) struct Common {
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) common: Common,
-    pub(super) dials: Vec<Dial>,
+    /// Those of the world, asked for or not: what has runs is on the page.
+    pub(super) all_dials: Vec<Dial>,
+    /// The names of those that are asked for.
+    pub(super) asked: Vec<String>,
     pub(super) seeds: u32,
     /// Machine time for the runs of this call, in seconds.
     pub(super) budget_seconds: f64,
@@ -46,24 +49,24 @@ pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings,
     let base = dials::world_base(world)?;
     let length = dials::length(args.flags.smoke);
     let asked = [length.sets, args.queue.sets.clone()];
-    let sets = base.sets.into_iter().chain(asked.concat()).collect();
-    let frames = length.frames.unwrap_or(base.frames);
-    let frames_open = args.frames.is_none() && found.is_none();
-    let found_frames = found.as_ref().map(|it| it.frames);
-    let found_jobs = found.as_ref().map(|it| it.jobs);
+    let found = found.as_ref();
+    let frames = args.frames.or(found.map(|it| it.frames));
+    let jobs = args.queue.jobs.or(found.map(|it| it.jobs));
+    let all_dials = dials::dials(world);
     Ok(Settings {
         common: Common {
             env: world.to_string(),
             preset: length.preset,
-            sets,
-            frames: args.frames.or(found_frames).unwrap_or(frames),
+            sets: base.sets.into_iter().chain(asked.concat()).collect(),
+            frames: frames.or(length.frames).unwrap_or(base.frames),
             episodes: args.episodes.unwrap_or(length.episodes),
-            jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
+            jobs: jobs.unwrap_or(1),
         },
-        dials: dials::chosen(dials::dials(world), &args.dials)?,
+        asked: dials::chosen(&all_dials, &args.dials)?,
+        all_dials,
         seeds: args.flags.seeds.unwrap_or(length.seeds),
         budget_seconds: f64::from(args.budget) * 60.0,
-        frames_open,
+        frames_open: frames.is_none(),
     })
 }
 
@@ -76,6 +79,11 @@ impl Settings {
             self.seeds
         }
     }
+
+    /// Whether the call asks for this dial.
+    pub(super) fn asks_for(&self, dial: &Dial) -> bool {
+        self.asked.contains(&dial.name)
+    }
 }
 
 impl Common {
@@ -86,9 +94,9 @@ impl Common {
 
     /// The run of a seed at `point`.
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
-        PlannedRun {
-            name: format!("{}-seed{seed}", point.key),
-            call: Call {
+        PlannedRun::new(
+            format!("{}-seed{seed}", point.key),
+            Call {
                 env: Some(self.env.clone()),
                 agent: Some(point.agent.clone()),
                 preset: Some(self.preset.clone()),
@@ -96,10 +104,8 @@ impl Common {
                 frames: Some(self.frames),
                 sets: self.sets.iter().chain(&point.sets).cloned().collect(),
             },
-            frames: self.frames,
-            episodes: None,
-            units: self.frames,
-        }
+            self.frames,
+        )
     }
 }
 
@@ -107,147 +113,133 @@ impl Common {
 mod tests {
     use std::collections::BTreeSet;
 
+    use clap::Parser;
+
     use super::*;
 
-    fn common(world: WorldName, smoke: bool) -> Common {
-        let mut args = TradeoffArgs::of(&world.to_string(), smoke);
+    #[derive(Parser)]
+    struct CommandLine {
+        #[command(flatten)]
+        args: TradeoffArgs,
+    }
+
+    fn args(line: &str) -> TradeoffArgs {
+        let words = ["tradeoff"].into_iter().chain(line.split(' '));
+        CommandLine::parse_from(words).args
+    }
+
+    fn settings(world: &str, smoke: bool) -> Settings {
         // Else the free memory of the moment decides.
-        args.queue
-            .sets
-            .push("replay.capacity_transitions=10000".into());
-        of(&args, None).unwrap().common
+        let line = format!("--env={world} --set=replay.capacity_transitions=10000");
+        let mut args = args(&line);
+        args.flags.smoke = smoke;
+        of(&args, None).unwrap()
     }
 
     #[test]
     fn every_level_of_every_dial_is_a_run_that_can_be_made() {
-        for name in [
-            "mspacman",
-            "procgen:coinrun",
-            "procgen:fruitbot",
-            "procgen:dodgeball",
-            "chain",
-        ] {
-            let world: WorldName = name.parse().unwrap();
-            for smoke in [false, true] {
-                let common = common(world, smoke);
-                let mut keys = BTreeSet::new();
-                for dial in dials::dials(world) {
-                    assert!(!dial.buys.is_empty() && !dial.costs.is_empty());
-                    let base = dial.base_point();
-                    let base_config = common.config(&base).unwrap();
-                    for level in &dial.levels {
-                        let point = dial.point(level);
-                        let config = common
-                            .config(&point)
-                            .unwrap_or_else(|e| panic!("{name} {}: {e}", point.key));
-                        assert_ne!(config, base_config, "{}: nothing is turned", point.key);
-                        let one = keys.insert(point.key.clone());
-                        assert!(one || point.sets.is_empty(), "{} twice", point.key);
-                    }
-                }
+        let worlds = ["mspacman", "coinrun", "fruitbot", "dodgeball", "chain"];
+        for (name, smoke) in worlds.iter().flat_map(|it| [(it, false), (it, true)]) {
+            let Settings {
+                common, all_dials, ..
+            } = settings(name, smoke);
+            let mut keys = BTreeSet::new();
+            for level in all_dials.iter().flat_map(Dial::level_points) {
+                let config = common.config(&level.point);
+                let config = config.unwrap_or_else(|e| panic!("{name} {}: {e}", level.point.key));
+                let base = common.config(&level.base).unwrap();
+                let key = level.point.key;
+                assert_ne!(config, base, "{key}: nothing is turned");
+                let one = keys.insert(key.clone());
+                assert!(one || level.point.sets.is_empty(), "{key} twice");
             }
         }
     }
 
     #[test]
     fn a_base_has_what_its_dial_says() {
-        let has = |world: &str, dial: &str, sets: &[&str]| {
-            let world: WorldName = world.parse().unwrap();
-            let common = common(world, false);
-            let found = dials::chosen(dials::dials(world), &[dial.to_owned()]).unwrap();
-            let base = found[0].base_point();
-            let said = Point {
-                sets: sets.iter().map(|&set| set.to_owned()).collect(),
-                ..base.clone()
-            };
-            assert_eq!(
-                common.config(&base).unwrap(),
-                common.config(&said).unwrap(),
-                "{dial} in {world}"
-            );
-        };
-        for world in ["mspacman", "procgen:coinrun", "chain"] {
-            has(world, "learner.precision", &["learner.precision=f32"]);
-            has(world, "actor.precision", &["actor.precision=f32"]);
-            has(world, "learner.publish_as", &["learner.publish_as=f32"]);
-            has(world, "learner.batch_size", &["learner.batch_size=64"]);
-            has(world, "replay.replay_ratio", &["replay.replay_ratio=8"]);
-            has(world, "model.atoms", &["model.atoms=51"]);
-            has(world, "replay.compression", &["replay.compression=none"]);
-            has(
-                world,
+        const ALL: [&str; 3] = ["mspacman", "coinrun", "chain"];
+        for (worlds, dial, sets) in [
+            (&ALL[..], "learner.precision", "learner.precision=f32"),
+            (&ALL, "actor.precision", "actor.precision=f32"),
+            (&ALL, "learner.publish_as", "learner.publish_as=f32"),
+            (&ALL, "learner.batch_size", "learner.batch_size=64"),
+            (&ALL, "replay.replay_ratio", "replay.replay_ratio=8"),
+            (&ALL, "model.atoms", "model.atoms=51"),
+            (&ALL, "replay.compression", "replay.compression=none"),
+            (
+                &ALL,
                 "learner.affinity.estimator",
-                &["learner.affinity.estimator=learned"],
-            );
-            has(world, "replay.shards", &["replay.shards=1"]);
-            has(
-                world,
+                "learner.affinity.estimator=learned",
+            ),
+            (&ALL, "replay.shards", "replay.shards=1"),
+            (
+                &ALL,
                 "transport.shared_memory",
-                &["transport.shared_memory=true"],
-            );
-        }
-        for world in ["mspacman", "procgen:coinrun"] {
-            has(
-                world,
+                "transport.shared_memory=true",
+            ),
+            (
+                &ALL[..2],
                 "learner.publish_period_updates",
-                &["learner.publish_period_updates=8"],
-            );
-            has(world, "model.hidden", &["model.hidden=512"]);
-            has(world, "model.rkhs", &["model.rkhs=512"]);
-            let zero = ["3t3", "3t4", "4t3"].map(|pair| format!("learner.update.lambda.{pair}=0"));
-            has(world, "pairs NtM", &zero.each_ref().map(String::as_str));
+                "learner.publish_period_updates=8",
+            ),
+            (&ALL[..2], "model.hidden", "model.hidden=512"),
+            (&ALL[..2], "model.rkhs", "model.rkhs=512"),
+            (
+                &ALL[..2],
+                "pairs NtM",
+                "learner.update.lambda.3t3=0 learner.update.lambda.3t4=0 learner.update.lambda.4t3=0",
+            ),
+            (&ALL[..1], "observation", "input.height=42 input.width=38"),
+            (&ALL[1..2], "observation", "input.height=64 input.width=64"),
+        ] {
+            for world in worlds {
+                let Settings {
+                    common, all_dials, ..
+                } = settings(world, false);
+                let dial = all_dials.iter().find(|it| it.name == dial).unwrap();
+                let base = dial.base_point();
+                let mut said = base.clone();
+                said.sets = sets.split(' ').map(String::from).collect();
+                let configs = [&base, &said].map(|point| common.config(point).unwrap());
+                assert_eq!(configs[0], configs[1], "{} in {world}", dial.name);
+            }
         }
-        has(
-            "mspacman",
-            "observation",
-            &["input.height=42", "input.width=38"],
-        );
-        has(
-            "procgen:coinrun",
-            "observation",
-            &["input.height=64", "input.width=64"],
-        );
     }
 
     #[test]
     fn a_preset_as_a_level_is_that_preset() {
-        let world: WorldName = "mspacman".parse().unwrap();
-        let common = common(world, false);
-        for name in ["preset", "preset with DIM"] {
-            let found = dials::chosen(dials::dials(world), &[name.to_owned()]);
-            let dial = &found.unwrap()[0];
+        let Settings {
+            common, all_dials, ..
+        } = settings("mspacman", false);
+        let of = |preset: &str, point: &Point| {
+            let mut common = common.clone();
+            common.preset = preset.to_owned();
+            let mut config = common.config(point).unwrap();
+            // A priced preset says in its notes what it gives up.
+            config.notes.clear();
+            config
+        };
+        for dial in all_dials.iter().filter(|it| it.name.starts_with("preset")) {
             let base = dial.base_point();
-            let of = |preset: &str, point: &Point| {
-                let common = Common {
-                    preset: preset.to_owned(),
-                    ..common.clone()
-                };
-                // A priced preset says in its notes what it gives up.
-                RunConfig {
-                    notes: Vec::new(),
-                    ..common.config(point).unwrap()
-                }
-            };
             assert_eq!(of("paper", &base), of(&dial.base, &base));
-            for level in &dial.levels {
-                let point = dial.point(level);
-                let whole = of(&level.name, &base);
-                assert_eq!(of("paper", &point), whole, "{}", point.key);
+            for level in dial.level_points() {
+                let whole = of(&level.level, &base);
+                assert_eq!(of("paper", &level.point), whole, "{}", level.point.key);
             }
         }
     }
 
     #[test]
     fn a_folder_keeps_its_length() {
-        let args = TradeoffArgs::of("mspacman", false);
-        let first = of(&args, None).unwrap();
+        let first = of(&args("--env mspacman"), None).unwrap();
         assert!(first.frames_open);
         let found = Common {
             frames: 777,
             jobs: 2,
             ..first.common
         };
-        let again = of(&args, Some(found)).unwrap();
+        let again = of(&args("--env mspacman"), Some(found)).unwrap();
         assert_eq!(
             (again.common.frames, again.common.jobs, again.frames_open),
             (777, 2, false)
@@ -256,15 +248,15 @@ mod tests {
 
     #[test]
     fn names_that_nothing_has() {
-        let args = TradeoffArgs {
-            dials: vec!["learner.precison".into()],
-            ..TradeoffArgs::of("chain", false)
-        };
-        let said = of(&args, None).unwrap_err().to_string();
-        assert!(
-            said.contains("did you mean \"learner.precision\"?"),
-            "{said}"
-        );
-        assert!(of(&TradeoffArgs::of("ising", false), None).is_err());
+        for (line, expected) in [
+            (
+                "--env chain --dials learner.precison",
+                "did you mean \"learner.precision\"?",
+            ),
+            ("--env ising", "it has some for mspacman, procgen, chain"),
+        ] {
+            let said = of(&args(line), None).unwrap_err().to_string();
+            assert!(said.contains(expected), "{said}");
+        }
     }
 }

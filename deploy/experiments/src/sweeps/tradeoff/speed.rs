@@ -43,15 +43,15 @@ pub(super) struct Speed {
     /// Seconds of an update of all rows.
     pub(super) update_seconds: f64,
     /// How many times as many rows a second are learned from as at the base.
-    pub(super) rows_gain: f64,
+    rows_gain: f64,
     /// Seconds of choosing an action for one frame, among as many as an actor has copies.
     pub(super) act_seconds: f64,
     /// How many times as many frames a second are acted on as at the base.
-    pub(super) act_gain: f64,
+    act_gain: f64,
     /// Of one broadcast of the weights.
-    pub(super) weights_bytes: u64,
+    weights_bytes: u64,
     /// Of one frame as an actor sends it and the replay holds it, uncompressed.
-    pub(super) frame_bytes: u64,
+    frame_bytes: u64,
 }
 
 /// What is timed.

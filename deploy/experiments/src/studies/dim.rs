@@ -1,0 +1,78 @@
+//! A network with the objective DIM alone and its optimiser, which are the learner's: what both studies train.
+//! There is no return, no action and no replay.
+
+use candle_core::{DType, Device, Tensor};
+use driml_learner::{
+    AdamSettings,
+    auxiliary::dim::{Dim, dots},
+    optimiser::{
+        adam::Adam,
+        gradients::{Gradients, clip_factor},
+    },
+};
+use driml_model::{Features, Kernels, ModelConfig, Network, Parameters};
+use rand_chacha::ChaCha8Rng;
+
+pub(super) struct DimLearner {
+    parameters: Parameters,
+    pub(super) network: Network,
+    adam: Adam,
+    dim: Dim,
+    max_grad_norm: f64,
+}
+
+impl DimLearner {
+    /// A network at its initial weights.
+    pub(super) fn new(
+        model: &ModelConfig,
+        dim: Dim,
+        adam: AdamSettings,
+        max_grad_norm: f64,
+        rng: &mut ChaCha8Rng,
+    ) -> anyhow::Result<Self> {
+        let parameters = Parameters::init(model, rng, &Device::Cpu)?;
+        Ok(Self {
+            network: Network::new(model, &parameters)?,
+            adam: Adam::new(adam, &parameters, Kernels::FUSED)?,
+            parameters,
+            dim,
+            max_grad_norm,
+        })
+    }
+
+    /// InfoNCE of the pairs 3t3, 3t4, 4t3 and 4t4 that have a weight, with its graph.
+    pub(super) fn losses(
+        &self,
+        now: &Features,
+        next: &Features,
+    ) -> anyhow::Result<[Option<Tensor>; 4]> {
+        let rows = now.f4.dim(0)?;
+        let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
+        let valid = vec![1; rows];
+        let network = &self.network;
+        Ok(self.dim.pair_losses(network, now, next, &action, &valid)?)
+    }
+
+    /// A step of the optimiser down this loss.
+    pub(super) fn step(&mut self, loss: &Tensor) -> anyhow::Result<()> {
+        let gradients = Gradients::of(&self.parameters, loss)?;
+        let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
+        Ok(self.adam.step(&self.parameters, &gradients, factor)?)
+    }
+
+    /// Clipped scores [L, B, B] of every anchor with every candidate at each location, of the one pair that is wanted.
+    pub(super) fn scores(
+        &self,
+        now: &Features,
+        next: &Features,
+        wanted: [bool; 4],
+    ) -> anyhow::Result<Vec<f64>> {
+        let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
+        let found = dots(&self.network, now, next, &action, wanted)?;
+        let found = found.into_iter().flatten().next();
+        let found = found.expect("a pair is wanted");
+        let scores = self.dim.scores(found.rkhs);
+        let values = found.dots.flatten_all()?.to_vec1::<f32>()?;
+        Ok(values.iter().map(|&dot| scores.score(dot)).collect())
+    }
+}
