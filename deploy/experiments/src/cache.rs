@@ -106,21 +106,31 @@ impl Session {
         Self::open(name, flags, settings, units)
     }
 
-    /// The piece of this name if it is there, whatever it was made of.
+    /// The piece of this name if it is there and can be read, whatever it was made of.
     pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
-        let text = fs::read(self.piece_path(key)).ok()?;
-        let kept: Kept<T> = serde_json::from_slice(&text).ok()?;
-        Some(kept.result)
+        self.read(key).map(|kept| kept.result)
     }
 
     /// Keeps a piece that took no time.
     pub(crate) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
-        let kept = Kept {
-            of: String::new(),
-            seconds: 0.0,
-            result,
-        };
-        let text = serde_json::to_vec(&kept).context("keeping a piece")?;
+        let (of, seconds) = (String::new(), 0.0);
+        self.write(
+            key,
+            &Kept {
+                of,
+                seconds,
+                result,
+            },
+        )
+    }
+
+    fn read<T: DeserializeOwned>(&self, key: &str) -> Option<Kept<T>> {
+        let text = fs::read(self.piece_path(key)).ok()?;
+        serde_json::from_slice(&text).ok()
+    }
+
+    fn write<T: Serialize>(&self, key: &str, kept: &Kept<T>) -> anyhow::Result<()> {
+        let text = serde_json::to_vec(kept).context("keeping a piece")?;
         write_whole(&self.piece_path(key), &text)
     }
 
@@ -162,12 +172,8 @@ impl Session {
         units: u64,
         make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        let path = self.piece_path(key);
-        let found: Option<Kept<T>> = fs::read(&path)
-            .ok()
-            .and_then(|text| serde_json::from_slice(&text).ok());
         // A piece that cannot be read is made again.
-        if let Some(kept) = found.filter(|kept| kept.of == of) {
+        if let Some(kept) = self.read::<T>(key).filter(|kept| kept.of == of) {
             self.progress.find(units);
             self.seconds += kept.seconds;
             return Ok(kept.result);
@@ -184,10 +190,7 @@ impl Session {
             seconds: started.elapsed().as_secs_f64(),
             result,
         };
-        write_whole(
-            &path,
-            &serde_json::to_vec(&kept).context("keeping a piece")?,
-        )?;
+        self.write(key, &kept)?;
         self.seconds += kept.seconds;
         Ok(kept.result)
     }
@@ -197,9 +200,8 @@ impl Session {
         let path = self.folder.join(format!("{name}.csv"));
         let doing = || format!("writing {}", path.display());
         let mut file = csv::Writer::from_path(&path).with_context(doing)?;
-        file.write_record(&table.header).with_context(doing)?;
-        for row in &table.rows {
-            file.write_record(row).with_context(doing)?;
+        for line in std::iter::once(&table.header).chain(&table.rows) {
+            file.write_record(line).with_context(doing)?;
         }
         file.flush().with_context(doing)
     }
@@ -266,14 +268,12 @@ mod tests {
         assert!(report().unwrap_err().is::<Usage>());
         assert!(!folder.path().join("walk").exists());
         let mut session = open("a").unwrap();
-        let made = session.piece("one", 2, |_| Ok(7)).unwrap();
-        assert_eq!(made, 7);
+        assert_eq!(session.piece("one", 2, |_| Ok(7)).unwrap(), 7);
         let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
         assert!(failed.is_err());
 
         let mut again = open("a").unwrap();
-        let found = again.piece("one", 2, |_| -> anyhow::Result<i32> { panic!("is kept") });
-        assert_eq!(found.unwrap(), 7);
+        assert_eq!(again.piece("one", 2, |_| Ok(8)).unwrap(), 7, "it is kept");
         assert_eq!(again.piece("two", 2, |_| Ok(8)).unwrap(), 8);
         // Cut off in the middle of a write by a crash of the machine.
         fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();

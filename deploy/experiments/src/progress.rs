@@ -63,11 +63,7 @@ impl Progress {
     /// Counts work done.
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.done += units;
-        let period = if self.screen.bar().is_some() {
-            BAR_PERIOD
-        } else {
-            PLAIN_PERIOD
-        };
+        let period = self.screen.bar().map_or(PLAIN_PERIOD, |_| BAR_PERIOD);
         if self.shown.elapsed() >= period {
             self.shown = Instant::now();
             self.show();

@@ -56,6 +56,29 @@ pub(super) struct TextStyle {
     pub(super) upright: bool,
 }
 
+impl TextStyle {
+    /// Regular letters from left to right.
+    pub(super) const fn new(size: f64, colour: Colour, anchor: Anchor) -> Self {
+        Self {
+            size,
+            weight: Weight::Regular,
+            colour,
+            anchor,
+            upright: false,
+        }
+    }
+
+    pub(super) const fn bold(self) -> Self {
+        let weight = Weight::Bold;
+        Self { weight, ..self }
+    }
+
+    pub(super) const fn upright(self) -> Self {
+        let upright = true;
+        Self { upright, ..self }
+    }
+}
+
 /// How a line is drawn: colour, width, dashes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stroke {
@@ -179,13 +202,7 @@ fn circle((x, y): Point, radius: f64) -> impl Iterator<Item = Point> {
 /// Draws a panel's title and returns what is left below it.
 pub(super) fn titled(canvas: &mut Canvas, place: Rect, title: &str) -> Rect {
     const SIZE: f64 = 14.0;
-    let style = TextStyle {
-        size: SIZE,
-        weight: Weight::Bold,
-        colour: INK,
-        anchor: Anchor::Start,
-        upright: false,
-    };
+    let style = TextStyle::new(SIZE, INK, Anchor::Start).bold();
     let lines = font::wrap(title, SIZE, place.width);
     for (index, line) in lines.iter().enumerate() {
         let y = place.y + SIZE + index as f64 * (SIZE + 4.0);

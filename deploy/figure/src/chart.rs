@@ -99,10 +99,9 @@ impl Axis {
         if !(low.is_finite() && high.is_finite()) {
             return None;
         }
-        let least = if low == high {
-            low.abs().max(1.0) * 0.05
-        } else {
-            0.0
+        let least = match low == high {
+            true => low.abs().max(1.0) * 0.05,
+            false => 0.0,
         };
         let by = ((high - low) * slack).max(least);
         Some((low - by, high + by))
@@ -219,7 +218,7 @@ impl Chart {
             (self.x.range(xs, SLACK / 2.0), self.y.range(ys, SLACK))
         else {
             let middle = (place.x + place.width / 2.0, place.y + place.height / 2.0);
-            canvas.text(middle, "no values yet", style(LABEL_SIZE, Anchor::Middle));
+            canvas.text(middle, "no values yet", soft(LABEL_SIZE, Anchor::Middle));
             return;
         };
 
@@ -271,14 +270,14 @@ impl Chart {
             let line = vec![(x, plot.y), (x, plot.bottom())];
             canvas.line(line, Stroke::solid(GRID, 1.0));
             let at = (x, plot.bottom() + TICK_SIZE + 5.0);
-            canvas.text(at, &label, style(TICK_SIZE, Anchor::Middle));
+            canvas.text(at, &label, soft(TICK_SIZE, Anchor::Middle));
         }
         for (tick, label) in y_ticks.iter().zip(y_labels) {
-            let y = frame.y_of(*tick);
+            let y = frame.at(1.0, *tick).1;
             let line = vec![(plot.x, y), (plot.right(), y)];
             canvas.line(line, Stroke::solid(GRID, 1.0));
             let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
-            canvas.text(at, label, style(TICK_SIZE, Anchor::End));
+            canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
         }
         let corner = vec![
             (plot.x, plot.y),
@@ -291,17 +290,10 @@ impl Chart {
             plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0,
         );
         let label = |text: &str, room: f64| font::fit(text, LABEL_SIZE, Weight::Regular, room);
-        let ink = TextStyle {
-            colour: INK,
-            ..style(LABEL_SIZE, Anchor::Middle)
-        };
+        let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
         canvas.text(x_at, &label(&self.x.label, plot.width), ink);
         let y_at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
-        let upright = TextStyle {
-            upright: true,
-            ..ink
-        };
-        canvas.text(y_at, &label(&self.y.label, plot.height), upright);
+        canvas.text(y_at, &label(&self.y.label, plot.height), ink.upright());
     }
 
     /// Draws the legend in as many rows as it needs; returns what is left below it.
@@ -329,18 +321,10 @@ impl Chart {
                     vec![(x, middle), (x + LEGEND_MARK, middle)],
                     pen(series.colour, series.mark),
                 ),
-                Mark::Rings => {
-                    canvas.ring((x + LEGEND_MARK / 2.0, middle), RING_RADIUS, series.colour)
-                }
-                Mark::Bars => {
-                    canvas.dot((x + LEGEND_MARK / 2.0, middle), DOT_RADIUS, series.colour);
-                }
+                mark => point_mark(canvas, (x + LEGEND_MARK / 2.0, middle), mark, series.colour),
             }
             let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
-            let ink = TextStyle {
-                colour: INK,
-                ..style(LEGEND_SIZE, Anchor::Start)
-            };
+            let ink = TextStyle::new(LEGEND_SIZE, INK, Anchor::Start);
             canvas.text(at, &name, ink);
             x += width;
         }
@@ -358,15 +342,13 @@ struct Plot<'a> {
 
 impl Plot<'_> {
     fn at(&self, x: f64, y: f64) -> Point {
-        let (axis, (low, high)) = self.x;
-        let share = (axis.spread(x) - low) / (high - low);
-        (self.rect.x + share * self.rect.width, self.y_of(y))
-    }
-
-    fn y_of(&self, y: f64) -> f64 {
-        let (axis, (low, high)) = self.y;
-        let share = (axis.spread(y) - low) / (high - low);
-        self.rect.bottom() - share * self.rect.height
+        let share = |(axis, (low, high)): (&Axis, (f64, f64)), value| {
+            (axis.spread(value) - low) / (high - low)
+        };
+        (
+            self.rect.x + share(self.x, x) * self.rect.width,
+            self.rect.bottom() - share(self.y, y) * self.rect.height,
+        )
     }
 
     fn keeps(&self, x: f64, y: f64) -> bool {
@@ -405,16 +387,17 @@ fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
             }
             canvas.line(points, pen(series.colour, series.mark));
         }
-        Mark::Rings => {
-            for point in points {
-                canvas.ring(point, RING_RADIUS, series.colour);
-            }
-        }
-        Mark::Bars => {
-            for point in points {
-                canvas.dot(point, DOT_RADIUS, series.colour);
-            }
-        }
+        mark => points
+            .iter()
+            .for_each(|it| point_mark(canvas, *it, mark, series.colour)),
+    }
+}
+
+/// A mark that stands for one point.
+fn point_mark(canvas: &mut Canvas, at: Point, mark: Mark, colour: Colour) {
+    match mark {
+        Mark::Rings => canvas.ring(at, RING_RADIUS, colour),
+        _ => canvas.dot(at, DOT_RADIUS, colour),
     }
 }
 
@@ -426,12 +409,6 @@ const fn pen(colour: Colour, mark: Mark) -> Stroke {
     }
 }
 
-const fn style(size: f64, anchor: Anchor) -> TextStyle {
-    TextStyle {
-        size,
-        weight: Weight::Regular,
-        colour: INK_SOFT,
-        anchor,
-        upright: false,
-    }
+const fn soft(size: f64, anchor: Anchor) -> TextStyle {
+    TextStyle::new(size, INK_SOFT, anchor)
 }

@@ -52,14 +52,6 @@ pub enum FigureError {
     /// The name asks for no kind of picture that there is.
     #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
     Extension(PathBuf),
-    /// The picture has no area, or is too large for memory.
-    #[error("drawing {}: {why}", .path.display())]
-    Draw {
-        /// The file that was to be written.
-        path: PathBuf,
-        /// What is wrong with it.
-        why: String,
-    },
     /// The name is no film's.
     #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
     NoFilm(PathBuf),
@@ -138,11 +130,7 @@ impl Figure {
         let bytes = match format {
             Format::Svg => svg::encode(&canvas).into_bytes(),
             Format::Pdf => pdf::encode(&canvas).map_err(|e| FigureError::Encode(e.to_string()))?,
-            Format::Png => {
-                let drawn = png::encode(&canvas, PNG_ZOOM);
-                let path = path.to_owned();
-                drawn.map_err(|why| FigureError::Draw { path, why })?
-            }
+            Format::Png => png::encode(&canvas, PNG_ZOOM)?,
         };
         let path = path.to_owned();
         std::fs::write(&path, bytes).map_err(|source| FigureError::Write { path, source })
@@ -208,14 +196,7 @@ impl Figure {
             CARD,
             CARD_BORDER,
         );
-        let style = |size, weight, colour| TextStyle {
-            size,
-            weight,
-            colour,
-            anchor: Anchor::Start,
-            upright: false,
-        };
-        let title = style(TITLE_SIZE, Weight::Bold, INK);
+        let title = TextStyle::new(TITLE_SIZE, INK, Anchor::Start).bold();
         canvas.text(
             (MARGIN, MARGIN + TITLE_SIZE - 3.0),
             &font::fit(&self.title, TITLE_SIZE, Weight::Bold, width - 2.0 * MARGIN),
@@ -223,11 +204,8 @@ impl Figure {
         );
         for (line, note) in notes.iter().enumerate() {
             let y = MARGIN + TITLE_SIZE + 4.0 + (line + 1) as f64 * NOTE_LEADING - 4.0;
-            canvas.text(
-                (MARGIN, y),
-                note,
-                style(NOTE_SIZE, Weight::Regular, INK_SOFT),
-            );
+            let style = TextStyle::new(NOTE_SIZE, INK_SOFT, Anchor::Start);
+            canvas.text((MARGIN, y), note, style);
         }
     }
 }
@@ -331,13 +309,7 @@ mod tests {
     fn text_is_drawn_without_a_font_of_the_machine() {
         let canvas = |text: &str| {
             let mut canvas = Canvas::new(80.0, 30.0);
-            let style = TextStyle {
-                size: 16.0,
-                weight: Weight::Regular,
-                colour: INK,
-                anchor: Anchor::Start,
-                upright: false,
-            };
+            let style = TextStyle::new(16.0, INK, Anchor::Start);
             canvas.text((4.0, 20.0), text, style);
             png::encode(&canvas, 1.0).unwrap()
         };

@@ -39,7 +39,7 @@ pub struct Field {
 }
 
 /// A square matrix.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Heat {
     /// Over the panel.
     pub title: String,
@@ -71,13 +71,7 @@ impl Heat {
             title: title.to_owned(),
             side,
             values,
-            names: Vec::new(),
-            labels: (String::new(), String::new()),
-            unit: String::new(),
-            range: None,
-            decimals: None,
-            field: None,
-            outline: None,
+            ..Self::default()
         }
     }
 
@@ -158,10 +152,7 @@ impl Heat {
             &label(&self.labels.0),
             style(LABEL_SIZE, Anchor::Middle),
         );
-        let upright = TextStyle {
-            upright: true,
-            ..style(LABEL_SIZE, Anchor::Middle)
-        };
+        let upright = style(LABEL_SIZE, Anchor::Middle).upright();
         let beside = (place.x + LABEL_SIZE - 2.0, map.y + room / 2.0);
         canvas.text(beside, &label(&self.labels.1), upright);
         if let Some(outline) = self.outline {
@@ -202,10 +193,7 @@ impl Heat {
                 && cell >= CELL_TEXT_MIN
             {
                 let size = (cell * 0.36).min(TICK_SIZE);
-                let style = TextStyle {
-                    colour: ink_on(colour),
-                    ..style(size, Anchor::Middle)
-                };
+                let style = TextStyle::new(size, ink_on(colour), Anchor::Middle);
                 let at = (x + cell / 2.0, y + cell / 2.0 + size * 0.36);
                 canvas.text(at, &format!("{value:.decimals$}"), style);
             }
@@ -219,11 +207,7 @@ impl Heat {
             canvas.text(at, name, style(TICK_SIZE, Anchor::End));
             if turned {
                 let at = (map.x + middle + TICK_SIZE * 0.36, map.bottom() + 5.0);
-                let upright = TextStyle {
-                    upright: true,
-                    ..style(TICK_SIZE, Anchor::End)
-                };
-                canvas.text(at, name, upright);
+                canvas.text(at, name, style(TICK_SIZE, Anchor::End).upright());
             } else {
                 let at = (map.x + middle, map.bottom() + TICK_SIZE + 3.0);
                 canvas.text(at, name, style(TICK_SIZE, Anchor::Middle));
@@ -245,11 +229,5 @@ pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outl
 }
 
 const fn style(size: f64, anchor: Anchor) -> TextStyle {
-    TextStyle {
-        size,
-        weight: Weight::Regular,
-        colour: INK,
-        anchor,
-        upright: false,
-    }
+    TextStyle::new(size, INK, anchor)
 }

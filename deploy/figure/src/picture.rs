@@ -7,8 +7,7 @@ use crate::{
     canvas::{Anchor, Point, Rect, Shape, Stroke, TextStyle},
     colours::{CARD, Colour, GREY, INK, INK_SOFT, NO_VALUE, heat_colour, series_colour},
     figure::FigureError,
-    font::{self, Weight},
-    png,
+    font, png,
 };
 
 /// An upright rectangle in pixels, by its upper left corner.
@@ -57,9 +56,7 @@ impl Picture {
     /// # Errors
     /// A size without area, or too large for memory.
     pub fn new(width: usize, height: usize) -> Result<Self, FigureError> {
-        let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
-        let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
-        let mut pixmap = pixmap.ok_or(FigureError::Size { width, height })?;
+        let mut pixmap = png::pixmap(width, height)?;
         pixmap.fill(CARD.solid());
         Ok(Self(pixmap))
     }
@@ -89,19 +86,13 @@ impl Picture {
     /// Writes a line whose baseline starts at (x, y), cut to `width_max` pixels.
     pub fn text(&mut self, (x, y): (usize, usize), width_max: usize, ink: Ink, text: &str) {
         const SIZE: f64 = 13.0;
-        let (weight, colour) = match ink {
-            Ink::Plain => (Weight::Regular, INK),
-            Ink::Bold => (Weight::Bold, INK),
-            Ink::Soft => (Weight::Regular, INK_SOFT),
+        let style = |colour| TextStyle::new(SIZE, colour, Anchor::Start);
+        let style = match ink {
+            Ink::Plain => style(INK),
+            Ink::Bold => style(INK).bold(),
+            Ink::Soft => style(INK_SOFT),
         };
-        let style = TextStyle {
-            size: SIZE,
-            weight,
-            colour,
-            anchor: Anchor::Start,
-            upright: false,
-        };
-        let text = font::fit(text, SIZE, weight, width_max as f64);
+        let text = font::fit(text, SIZE, style.weight, width_max as f64);
         let at = (x as f64, y as f64);
         self.draw(&Shape::Text { at, text, style });
     }
@@ -166,8 +157,7 @@ impl Picture {
     /// # Errors
     /// It cannot be encoded.
     pub fn png(&self) -> Result<Vec<u8>, FigureError> {
-        let encoded = self.0.encode_png();
-        encoded.map_err(|e| FigureError::Encode(e.to_string()))
+        png::packed(&self.0)
     }
 
     /// Red, green and blue of every pixel.

@@ -8,6 +8,7 @@ use tiny_skia::{
 use super::{
     canvas::{Anchor, CARD_RADIUS, Canvas, DASH, Point, Rect, Shape, Stroke, TextStyle},
     colours::Colour,
+    figure::FigureError,
     font,
 };
 
@@ -15,18 +16,27 @@ use super::{
 const SIDE_MIN: f32 = 1.0 / 4096.0;
 
 /// The picture, `zoom` pixels to a unit; what no shape covers is transparent.
-pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, String> {
-    let pixels = |length: f64| (length as f32 * zoom).ceil() as u32;
-    let (width, height) = (pixels(canvas.width), pixels(canvas.height));
-    let mut pixmap = Pixmap::new(width, height)
-        .ok_or_else(|| format!("a picture of {width} x {height} pixels cannot be made"))?;
+pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, FigureError> {
+    let pixels = |length: f64| (length as f32 * zoom).ceil() as usize;
+    let mut pixmap = pixmap(pixels(canvas.width), pixels(canvas.height))?;
     let scale = Transform::from_scale(zoom, zoom);
     for shape in &canvas.shapes {
         draw(&mut pixmap, shape, scale);
     }
-    pixmap
-        .encode_png()
-        .map_err(|e| format!("encoding a picture: {e}"))
+    packed(&pixmap)
+}
+
+/// Transparent pixels.
+pub(super) fn pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
+    let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
+    let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
+    pixmap.ok_or(FigureError::Size { width, height })
+}
+
+/// The pixels as a file.
+pub(super) fn packed(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
+    let packed = pixmap.encode_png();
+    packed.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
 /// Draws one shape, `scale` pixels to a unit.

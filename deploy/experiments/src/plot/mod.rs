@@ -88,25 +88,17 @@ fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let mut seen = BTreeSet::new();
     // A folder given twice is one run, not two seeds.
     let whole = |folder: &PathBuf| folder.canonicalize().unwrap_or_else(|_| folder.clone());
-    let named: Vec<_> = args
-        .runs
-        .iter()
-        .filter(|it| seen.insert(whole(it)))
-        .collect();
-    let (runs, others): (Vec<_>, Vec<_>) = named
-        .into_iter()
-        .map(RunFolder::new)
-        .partition(|folder| folder.metrics().is_file());
+    let named = args.runs.iter().filter(|it| seen.insert(whole(it)));
+    let folders = named.map(RunFolder::new);
+    let (runs, others): (Vec<_>, Vec<_>) = folders.partition(|it| it.metrics().is_file());
     if runs.is_empty() {
         let named: Vec<String> = others.iter().map(|it| it.display().to_string()).collect();
+        let metrics = others[0].metrics();
+        let file = metrics.file_name().unwrap_or_default();
         return Err(usage!(
             "{} is not the folder of a run: there is no {} in it",
             named.join(", "),
-            others[0]
-                .metrics()
-                .file_name()
-                .unwrap_or_default()
-                .display()
+            file.display()
         )
         .into());
     }

@@ -105,15 +105,10 @@ impl Run {
         let x = self.place(table, over.column())?;
         let place = self.place(table, column)?;
         let mut values = Vec::new();
-        for (line, row) in table.rows.iter().enumerate() {
+        for (line, row) in (2..).zip(&table.rows) {
             let number = |text: &str| {
-                text.parse::<f64>().map_err(|_| {
-                    usage!(
-                        "{}, row {}: {text:?} is no number",
-                        path.display(),
-                        line + 2
-                    )
-                })
+                let number = text.parse::<f64>();
+                number.map_err(|_| usage!("{}, row {line}: {text:?} is no number", path.display()))
             };
             // What was not known yet at a time is empty.
             if !row[place].is_empty() && !row[x].is_empty() {
@@ -121,13 +116,11 @@ impl Run {
             }
         }
         values.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let same = values.chunk_by(|a, b| a.0 == b.0);
-        Ok(same
-            .map(|rows| {
-                let sum: f64 = rows.iter().map(|(_, y)| y).sum();
-                (rows[0].0, sum / rows.len() as f64)
-            })
-            .collect())
+        let mean = |rows: &[(f64, f64)]| {
+            let sum: f64 = rows.iter().map(|(_, y)| y).sum();
+            (rows[0].0, sum / rows.len() as f64)
+        };
+        Ok(values.chunk_by(|a, b| a.0 == b.0).map(mean).collect())
     }
 
     /// The table that has the column, and its file; the metrics if neither has.
@@ -203,15 +196,15 @@ fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
     table.remove("transport");
     let seed = table.get_mut("run")?.as_table_mut()?.remove("seed");
     // How often it is saved and played changes nothing that is learned.
-    if let Some(learner) = table.get_mut("learner").and_then(toml::Value::as_table_mut) {
-        learner.remove("checkpoint_period_updates");
-        learner.remove("checkpoints_kept");
-    }
-    if let Some(actor) = table.get_mut("actor").and_then(toml::Value::as_table_mut) {
-        actor.remove("world_threads");
-    }
-    if let Some(replay) = table.get_mut("replay").and_then(toml::Value::as_table_mut) {
-        replay.remove("capacity_transitions");
+    for (part, key) in [
+        ("learner", "checkpoint_period_updates"),
+        ("learner", "checkpoints_kept"),
+        ("actor", "world_threads"),
+        ("replay", "capacity_transitions"),
+    ] {
+        if let Some(part) = table.get_mut(part).and_then(toml::Value::as_table_mut) {
+            part.remove(key);
+        }
     }
     Some((table, seed.and_then(|seed| seed.as_integer())))
 }

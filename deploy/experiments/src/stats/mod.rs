@@ -324,24 +324,35 @@ mod tests {
 
     #[test]
     fn rank_correlation_knows_order_and_ties() {
-        let line = [(1.0, 10.0), (2.0, 100.0), (3.0, 1000.0)];
-        assert_eq!(rank_correlation(&line), Some(1.0));
-        let fall = line.map(|(x, y)| (x, -y));
-        assert_eq!(rank_correlation(&fall), Some(-1.0));
-        assert_eq!(rank_correlation(&[(1.0, 1.0); 4]), None);
-        // By hand: ranks of x 1, 2.5, 2.5, 4 and of y 1, 3, 2, 4 give 4.5 / sqrt(4.5 * 5).
-        let ties = [(1.0, 1.0), (2.0, 3.0), (2.0, 2.0), (3.0, 4.0)];
-        let expected = 4.5 / (4.5f64 * 5.0).sqrt();
-        assert!((rank_correlation(&ties).unwrap() - expected).abs() < 1e-12);
+        for (x, y, expected) in [
+            ([1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 50.0, 90.0], Some(1.0)),
+            ([1.0, 2.0, 3.0, 4.0], [0.0, -1.0, -2.0, -5.0], Some(-1.0)),
+            ([1.0; 4], [1.0; 4], None),
+            // By hand: ranks of x 1, 2.5, 2.5, 4 and of y 1, 3, 2, 4 give 4.5 / sqrt(4.5 * 5).
+            (
+                [1.0, 2.0, 2.0, 3.0],
+                [1.0, 3.0, 2.0, 4.0],
+                Some(4.5 / (4.5f64 * 5.0).sqrt()),
+            ),
+        ] {
+            let pairs: Vec<_> = x.into_iter().zip(y).collect();
+            let found = rank_correlation(&pairs);
+            assert_eq!(found.is_none(), expected.is_none());
+            assert!((found.unwrap_or(0.0) - expected.unwrap_or(0.0)).abs() < 1e-12);
+        }
     }
 
     #[test]
     fn auc_is_the_share_of_pairs_in_order() {
-        assert_eq!(auc(&[2.0, 3.0], &[0.0, 1.0]), Some(1.0));
-        assert_eq!(auc(&[1.0], &[1.0]), Some(0.5));
-        // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
-        assert_eq!(auc(&[2.0, 4.0], &[1.0, 3.0, 2.0]), Some(4.5 / 6.0));
-        assert_eq!(auc(&[], &[1.0]), None);
+        for (yes, no, expected) in [
+            (&[2.0, 3.0][..], &[0.0, 1.0][..], Some(1.0)),
+            (&[1.0], &[1.0], Some(0.5)),
+            // Of the six pairs 2 > 1, 4 > 1, 4 > 3 are in order, 2 < 3 is not, and 2 = 2, 4 > 2.
+            (&[2.0, 4.0], &[1.0, 3.0, 2.0], Some(4.5 / 6.0)),
+            (&[], &[1.0], None),
+        ] {
+            assert_eq!(auc(yes, no), expected);
+        }
     }
 
     #[test]

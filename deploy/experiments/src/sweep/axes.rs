@@ -33,13 +33,10 @@ impl Axis {
         let (name, values) = text
             .split_once('=')
             .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
-        let values: Vec<String> = split(values)
-            .iter()
-            .map(|it| it.trim().to_owned())
-            .collect();
+        let values = split(values).into_iter();
         let axis = Self {
             name: name.trim().into(),
-            values,
+            values: values.map(|it| it.trim().to_owned()).collect(),
         };
         axis.check(form)?;
         Ok(axis)
@@ -91,15 +88,12 @@ pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
     }
     let mut cells = vec![Cell::new()];
     for axis in axes {
-        let longer = |cell: &Cell, value: &String| {
-            let mut cell = cell.clone();
-            cell.push(value.clone());
-            cell
+        let longer = |cell: &Cell| {
+            let cell = cell.clone();
+            let values = axis.values.iter();
+            values.map(move |value| [&cell[..], std::slice::from_ref(value)].concat())
         };
-        cells = cells
-            .iter()
-            .flat_map(|cell| axis.values.iter().map(|value| longer(cell, value)))
-            .collect();
+        cells = cells.iter().flat_map(longer).collect();
     }
     Ok(cells)
 }
@@ -131,18 +125,10 @@ mod tests {
 
     #[test]
     fn cells_are_all_combinations() {
-        let axes = [
-            Axis::parse("a=1,2").unwrap(),
-            Axis::parse("b=x").unwrap(),
-            Axis::parse("c=3,4").unwrap(),
-        ];
-        let expected = [
-            ["1", "x", "3"],
-            ["1", "x", "4"],
-            ["2", "x", "3"],
-            ["2", "x", "4"],
-        ];
-        assert_eq!(cells(&axes, 2).unwrap(), expected);
+        let axes = ["a=1,2", "b=x", "c=3,4"].map(|it| Axis::parse(it).unwrap());
+        let found = cells(&axes, 2).unwrap();
+        let found: Vec<String> = found.iter().map(|cell| cell.concat()).collect();
+        assert_eq!(found, ["1x3", "1x4", "2x3", "2x4"]);
         assert_eq!(cells(&[], 1).unwrap(), [Cell::new()]);
         let many: Vec<String> = (0..200).map(|it| it.to_string()).collect();
         let axis = Axis::of_flag("a", &many);

@@ -34,18 +34,15 @@ pub(crate) fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let mut points = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
         let config = call(args, &axes, cell, 1).config();
-        let config = config.map_err(|e| match cell.is_empty() {
-            true => e,
-            false => usage!("{}: {e}", described(&axes, cell)),
+        let config = config.map_err(|e| match &described(&axes, cell)[..] {
+            "" => e,
+            cell => usage!("{cell}: {e}"),
         })?;
         points.push((at, config.frames()));
     }
-    let plans = seed_by_seed(&points, args.seeds, |&(at, frames), seed| PlannedRun {
-        name: format!("{}-seed{seed}", folder_name(&axes, &cells[at], at)),
-        call: call(args, &axes, &cells[at], seed),
-        frames,
-        episodes: None,
-        units: frames,
+    let plans = seed_by_seed(&points, args.seeds, |&(at, frames), seed| {
+        let name = format!("{}-seed{seed}", folder_name(&axes, &cells[at], at));
+        PlannedRun::new(name, call(args, &axes, &cells[at], seed), frames)
     });
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     // Other seeds, and more runs at once, are the same sweep.
@@ -97,11 +94,9 @@ fn call(args: &SweepArgs, axes: &[Axis], cell: &Cell, seed: u32) -> Call {
         let at = axes.iter().position(|axis| axis.name == name)?;
         Some(cell[at].clone())
     };
-    let set = axes
-        .iter()
-        .zip(cell)
-        .filter(|(axis, _)| axis.name != "env" && axis.name != "agent")
-        .map(|(axis, value)| format!("{}={value}", axis.name));
+    let sets = axes.iter().zip(cell);
+    let sets = sets.filter(|(axis, _)| axis.name != "env" && axis.name != "agent");
+    let sets = sets.map(|(axis, value)| format!("{}={value}", axis.name));
     Call {
         // A game may be named alone.
         env: value("env").map(|name| full_name(&name)),
@@ -109,7 +104,7 @@ fn call(args: &SweepArgs, axes: &[Axis], cell: &Cell, seed: u32) -> Call {
         preset: args.preset.clone(),
         seed,
         frames: args.frames,
-        sets: set.collect(),
+        sets: sets.collect(),
     }
 }
 
@@ -124,26 +119,21 @@ fn full_name(world: &str) -> String {
 /// Such as `agent=c51, learner.batch_size=64`: the axes along which something changes.
 fn described(axes: &[Axis], cell: &Cell) -> String {
     let words = axes.iter().zip(cell);
-    let words: Vec<_> = words
-        .map(|(axis, value)| format!("{}={value}", axis.name))
-        .collect();
-    words.join(", ")
+    let words = words.map(|(axis, value)| format!("{}={value}", axis.name));
+    words.collect::<Vec<_>>().join(", ")
 }
 
 /// A name for a cell's runs: its number, and what a person knows it by.
 fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     let mut name = (at + 1).to_string();
-    for (axis, value) in axes
-        .iter()
-        .zip(cell)
-        .filter(|(axis, _)| axis.values.len() > 1)
-    {
+    let varied = axes.iter().zip(cell);
+    for (axis, value) in varied.filter(|(axis, _)| axis.values.len() > 1) {
         let key = axis.name.rsplit('.').next().unwrap_or_default();
         let value = value.replace("procgen:", "");
-        match axis.name.as_str() {
-            "env" | "agent" => name += &format!("-{value}"),
-            _ => name += &format!("-{key}={value}"),
-        }
+        name += &match axis.name.as_str() {
+            "env" | "agent" => format!("-{value}"),
+            _ => format!("-{key}={value}"),
+        };
     }
     let fits = |letter: char| letter.is_ascii_alphanumeric() || "-_=.+".contains(letter);
     let letters = name.chars().map(|it| if fits(it) { it } else { '-' });
@@ -152,18 +142,9 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
 
 /// What came out, a row a cell; the point of a run is its cell's number, and its frames.
 fn table(axes: &[Axis], cells: &[Cell], made: &[Made<(usize, u64)>]) -> Table {
-    let columns = [
-        "seeds",
-        "mean_return",
-        "sd",
-        "ci_low",
-        "ci_high",
-        "lowest",
-        "highest",
-        "updates_per_second",
-        "minutes",
-    ];
-    let header = axes.iter().map(|axis| axis.name.as_str()).chain(columns);
+    let measured = "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
+    let header = axes.iter().map(|axis| axis.name.as_str());
+    let header: Vec<_> = header.chain(measured.split(',')).collect();
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point.0 == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
@@ -185,10 +166,7 @@ fn table(axes: &[Axis], cells: &[Cell], made: &[Made<(usize, u64)>]) -> Table {
         ];
         cell.iter().cloned().chain(measured).collect()
     };
-    Table::new(
-        &header.collect::<Vec<_>>(),
-        cells.iter().enumerate().map(row),
-    )
+    Table::new(&header, cells.iter().enumerate().map(row))
 }
 
 #[cfg(test)]
@@ -204,14 +182,9 @@ mod tests {
             Axis::parse("run.horizon=[1, 2],x y").unwrap(),
         ];
         let cells = cells(&axes, 1).unwrap();
-        assert_eq!(
-            folder_name(&axes, &cells[0], 0),
-            "1-c51-lr=1e-4-horizon=-1--2-"
-        );
-        assert_eq!(
-            folder_name(&axes, &cells[7], 7),
-            "8-curl-lr=2.5e-4-horizon=x-y"
-        );
+        let name = |at: usize| folder_name(&axes, &cells[at], at);
+        assert_eq!(name(0), "1-c51-lr=1e-4-horizon=-1--2-");
+        assert_eq!(name(7), "8-curl-lr=2.5e-4-horizon=x-y");
     }
 
     #[test]

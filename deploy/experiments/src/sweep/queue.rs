@@ -6,7 +6,7 @@ use std::{
     collections::VecDeque,
     fs::File,
     os::unix::process::CommandExt,
-    process::{Child, Command, Stdio},
+    process::{Child, Command, ExitStatus, Stdio},
     time::{Duration, Instant},
 };
 
@@ -110,16 +110,10 @@ fn install<P>(plans: &[Planned<P>]) -> anyhow::Result<()> {
 fn commit() -> anyhow::Result<String> {
     let program = std::env::current_exe().context("finding this program's own file")?;
     let output = Command::new(program).arg("--version").output();
-    let text = String::from_utf8_lossy(
-        &output
-            .context("asking this program for its version")?
-            .stdout,
-    )
-    .into_owned();
-    let commit = text
-        .trim()
-        .strip_suffix(')')
-        .and_then(|it| it.rsplit_once('('));
+    let output = output.context("asking this program for its version")?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    let text = text.trim().strip_suffix(')');
+    let commit = text.and_then(|it| it.rsplit_once('('));
     Ok(commit.map_or_else(String::new, |it| it.1.to_owned()))
 }
 
@@ -191,11 +185,9 @@ impl Queue {
             let folder = self.runs.folder(plan);
             let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
             let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
-            let share = plan
-                .episodes
-                .map_or(0.0, |all| share(episodes, all))
-                .max(share(frames, plan.frames));
-            let done = (share.min(1.0) * plan.units as f64) as u64;
+            let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
+            let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
+            let done = (share * plan.units as f64) as u64;
             let fresh = done.saturating_sub(running.done);
             running.done += fresh;
             progress.advance(fresh)?;
@@ -204,42 +196,46 @@ impl Queue {
                 signal(&running.child, Signal::SIGTERM);
             }
             let ended = running.child.try_wait();
-            match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
+            match ended.with_context(|| format!("waiting for {}", plan.name))? {
                 None => at += 1,
                 Some(status) => {
-                    let Running {
-                        plan,
-                        tried,
-                        resumed,
-                        done,
-                        ..
-                    } = self.running.remove(at);
-                    if self.runs.finished(&plan).is_some() {
-                        progress.advance(plan.units - done)?;
-                        continue;
-                    }
-                    let words = self.runs.last_words(&plan);
-                    let name = &plan.name;
-                    // Settings that cannot work will not work for the others either.
-                    if status.code() == Some(EXIT_USAGE.into()) && !resumed {
-                        return Err(usage!("the run {name} cannot be made:\n{words}").into());
-                    }
-                    if tried < TRIES {
-                        progress.line(&format!(
-                            "the run {name} failed ({status}) and is tried once more. Its last words:\n{words}"
-                        ));
-                        progress.again(done);
-                        self.waiting.push_back((tried, plan));
-                    } else {
-                        progress.line(&format!(
-                            "the run {name} failed again ({status}) and is left out. Its last words:\n{words}"
-                        ));
-                        progress.advance(plan.units - done)?;
-                    }
+                    let ended = self.running.remove(at);
+                    self.see_to(ended, status, progress)?;
                 }
             }
         }
         Ok(())
+    }
+
+    /// Counts a run that ended; one that failed is tried once more, or left out.
+    fn see_to(
+        &mut self,
+        ended: Running,
+        status: ExitStatus,
+        progress: &mut Progress,
+    ) -> anyhow::Result<()> {
+        let Running { plan, tried, .. } = &ended;
+        if self.runs.finished(plan).is_some() {
+            return Ok(progress.advance(plan.units - ended.done)?);
+        }
+        let (name, words) = (&plan.name, self.runs.last_words(plan));
+        // Settings that cannot work will not work for the others either.
+        if status.code() == Some(EXIT_USAGE.into()) && !ended.resumed {
+            return Err(usage!("the run {name} cannot be made:\n{words}").into());
+        }
+        let (failed, then) = match *tried < TRIES {
+            true => ("failed", "is tried once more"),
+            false => ("failed again", "is left out"),
+        };
+        progress.line(&format!(
+            "the run {name} {failed} ({status}) and {then}. Its last words:\n{words}"
+        ));
+        if *tried < TRIES {
+            progress.again(ended.done);
+            self.waiting.push_back((*tried, ended.plan));
+            return Ok(());
+        }
+        Ok(progress.advance(plan.units - ended.done)?)
     }
 
     /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone.
@@ -308,20 +304,20 @@ impl Queue {
         if tried > 1 || !self.runs.is_made_by(plan) {
             return Ok(false);
         }
-        match resume::find(&folder, &Flags::default(), &Machine::this()) {
-            Ok(Found::Nothing(sentence)) => {
-                progress.line(&sentence);
-                Ok(false)
-            }
-            Ok(Found::Resumed(_)) => {
-                progress.line(&format!("{} resumes from its checkpoint", folder.display()));
-                Ok(true)
-            }
-            Err(e) => {
-                progress.line(&format!("{} cannot be resumed: {e:#}", folder.display()));
-                Ok(false)
-            }
-        }
+        let (sentence, is_resumable) =
+            match resume::find(&folder, &Flags::default(), &Machine::this()) {
+                Ok(Found::Nothing(sentence)) => (sentence, false),
+                Ok(Found::Resumed(_)) => (
+                    format!("{} resumes from its checkpoint", folder.display()),
+                    true,
+                ),
+                Err(e) => (
+                    format!("{} cannot be resumed: {e:#}", folder.display()),
+                    false,
+                ),
+            };
+        progress.line(&sentence);
+        Ok(is_resumable)
     }
 
     /// The cores shared out among the runs at once, so that their learners do not get in each other's way.
@@ -371,12 +367,8 @@ fn signal(child: &Child, signal: Signal) {
 /// that two never write into one folder.
 fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<()> {
     let mut said = false;
-    loop {
-        if lock_file::try_lock(log).context("locking a run's log")? {
-            return Ok(());
-        }
-        if !said {
-            said = true;
+    while !lock_file::try_lock(log).context("locking a run's log")? {
+        if !std::mem::replace(&mut said, true) {
             let name = &plan.name;
             progress.line(&format!(
                 "an earlier {name} still runs or saves: waiting for it"
@@ -385,4 +377,5 @@ fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
         std::thread::sleep(POLL);
         progress.advance(0)?;
     }
+    Ok(())
 }

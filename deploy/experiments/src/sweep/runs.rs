@@ -38,16 +38,17 @@ impl Runs {
         how_far(&folder)?;
         let summary = Summary::read(&folder).ok()?;
         let enough = plan.episodes.is_some_and(|all| summary.episodes >= all);
-        let good = match summary.outcome {
+        let is_good = match summary.outcome {
             Outcome::Finished => true,
             Outcome::Interrupted => enough,
             Outcome::Failed => false,
         };
         let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
-        good.then(|| FinishedRun {
+        let commit = commit.trim().to_owned();
+        is_good.then_some(FinishedRun {
             folder,
             summary,
-            commit: commit.trim().to_owned(),
+            commit,
         })
     }
 

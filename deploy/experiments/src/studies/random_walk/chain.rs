@@ -36,10 +36,8 @@ impl Chain {
     /// theta = |ln(alpha / (1 - alpha))|, by which the stationary law falls from state to state away from the end to which the walk
     /// tends: 0 at even odds, infinite for a walk that only goes one way.
     fn rate(&self) -> f64 {
-        let (less, more) = (
-            self.alpha.min(1.0 - self.alpha),
-            self.alpha.max(1.0 - self.alpha),
-        );
+        let [up, down] = [self.alpha, 1.0 - self.alpha];
+        let (less, more) = (up.min(down), up.max(down));
         if less < more / 2.0 {
             -(less / more).ln()
         } else {
@@ -223,10 +221,8 @@ mod tests {
     use super::*;
 
     fn assert_near(a: f64, b: f64, what: &str) {
-        assert!(
-            (a - b).abs() < 1e-9 * b.abs().max(1.0),
-            "{what}: {a} and {b}"
-        );
+        let error = (a - b).abs() / b.abs().max(1.0);
+        assert!(error < 1e-9, "{what}: {a} and {b}");
     }
 
     #[test]
@@ -236,23 +232,13 @@ mod tests {
                 let chain = Chain { states, alpha };
                 let t = chain.transitions();
                 let what = format!("K = {states}, alpha = {alpha}");
-                for (a, b) in chain
-                    .stationary()
-                    .iter()
-                    .zip(stationary_numerically(&t, states))
-                {
-                    assert_near(*a, b, &what);
-                }
-                assert_near(
-                    chain.mutual_information(),
-                    mutual_information_numerically(&t, states),
-                    &what,
-                );
-                assert_near(
-                    chain.spectral_gap(),
-                    spectral_gap_numerically(&t, states),
-                    &what,
-                );
+                let laws = [chain.stationary(), stationary_numerically(&t, states)];
+                let pairs = laws[0].iter().zip(&laws[1]);
+                pairs.for_each(|(a, b)| assert_near(*a, *b, &what));
+                let information = mutual_information_numerically(&t, states);
+                assert_near(chain.mutual_information(), information, &what);
+                let gap = spectral_gap_numerically(&t, states);
+                assert_near(chain.spectral_gap(), gap, &what);
             }
         }
     }
@@ -271,18 +257,8 @@ mod tests {
     #[test]
     fn closed_forms_hold_for_long_walks() {
         for states in [324, 1_000, 100_000] {
-            for alpha in [
-                1e-9,
-                0.1,
-                0.3,
-                0.499,
-                0.5 - 2.4e-7,
-                0.5,
-                0.5 + 1e-9,
-                0.6,
-                0.7,
-                0.9,
-            ] {
+            let near_even = [0.499, 0.5 - 2.4e-7, 0.5, 0.5 + 1e-9];
+            for alpha in [&[1e-9, 0.1, 0.3, 0.6, 0.7, 0.9][..], &near_even].concat() {
                 let chain = Chain { states, alpha };
                 let what = format!("K = {states}, alpha = {alpha}");
                 assert_near(chain.mutual_information(), summed(states, alpha), &what);
@@ -291,10 +267,8 @@ mod tests {
                 for (here, next) in rho.iter().zip(&rho[1..]) {
                     // Detailed balance.
                     let (up, down) = (alpha * here, (1.0 - alpha) * next);
-                    assert!(
-                        (up - down).abs() <= 1e-9 * up + 1e-300,
-                        "{what}: {up}, {down}"
-                    );
+                    let is_balanced = (up - down).abs() <= 1e-9 * up + 1e-300;
+                    assert!(is_balanced, "{what}: {up}, {down}");
                 }
             }
         }
@@ -305,10 +279,8 @@ mod tests {
         for (alpha, end) in [(0.0, 0), (1.0, 9)] {
             let chain = Chain { states: 10, alpha };
             let rho = chain.stationary();
-            assert!(
-                (0..10).all(|i| rho[i] == f64::from(u8::from(i == end))),
-                "{rho:?}"
-            );
+            let expected: Vec<f64> = (0..10).map(|i| f64::from(u8::from(i == end))).collect();
+            assert_eq!(rho, expected);
             assert_eq!(chain.mutual_information(), 0.0);
             assert_eq!(chain.mutual_information_as_printed(), 0.0);
             assert_eq!(chain.spectral_gap(), 1.0);
@@ -322,8 +294,9 @@ mod tests {
             let gap = |alpha| Chain { states, alpha }.spectral_gap();
             let x = std::f64::consts::PI / states as f64;
             let expected = x * x / 2.0 * (1.0 - x * x / 12.0);
+            let error = |found: f64, expected: f64| (found / expected - 1.0).abs();
             assert!(
-                (gap(0.5) / expected - 1.0).abs() < 1e-14,
+                error(gap(0.5), expected) < 1e-14,
                 "K = {states}: {}",
                 gap(0.5)
             );
@@ -332,7 +305,7 @@ mod tests {
             let expected = d * d / 2.0 * (1.0 + d * d / 4.0) + expected;
             let found = gap(0.5 + d / 2.0);
             assert!(
-                (found / expected - 1.0).abs() < 1e-9,
+                error(found, expected) < 1e-9,
                 "K = {states}: {found}, {expected}"
             );
         }

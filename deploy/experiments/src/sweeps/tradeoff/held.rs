@@ -21,6 +21,7 @@ const EPSILON: f64 = 0.1;
 const SEED: u64 = 1_000_003;
 
 /// Rows as an update reads them.
+#[derive(Default)]
 pub(super) struct HeldBatch {
     pub(super) states_t: Vec<u8>,
     states_k: Vec<u8>,
@@ -61,15 +62,8 @@ impl HeldBatch {
         let len = config.model.frame_len();
         let wanted = usize::from(config.run.horizon.positives() > 0);
         let mut batch = Self {
-            states_t: Vec::with_capacity(rows * len),
-            states_k: Vec::new(),
-            states_n: Vec::with_capacity(rows * len),
-            action: Vec::new(),
-            next_action: Vec::new(),
-            n_step_return: Vec::new(),
-            bootstrap_discount: Vec::new(),
-            positive_valid: Vec::new(),
             positives: wanted,
+            ..Self::default()
         };
         for row in 0..rows {
             let (env, t) = (row % COPIES, row / COPIES * apart);
@@ -95,9 +89,8 @@ impl HeldBatch {
             batch.bootstrap_discount.push(discount as f32);
             if wanted > 0 {
                 batch.states_k.extend_from_slice(state(t + k));
-                batch
-                    .positive_valid
-                    .push(u8::from(history[t].ends[env] == StepEnd::Running));
+                let is_running = history[t].ends[env] == StepEnd::Running;
+                batch.positive_valid.push(u8::from(is_running));
             }
         }
         Ok(batch)
@@ -139,14 +132,10 @@ fn history(
 ) -> anyhow::Result<Vec<Moment>> {
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let actions = config.world.actions(config.actor.actions);
-    let sent = (
-        config.run.frame_height as usize,
-        config.run.frame_width as usize,
-    );
-    let world = config
-        .world
-        .build(COPIES, SEED, 0)
-        .context("building the world")?;
+    let sent = [config.run.frame_height, config.run.frame_width].map(|side| side as usize);
+    let sent = (sent[0], sent[1]);
+    let world = config.world.build(COPIES, SEED, 0);
+    let world = world.context("building the world")?;
     let mut world = CutFrames::of(FewerActions::of(world, actions)?, sent)?;
     let frame = world.frame_shape();
     let mut stack = FrameStack::new(frame, config.run.frame_stack as usize, COPIES)?;
@@ -157,7 +146,7 @@ fn history(
         .transpose()?;
     let mut frames = vec![0; frame.bytes() * COPIES];
     let mut first = vec![true; COPIES];
-    let mut history = Vec::with_capacity(steps);
+    let mut history = Vec::new();
     for step in 0..steps {
         world.observe(&mut frames);
         stack.push(&frames, &first);

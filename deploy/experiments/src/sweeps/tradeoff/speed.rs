@@ -24,16 +24,9 @@ pub(super) struct Effort {
 impl Effort {
     /// Some seconds a level; a tenth of one for the smoke length.
     pub(super) const fn of(smoke: bool) -> Self {
-        match smoke {
-            true => Self {
-                rounds: 1,
-                turn: Duration::from_millis(20),
-            },
-            false => Self {
-                rounds: 9,
-                turn: Duration::from_millis(80),
-            },
-        }
+        let (rounds, turn) = if smoke { (1, 20) } else { (9, 80) };
+        let turn = Duration::from_millis(turn);
+        Self { rounds, turn }
     }
 }
 
@@ -87,21 +80,17 @@ impl Side {
         })
     }
 
-    /// Seconds of an update, over a turn.
-    fn update(&mut self, turn: Duration) -> anyhow::Result<f64> {
-        timed(turn, || {
-            Ok(self.agent.update(&self.held.batch()).map(drop)?)
-        })
-    }
-
-    /// Seconds of an action, over a turn.
-    fn act(&mut self, turn: Duration) -> anyhow::Result<f64> {
-        let seconds = timed(turn, || {
-            Ok(self
-                .policy
-                .greedy_actions(&self.frames, &mut self.actions)?)
+    /// Seconds of an update, and of an action for one frame; each over a turn.
+    fn seconds(&mut self, turn: Duration) -> anyhow::Result<[f64; 2]> {
+        let update = timed(turn, || {
+            self.agent.update(&self.held.batch())?;
+            Ok(())
         })?;
-        Ok(seconds / self.actions.len() as f64)
+        let act = timed(turn, || {
+            let acted = self.policy.greedy_actions(&self.frames, &mut self.actions);
+            Ok(acted?)
+        })?;
+        Ok([update, act / self.actions.len() as f64])
     }
 }
 
@@ -124,18 +113,16 @@ pub(super) fn measure(
 ) -> anyhow::Result<Speed> {
     let (mut from, mut to) = (Side::new(base)?, Side::new(level)?);
     // Buffers are made in the first call.
-    for side in [&mut from, &mut to] {
-        side.update(Duration::ZERO)?;
-        side.act(Duration::ZERO)?;
-    }
+    from.seconds(Duration::ZERO)?;
+    to.seconds(Duration::ZERO)?;
     let [mut updates, mut update_gains, mut acts, mut act_gains] = [const { Vec::new() }; 4];
     for _ in 0..rounds {
-        let (one, other) = (from.update(turn)?, to.update(turn)?);
-        updates.push(other);
-        update_gains.push(one / other);
-        let (one, other) = (from.act(turn)?, to.act(turn)?);
-        acts.push(other);
-        act_gains.push(one / other);
+        // In turns, a call of each after the other.
+        let ([base_update, base_act], [update, act]) = (from.seconds(turn)?, to.seconds(turn)?);
+        updates.push(update);
+        update_gains.push(base_update / update);
+        acts.push(act);
+        act_gains.push(base_act / act);
     }
     let rows = to.held.rows() as f64 / from.held.rows() as f64;
     let run = &level.run;
