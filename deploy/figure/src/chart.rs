@@ -90,15 +90,8 @@ impl Axis {
     /// First and last value, evenly spread, with slack; none if there is no value.
     fn range(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<(f64, f64)> {
         let all = values.chain(self.shows.iter().copied());
-        let all = all
-            .filter(|value| self.keeps(*value))
-            .map(|value| self.spread(value));
-        let (low, high) = all.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(value), high.max(value))
-        });
-        if !(low.is_finite() && high.is_finite()) {
-            return None;
-        }
+        let kept = all.filter(|value| self.keeps(*value));
+        let (low, high) = ticks::bounds(kept.map(|value| self.spread(value)))?;
         let least = match low == high {
             true => low.abs().max(1.0) * 0.05,
             false => 0.0,
@@ -225,11 +218,7 @@ impl Chart {
         let below = TICK_SIZE + LABEL_SIZE + 16.0;
         let y_ticks = self.y.ticks(y_range, place.height - below, 42.0);
         let y_labels = ticks::labels(&y_ticks);
-        let label_width = y_labels
-            .iter()
-            .map(|label| font::width(label, TICK_SIZE, Weight::Regular))
-            .fold(0.0, f64::max);
-        let left = label_width + LABEL_SIZE + 18.0;
+        let left = font::widest(&y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
         let plot = Rect::new(
             place.x + left,
             place.y + 4.0,

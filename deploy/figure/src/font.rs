@@ -35,6 +35,12 @@ pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
     units * size / f64::from(face.units_per_em())
 }
 
+/// Width of the longest of these texts in regular letters.
+pub(super) fn widest(texts: &[String], size: f64) -> f64 {
+    let widths = texts.iter().map(|text| width(text, size, Weight::Regular));
+    widths.fold(0.0, f64::max)
+}
+
 fn advance(face: &Face<'_>, c: char) -> f64 {
     let glyph = face.glyph_index(c).unwrap_or_default();
     f64::from(face.glyph_hor_advance(glyph).unwrap_or_default())

@@ -76,19 +76,13 @@ impl Heat {
     }
 
     fn ends(&self) -> (f64, f64) {
-        let values = self
-            .values
-            .iter()
-            .flatten()
-            .filter(|value| value.is_finite());
-        let found = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(*value), high.max(*value))
-        });
-        let (low, high) = self.range.unwrap_or(found);
-        match low.is_finite() && high.is_finite() {
-            true if high > low => (low, high),
-            true => (low, low + 1.0),
-            false => (0.0, 1.0),
+        let values = self.values.iter().flatten().copied();
+        let found = ticks::bounds(values.filter(|value| value.is_finite()));
+        let ends = self.range.or(found);
+        match ends.filter(|(low, high)| low.is_finite() && high.is_finite()) {
+            Some((low, high)) if high > low => (low, high),
+            Some((low, _)) => (low, low + 1.0),
+            None => (0.0, 1.0),
         }
     }
 
@@ -97,12 +91,7 @@ impl Heat {
         let (low, high) = self.ends();
         let bar_ticks = ticks::linear(low, high, 5);
         let bar_labels = ticks::labels(&bar_ticks);
-        let widest = |texts: &[String]| {
-            let widths = texts
-                .iter()
-                .map(|text| font::width(text, TICK_SIZE, Weight::Regular));
-            widths.fold(0.0, f64::max)
-        };
+        let widest = |texts: &[String]| font::widest(texts, TICK_SIZE);
         let names_width = widest(&self.names);
         let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
             (true, true) => 0.0,
@@ -118,10 +107,9 @@ impl Heat {
             (false, true) => names_width + 6.0,
             (false, false) => TICK_SIZE + 6.0,
         };
-        let label_below = if self.labels.0.is_empty() {
-            0.0
-        } else {
-            LABEL_SIZE + 6.0
+        let label_below = match self.labels.0.is_empty() {
+            true => 0.0,
+            false => LABEL_SIZE + 6.0,
         };
         let below = names_below + label_below + 4.0;
         let room = (place.width - left - right)

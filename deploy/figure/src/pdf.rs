@@ -7,9 +7,9 @@ use flate2::{Compression, write::ZlibEncoder};
 use tiny_skia::{Path, PathSegment, Point};
 
 use super::{
-    canvas::{Canvas, DASH, Rect, Shape, Stroke},
+    canvas::{Canvas, DASH, Shape, Stroke},
     colours::Colour,
-    png::{polygon, rounded, text_path},
+    png::{Ink, Outline, outlines},
 };
 
 /// Points, of which an inch has 72, in a figure's unit, of which it has 96.
@@ -79,38 +79,19 @@ impl Page {
     }
 
     fn draw(&mut self, shape: &Shape) {
-        match shape {
-            Shape::Line { points, stroke } => self.stroke(polygon(points, false), *stroke),
-            Shape::Area { points, fill } => self.fill(polygon(points, true), *fill),
-            Shape::Rects { rects, fill } => {
-                let each: String = rects.iter().map(sides).collect();
-                self.filled(&each, *fill);
-            }
-            Shape::Frame { rect, stroke } => self.stroked(&sides(rect), *stroke),
-            Shape::Card { rect, fill, border } => {
-                self.fill(rounded(*rect), *fill);
-                self.stroke(rounded(*rect), Stroke::solid(*border, 1.0));
-            }
-            Shape::Text { at, text, style } => {
-                let (path, place) = text_path(*at, text, *style);
-                self.fill(path.and_then(|path| path.transform(place)), style.colour);
+        for Outline { path, place, ink } in outlines(shape) {
+            let Some(path) = path.transform(place) else {
+                continue;
+            };
+            let path = operators(&path);
+            match ink {
+                Ink::Fill { colour, .. } => self.fill(&path, colour),
+                Ink::Pen(stroke) => self.stroke(&path, stroke),
             }
         }
     }
 
-    fn fill(&mut self, path: Option<Path>, colour: Colour) {
-        if let Some(path) = path {
-            self.filled(&operators(&path), colour);
-        }
-    }
-
-    fn stroke(&mut self, path: Option<Path>, stroke: Stroke) {
-        if let Some(path) = path {
-            self.stroked(&operators(&path), stroke);
-        }
-    }
-
-    fn filled(&mut self, path: &str, colour: Colour) {
+    fn fill(&mut self, path: &str, colour: Colour) {
         let percent = (colour.alpha * 100.0).round() as u32;
         let brush = rgb(colour);
         if percent < 100 {
@@ -121,7 +102,7 @@ impl Page {
         }
     }
 
-    fn stroked(&mut self, path: &str, stroke: Stroke) {
+    fn stroke(&mut self, path: &str, stroke: Stroke) {
         let dash = match stroke.dashed {
             true => format!("[{} {}]", DASH[0], DASH[1]),
             false => "[]".to_owned(),
@@ -134,16 +115,6 @@ impl Page {
 fn rgb(colour: Colour) -> String {
     let [r, g, b] = colour.rgb.map(|part| f64::from(part) / 255.0);
     format!("{r:.3} {g:.3} {b:.3}")
-}
-
-fn sides(rect: &Rect) -> String {
-    let Rect {
-        x,
-        y,
-        width,
-        height,
-    } = rect;
-    format!("{x:.2} {y:.2} {width:.2} {height:.2} re ")
 }
 
 fn operators(path: &Path) -> String {

@@ -41,42 +41,64 @@ pub(super) fn packed(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
 
 /// Draws one shape, `scale` pixels to a unit.
 pub(super) fn draw(pixmap: &mut Pixmap, shape: &Shape, scale: Transform) {
-    let mut fill = |path: Option<Path>, colour: Colour, smooth: bool, at: Transform| {
-        if let Some(path) = path.filter(has_area) {
-            let paint = paint(colour, smooth);
-            pixmap.fill_path(&path, &paint, FillRule::Winding, at, None);
-        }
-    };
-    match shape {
-        Shape::Line { points, stroke } => {
-            stroke_path(pixmap, polygon(points, false), *stroke, scale);
-        }
-        Shape::Area { points, fill: with } => fill(polygon(points, true), *with, true, scale),
-        Shape::Rects { rects, fill: with } => {
-            let mut path = PathBuilder::new();
-            for rect in rects {
-                path.push_rect(path_rect(*rect));
+    for Outline { path, place, ink } in outlines(shape) {
+        let place = place.post_concat(scale);
+        match ink {
+            Ink::Fill { colour, smooth } if has_area(&path) => {
+                let paint = paint(colour, smooth);
+                pixmap.fill_path(&path, &paint, FillRule::Winding, place, None);
             }
-            fill(path.finish(), *with, false, scale);
+            Ink::Fill { .. } => {}
+            Ink::Pen(stroke) => stroke_path(pixmap, &path, stroke, place),
+        }
+    }
+}
+
+/// A path with where it goes, and what it is drawn with.
+pub(super) struct Outline {
+    pub(super) path: Path,
+    pub(super) place: Transform,
+    pub(super) ink: Ink,
+}
+
+/// What a path is drawn with.
+pub(super) enum Ink {
+    /// Its inside, with soft edges or with hard ones.
+    Fill { colour: Colour, smooth: bool },
+    /// Its line.
+    Pen(Stroke),
+}
+
+/// The outlines of a shape, in the order in which they are drawn.
+pub(super) fn outlines(shape: &Shape) -> Vec<Outline> {
+    let mut outlines = Vec::new();
+    let mut add = |path: Option<Path>, place: Transform, ink: Ink| {
+        outlines.extend(path.map(|path| Outline { path, place, ink }));
+    };
+    let here = Transform::identity();
+    let filled = |colour, smooth| Ink::Fill { colour, smooth };
+    match shape {
+        Shape::Line { points, stroke } => add(polygon(points, false), here, Ink::Pen(*stroke)),
+        Shape::Area { points, fill } => add(polygon(points, true), here, filled(*fill, true)),
+        Shape::Rects { rects, fill } => {
+            let mut path = PathBuilder::new();
+            rects.iter().for_each(|it| path.push_rect(path_rect(*it)));
+            add(path.finish(), here, filled(*fill, false));
         }
         Shape::Frame { rect, stroke } => {
             let path = PathBuilder::from_rect(path_rect(*rect));
-            stroke_path(pixmap, Some(path), *stroke, scale);
+            add(Some(path), here, Ink::Pen(*stroke));
         }
-        Shape::Card {
-            rect,
-            fill: with,
-            border,
-        } => {
-            let path = rounded(*rect);
-            fill(path.clone(), *with, true, scale);
-            stroke_path(pixmap, path, Stroke::solid(*border, 1.0), scale);
+        Shape::Card { rect, fill, border } => {
+            add(rounded(*rect), here, filled(*fill, true));
+            add(rounded(*rect), here, Ink::Pen(Stroke::solid(*border, 1.0)));
         }
         Shape::Text { at, text, style } => {
             let (path, place) = text_path(*at, text, *style);
-            fill(path, style.colour, true, place.post_concat(scale));
+            add(path, place, filled(style.colour, true));
         }
     }
+    outlines
 }
 
 /// Whether there is anything to fill: tiny-skia warns of bars and bands that are flat.
@@ -85,13 +107,9 @@ fn has_area(path: &Path) -> bool {
     bounds.width().min(bounds.height()) > SIDE_MIN
 }
 
-fn stroke_path(pixmap: &mut Pixmap, path: Option<Path>, stroke: Stroke, scale: Transform) {
-    let Some(path) = path else { return };
-    let dash = if stroke.dashed {
-        StrokeDash::new(DASH.map(|length| length as f32).to_vec(), 0.0)
-    } else {
-        None
-    };
+fn stroke_path(pixmap: &mut Pixmap, path: &Path, stroke: Stroke, place: Transform) {
+    let dash = DASH.map(|length| length as f32).to_vec();
+    let dash = StrokeDash::new(dash, 0.0).filter(|_| stroke.dashed);
     let pen = tiny_skia::Stroke {
         width: stroke.width as f32,
         line_cap: LineCap::Butt,
@@ -99,7 +117,7 @@ fn stroke_path(pixmap: &mut Pixmap, path: Option<Path>, stroke: Stroke, scale: T
         dash,
         ..tiny_skia::Stroke::default()
     };
-    pixmap.stroke_path(&path, &paint(stroke.colour, true), &pen, scale, None);
+    pixmap.stroke_path(path, &paint(stroke.colour, true), &pen, place, None);
 }
 
 fn paint(colour: Colour, smooth: bool) -> Paint<'static> {
@@ -110,7 +128,7 @@ fn paint(colour: Colour, smooth: bool) -> Paint<'static> {
     paint
 }
 
-pub(super) fn polygon(points: &[Point], closed: bool) -> Option<Path> {
+fn polygon(points: &[Point], closed: bool) -> Option<Path> {
     let mut path = PathBuilder::new();
     for (index, &(x, y)) in points.iter().enumerate() {
         match index {
@@ -127,16 +145,12 @@ pub(super) fn polygon(points: &[Point], closed: bool) -> Option<Path> {
 fn path_rect(rect: Rect) -> tiny_skia::Rect {
     let (x, y) = (rect.x as f32, rect.y as f32);
     // A side of 0 is drawn as nothing; sides are sums of finite, ordered numbers.
-    tiny_skia::Rect::from_xywh(
-        x,
-        y,
-        rect.width.max(0.0) as f32,
-        rect.height.max(0.0) as f32,
-    )
-    .unwrap_or_else(|| tiny_skia::Rect::from_xywh(0.0, 0.0, 0.0, 0.0).expect("0 is finite"))
+    let [width, height] = [rect.width, rect.height].map(|side| side.max(0.0) as f32);
+    let found = tiny_skia::Rect::from_xywh(x, y, width, height);
+    found.unwrap_or_else(|| tiny_skia::Rect::from_xywh(0.0, 0.0, 0.0, 0.0).expect("0 is finite"))
 }
 
-pub(super) fn rounded(rect: Rect) -> Option<Path> {
+fn rounded(rect: Rect) -> Option<Path> {
     let r = CARD_RADIUS as f32;
     let (left, top) = (rect.x as f32, rect.y as f32);
     let (right, bottom) = (rect.right() as f32, rect.bottom() as f32);
@@ -155,7 +169,7 @@ pub(super) fn rounded(rect: Rect) -> Option<Path> {
 }
 
 /// Outlines of a text from (0, 0), and where they go.
-pub(super) fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Transform) {
+fn text_path((x, y): Point, text: &str, style: TextStyle) -> (Option<Path>, Transform) {
     let mut path = PathBuilder::new();
     font::outline(text, style.size, style.weight, &mut path);
     let width = font::width(text, style.size, style.weight) as f32;

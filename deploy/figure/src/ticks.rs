@@ -48,51 +48,39 @@ const WRITTEN_OUT: std::ops::Range<f64> = 1e-4..1e10;
 
 /// The numbers as labels of one axis: the same decimals for all, thousands and millions as k and M.
 pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
-    let largest = ticks.iter().map(|tick| tick.abs()).fold(0.0, f64::max);
-    let smallest = ticks
-        .iter()
-        .map(|tick| tick.abs())
-        .filter(|tick| *tick > 0.0)
-        .fold(f64::INFINITY, f64::min);
-    let (divisor, unit) = if largest >= 1e7 {
-        (1e6, "M")
-    } else if largest >= 1e4 {
-        (1e3, "k")
-    } else {
-        (1.0, "")
+    let sizes = ticks.iter().map(|tick| tick.abs());
+    let (_, largest) = bounds(sizes.clone()).unwrap_or_default();
+    let (smallest, _) = bounds(sizes.filter(|size| *size > 0.0)).unwrap_or_default();
+    let (divisor, unit) = match largest {
+        size if size >= 1e7 => (1e6, "M"),
+        size if size >= 1e4 => (1e3, "k"),
+        _ => (1.0, ""),
     };
     let wide = largest / smallest >= 1000.0;
-    let decimals = (0..6)
-        .find(|&decimals| {
-            let texts: Vec<f64> = ticks
-                .iter()
-                .map(|tick| {
-                    let scale = 10f64.powi(decimals);
-                    (tick / divisor * scale).round() / scale
-                })
-                .collect();
-            ticks.iter().zip(&texts).all(|(tick, text)| {
-                (tick / divisor - text).abs() <= 1e-6 * (largest / divisor).min(1.0)
-            })
+    let is_enough = |decimals: &i32| {
+        let scale = 10f64.powi(*decimals);
+        ticks.iter().map(|tick| tick / divisor).all(|value| {
+            let rounded = (value * scale).round() / scale;
+            (value - rounded).abs() <= 1e-6 * (largest / divisor).min(1.0)
         })
-        .unwrap_or(6) as usize;
-    ticks
-        .iter()
-        .map(|tick| {
-            let value = tick / divisor;
-            if *tick == 0.0 {
-                return "0".to_owned();
-            }
-            let text = if !WRITTEN_OUT.contains(&largest) && !wide {
-                power_of_ten(*tick)
-            } else if wide {
-                plain(*tick)
-            } else {
-                format!("{value:.decimals$}{unit}")
-            };
-            text.replace('-', "\u{2212}")
-        })
-        .collect()
+    };
+    let decimals = (0..6).find(is_enough).unwrap_or(6) as usize;
+    let label = |tick: &f64| match *tick {
+        0.0 => "0".to_owned(),
+        tick if wide => plain(tick),
+        tick if !WRITTEN_OUT.contains(&largest) => power_of_ten(tick),
+        tick => format!("{:.decimals$}{unit}", tick / divisor),
+    };
+    let labels = ticks.iter().map(label);
+    labels.map(|it| it.replace('-', "\u{2212}")).collect()
+}
+
+/// The smallest and the largest of these numbers; none if there is none.
+pub(super) fn bounds(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
+    values.fold(None, |bounds, value| {
+        let (low, high) = bounds.unwrap_or((value, value));
+        Some((low.min(value), high.max(value)))
+    })
 }
 
 /// One number on its own, in as few characters as it needs.

@@ -8,7 +8,7 @@ use driml_machine::whole_number;
 pub use super::runs::Over;
 
 /// What `driml plot` takes.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub struct PlotArgs {
     /// Run folders; runs that differ only in their seed become one line with a band, and other folders are skipped
     #[arg(value_name = "RUN", required = true)]
@@ -44,28 +44,11 @@ pub struct PlotArgs {
     pub(crate) out: PathBuf,
 }
 
-impl PlotArgs {
-    /// A call that names runs and a picture alone.
-    pub(crate) const fn overview(runs: Vec<PathBuf>, out: PathBuf) -> Self {
-        Self {
-            runs,
-            column: Vec::new(),
-            x: Over::Frames,
-            smooth: None,
-            band: Band::Range,
-            separate: false,
-            random: None,
-            affinity: false,
-            plain: false,
-            out,
-        }
-    }
-}
-
 /// What the band over several seeds shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Band {
     /// From the smallest to the largest value
+    #[default]
     Range,
     /// One standard deviation to each side of the mean
     Sd,

@@ -1,33 +1,51 @@
 //! Charts of run folders: what is drawn, left out and said of it.
 //! No picture is looked at here.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use driml_machine::{error::Usage, resources::Machine};
-use driml_settings::{
-    flags::{self, RunFlags},
-    resolve::Flags,
-};
+use driml_machine::error::Usage;
 
 use super::{flags::Band, *};
+use crate::sweep::plan::Call;
 
-/// A run's folder under `root`, with settings that differ in `agent` and `seed`.
-fn run_folder(root: &Path, name: &str, agent: &str, seed: u32, metrics: &str) -> PathBuf {
-    let folder = root.join(name);
-    std::fs::create_dir(&folder).unwrap();
-    std::fs::write(folder.join("metrics.csv"), metrics).unwrap();
-    let config = format!(
-        "[run]\nworld = \"chain\"\nagent = \"{agent}\"\nseed = {seed}\n[local]\nactors = 1\nlearner_threads = {seed}\n"
-    );
-    std::fs::write(folder.join("config.toml"), config).unwrap();
-    folder
+/// Folders of runs.
+struct Runs(tempfile::TempDir);
+
+impl Runs {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    /// A run's folder, with settings that differ in `agent` and `seed`.
+    fn run(&self, name: &str, agent: &str, seed: u32, metrics: &str) -> PathBuf {
+        let folder = self.0.path().join(name);
+        std::fs::create_dir(&folder).unwrap();
+        std::fs::write(folder.join("metrics.csv"), metrics).unwrap();
+        let config = format!(
+            "[run]\nworld = \"chain\"\nagent = \"{agent}\"\nseed = {seed}\n[local]\nactors = 1\nlearner_threads = {seed}\n"
+        );
+        std::fs::write(folder.join("config.toml"), config).unwrap();
+        folder
+    }
+
+    fn args(&self, runs: &[&PathBuf], columns: &[&str]) -> PlotArgs {
+        PlotArgs {
+            runs: runs.iter().map(|&run| run.clone()).collect(),
+            column: columns.iter().map(|&column| column.into()).collect(),
+            out: self.0.path().join("p.svg"),
+            ..PlotArgs::default()
+        }
+    }
 }
 
-fn args(runs: &[&PathBuf], columns: &[&str], out: PathBuf) -> PlotArgs {
-    PlotArgs {
-        column: columns.iter().map(|&column| column.into()).collect(),
-        ..PlotArgs::overview(runs.iter().map(|&run| run.clone()).collect(), out)
-    }
+/// The picture that a call draws.
+fn drawn(args: &PlotArgs) -> String {
+    run(args).unwrap();
+    std::fs::read_to_string(&args.out).unwrap()
+}
+
+fn read(folder: &PathBuf) -> Run {
+    Run::read(&RunFolder::new(folder)).unwrap()
 }
 
 const WAY: Way = Way {
@@ -40,14 +58,11 @@ const METRICS: &str =
 
 #[test]
 fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
-    let root = tempfile::tempdir().unwrap();
-    let other = METRICS.replace("2.5", "4.5");
-    let a = run_folder(root.path(), "a-1", "c51", 1, METRICS);
-    let b = run_folder(root.path(), "a-2", "c51", 2, &other);
-    let c = run_folder(root.path(), "c", "driml-ada", 1, METRICS);
-    let runs: Vec<_> = [&a, &b, &c]
-        .map(|run| Run::read(&RunFolder::new(run)).unwrap())
-        .into();
+    let root = Runs::new();
+    let a = root.run("a-1", "c51", 1, METRICS);
+    let b = root.run("a-2", "c51", 2, &METRICS.replace("2.5", "4.5"));
+    let c = root.run("c", "driml-ada", 1, METRICS);
+    let runs = [&a, &b, &c].map(read);
     let groups = groups::of(&runs, true);
     let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
     assert_eq!(names, ["chain c51, 2 seeds", "chain driml-ada, seed 1"]);
@@ -56,30 +71,23 @@ fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
     assert_eq!(curve.band.last(), Some(&(20.0, 2.5, 4.5)));
     assert_eq!(groups::of(&runs, false).len(), 3);
 
-    for name in ["all.svg", "all.png"] {
-        let out = root.path().join(name);
-        run(&args(&[&a, &b, &c], &[], out.clone())).unwrap();
-        assert!(std::fs::metadata(out).unwrap().len() > 1000);
-    }
-    let svg = std::fs::read_to_string(root.path().join("all.svg")).unwrap();
+    let svg = drawn(&root.args(&[&a, &b, &c], &[]));
     assert!(svg.contains("the band is their smallest and largest value"));
     assert!(svg.contains("Not smoothed."));
 }
 
 #[test]
 fn agents_with_different_losses_are_drawn_beside_each_other() {
-    let root = tempfile::tempdir().unwrap();
+    let root = Runs::new();
     let folder = |agent: &str, losses: &str, values: &str| {
         let metrics = format!("frames,c51_kl,{losses}total_loss\n10,0.5,{values}0.5\n");
-        run_folder(root.path(), agent, agent, 1, &metrics)
+        root.run(agent, agent, 1, &metrics)
     };
     let a = folder("driml-fix", "dim_3t3,dim_4t4,", ",1.5,");
     let b = folder("curl", "curl,", "2.5,");
     let c = folder("c51", "", "");
     for columns in [&[][..], &["dim_4t4", "curl"]] {
-        let out = root.path().join("losses.svg");
-        run(&args(&[&a, &b, &c], columns, out.clone())).unwrap();
-        let svg = std::fs::read_to_string(out).unwrap();
+        let svg = drawn(&root.args(&[&a, &b, &c], columns));
         assert!(svg.contains("DIM 4t4 loss") && svg.contains("CURL loss"));
         assert!(!svg.contains("DIM 3t3"), "it has no values");
     }
@@ -87,67 +95,51 @@ fn agents_with_different_losses_are_drawn_beside_each_other() {
 
 #[test]
 fn a_row_that_was_cut_off_is_left_out_and_a_folder_given_twice_is_one_run() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, &format!("{METRICS}4,3"));
-    let values = Run::read(&RunFolder::new(&a))
-        .unwrap()
-        .values("mean_return")
-        .unwrap();
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, &format!("{METRICS}4,3"));
+    let values = read(&a).values("mean_return").unwrap();
     assert_eq!(values, [(10.0, 1.5), (20.0, 2.5)]);
-    let again = root.path().join(".").join("a");
-    let out = root.path().join("twice.svg");
-    run(&args(&[&a, &again], &["mean_return"], out.clone())).unwrap();
-    let svg = std::fs::read_to_string(out).unwrap();
+    let again = root.0.path().join(".").join("a");
+    let svg = drawn(&root.args(&[&a, &again], &["mean_return"]));
     assert!(!svg.contains("2 seeds"));
 }
 
 #[test]
 fn smoothing_is_a_mean_over_the_frames_before_and_said() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let runs = [Run::read(&RunFolder::new(&a)).unwrap()];
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let runs = [read(&a)];
     let groups = groups::of(&runs, true);
-    let curve = groups[0]
-        .curve(
-            "mean_return",
-            Way {
-                smooth: Some(15),
-                ..WAY
-            },
-        )
-        .unwrap();
-    assert_eq!(curve.points, [(10.0, 1.5), (20.0, 2.0)]);
-    let mut args = args(&[&a], &["mean_return"], root.path().join("a.svg"));
-    args.smooth = Some(15);
-    run(&args).unwrap();
-    let svg = std::fs::read_to_string(&args.out).unwrap();
-    assert!(svg.contains("Smoothed: each point is the mean over the 15 frames before it."));
+    let smooth = Some(15);
+    let curve = groups[0].curve("mean_return", Way { smooth, ..WAY });
+    assert_eq!(curve.unwrap().points, [(10.0, 1.5), (20.0, 2.0)]);
+    let mut args = root.args(&[&a], &["mean_return"]);
+    args.smooth = smooth;
+    let expected = "Smoothed: each point is the mean over the 15 frames before it.";
+    assert!(drawn(&args).contains(expected));
 }
 
 #[test]
 fn lines_are_called_by_what_differs_and_by_their_seeds() {
-    let root = tempfile::tempdir().unwrap();
-    let run = |name: &str, seed: u32, lr: &str| {
-        let folder = run_folder(root.path(), name, "c51", seed, METRICS);
+    let root = Runs::new();
+    let runs = [
+        ("a", 1, "0.1"),
+        ("b", 1, "0.1"),
+        ("c", 2, "0.1"),
+        ("d", 2, "0.2"),
+        ("e", 2, "0.2"),
+        ("f", 3, "0.3"),
+    ];
+    let runs = runs.map(|(name, seed, lr)| {
+        let folder = root.run(name, "c51", seed, METRICS);
         let path = folder.join("config.toml");
         let config = std::fs::read_to_string(&path).unwrap();
         std::fs::write(path, format!("{config}[learner.update.adam]\nlr = {lr}\n")).unwrap();
-        Run::read(&RunFolder::new(folder)).unwrap()
-    };
-    let runs = [
-        run("a", 1, "0.1"),
-        run("b", 1, "0.1"),
-        run("c", 2, "0.1"),
-        run("d", 2, "0.2"),
-        run("e", 2, "0.2"),
-        run("f", 3, "0.3"),
-    ];
-    let names = |together| {
-        let groups = groups::of(&runs, together);
-        groups
-            .into_iter()
-            .map(|group| group.name)
-            .collect::<Vec<_>>()
+        read(&folder)
+    });
+    let names = |together| -> Vec<String> {
+        let groups = groups::of(&runs, together).into_iter();
+        groups.map(|group| group.name).collect()
     };
     let expected = [
         "chain c51, lr=0.1, 3 runs of 2 seeds",
@@ -167,10 +159,8 @@ fn lines_are_called_by_what_differs_and_by_their_seeds() {
 
 #[test]
 fn rows_at_the_same_place_are_one_point_whatever_their_order() {
-    let root = tempfile::tempdir().unwrap();
     let metrics = "seconds,frames,updates,loss\n1,10,0,1\n2,10,1,3\n3,30,2,5\n4,20,2,7\n";
-    let folder = run_folder(root.path(), "a", "c51", 1, metrics);
-    let run = Run::read(&RunFolder::new(folder)).unwrap();
+    let run = read(&Runs::new().run("a", "c51", 1, metrics));
     let over = |x| run.values_over(x, "loss").unwrap();
     assert_eq!(over(Over::Frames), [(10.0, 2.0), (20.0, 7.0), (30.0, 5.0)]);
     assert_eq!(over(Over::Updates), [(0.0, 1.0), (1.0, 3.0), (2.0, 6.0)]);
@@ -179,31 +169,24 @@ fn rows_at_the_same_place_are_one_point_whatever_their_order() {
 
 #[test]
 fn a_folder_that_is_no_runs_is_left_out() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let none = root.path().to_owned();
-    let out = root.path().join("p.svg");
-    run(&args(&[&none, &a], &[], out.clone())).unwrap();
-    assert!(std::fs::read_to_string(out).unwrap().contains("seed 1"));
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let none = root.0.path().to_owned();
+    assert!(drawn(&root.args(&[&none, &a], &[])).contains("seed 1"));
 }
 
 #[test]
 fn a_random_policy_is_a_line() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let flags = RunFlags {
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let call = Call {
         env: Some("chain".into()),
-        agent: Some("c51".into()),
-        preset: None,
-        config: None,
-        over: Flags::default(),
+        ..Call::default()
     };
-    let (config, _) = flags::resolve(&flags, &Machine::this()).unwrap();
-    std::fs::write(a.join("config.toml"), config.to_toml()).unwrap();
-    let mut args = args(&[&a], &["mean_return"], root.path().join("p.svg"));
+    std::fs::write(a.join("config.toml"), call.config().unwrap().to_toml()).unwrap();
+    let mut args = root.args(&[&a], &["mean_return"]);
     args.random = Some(8);
-    run(&args).unwrap();
-    let svg = std::fs::read_to_string(&args.out).unwrap();
+    let svg = drawn(&args);
     assert!(svg.contains("random policy") && svg.contains("8 whole episodes"));
 }
 
@@ -221,11 +204,10 @@ fn random_policies_of_two_worlds_are_two_lines_that_can_be_told_apart() {
 
 #[test]
 fn a_run_without_an_episode_is_named() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let empty = run_folder(root.path(), "e", "c51", 1, "frames,mean_return\n9,\n");
-    let runs = [&a, &empty].map(|run| Run::read(&RunFolder::new(run)).unwrap());
-    let said = absent(RETURN, &runs);
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let empty = root.run("e", "c51", 1, "frames,mean_return\n9,\n");
+    let said = absent(RETURN, &[&a, &empty].map(read));
     let expected = format!(
         "{} is not in the chart of mean_return: no episode has ended in it",
         empty.display()
@@ -235,43 +217,46 @@ fn a_run_without_an_episode_is_named() {
 
 #[test]
 fn a_column_goes_by_the_word_that_the_help_has() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let out = root.path().join("p.pdf");
-    let mut args = args(&[&a], &["return", "k"], out.clone());
-    args.plain = true;
-    run(&args).unwrap();
-    assert!(std::fs::read(out).unwrap().starts_with(b"%PDF"));
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    for (name, start) in [("p.pdf", "%PDF"), ("p.png", "\u{89}PNG")] {
+        let mut args = root.args(&[&a], &["return", "k"]);
+        args.plain = true;
+        args.out = root.0.path().join(name);
+        run(&args).unwrap();
+        let bytes = std::fs::read(args.out).unwrap();
+        let start: Vec<u8> = start.chars().map(|it| it as u8).collect();
+        assert!(bytes.starts_with(&start), "{name}");
+    }
 }
 
 #[test]
 fn what_cannot_be_drawn_is_said() {
-    let root = tempfile::tempdir().unwrap();
-    let a = run_folder(root.path(), "a", "c51", 1, METRICS);
-    let empty = run_folder(root.path(), "e", "c51", 1, "frames,mean_return\n0,\n");
-    let none = root.path().join("none");
-    let out = root.path().join("p.svg");
-    let said = |args: &PlotArgs| {
-        let e = run(args).unwrap_err();
-        assert!(e.is::<Usage>(), "{e}");
-        e.to_string()
-    };
-    let no_column = said(&args(&[&a], &["mean_retrun"], out.clone()));
-    assert!(
-        no_column.ends_with(
-            "has no column \"mean_retrun\" (did you mean \"mean_return\"?); it has seconds, frames, mean_return, mean_k"
-        ),
-        "{no_column}"
-    );
-    assert!(said(&args(&[&a], &["waiting"], out.clone())).contains("has no column"));
-    assert!(
-        said(&args(&[&empty], &["mean_return"], out.clone()))
-            .contains("none of these runs has a value of \"mean_return\" yet")
-    );
-    assert!(said(&args(&[&empty], &[], out.clone())).contains("recorded a value yet"));
-    assert!(said(&args(&[&none], &[], out.clone())).contains("is not the folder of a run"));
-    assert!(said(&args(&[&a], &[], root.path().join("p.eps"))).contains(".svg, .pdf or .png"));
-    let mut affinity = args(&[&a], &[], out);
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let empty = root.run("e", "c51", 1, "frames,mean_return\n0,\n");
+    let none = root.0.path().join("none");
+    let mut eps = root.args(&[&a], &[]);
+    eps.out = root.0.path().join("p.eps");
+    let mut affinity = root.args(&[&a], &[]);
     affinity.affinity = true;
-    assert!(said(&affinity).contains("no checkpoint"));
+    for (args, expected) in [
+        (
+            root.args(&[&a], &["mean_retrun"]),
+            "has no column \"mean_retrun\" (did you mean \"mean_return\"?); it has seconds, frames, mean_return, mean_k",
+        ),
+        (root.args(&[&a], &["waiting"]), "has no column"),
+        (
+            root.args(&[&empty], &["mean_return"]),
+            "none of these runs has a value of \"mean_return\" yet",
+        ),
+        (root.args(&[&empty], &[]), "recorded a value yet"),
+        (root.args(&[&none], &[]), "is not the folder of a run"),
+        (eps, ".svg, .pdf or .png"),
+        (affinity, "no checkpoint"),
+    ] {
+        let e = run(&args).unwrap_err();
+        assert!(e.is::<Usage>(), "{e}");
+        assert!(e.to_string().contains(expected), "{e}");
+    }
 }

@@ -112,12 +112,12 @@ mod tests {
                     (0..4).map(|_| game()).collect()
                 };
                 let (x, y) = (scores(), scores());
-                let has = |found: Interval| {
-                    let (low, high) = found.ends.unwrap();
+                let has = |found: Option<Interval>| {
+                    let (low, high) = found.unwrap().ends.unwrap();
                     u32::from((low..=high).contains(&0.5))
                 };
-                of_iqm += has(iqm(&x).unwrap());
-                of_improvement += has(improvement(&x, &y).unwrap());
+                of_iqm += has(iqm(&x));
+                of_improvement += has(improvement(&x, &y));
             }
             for count in [of_iqm, of_improvement] {
                 let share = f64::from(count) / f64::from(rounds);

@@ -60,9 +60,12 @@ pub(crate) fn run(args: &SweepArgs) -> anyhow::Result<()> {
     if swept.made.is_empty() {
         return Err(usage!("no run is finished yet: there is nothing to draw").into());
     }
-    let folders = swept.made.iter().map(|it| it.run.folder.path().to_owned());
-    let plot = session.folder().join(format!("{NAME}.svg"));
-    plot::run(&PlotArgs::overview(folders.collect(), plot))?;
+    let runs = swept.made.iter().map(|it| it.run.folder.path().to_owned());
+    plot::run(&PlotArgs {
+        runs: runs.collect(),
+        out: session.folder().join(format!("{NAME}.svg")),
+        ..PlotArgs::default()
+    })?;
     queue::check_made(&swept.missing, args.report)
 }
 

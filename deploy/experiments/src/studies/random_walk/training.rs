@@ -17,8 +17,7 @@ const MEASURE_GROWTH: f64 = 1.04;
 const WARMUP_TRANSITIONS: usize = 16;
 
 /// Where the pairs come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sampling {
     /// Independent, the first state from the stationary law: no mixing to wait for.
     Stationary,

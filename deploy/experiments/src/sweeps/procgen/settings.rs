@@ -130,17 +130,16 @@ pub(super) fn short(world: &str) -> &str {
 
 /// Worlds by their names or their games', each once; `all` is every game.
 fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
-    let mut found = Vec::new();
-    for name in names {
-        if name == "all" {
+    once(names, |name| match name {
+        "all" => {
             let games = WorldName::all().filter(|it| it.kind() == "procgen");
-            found.extend(games.map(|world| world.to_string()));
-        } else {
-            let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
-            found.push(world.to_string());
+            Ok(games.map(|world| world.to_string()).collect())
         }
-    }
-    Ok(once(found))
+        name => {
+            let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
+            Ok(vec![world.to_string()])
+        }
+    })
 }
 
 /// The agent and the k of a name such as `driml-noact-k5`; other names are the agent's alone.
@@ -154,27 +153,33 @@ fn with_k(name: &str) -> (&str, Option<u32>) {
 
 /// Agents by name, each once; `all` is every one of the paper's, and a name with a k one that looks so far ahead.
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
-    let mut found = Vec::new();
-    for name in names {
-        if name == "all" {
-            found.extend(AGENTS.map(String::from));
-        } else {
+    once(names, |name| match name {
+        "all" => Ok(AGENTS.map(String::from).into()),
+        name => {
             let (agent, k) = with_k(name);
             let agent = presets::agent(agent)?.name;
-            found.push(k.map_or_else(|| agent.to_owned(), |k| format!("{agent}-k{k}")));
+            Ok(vec![k.map_or_else(
+                || agent.to_owned(),
+                |k| format!("{agent}-k{k}"),
+            )])
         }
-    }
-    Ok(once(found))
+    })
 }
 
-fn once(names: Vec<String>) -> Vec<String> {
+/// What the names stand for, each once.
+fn once(
+    names: &[String],
+    of: impl Fn(&str) -> Result<Vec<String>, Usage>,
+) -> Result<Vec<String>, Usage> {
     let mut kept: Vec<String> = Vec::new();
     for name in names {
-        if !kept.contains(&name) {
-            kept.push(name);
+        for found in of(name)? {
+            if !kept.contains(&found) {
+                kept.push(found);
+            }
         }
     }
-    kept
+    Ok(kept)
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use super::{
     report::training_curves,
     results::{FRAMES_PER_SECOND, Measure, PointResult, Results},
 };
-use crate::plot::over_seeds;
+use crate::{plot::over_seeds, stats::Spread};
 
 /// Panels side by side.
 const COLUMNS: usize = 3;
@@ -25,10 +25,9 @@ struct Placed {
 /// all dials that no other beats in both. `returns` is which return, and `name` what it is called.
 pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure {
     let of_runs = results.points.values().flat_map(|it| it.values(returns));
-    let of_runs = of_runs.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-        (low.min(value), high.max(value))
-    });
-    let place = |point: &PointResult| place(point, returns, of_runs);
+    let all = Spread::of(of_runs);
+    let (least, greatest) = all.map_or((0.0, 0.0), |it| (it.min, it.max));
+    let place = |point: &PointResult| place(point, returns, (least, greatest));
     let placed: Vec<Placed> = results.points.values().filter_map(place).collect();
     let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
     let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();

@@ -3,12 +3,12 @@
 //! nothing is augmented.
 
 use anyhow::Context;
-use driml_envs::{CutFrames, FewerActions, FrameStack, StepEnd};
+use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
+use driml_envs::{CutFrames, FewerActions, StepEnd};
 use driml_learner::Batch;
-use driml_model::PolicyNetwork;
 use driml_protocol::NO_ACTION;
 use driml_settings::config::RunConfig;
-use rand::{Rng, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 /// Copies of the world that are played.
@@ -130,54 +130,38 @@ fn history(
     steps: usize,
     wanted_at: impl Fn(usize) -> bool,
 ) -> anyhow::Result<Vec<Moment>> {
-    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
-    let actions = config.world.actions(config.actor.actions);
-    let sent = [config.run.frame_height, config.run.frame_width].map(|side| side as usize);
-    let sent = (sent[0], sent[1]);
+    let (run, model) = (&config.run, &config.model);
+    let sent = (run.frame_height as usize, run.frame_width as usize);
     let world = config.world.build(COPIES, SEED, 0);
     let world = world.context("building the world")?;
-    let mut world = CutFrames::of(FewerActions::of(world, actions)?, sent)?;
-    let frame = world.frame_shape();
-    let mut stack = FrameStack::new(frame, config.run.frame_stack as usize, COPIES)?;
-    let model = &config.model;
-    let enlarge = config.input.enlarge(sent, model)?;
-    let mut policy = weights
-        .map(|weights| PolicyNetwork::new(model, weights, config.actor.precision))
-        .transpose()?;
-    let mut frames = vec![0; frame.bytes() * COPIES];
-    let mut first = vec![true; COPIES];
+    let fewer = FewerActions::of(world, config.world.actions(config.actor.actions))?;
+    let rng = ChaCha8Rng::seed_from_u64(SEED);
+    let mut acting = Acting::new(CutFrames::of(fewer, sent)?, run.frame_stack as usize, rng)?;
+    let enlarge = || config.input.enlarge(sent, model);
+    let enlarged = enlarge()?;
+    let precision = config.actor.precision;
+    let mut policy: Box<dyn Policy> = match weights {
+        Some(weights) => Box::new(NetworkPolicy::new(model, enlarge()?, weights, precision)?),
+        None => Box::new(RandomPolicy::new(u8::try_from(model.num_actions)?)),
+    };
     let mut history = Vec::new();
     for step in 0..steps {
-        world.observe(&mut frames);
-        stack.push(&frames, &first);
-        let mut moment = Moment {
-            states: vec![0; model.frame_len() * COPIES],
-            actions: vec![0; COPIES],
-            rewards: vec![0.0; COPIES],
-            ends: vec![StepEnd::Running; COPIES],
-        };
-        match &enlarge {
-            Some(enlarge) => enlarge.apply(stack.stacked(), &mut moment.states),
-            None => moment.states.copy_from_slice(stack.stacked()),
-        }
-        if let Some(policy) = &mut policy {
-            policy.greedy_actions(&moment.states, &mut moment.actions)?;
-        }
-        for action in &mut moment.actions {
-            if policy.is_none() || rng.random_bool(EPSILON) {
-                *action = rng.random_range(0..model.num_actions) as u8;
+        let seen = acting.step(&mut *policy, EPSILON)?;
+        let mut states = Vec::new();
+        match &enlarged {
+            _ if !wanted_at(step) => {}
+            None => states.extend_from_slice(seen.states),
+            Some(enlarge) => {
+                states.resize(model.frame_len() * COPIES, 0);
+                enlarge.apply(seen.states, &mut states);
             }
         }
-        world.step(&moment.actions, &mut moment.rewards, &mut moment.ends)?;
-        first = moment
-            .ends
-            .iter()
-            .map(|end| *end != StepEnd::Running)
-            .collect();
-        if !wanted_at(step) {
-            moment.states = Vec::new();
-        }
-        history.push(moment);
+        history.push(Moment {
+            states,
+            actions: seen.actions.to_vec(),
+            rewards: seen.rewards.to_vec(),
+            ends: seen.ends.to_vec(),
+        });
     }
     Ok(history)
 }
