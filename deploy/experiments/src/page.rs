@@ -7,7 +7,7 @@ use driml_machine::units::rough_duration;
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value};
 use serde::{Serialize, Serializer};
 
-use crate::stats::{Spread, difference, interval};
+use crate::stats::{Interval, Spread, difference, interval};
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
@@ -63,6 +63,17 @@ impl fmt::Display for Table {
 /// The cell of a number; empty in data where there is none.
 pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
+}
+
+/// Mean, low and high end as a file of data has them; empty where there is none.
+pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
+    let ends = of.and_then(|it| it.ends);
+    let numbers = [
+        of.map(|it| it.mean),
+        ends.map(|it| it.0),
+        ends.map(|it| it.1),
+    ];
+    numbers.map(|it| number(it, 4))
 }
 
 /// A cell of a page; a dash where there is nothing.

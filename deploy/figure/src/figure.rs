@@ -6,6 +6,7 @@ use crate::{
     canvas::{Anchor, Canvas, Rect, TextStyle},
     chart::Chart,
     colours::{CARD, CARD_BORDER, INK, INK_SOFT},
+    error::FigureError,
     font::{self, Weight},
     heat::Heat,
     lattice::Lattice,
@@ -44,36 +45,6 @@ pub struct Figure {
     pub panel_size: (f64, f64),
     /// The panels, row by row.
     pub panels: Vec<Panel>,
-}
-
-/// What kept a figure from its file.
-#[derive(Debug, thiserror::Error)]
-pub enum FigureError {
-    /// The name asks for no kind of picture that there is.
-    #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
-    Extension(PathBuf),
-    /// The name is no film's.
-    #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
-    NoFilm(PathBuf),
-    /// A picture or film of no area, or too large.
-    #[error("a picture of {width} x {height} pixels cannot be made")]
-    Size {
-        /// Pixels across.
-        width: usize,
-        /// Pixels down.
-        height: usize,
-    },
-    /// A picture cannot be encoded.
-    #[error("encoding a picture: {0}")]
-    Encode(String),
-    /// The file system refused.
-    #[error("writing {}", .path.display())]
-    Write {
-        /// The file that was to be written.
-        path: PathBuf,
-        /// What the file system said.
-        source: std::io::Error,
-    },
 }
 
 /// The kind of picture that a file's name asks for.

@@ -9,7 +9,7 @@ use std::{
 
 use gif::{Encoder, Frame, Repeat};
 
-use crate::{figure::FigureError, picture::Picture};
+use crate::{error::FigureError, picture::Picture};
 
 /// Hundredths of a second that viewers show a picture at least; some take less for none.
 const DELAY_MIN: u16 = 2;

@@ -33,6 +33,7 @@
 mod canvas;
 mod chart;
 mod colours;
+mod error;
 mod figure;
 mod film;
 mod font;
@@ -47,7 +48,8 @@ mod ticks;
 pub use crate::{
     chart::{Axis, Chart, Mark, Series},
     colours::{Colour, GREY},
-    figure::{Figure, FigureError, Format, Look, Panel},
+    error::FigureError,
+    figure::{Figure, Format, Look, Panel},
     film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,

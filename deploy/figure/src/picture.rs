@@ -6,7 +6,7 @@ use tiny_skia::{Pixmap, PremultipliedColorU8, Transform};
 use crate::{
     canvas::{Anchor, Point, Rect, Shape, Stroke, TextStyle},
     colours::{CARD, Colour, GREY, INK, INK_SOFT, NO_VALUE, heat_colour, series_colour},
-    figure::FigureError,
+    error::FigureError,
     font, png,
 };
 

@@ -8,7 +8,7 @@ use tiny_skia::{
 use super::{
     canvas::{Anchor, CARD_RADIUS, Canvas, DASH, Point, Rect, Shape, Stroke, TextStyle},
     colours::Colour,
-    figure::FigureError,
+    error::FigureError,
     font,
 };
 

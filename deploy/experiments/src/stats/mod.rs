@@ -9,8 +9,6 @@ use driml_launch::stats::{self, mean_and_deviation, student_quantile};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::page::number;
-
 /// Mean and standard deviation (n - 1) over seeds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Spread {
@@ -61,17 +59,6 @@ pub(crate) struct Interval {
     pub(crate) mean: f64,
     /// Both none for a single value: it does not tell how far others would spread.
     pub(crate) ends: Option<(f64, f64)>,
-}
-
-/// Mean, low and high end as a file of data has them; empty where there is none.
-pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
-    let ends = of.and_then(|it| it.ends);
-    let numbers = [
-        of.map(|it| it.mean),
-        ends.map(|it| it.0),
-        ends.map(|it| it.1),
-    ];
-    numbers.map(|it| number(it, 4))
 }
 
 /// Student's interval of the mean; none of no value.

@@ -13,6 +13,7 @@ use driml_learner::{
 use driml_model::{Features, Kernels, ModelConfig, Network, Parameters};
 use rand_chacha::ChaCha8Rng;
 
+/// The weights of a network that DIM trains, and how they are trained.
 pub(super) struct DimLearner {
     parameters: Parameters,
     pub(super) network: Network,

@@ -2,10 +2,7 @@
 
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
-use super::{
-    report::training_curves,
-    results::{FRAMES_PER_SECOND, Measure, PointResult, Results},
-};
+use super::results::{FRAMES_PER_SECOND, Measure, PointResult, Results};
 use crate::{plot::over_seeds, stats::Spread};
 
 /// Panels side by side.
@@ -110,7 +107,7 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
     for (dial, named) in by_dial(results) {
         let mut series = Vec::new();
         for (index, (name, point)) in named.enumerate() {
-            let curve = over_seeds(&training_curves(point)?);
+            let curve = over_seeds(&point.training_curves()?);
             series.push(curve.series(name, index));
         }
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));

@@ -12,9 +12,8 @@ use super::{
 };
 use crate::{
     cache::Session,
-    page::{Page, Table, Values, number},
-    plot::{Over, Run},
-    stats::{apart_by_chance, difference, interval, interval_cells},
+    page::{Page, Table, Values, interval_cells, number},
+    stats::{apart_by_chance, difference, interval},
 };
 
 /// What the bench and the errors against the reference give, as the data has it, and its decimals; none for `1.234e-5`.
@@ -159,8 +158,8 @@ impl EqualTime {
 fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
     let mut all = Vec::new();
     for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
-        let base = training_curves(results.at(&of.base))?;
-        let level = training_curves(results.at(&of.point))?;
+        let base = results.at(&of.base).training_curves()?;
+        let level = results.at(&of.point).training_curves()?;
         let ends = |curves: &[Vec<(f64, f64)>]| -> (Vec<f64>, Vec<f64>) {
             curves
                 .iter()
@@ -194,13 +193,6 @@ fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
         }
     }
     Ok(all)
-}
-
-/// Training return over seconds, of each run.
-pub(super) fn training_curves(point: &PointResult) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
-    let each = point.seeds.iter();
-    each.map(|it| Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?))
-        .collect()
 }
 
 /// The value at a time: the last one before it.

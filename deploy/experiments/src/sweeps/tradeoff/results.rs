@@ -11,6 +11,7 @@ use super::{
     speed::Speed,
 };
 use crate::{
+    plot::{Over, Run},
     stats::{Difference, Interval, Spread, difference, interval},
     sweep::{plan::FinishedRun, results::mean},
 };
@@ -108,6 +109,14 @@ impl PointResult {
     /// The mean over seeds, with its interval.
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
         interval(&self.values(measure))
+    }
+
+    /// Training return over seconds, of each run.
+    pub(super) fn training_curves(&self) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
+        let read = |it: &SeedResult| {
+            Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?)
+        };
+        self.seeds.iter().map(read).collect()
     }
 
     /// The bench and the errors by their names in the data.

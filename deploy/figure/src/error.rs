@@ -1,0 +1,33 @@
+//! What kept a figure, a picture or a film from its file.
+
+use std::path::PathBuf;
+
+/// What kept a figure from its file.
+#[derive(Debug, thiserror::Error)]
+pub enum FigureError {
+    /// The name asks for no kind of picture that there is.
+    #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
+    Extension(PathBuf),
+    /// The name is no film's.
+    #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
+    NoFilm(PathBuf),
+    /// A picture or film of no area, or too large.
+    #[error("a picture of {width} x {height} pixels cannot be made")]
+    Size {
+        /// Pixels across.
+        width: usize,
+        /// Pixels down.
+        height: usize,
+    },
+    /// A picture cannot be encoded.
+    #[error("encoding a picture: {0}")]
+    Encode(String),
+    /// The file system refused.
+    #[error("writing {}", .path.display())]
+    Write {
+        /// The file that was to be written.
+        path: PathBuf,
+        /// What the file system said.
+        source: std::io::Error,
+    },
+}
