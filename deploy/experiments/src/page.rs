@@ -293,7 +293,7 @@ mod tests {
             (
                 vec![1.0, 1.1, 1.2, 1.3],
                 "{{ it | minus(base) }}{{ it | verdict(base) }}",
-                "+1.13 [+0.94, +1.33], better than its base\n",
+                "+1.14 [+0.93, +1.34], better than its base\n",
             ),
             (
                 vec![-1.0, -1.1, -1.2, -1.3],
