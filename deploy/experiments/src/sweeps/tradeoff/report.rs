@@ -84,7 +84,7 @@ fn runs(results: &Results) -> Table {
 }
 
 fn levels(results: &Results) -> Table {
-    let mut columns = vec!["dial", "level", "base", "seeds"].join(",");
+    let mut columns = "dial,level,base,seeds".to_owned();
     for (name, _) in MEASURED {
         columns += &format!(",{name}");
     }

@@ -123,7 +123,7 @@ impl PointResult {
     pub(super) fn measured(&self) -> Map<String, Value> {
         let both = [
             serde_json::to_value(&self.speed),
-            serde_json::to_value(&self.exactness),
+            serde_json::to_value(self.exactness),
         ];
         let maps = both.into_iter().filter_map(|it| match it {
             Ok(Value::Object(map)) => Some(map),
