@@ -152,9 +152,6 @@ pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
 
 impl RunConfig {
     /// Bytes of a version of the weights as the learner publishes it.
-    ///
-    /// # Errors
-    /// A network that cannot be.
     pub fn weights_bytes(&self) -> driml_model::Result<usize> {
         let published = self.model.without_dim();
         published.weights_bytes(self.learner.publish_as)
@@ -168,9 +165,6 @@ impl RunConfig {
     }
 
     /// Reads resolved settings, as in a run folder's `config.toml`.
-    ///
-    /// # Errors
-    /// As [`resolve`](crate::resolve::resolve).
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
         let table: Table = text
             .parse()
@@ -189,9 +183,6 @@ impl RunConfig {
     }
 
     /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
-    ///
-    /// # Errors
-    /// None, of settings that were resolved.
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
         let text = self.to_toml();
         let mut table: Table = text.parse().map_err(|e| usage!("the settings: {e}"))?;

@@ -10,27 +10,22 @@ use toml::{Table, Value};
 
 use crate::overrides::inline;
 
+const BY_ENV: &str = "is chosen by --env";
+const FROM_FRAME: &str = "follows from the world and what model.conv reads";
+const FROM_ACTIONS: &str = "follows from the world and actor.actions";
+
 /// What follows, and from what.
 const FOLLOWS: [(&str, &str); 16] = [
-    ("run.world", "is chosen by --env"),
+    ("run.world", BY_ENV),
     ("run.agent", "is chosen by --agent"),
-    (
-        "run.frame_height",
-        "follows from the world and what model.conv reads",
-    ),
-    (
-        "run.frame_width",
-        "follows from the world and what model.conv reads",
-    ),
+    ("run.frame_height", FROM_FRAME),
+    ("run.frame_width", FROM_FRAME),
     ("run.frame_channels", "follows from the world"),
-    (
-        "run.num_actions",
-        "follows from the world and actor.actions",
-    ),
-    ("world.kind", "is chosen by --env"),
-    ("world.game", "is chosen by --env"),
-    ("world.command", "is chosen by --env"),
-    ("world.library", "is chosen by --env"),
+    ("run.num_actions", FROM_ACTIONS),
+    ("world.kind", BY_ENV),
+    ("world.game", BY_ENV),
+    ("world.command", BY_ENV),
+    ("world.library", BY_ENV),
     ("input.frame", "follows from the world"),
     (
         "model.height",
@@ -44,10 +39,7 @@ const FOLLOWS: [(&str, &str); 16] = [
         "model.channels",
         "follows from the world and run.frame_stack",
     ),
-    (
-        "model.num_actions",
-        "follows from the world and actor.actions",
-    ),
+    ("model.num_actions", FROM_ACTIONS),
     ("model.dim", "follows from learner.update"),
 ];
 
@@ -143,13 +135,9 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
     let frame = (shape.height, shape.width);
-    let mut read = InputRead {
-        input: (
-            whole_size(table, "input.height")?,
-            whole_size(table, "input.width")?,
-        ),
-        frame,
-    };
+    let side = |path| whole_size(table, path);
+    let input = (side("input.height")?, side("input.width")?);
+    let mut read = InputRead { input, frame };
     if find(table, FRAME).is_some() {
         let size = FrameSize {
             height: shape.height as u32,
@@ -263,7 +251,8 @@ pub(crate) fn check(read: &Table) -> Result<(), Usage> {
     Ok(())
 }
 
-fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
+/// The value at a dotted path.
+pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').unwrap_or((path, ""));
     let value = table.get(first)?;
     if rest.is_empty() {
@@ -274,7 +263,7 @@ fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
 }
 
 /// Writes a value, making the tables on the way; what is no table on the way stays, for its reader to refuse.
-fn put(table: &mut Table, path: &str, value: Value) {
+pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     match path.split_once('.') {
         None => {
             table.insert(path.into(), value);

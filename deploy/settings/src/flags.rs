@@ -41,9 +41,6 @@ pub struct RunFlags {
 }
 
 /// The settings that the flags ask for, and where they come from.
-///
-/// # Errors
-/// Flags or a file that cannot work.
 pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
     let (source, from) = match &args.config {
         Some(path) => {

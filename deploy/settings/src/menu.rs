@@ -11,7 +11,7 @@ use driml_machine::{
 use toml::{Table, Value};
 
 use crate::{
-    derived,
+    derived::{self, find},
     presets::{Agent, Layer, Only, PRESETS, Preset, agent, agents, layers, stack},
     resolve::{Flags, Source, resolve},
 };
@@ -42,12 +42,8 @@ pub fn menu() -> Result<String, Usage> {
     let presets = PRESETS.iter().map(|preset| (preset.name, preset.about));
     let agents = agents();
     let agents = agents.iter().map(|agent| (agent.name, agent.about));
-    let width = presets
-        .clone()
-        .chain(agents.clone())
-        .map(|(name, _)| name.len())
-        .max()
-        .unwrap_or(0);
+    let names = presets.clone().chain(agents.clone());
+    let width = names.map(|(name, _)| name.len()).max().unwrap_or(0);
     let line = |(name, about)| format!("{name:width$}  {about}\n");
     let presets: String = presets.map(line).collect();
     let agents: String = agents.map(line).collect();
@@ -60,18 +56,10 @@ pub fn menu() -> Result<String, Usage> {
     for world in WorldName::all() {
         let of = |name: &str| layers(&PRESETS[0], world, agent(name)?);
         let (fix, noact) = (of("driml-fix")?, of("driml-noact")?);
-        text += &format!(
-            "{:18}  k = {:<5}  {:9}  k = {:<7}  {}\n",
-            world.to_string(),
-            k(&fix),
-            if find(&fix, "learner.augment").is_some() {
-                "yes"
-            } else {
-                "-"
-            },
-            k(&noact),
-            lambdas(&fix),
-        );
+        let augments = find(&fix, "learner.augment").map_or("-", |_| "yes");
+        let (world, fix_k, noact_k, lambdas) =
+            (world.to_string(), k(&fix), k(&noact), lambdas(&fix));
+        text += &format!("{world:18}  k = {fix_k:<5}  {augments:9}  k = {noact_k:<7}  {lambdas}\n");
     }
     text += "\noff in every preset\n";
     text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  fixed epsilons from actor to actor smaller, as Ape-X has them\n";
@@ -94,16 +82,6 @@ fn lambdas(table: &Table) -> String {
         .map(|(pair, value)| format!("{pair} {value}"))
         .collect();
     texts.join(", ")
-}
-
-fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
-    let (first, rest) = path.split_once('.').unwrap_or((path, ""));
-    let value = table.get(first)?;
-    if rest.is_empty() {
-        Some(value)
-    } else {
-        find(value.as_table()?, rest)
-    }
 }
 
 /// The resolved settings, each with its source.
@@ -197,8 +175,7 @@ fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, Strin
     note(everywhere, "");
     for block in parts {
         let read = toml::from_str::<Only>(block);
-        let here = |only: &Only| only.worlds.iter().any(|name| name == world);
-        if read.is_ok_and(|only| here(&only)) {
+        if read.is_ok_and(|only| only.is_for(world)) {
             note(block, ", by world");
         }
     }
@@ -254,21 +231,15 @@ mod tests {
     fn a_game_s_own_choice_is_named_as_such() {
         let world = "procgen:bigfish".parse().unwrap();
         let text = sourced(&PRESETS[0], world, agent("driml-fix").unwrap()).unwrap();
-        let k = text
-            .lines()
-            .find(|line| line.starts_with("horizon"))
-            .unwrap();
+        let mut lines = text.lines();
+        let horizon = lines.find(|line| line.starts_with("horizon")).unwrap();
         assert!(
-            k.contains("k = 5") && k.ends_with("# paper [agent/driml-fix, by world]"),
-            "{k}"
+            horizon.contains("k = 5") && horizon.ends_with("# paper [agent/driml-fix, by world]"),
+            "{horizon}"
         );
         assert!(text.contains("augment = "), "{text}");
         let again: Table = text.parse().unwrap();
-        assert_eq!(k_of(&again), Some(5));
-    }
-
-    fn k_of(table: &Table) -> Option<i64> {
-        find(table, "run.horizon.k")?.as_integer()
+        assert_eq!(k(&again), "5");
     }
 
     #[test]
@@ -276,28 +247,18 @@ mod tests {
         let text = "# of the file\n\n[a]\nx = 1   # one\ny = 2   # two,\n        # and more\n# above\nz = 3\n";
         let found = comments(text);
         let expected = [("a.x", "one"), ("a.y", "two, and more"), ("a.z", "above")];
-        assert_eq!(
-            found,
-            expected.map(|(path, comment)| (path.into(), comment.into()))
-        );
+        let expected = expected.map(|(path, comment)| (path.into(), comment.into()));
+        assert_eq!(found, expected);
     }
 
     #[test]
     fn the_menu_shows_what_differs_by_game() {
         let text = menu().unwrap();
-        let line = |name: &str| {
-            text.lines()
-                .find(|line| line.starts_with(name))
-                .unwrap()
-                .to_owned()
-        };
-        assert_eq!(
-            line("procgen:bigfish"),
-            "procgen:bigfish     k = 5      yes        k = 1        4t4 1.0"
-        );
-        assert_eq!(
-            line("mspacman"),
-            "mspacman            k = 1      -          k = 1        3t3 1.0, 4t4 1.0"
-        );
+        for line in [
+            "procgen:bigfish     k = 5      yes        k = 1        4t4 1.0",
+            "mspacman            k = 1      -          k = 1        3t3 1.0, 4t4 1.0",
+        ] {
+            assert!(text.lines().any(|it| it == line), "{text}");
+        }
     }
 }

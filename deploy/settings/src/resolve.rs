@@ -82,16 +82,17 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     };
     let sized_by_machine = matches!(source, Source::Layers(..));
     if sized_by_machine {
-        fill(&mut table, "local", "actors", machine.actors());
-        fill(
-            &mut table,
-            "local",
-            "learner_threads",
-            machine.learner_threads(),
-        );
-        fill(&mut table, "local", "learner_device", "cpu");
-        fill(&mut table, "actor", "envs", machine.envs());
-        fill(&mut table, "actor", "world_threads", 0);
+        for (path, value) in [
+            ("local.actors", Value::from(machine.actors())),
+            ("local.learner_threads", machine.learner_threads().into()),
+            ("local.learner_device", "cpu".into()),
+            ("actor.envs", machine.envs().into()),
+            ("actor.world_threads", 0.into()),
+        ] {
+            if derived::find(&table, path).is_none() {
+                derived::put(&mut table, path, value);
+            }
+        }
     }
     let by_flag = [
         ("local.actors", flags.actors.map(u64::from)),
@@ -141,15 +142,6 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
         *table = tried;
     }
     Ok(capacity_set)
-}
-
-fn fill(table: &mut Table, name: &str, key: &str, value: impl Into<Value>) {
-    let inner = table
-        .entry(name)
-        .or_insert_with(|| Value::Table(Table::new()));
-    if let Some(inner) = inner.as_table_mut() {
-        inner.entry(key).or_insert(value.into());
-    }
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use expect_test::expect_file;
 use toml::{Table, Value};
 
 use super::{AGENTS, BASE, Layer, PRESETS, world_layer};
-use crate::menu::comments;
+use crate::{derived::find, menu::comments, overrides::leaves};
 
 const LEFT_OUT: [&str; 2] = ["world/chain", "variant/smoke"];
 
@@ -39,27 +39,14 @@ fn all_layers() -> BTreeMap<&'static str, Layer> {
         .collect()
 }
 
-/// The settings of a table by their dotted paths, which begin with `before`.
-fn leaves(table: &Table, before: &str, found: &mut BTreeMap<String, Value>) {
-    for (key, value) in table {
-        let path = format!("{before}{key}");
-        match value {
-            Value::Table(inner) => leaves(inner, &format!("{path}."), found),
-            other => drop(found.insert(path, other.clone())),
-        }
-    }
-}
-
 /// What each part of a layer sets: what holds everywhere, then each `[[only]]` block.
 fn parts(layer: &Layer) -> Vec<BTreeMap<String, Value>> {
     let (everywhere, blocks) = layer.read();
-    let tables = [everywhere]
-        .into_iter()
-        .chain(blocks.into_iter().map(|it| it.set));
+    let tables = std::iter::once(everywhere).chain(blocks.into_iter().map(|it| it.set));
     let part = |table: Table| {
-        let mut found = BTreeMap::new();
-        leaves(&table, "", &mut found);
-        found
+        let paths = leaves(&table).into_iter();
+        let setting = |path: String| find(&table, &path).cloned().map(|value| (path, value));
+        paths.filter_map(setting).collect()
     };
     tables.map(part).collect()
 }
