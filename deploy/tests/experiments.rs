@@ -13,19 +13,28 @@ use std::{
 
 use driml_protocol::fault;
 
-fn driml(folder: &Path, args: &[&str]) -> Output {
+/// Calls the program with these words.
+fn driml(folder: &Path, call: &str) -> Output {
     Command::new(env!("CARGO_BIN_EXE_driml"))
-        .args(args)
+        .args(call.split_whitespace())
         .current_dir(folder)
         .env_remove("DRIML_LOG")
         .output()
         .unwrap()
 }
 
-fn run(folder: &Path, args: &[&str]) -> String {
-    let output = driml(folder, args);
-    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(0), "{args:?}: {stderr}");
+/// What a call says on stderr that ends with this exit code.
+fn said(folder: &Path, call: &str, code: i32) -> String {
+    let output = driml(folder, call);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{call}: {said}");
+    said
+}
+
+fn run(folder: &Path, call: &str) -> String {
+    let output = driml(folder, call);
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{call}: {stderr}");
     String::from_utf8(output.stdout).unwrap()
 }
 
@@ -42,9 +51,23 @@ fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
         .collect()
 }
 
-fn check(name: &str, files: &[&str]) {
+fn names(files: &BTreeMap<String, Vec<u8>>) -> String {
+    files
+        .keys()
+        .map(String::as_str)
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+/// Lines of a CSV file without its header.
+fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
+    String::from_utf8_lossy(&files[name]).lines().count() - 1
+}
+
+fn check(name: &str, files: &str) {
     let root = tempfile::tempdir().unwrap();
-    let printed = run(root.path(), &["experiment", name, "--smoke"]);
+    let call = format!("experiment {name} --smoke");
+    let printed = run(root.path(), &call);
     let folder = root.path().join("experiments").join(name);
     assert!(printed.ends_with("README.md\n"), "{printed}");
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
@@ -60,7 +83,7 @@ fn check(name: &str, files: &[&str]) {
         assert!(page.contains(part), "{part}\n{page}");
     }
     let first = data(&folder);
-    assert_eq!(first.keys().collect::<Vec<_>>(), files, "{name}");
+    assert_eq!(names(&first), files, "{name}");
     for (file, bytes) in &first {
         assert!(bytes.len() > 50, "{file} is all but empty");
         // What is refused is said with its value.
@@ -69,10 +92,7 @@ fn check(name: &str, files: &[&str]) {
     }
 
     // Elsewhere: the same bytes. Again, with one piece lost: that one is made anew, to the same bytes.
-    run(
-        root.path(),
-        &["experiment", name, "--smoke", "--out", "other"],
-    );
+    run(root.path(), &format!("{call} --out other"));
     assert_eq!(data(&root.path().join("other")), first);
     let mut pieces: Vec<_> = fs::read_dir(folder.join("pieces"))
         .unwrap()
@@ -81,17 +101,12 @@ fn check(name: &str, files: &[&str]) {
         .collect();
     pieces.sort();
     fs::remove_file(&pieces[0]).unwrap();
-    run(root.path(), &["experiment", name, "--smoke"]);
+    run(root.path(), &call);
     assert_eq!(data(&folder), first);
 
     // More seeds are more pieces of the same grid; the full length is another grid.
-    run(
-        root.path(),
-        &["experiment", name, "--smoke", "--seeds", "3"],
-    );
-    let refused = driml(root.path(), &["experiment", name]);
-    let said = String::from_utf8(refused.stderr).unwrap();
-    assert_eq!(refused.status.code(), Some(64), "{said}");
+    run(root.path(), &format!("{call} --seeds 3"));
+    let said = said(root.path(), &format!("experiment {name}"), 64);
     assert!(said.contains("made with other settings"), "{said}");
 }
 
@@ -99,16 +114,7 @@ fn check(name: &str, files: &[&str]) {
 fn random_walk() {
     check(
         "random-walk",
-        &[
-            "alpha.csv",
-            "convergence.csv",
-            "convergence.png",
-            "convergence.svg",
-            "curves.csv",
-            "fig1.png",
-            "fig1.svg",
-            "ratio.csv",
-        ],
+        "alpha.csv convergence.csv convergence.png convergence.svg curves.csv fig1.png fig1.svg ratio.csv",
     );
 }
 
@@ -116,29 +122,18 @@ fn random_walk() {
 fn ising() {
     check(
         "ising",
-        &[
-            "auc.csv",
-            "fig2.png",
-            "fig2.svg",
-            "learning.png",
-            "learning.svg",
-            "loss.csv",
-            "maps.csv",
-        ],
+        "auc.csv fig2.png fig2.svg learning.png learning.svg loss.csv maps.csv",
     );
 }
 
 /// Every routine keeps what it promises here too, in whatever build this is, or the command would have failed.
 #[test]
 fn stability() {
-    check(
-        "stability",
-        &["promises.csv", "refused.csv", "worst.png", "worst.svg"],
-    );
+    check("stability", "promises.csv refused.csv worst.png worst.svg");
 }
 
 /// The parts of a page, and the files beside it.
-fn check_page(folder: &Path, files: &[&str]) -> String {
+fn check_page(folder: &Path, files: &str) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     for part in [
         "smoke length",
@@ -151,7 +146,7 @@ fn check_page(folder: &Path, files: &[&str]) -> String {
         assert!(page.contains(part), "{part}\n{page}");
     }
     let found = data(folder);
-    assert_eq!(found.keys().collect::<Vec<_>>(), files);
+    assert_eq!(names(&found), files);
     for (file, bytes) in &found {
         let text = String::from_utf8_lossy(bytes);
         assert!(bytes.len() > 20 && !text.contains("NaN"), "{file}");
@@ -163,11 +158,11 @@ fn check_page(folder: &Path, files: &[&str]) -> String {
 #[test]
 fn procgen_without_the_engine() {
     let root = tempfile::tempdir().unwrap();
-    let args = ["experiment", "procgen", "--smoke"];
-    run(root.path(), &args);
+    let call = "experiment procgen --smoke";
+    run(root.path(), call);
     let folder = root.path().join("experiments/procgen");
-    let files = ["curves.png", "curves.svg", "table.csv"];
-    let page = check_page(&folder, &files);
+    let files = "curves.png curves.svg table.csv";
+    let page = check_page(&folder, files);
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data(&folder);
@@ -188,7 +183,7 @@ fn procgen_without_the_engine() {
     assert!(!page.contains("Interquartile"), "of two seeds: {page}");
 
     // Nothing is run again, and the same runs give the same files.
-    run(root.path(), &args);
+    run(root.path(), call);
     assert_eq!(data(&folder), first);
 
     // A run that failed is moved aside and made anew, and played anew; the others stay. What was played before is made recognisable.
@@ -206,9 +201,7 @@ fn procgen_without_the_engine() {
     fs::write(summary("chain-c51-seed2"), failed).unwrap();
     // Runs of programs that did not note their commit are adopted.
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
-    let output = driml(root.path(), &args);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(0), "{said}");
+    let said = said(root.path(), call, 0);
     assert!(said.contains("chain-c51-seed2 was not finished"), "{said}");
     assert!(summary("chain-c51-seed2.unfinished-1").exists());
     let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
@@ -227,16 +220,15 @@ fn procgen_without_the_engine() {
     assert!(line("chain", "c51", "1").ends_with(','), "no commit");
 
     // More agents can be added; another length cannot.
-    let report = ["--agents", "c51,cpc", "--report"];
-    run(root.path(), &[&args[..], &report].concat());
+    run(root.path(), &format!("{call} --agents c51,cpc --report"));
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     assert!(page.contains("Not finished: chain-cpc-seed1"), "{page}");
-    let refused = driml(root.path(), &[&args[..], &["--frames", "900"]].concat());
+    let refused = driml(root.path(), &format!("{call} --frames 900"));
     assert_eq!(refused.status.code(), Some(64));
 
     // Runs that lie there beside their calls, and nothing else, are reported.
     fs::remove_dir_all(&pieces).unwrap();
-    run(root.path(), &[&args[..], &["--report"]].concat());
+    run(root.path(), &format!("{call} --report"));
     let table = String::from_utf8(data(&folder)["table.csv"].clone()).unwrap();
     assert!(
         table.lines().count() == 9 && !table.contains(",777.0000,"),
@@ -247,17 +239,10 @@ fn procgen_without_the_engine() {
 #[test]
 fn pacman() {
     let root = tempfile::tempdir().unwrap();
-    run(root.path(), &["experiment", "pacman", "--smoke"]);
+    run(root.path(), "experiment pacman --smoke");
     let folder = root.path().join("experiments/pacman");
-    let files = [
-        "fig3.png",
-        "fig3.svg",
-        "final_loss.csv",
-        "ghosts.csv",
-        "loss.csv",
-        "noise.csv",
-    ];
-    check_page(&folder, &files);
+    let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
+    check_page(&folder, files);
     let config = |name: &str| {
         let path = folder.join("runs").join(name).join("config.toml");
         fs::read_to_string(path).unwrap()
@@ -276,13 +261,12 @@ fn pacman() {
 #[test]
 fn tradeoff() {
     let root = tempfile::tempdir().unwrap();
-    let call = |more: &[&str]| {
-        let args = ["tradeoff", "--env", "chain", "--smoke", "--out", "t"];
-        run(root.path(), &[&args[..], more].concat())
+    let call = |more: &str| {
+        let call = format!("tradeoff --env chain --smoke --out t {more}");
+        run(root.path(), &call)
     };
     let folder = root.path().join("t");
-    let precision = ["--dials", "learner.precision"];
-    let planned = call(&[&precision[..], &["--plan"]].concat());
+    let planned = call("--dials learner.precision --plan");
     assert!(
         planned.contains("level       learner.precision = bf16: about"),
         "{planned}"
@@ -292,40 +276,23 @@ fn tradeoff() {
         "a plan runs nothing"
     );
 
-    call(&precision);
+    call("--dials learner.precision");
     let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
     let first = summary("c51-seed1").unwrap();
-    let planned = call(&[
-        "--dials",
-        "learner.precision,DIM",
-        "--plan",
-        "--budget",
-        "0",
-    ]);
+    let planned = call("--dials learner.precision,DIM --plan --budget 0");
     assert!(
         planned.contains("learner.precision = bf16: finished\n")
             && planned.contains("DIM = driml-fix: does not fit"),
         "{planned}"
     );
-    call(&["--dials", "DIM"]);
+    call("--dials DIM");
     assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
     let files = data(&folder);
-    let names = [
-        "equal_time.csv",
-        "levels.csv",
-        "pareto.png",
-        "pareto.svg",
-        "pareto_training.png",
-        "pareto_training.svg",
-        "runs.csv",
-        "wall.png",
-        "wall.svg",
-    ];
-    assert_eq!(files.keys().collect::<Vec<_>>(), names);
-    let rows = |name: &str| String::from_utf8_lossy(&files[name]).lines().count() - 1;
+    let all = "equal_time.csv levels.csv pareto.png pareto.svg pareto_training.png pareto_training.svg runs.csv wall.png wall.svg";
+    assert_eq!(names(&files), all);
     // Of the base two seeds, of each level one; each dial's base has a row of its own.
-    assert_eq!((rows("levels.csv"), rows("runs.csv")), (2 + 3, 2 + 3));
-    assert_eq!(rows("equal_time.csv"), 2);
+    let counts = ["levels.csv", "runs.csv", "equal_time.csv"].map(|name| rows(&files, name));
+    assert_eq!(counts, [2 + 3, 2 + 3, 2]);
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     for part in [
         "smoke length",
@@ -338,7 +305,7 @@ fn tradeoff() {
     ] {
         assert!(page.contains(part), "{part}\n{page}");
     }
-    let again = call(&["--report"]);
+    let again = call("--report");
     assert!(
         again.contains("learner.precision = bf16 (c51): x"),
         "{again}"
@@ -346,17 +313,12 @@ fn tradeoff() {
     assert_eq!(data(&folder), files);
 
     // Seeds of another call are on the page, and a report of one dial has that alone.
-    call(&[&precision[..], &["--seeds", "2"]].concat());
-    call(&["--report"]);
-    let rows = |name: &str| {
-        String::from_utf8_lossy(&data(&folder)[name])
-            .lines()
-            .count()
-            - 1
-    };
-    assert_eq!((rows("levels.csv"), rows("runs.csv")), (2 + 3, 4 + 4));
-    call(&[&precision[..], &["--report"]].concat());
-    assert_eq!(rows("levels.csv"), 2);
+    call("--dials learner.precision --seeds 2");
+    call("--report");
+    let counts = ["levels.csv", "runs.csv"].map(|name| rows(&data(&folder), name));
+    assert_eq!(counts, [2 + 3, 4 + 4]);
+    call("--dials learner.precision --report");
+    assert_eq!(rows(&data(&folder), "levels.csv"), 2);
 }
 
 /// A killed experiment takes its runs with it, and resumes at the next call.
@@ -364,18 +326,10 @@ fn tradeoff() {
 fn killed_and_resumed() {
     let root = tempfile::tempdir().unwrap();
     let go = root.path().join("go");
-    let mut args = vec![
-        "experiment",
-        "procgen",
-        "--smoke",
-        "--games",
-        "mspacman",
-        "--agents",
-        "c51",
-    ];
-    args.extend(["--seeds", "1", "--out", "x", "--frames", "20000"]);
+    let call =
+        "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 20000";
     let mut child = Command::new(env!("CARGO_BIN_EXE_driml"))
-        .args(&args)
+        .args(call.split(' '))
         .current_dir(root.path())
         // Its run is not over before it is killed.
         .env(fault::HOLD, format!("100 {}", go.display()))
@@ -395,9 +349,7 @@ fn killed_and_resumed() {
     child.kill().unwrap();
     fs::write(&go, "").unwrap();
     child.wait().unwrap();
-    let output = driml(root.path(), &args);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(0), "{said}");
+    let said = said(root.path(), call, 0);
     assert!(
         said.contains("mspacman-c51-seed1 resumes from its checkpoint"),
         "{said}"
@@ -414,90 +366,41 @@ fn killed_and_resumed() {
 #[test]
 fn an_experiment_that_is_not_there() {
     let root = tempfile::tempdir().unwrap();
-    for args in [
-        &["experiment"][..],
-        &["experiment", "walk"],
-        &["experiment", "ising", "--seeds", "0"],
-        &["experiment", "procgen", "--games", "pong"],
-        &["experiment", "procgen", "--agents", "dqn"],
-        &[
-            "experiment",
-            "procgen",
-            "--smoke",
-            "--games",
-            "chain",
-            "--set",
-            "run.gamma=2",
-        ],
-        &[
-            "experiment",
-            "procgen",
-            "--smoke",
-            "--report",
-            "--out",
-            "none",
-        ],
-        &["experiment", "pacman", "--episodes-per-task", "33"],
+    for call in [
+        "experiment",
+        "experiment walk",
+        "experiment ising --seeds 0",
+        "experiment procgen --games pong",
+        "experiment procgen --agents dqn",
+        "experiment procgen --smoke --games chain --set run.gamma=2",
+        "experiment procgen --smoke --report --out none",
+        "experiment pacman --episodes-per-task 33",
     ] {
-        assert_eq!(driml(root.path(), args).status.code(), Some(64), "{args:?}");
+        said(root.path(), call, 64);
     }
     // A file where the folder should be.
     fs::write(root.path().join("file"), "").unwrap();
-    let args = ["experiment", "random-walk", "--smoke", "--out", "file"];
-    let output = driml(root.path(), &args);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{said}");
+    let said = said(root.path(), "experiment random-walk --smoke --out file", 1);
     assert!(said.contains("making file/pieces"), "{said}");
 }
 
 #[test]
 fn a_grid_makes_every_combination_once() {
     let root = tempfile::tempdir().unwrap();
-    let fixed = [
-        "grid",
-        "--env",
-        "chain",
-        "--agent",
-        "c51,driml-ada",
-        "--preset",
-        "smoke",
-    ];
-    let sets = [
-        "--frames",
-        "320",
-        "--set",
-        "learner.update.adam.lr=1e-4,1e-3",
-    ];
-    fn call<'a>(parts: [&[&'a str]; 3]) -> Vec<&'a str> {
-        parts.concat()
-    }
-    let said = |args: &[&str]| {
-        let output = driml(root.path(), args);
-        (
-            output.status.code(),
-            String::from_utf8(output.stderr).unwrap(),
-        )
+    let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
+    let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
+    let refused = |call: &str, parts: &[&str]| {
+        let text = said(root.path(), call, 64);
+        assert!(parts.iter().all(|it| text.contains(it)), "{text}");
     };
     // What cannot work is said before anything starts.
-    let (code, text) = said(&[&fixed[..], &["--set", "learner.update.adam.lr=1e-4,fast"]].concat());
-    assert_eq!(code, Some(64));
-    assert!(
-        text.contains("agent=c51") && text.contains("lr=fast"),
-        "{text}"
-    );
-    let (code, text) = said(&call([
-        &fixed,
-        &sets,
-        &["--set", "learner.update.adam.lr=1"],
-    ]));
-    assert!(code == Some(64) && text.contains("is set twice"), "{text}");
-    let (code, text) = said(&call([&fixed, &sets, &["--report"]]));
-    assert!(
-        code == Some(64) && text.contains("there is nothing to report"),
-        "{text}"
-    );
+    let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");
+    refused(&unfit, &["agent=c51", "lr=fast"]);
+    let twice = format!("{call} --set learner.update.adam.lr=1");
+    refused(&twice, &["is set twice"]);
+    refused(&format!("{call} --report"), &["there is nothing to report"]);
 
-    let printed = run(root.path(), &call([&fixed, &sets, &["--jobs", "2"]]));
+    let printed = run(root.path(), &format!("{call} --jobs 2"));
     let folder = root.path().join("experiments/grid");
     assert!(printed.ends_with("grid.svg\n"), "{printed}");
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
@@ -527,10 +430,7 @@ fn a_grid_makes_every_combination_once() {
             .unwrap()
     };
     let before = made("1-c51-lr=1e-4-seed1/summary.json");
-    run(
-        root.path(),
-        &call([&fixed, &sets, &["--seeds", "2", "--jobs", "2"]]),
-    );
+    run(root.path(), &format!("{call} --seeds 2 --jobs 2"));
     assert_eq!(made("1-c51-lr=1e-4-seed1/summary.json"), before);
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
     assert!(
@@ -541,9 +441,5 @@ fn a_grid_makes_every_combination_once() {
         "{table}"
     );
     // Another grid does not mix with it.
-    let (code, text) = said(&[&fixed[..], &["--frames", "352"]].concat());
-    assert!(
-        code == Some(64) && text.contains("other settings"),
-        "{text}"
-    );
+    refused(&format!("{fixed} --frames 352"), &["other settings"]);
 }
