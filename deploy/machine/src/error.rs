@@ -30,10 +30,8 @@ pub struct Interrupted;
 /// ` (did you mean "..."?)` with the candidate most like `name`, or nothing if none is near.
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> String {
     let distance = |candidate: &str| strsim::levenshtein(name, candidate);
-    match candidates
-        .into_iter()
-        .min_by_key(|candidate| distance(candidate))
-    {
+    let nearest = candidates.into_iter().min_by_key(|it| distance(it));
+    match nearest {
         Some(best) if distance(best) <= 1 + name.len() / 4 => format!(" (did you mean {best:?}?)"),
         _ => String::new(),
     }
@@ -45,10 +43,8 @@ mod tests {
 
     #[test]
     fn near_names_are_offered_and_far_ones_are_not() {
-        assert_eq!(
-            nearest("drimlada", ["c51", "driml-ada"]),
-            " (did you mean \"driml-ada\"?)"
-        );
+        let found = nearest("drimlada", ["c51", "driml-ada"]);
+        assert_eq!(found, " (did you mean \"driml-ada\"?)");
         assert_eq!(nearest("zzz", ["c51", "driml-ada"]), "");
         assert_eq!(nearest("zzz", []), "");
     }

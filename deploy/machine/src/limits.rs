@@ -9,7 +9,7 @@ use nix::{
     sys::resource::{Resource, getrlimit, setrlimit},
 };
 
-use crate::resources::Machine;
+use crate::{resources::Machine, units::kib};
 
 /// Open files that a library may want at once, to connect or to share memory: with fewer left, they are scarce.
 const FILES_SPARE: u64 = 8;
@@ -46,7 +46,8 @@ pub fn check_open_files(needed: u64, whose: &str) -> Result<(), String> {
 
 /// What this process has nearly used up of what the system grants it, with how much there is and what to do.
 pub fn scarce() -> Vec<String> {
-    let all = [
+    type Look = fn() -> Option<String>;
+    let all: [Look; 5] = [
         open_files,
         shared_memory,
         locked_memory,
@@ -102,12 +103,6 @@ fn memory() -> Option<String> {
     (free < MEMORY_SPARE).then(|| format!("{} MiB of memory are free", free >> 20))
 }
 
-/// The number of KiB that stands behind `name` in one of the kernel's tables.
-fn kib(table: &str, name: &str) -> Option<u64> {
-    let line = table.lines().find_map(|line| line.strip_prefix(name))?;
-    line.trim().strip_suffix("kB")?.trim().parse().ok()
-}
-
 #[cfg(test)]
 mod tests {
     use std::{fs::File, os::unix::process::CommandExt, process::Command};
@@ -150,12 +145,5 @@ mod tests {
             .output()
             .unwrap();
         assert!(ended.status.success(), "{ended:?}");
-    }
-
-    #[test]
-    fn what_is_locked_is_read_from_the_kernels_table() {
-        let status = "Name:\tdriml\nVmLck:\t    2048 kB\n";
-        assert_eq!(kib(status, "VmLck:"), Some(2048));
-        assert_eq!(kib("Name:\tdriml\n", "VmLck:"), None);
     }
 }

@@ -38,9 +38,6 @@ pub fn settle(purpose: Purpose) -> io::Result<()> {
 
 /// Starts this program again, in the same process and with the same arguments, with these variables too. It returns only if that
 /// fails.
-///
-/// # Errors
-/// The program cannot be started again.
 pub fn start_again_with<'a>(
     variables: impl IntoIterator<Item = (&'a str, &'a str)>,
 ) -> io::Result<()> {

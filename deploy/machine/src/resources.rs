@@ -5,6 +5,8 @@ use std::fs;
 
 use serde::{Deserialize, Serialize};
 
+use crate::units::kib;
+
 /// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
 const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
@@ -129,15 +131,14 @@ pub fn processor() -> String {
 /// The processor's name in the kernel's table.
 fn processor_in(cpuinfo: &str) -> Option<&str> {
     let mut lines = cpuinfo.lines();
-    let (_, name) = lines
-        .find(|line| line.starts_with("model name"))?
-        .split_once(':')?;
+    let line = lines.find(|line| line.starts_with("model name"))?;
+    let (_, name) = line.split_once(':')?;
     Some(name.trim())
 }
 
 /// The kernel's estimate of available memory, or what the control group leaves, if that is less.
 fn free_memory_bytes() -> Option<u64> {
-    let system = meminfo_available(&fs::read_to_string("/proc/meminfo").ok()?)?;
+    let system = kib(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:")? << 10;
     let number = |path: &str| fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))
@@ -145,24 +146,12 @@ fn free_memory_bytes() -> Option<u64> {
     Some(group.map_or(system, |group| group.min(system)))
 }
 
-fn meminfo_available(text: &str) -> Option<u64> {
-    let line = text
-        .lines()
-        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
-    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    Some(kib * 1024)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn available_memory_is_read_from_the_kernels_table() {
-        let text =
-            "MemTotal:       24600000 kB\nMemFree:        1000 kB\nMemAvailable:    2000 kB\n";
-        assert_eq!(meminfo_available(text), Some(2000 * 1024));
-        assert_eq!(meminfo_available("MemTotal: 1 kB"), None);
+    fn the_load_is_read_from_the_kernels_table() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
     }
 

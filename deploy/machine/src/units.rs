@@ -29,6 +29,12 @@ pub fn gib(bytes: u64) -> String {
     format!("{:.1} GiB", bytes as f64 / f64::from(1 << 30))
 }
 
+/// The number of KiB that stands behind `name` in one of the kernel's tables.
+pub fn kib(table: &str, name: &str) -> Option<u64> {
+    let line = table.lines().find_map(|line| line.strip_prefix(name))?;
+    line.trim().strip_suffix("kB")?.trim().parse().ok()
+}
+
 /// A number with three digits that matter, and all those before the point.
 pub fn number(value: f64) -> String {
     match value.abs() {
@@ -64,5 +70,12 @@ mod tests {
     #[test]
     fn sizes_have_one_decimal() {
         assert_eq!(gib(3 << 29), "1.5 GiB");
+    }
+
+    #[test]
+    fn memory_is_read_from_the_kernel_s_tables() {
+        let table = "MemFree:        1000 kB\nVmLck:\t    2048 kB\n";
+        assert_eq!(kib(table, "VmLck:"), Some(2048));
+        assert_eq!(kib(table, "VmRSS:"), None);
     }
 }

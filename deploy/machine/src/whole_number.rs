@@ -20,15 +20,13 @@ pub fn read(text: &str) -> Result<u64, String> {
     let exponent: usize = exponent.parse().map_err(|_| none())?;
     let zeros = exponent.checked_sub(part.len()).ok_or_else(none)?;
     // No number of 64 bits has more digits.
-    let zeros = if digits.bytes().all(|it| it == b'0') {
-        0
-    } else {
-        zeros.min(20)
+    let zeros = match digits.bytes().all(|it| it == b'0') {
+        true => 0,
+        false => zeros.min(20),
     };
     let digits = digits + &"0".repeat(zeros);
-    digits
-        .parse()
-        .map_err(|_| format!("{text} is more than {}", u64::MAX))
+    let number = digits.parse();
+    number.map_err(|_| format!("{text} is more than {}", u64::MAX))
 }
 
 /// A flag's parser of whole numbers in `range`.
@@ -37,14 +35,10 @@ pub fn within(
 ) -> impl Fn(&str) -> Result<u64, String> + Clone + Send + Sync + 'static {
     move |text| {
         let number = read(text)?;
-        if range.contains(&number) {
-            Ok(number)
-        } else {
-            Err(format!(
-                "{number} is not in {}..={}",
-                range.start(),
-                range.end()
-            ))
+        let (least, most) = (range.start(), range.end());
+        match range.contains(&number) {
+            true => Ok(number),
+            false => Err(format!("{number} is not in {least}..={most}")),
         }
     }
 }

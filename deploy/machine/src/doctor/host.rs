@@ -115,40 +115,34 @@ fn memory(machine: &Machine) -> Fact {
         gib(replay),
         (replay / FRAME_BYTES) as f64 / 1e6
     );
-    if free < MEMORY_MIN {
-        Fact::missing(
-            "memory",
-            format!("{text}: a run needs {} at least", gib(MEMORY_MIN)),
-        )
-    } else if free < MEMORY_ENOUGH {
-        Fact::note(
-            "memory",
-            format!("{text}; --set replay.compression=lz4 makes more fit"),
-        )
-    } else {
-        Fact::ok("memory", text)
-    }
+    let (state, more) = match free {
+        ..MEMORY_MIN => {
+            let least = format!(": a run needs {} at least", gib(MEMORY_MIN));
+            (State::Missing, least)
+        }
+        MEMORY_MIN..MEMORY_ENOUGH => {
+            let packed = "; --set replay.compression=lz4 makes more fit";
+            (State::Note, packed.to_owned())
+        }
+        _ => (State::Ok, String::new()),
+    };
+    Fact::new(state, "memory", text + &more)
 }
 
 fn shared_memory(free: Result<u64, String>) -> Fact {
     let (what, folder) = ("shared memory", shared_memory::FOLDER);
-    match free {
+    let why = match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
-            Fact::ok(what, format!("{} free in {folder}", gib(free)))
+            return Fact::ok(what, format!("{} free in {folder}", gib(free)));
         }
-        Ok(free) => Fact::note(
-            what,
-            format!(
-                "{} MiB free in {folder}, a run takes up to {}: sockets serve instead, several times slower; a container needs --shm-size=1g",
-                free >> 20,
-                SHARED_MEMORY_ENOUGH >> 20
-            ),
+        Ok(free) => format!(
+            "{} MiB free in {folder}, a run takes up to {}: sockets serve instead, several times slower; a container needs --shm-size=1g",
+            free >> 20,
+            SHARED_MEMORY_ENOUGH >> 20
         ),
-        Err(why) => Fact::note(
-            what,
-            format!("{why}: sockets serve instead, several times slower"),
-        ),
-    }
+        Err(why) => format!("{why}: sockets serve instead, several times slower"),
+    };
+    Fact::note(what, why)
 }
 
 /// `limit` is how many bytes of shared memory a process may lock, as it has to; none if there is no limit.
@@ -215,31 +209,25 @@ mod tests {
         assert_eq!(vectors_of(true, true, false), State::Ok);
         assert_eq!(vectors_of(true, false, false), State::Note);
         assert_eq!(vectors(None).state, State::Note);
-        let memory_of = |memory_bytes| {
-            memory(&Machine {
-                cores: 2,
-                memory_bytes,
-                fast_bf16: false,
-            })
-            .state
+        let machine = |memory_bytes| Machine {
+            cores: 2,
+            memory_bytes,
+            fast_bf16: false,
         };
+        let memory_of = |bytes| memory(&machine(bytes)).state;
         assert_eq!(memory_of(1 << 29), State::Missing);
         assert_eq!(memory_of(2 << 30), State::Note);
         assert_eq!(memory_of(8 << 30), State::Ok);
         // What docker grants unless it is told otherwise.
         assert_eq!(shared_memory(Ok(64 << 20)).state, State::Note);
         assert_eq!(shared_memory(Ok(1 << 30)).state, State::Ok);
-        assert_eq!(
-            shared_memory(Err("no such folder".into())).state,
-            State::Note
-        );
+        let none = shared_memory(Err("no such folder".into()));
+        assert_eq!(none.state, State::Note);
         // The kernel's usual limit for an ordinary account.
         let locked = locked_memory(Some(8 << 20));
         assert_eq!(locked.state, State::Note);
-        assert!(
-            locked.text.contains("`ulimit -l` allows 8192 KiB"),
-            "{locked}"
-        );
+        let why = "`ulimit -l` allows 8192 KiB";
+        assert!(locked.text.contains(why), "{locked}");
         assert_eq!(locked_memory(Some(1 << 30)).state, State::Ok);
         assert_eq!(locked_memory(None).state, State::Ok);
         assert_eq!(cores(1).state, State::Note);
@@ -250,10 +238,8 @@ mod tests {
     fn a_folder_that_is_not_there_yet_is_judged_by_the_one_above() {
         let folder = tempfile::tempdir().unwrap();
         let fact = disk(&folder.path().join("runs/one"));
-        assert!(
-            fact.text.contains(folder.path().to_str().unwrap()),
-            "{fact}"
-        );
+        let there = folder.path().display().to_string();
+        assert!(fact.text.contains(&there), "{fact}");
         assert!(!fact.text.contains("runs"), "{fact}");
     }
 }

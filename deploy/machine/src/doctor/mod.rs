@@ -7,9 +7,9 @@ mod engine;
 mod fact;
 mod host;
 
-use std::{fmt::Write as _, path::Path};
+use std::path::Path;
 
-use anyhow::bail;
+use anyhow::ensure;
 
 use self::fact::{Fact, State};
 
@@ -41,9 +41,6 @@ impl Report {
     }
 
     /// The facts as JSON.
-    ///
-    /// # Errors
-    /// None that is known.
     pub fn json(&self) -> anyhow::Result<String> {
         Ok(serde_json::to_string_pretty(&self.all())? + "\n")
     }
@@ -53,24 +50,22 @@ impl Report {
         all.chain(&self.certificates).cloned().collect()
     }
 
-    /// Whether what training needs is there.
-    ///
-    /// # Errors
-    /// Something is missing that training on the CPU needs, or a certificate is not good; with `cuda`, also what training on a GPU
-    /// needs.
+    /// Fails where something is missing that training on the CPU needs, or a certificate is not good; with `cuda`, also what training
+    /// on a GPU needs.
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
-        let missing = lacking(&self.cpu, |state| state == State::Missing);
-        if !missing.is_empty() {
-            bail!("training on the CPU needs: {missing}");
-        }
-        let bad = lacking(&self.certificates, |state| state == State::Missing);
-        if !bad.is_empty() {
-            bail!("these certificates cannot be used: {bad}");
-        }
-        if cuda && !cuda::is_ready(&self.cuda) {
-            let missing = lacking(&self.cuda, |state| state != State::Ok);
-            bail!("--device cuda needs: {missing}");
-        }
+        let is_missing = |state| state == State::Missing;
+        let missing = lacking(&self.cpu, is_missing);
+        ensure!(
+            missing.is_empty(),
+            "training on the CPU needs: {missing}"
+        );
+        let bad = lacking(&self.certificates, is_missing);
+        ensure!(bad.is_empty(), "these certificates cannot be used: {bad}");
+        let missing = lacking(&self.cuda, |state| state != State::Ok);
+        ensure!(
+            !cuda || cuda::is_ready(&self.cuda),
+            "--device cuda needs: {missing}"
+        );
         Ok(())
     }
 }
@@ -83,11 +78,8 @@ fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
 }
 
 fn describe(facts: &[Fact], verdict: &str) -> String {
-    let mut text = String::new();
-    for fact in facts {
-        let _ = writeln!(text, "{fact}");
-    }
-    text + "\n" + verdict + "\n"
+    let lines = facts.iter().map(|fact| format!("{fact}\n"));
+    format!("{}\n{verdict}\n", lines.collect::<String>())
 }
 
 /// What can be trained on.
