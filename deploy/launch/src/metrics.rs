@@ -52,251 +52,125 @@ pub struct Member {
     pub value: Option<f64>,
 }
 
-/// All metrics, in the order of the columns of `metrics.csv`. The auxiliary losses stand between C51's loss and the total.
-pub const COLUMNS: &[Column] = &[
-    Column {
-        name: "seconds",
-        help: "Time since the run began, without interruptions.",
-        unit: "seconds",
-        plot_label: "Time",
-        group: "run",
-        value: Value::Counter(|it| it.seconds),
-    },
-    Column {
-        name: "frames",
-        help: "Transitions that the replay has stored.",
-        unit: "frames",
-        plot_label: "Frames",
-        group: "run",
-        value: Value::Counter(|it| Some(it.replay.transitions_inserted as f64)),
-    },
-    Column {
-        name: "updates",
-        help: "Updates of the learner.",
-        unit: "updates",
-        plot_label: "Updates",
-        group: "run",
-        value: Value::Counter(|it| {
-            let last_known = it.replay.learner_finished.then_some(it.replay.updates);
-            let updates = it.learner.map(|it| it.updates).or(last_known);
-            updates.map(|it| it as f64)
-        }),
-    },
-    Column {
-        name: "frames_per_second",
-        help: "Frames a second, over the last 20 seconds.",
-        unit: "frames per second",
-        plot_label: "Acting speed",
-        group: "speed",
-        value: Value::Gauge(|it| Some(it.speed.frames)),
-    },
-    Column {
-        name: "updates_per_second",
-        help: "Updates a second, over the last 20 seconds.",
-        unit: "updates per second",
-        plot_label: "Learning speed",
-        group: "speed",
-        value: Value::Gauge(|it| Some(it.speed.updates)),
-    },
-    Column {
-        name: "replay_ratio",
-        help: "Rows sampled per transition stored, both since the warm-up.",
-        unit: "rows sampled per transition",
-        plot_label: "Replay ratio",
-        group: "run",
-        value: Value::Gauge(|it| it.replay.replay_ratio()),
-    },
-    Column {
-        name: "episodes",
-        help: "Training episodes that ended.",
-        unit: "episodes",
-        plot_label: "Episodes",
-        group: "return",
-        value: Value::Counter(|it| Some(it.episodes.count as f64)),
-    },
-    Column {
-        name: "mean_return",
-        help: "Mean undiscounted return of the newest training episodes.",
-        unit: "mean of the last 100 episodes",
-        plot_label: "Return",
-        group: "return",
-        value: Value::Gauge(|it| it.episodes.mean_return.map(|it| it.mean)),
-    },
-    Column {
-        name: "mean_return_of",
-        help: "Episodes in the mean return: 100, or as many as there were.",
-        unit: "episodes",
-        plot_label: "Episodes in the mean return",
-        group: "return",
-        value: Value::Gauge(|it| Some(it.episodes.mean_return.map_or(0.0, |it| it.of as f64))),
-    },
-    Column {
-        name: "c51_kl",
-        help: "C51's loss of the last update.",
-        unit: "KL divergence [nats]",
-        plot_label: "C51 loss",
-        group: "learning",
-        value: Value::Gauge(|it| it.learned(|it| it.c51_kl.into())),
-    },
-    Column {
-        name: "losses",
-        help: "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
-        unit: "auxiliary loss [nats]",
-        plot_label: "Auxiliary loss",
-        group: "learning",
-        value: Value::Each {
-            label: "loss",
-            members: |it| {
-                let loss = |name: &str| it.learner?.loss(name).map(f64::from);
-                let member = |name: &&str| Member::new(name, name, loss(name));
-                it.losses.iter().map(member).collect()
-            },
-        },
-    },
-    Column {
-        name: "total_loss",
-        help: "The total loss of the last update.",
-        unit: "loss [nats]",
-        plot_label: "Total loss",
-        group: "learning",
-        value: Value::Gauge(|it| it.learned(|it| it.total.into())),
-    },
-    Column {
-        name: "grad_norm",
-        help: "Norm of the last update's gradient before clipping.",
-        unit: "global 2-norm",
-        plot_label: "Gradient before clipping",
-        group: "learning",
-        value: Value::Gauge(|it| it.learned(|it| it.grad_norm)),
-    },
-    Column {
-        name: "q_mean",
-        help: "Mean Q value of the last update's states.",
-        unit: "discounted return",
-        plot_label: "Mean Q value",
-        group: "learning",
-        value: Value::Gauge(|it| it.learned(|it| it.q_mean.into())),
-    },
-    Column {
-        name: "mean_k",
-        help: "Mean k of the rows served; of several positives the furthest.",
-        unit: "k [environment steps]",
-        plot_label: "How far ahead: k, mean since the start",
-        group: "k",
-        value: Value::Gauge(|it| it.k.map(|it| it.mean)),
-    },
-    Column {
-        name: "sd_k",
-        help: "Standard deviation of k over the same rows.",
-        unit: "environment steps",
-        plot_label: "Standard deviation of k",
-        group: "k",
-        value: Value::Gauge(|it| it.k.map(|it| it.sd)),
-    },
-    Column {
-        name: "mean_age",
-        help: "Mean age of the rows served last: transitions stored since theirs.",
-        unit: "transitions",
-        plot_label: "Age of sampled rows",
-        group: "run",
-        value: Value::Gauge(|it| Some(it.replay.mean_age)),
-    },
-    Column {
-        name: "weights_version",
-        help: "Version of the newest weights.",
-        unit: "version",
-        plot_label: "Version of the weights",
-        group: "run",
-        value: Value::Gauge(|it| it.learner.map(|it| it.weights_version as f64)),
-    },
-    Column {
-        name: "affinity_version",
-        help: "Version of the affinity in use; 0 is the uniform one.",
-        unit: "version",
-        plot_label: "Version of the affinity",
-        group: "run",
-        value: Value::Gauge(|it| Some(it.replay.affinity_version as f64)),
-    },
-    Column {
-        name: "actors",
-        help: "Actors that are connected.",
-        unit: "actors",
-        plot_label: "Actors",
-        group: "run",
-        value: Value::Gauge(|it| Some(it.replay.actors.into())),
-    },
-    Column {
-        name: "waiting",
-        help: "Which side waits at the rate limiter.",
-        unit: "words",
-        plot_label: "Waiting",
-        group: "run",
-        value: Value::Words(|it| it.replay.waiting.to_string()),
-    },
-    Column {
-        name: "epsilon",
-        help: "Probability of a random action; empty where actors differ in it.",
-        unit: "probability of a random action",
-        plot_label: "Epsilon",
-        group: "run",
-        value: Value::Gauge(|it| it.epsilon),
-    },
-    Column {
-        name: "transitions_lost",
-        help: "Transitions that actors produced and that never arrived.",
-        unit: "transitions",
-        plot_label: "Lost transitions",
-        group: "faults",
-        value: Value::Counter(|it| Some(it.replay.transitions_lost as f64)),
-    },
-    Column {
-        name: "transitions_duplicated",
-        help: "Transitions stored twice.",
-        unit: "transitions",
-        plot_label: "Duplicated transitions",
-        group: "faults",
-        value: Value::Counter(|it| Some(it.replay.transitions_duplicated as f64)),
-    },
-    Column {
-        name: "messages_refused",
-        help: "Messages rejected as malformed or foreign, or because of their sender's role.",
-        unit: "messages",
-        plot_label: "Rejected messages",
-        group: "faults",
-        value: Value::Counter(|it| Some(it.replay.messages_refused as f64)),
-    },
-    Column {
-        name: "learner_waited_seconds",
-        help: "Time that requests for a batch waited at the rate limiter.",
-        unit: "seconds",
-        plot_label: "Time that the learner waited",
-        group: "speed",
-        value: Value::Counter(|it| Some(it.replay.learner_waited_s)),
-    },
-    Column {
-        name: "actors_waited_seconds",
-        help: "Time that chunks waited at the rate limiter, summed over actors.",
-        unit: "seconds",
-        plot_label: "Time that actors waited",
-        group: "speed",
-        value: Value::Counter(|it| Some(it.replay.actors_waited_s)),
-    },
-    Column {
-        name: "rss_mib",
-        help: "Resident memory of each process, such as `rss_mib_actor_0`.",
-        unit: "resident memory [MiB]",
-        plot_label: "Memory",
-        group: "memory",
-        value: Value::Each {
-            label: "process",
-            members: |it| {
-                let column = |name: &str| format!("rss_mib_{}", name.replace('-', "_"));
-                let member = |(name, mib): &(&str, _)| Member::new(&column(name), name, *mib);
-                it.rss_mib.iter().map(member).collect()
-            },
-        },
-    },
-];
+/// Makes [`COLUMNS`]: a row has a metric's name, unit, group and title, then what it measures, then how it is taken.
+macro_rules! columns {
+    ($($name:literal, $unit:literal, $group:literal, $plot_label:literal: $help:literal, $value:expr;)+) => {
+        /// All metrics, in the order of the columns of `metrics.csv`. The auxiliary losses stand between C51's loss and the total.
+        pub const COLUMNS: &[Column] = &[$(Column {
+            name: $name,
+            help: $help,
+            unit: $unit,
+            plot_label: $plot_label,
+            group: $group,
+            value: $value,
+        }),+];
+    };
+}
+
+columns! {
+    "seconds", "seconds", "run", "Time":
+        "Time since the run began, without interruptions.",
+        Value::Counter(|it| it.seconds);
+    "frames", "frames", "run", "Frames":
+        "Transitions that the replay has stored.",
+        Value::Counter(|it| Some(it.replay.transitions_inserted as f64));
+    "updates", "updates", "run", "Updates":
+        "Updates of the learner.",
+        Value::Counter(updates);
+    "frames_per_second", "frames per second", "speed", "Acting speed":
+        "Frames a second, over the last 20 seconds.",
+        Value::Gauge(|it| Some(it.speed.frames));
+    "updates_per_second", "updates per second", "speed", "Learning speed":
+        "Updates a second, over the last 20 seconds.",
+        Value::Gauge(|it| Some(it.speed.updates));
+    "replay_ratio", "rows sampled per transition", "run", "Replay ratio":
+        "Rows sampled per transition stored, both since the warm-up.",
+        Value::Gauge(|it| it.replay.replay_ratio());
+    "episodes", "episodes", "return", "Episodes":
+        "Training episodes that ended.",
+        Value::Counter(|it| Some(it.episodes.count as f64));
+    "mean_return", "mean of the last 100 episodes", "return", "Return":
+        "Mean undiscounted return of the newest training episodes.",
+        Value::Gauge(|it| it.episodes.mean_return.map(|it| it.mean));
+    "mean_return_of", "episodes", "return", "Episodes in the mean return":
+        "Episodes in the mean return: 100, or as many as there were.",
+        Value::Gauge(|it| Some(it.episodes.mean_return.map_or(0.0, |it| it.of as f64)));
+    "c51_kl", "KL divergence [nats]", "learning", "C51 loss":
+        "C51's loss of the last update.",
+        Value::Gauge(|it| it.learned(|it| it.c51_kl.into()));
+    "losses", "auxiliary loss [nats]", "learning", "Auxiliary loss":
+        "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
+        Value::Each { label: "loss", members: losses };
+    "total_loss", "loss [nats]", "learning", "Total loss":
+        "The total loss of the last update.",
+        Value::Gauge(|it| it.learned(|it| it.total.into()));
+    "grad_norm", "global 2-norm", "learning", "Gradient before clipping":
+        "Norm of the last update's gradient before clipping.",
+        Value::Gauge(|it| it.learned(|it| it.grad_norm));
+    "q_mean", "discounted return", "learning", "Mean Q value":
+        "Mean Q value of the last update's states.",
+        Value::Gauge(|it| it.learned(|it| it.q_mean.into()));
+    "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
+        "Mean k of the rows served; of several positives the furthest.",
+        Value::Gauge(|it| it.k.map(|it| it.mean));
+    "sd_k", "environment steps", "k", "Standard deviation of k":
+        "Standard deviation of k over the same rows.",
+        Value::Gauge(|it| it.k.map(|it| it.sd));
+    "mean_age", "transitions", "run", "Age of sampled rows":
+        "Mean age of the rows served last: transitions stored since theirs.",
+        Value::Gauge(|it| Some(it.replay.mean_age));
+    "weights_version", "version", "run", "Version of the weights":
+        "Version of the newest weights.",
+        Value::Gauge(|it| it.learner.map(|it| it.weights_version as f64));
+    "affinity_version", "version", "run", "Version of the affinity":
+        "Version of the affinity in use; 0 is the uniform one.",
+        Value::Gauge(|it| Some(it.replay.affinity_version as f64));
+    "actors", "actors", "run", "Actors":
+        "Actors that are connected.",
+        Value::Gauge(|it| Some(it.replay.actors.into()));
+    "waiting", "words", "run", "Waiting":
+        "Which side waits at the rate limiter.",
+        Value::Words(|it| it.replay.waiting.to_string());
+    "epsilon", "probability of a random action", "run", "Epsilon":
+        "Probability of a random action; empty where actors differ in it.",
+        Value::Gauge(|it| it.epsilon);
+    "transitions_lost", "transitions", "faults", "Lost transitions":
+        "Transitions that actors produced and that never arrived.",
+        Value::Counter(|it| Some(it.replay.transitions_lost as f64));
+    "transitions_duplicated", "transitions", "faults", "Duplicated transitions":
+        "Transitions stored twice.",
+        Value::Counter(|it| Some(it.replay.transitions_duplicated as f64));
+    "messages_refused", "messages", "faults", "Rejected messages":
+        "Messages rejected as malformed or foreign, or because of their sender's role.",
+        Value::Counter(|it| Some(it.replay.messages_refused as f64));
+    "learner_waited_seconds", "seconds", "speed", "Time that the learner waited":
+        "Time that requests for a batch waited at the rate limiter.",
+        Value::Counter(|it| Some(it.replay.learner_waited_s));
+    "actors_waited_seconds", "seconds", "speed", "Time that actors waited":
+        "Time that chunks waited at the rate limiter, summed over actors.",
+        Value::Counter(|it| Some(it.replay.actors_waited_s));
+    "rss_mib", "resident memory [MiB]", "memory", "Memory":
+        "Resident memory of each process, such as `rss_mib_actor_0`.",
+        Value::Each { label: "process", members: memory };
+}
+
+fn updates(it: &Moment<'_>) -> Option<f64> {
+    let last_known = it.replay.learner_finished.then_some(it.replay.updates);
+    let updates = it.learner.map(|it| it.updates).or(last_known);
+    updates.map(|it| it as f64)
+}
+
+fn losses(it: &Moment<'_>) -> Vec<Member> {
+    let loss = |name: &str| it.learner?.loss(name).map(f64::from);
+    let member = |name: &&str| Member::new(name, name, loss(name));
+    it.losses.iter().map(member).collect()
+}
+
+fn memory(it: &Moment<'_>) -> Vec<Member> {
+    let column = |name: &str| format!("rss_mib_{}", name.replace('-', "_"));
+    let member = |(name, mib): &(&str, _)| Member::new(&column(name), name, *mib);
+    it.rss_mib.iter().map(member).collect()
+}
 
 impl Member {
     fn new(column: &str, name: &str, value: Option<f64>) -> Self {
@@ -425,17 +299,12 @@ mod tests {
     #[test]
     fn the_columns_of_the_file_keep_their_names_and_their_order() {
         let replay = ReplayStatus::default();
-        let names: Vec<_> = cells(&moment(&replay, None))
-            .into_iter()
-            .map(|(name, _)| name)
-            .collect();
+        let cells = cells(&moment(&replay, None)).into_iter();
+        let names: Vec<_> = cells.map(|(name, _)| name).collect();
         let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
                       dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
         assert!(names.join(",").starts_with(before), "{names:?}");
-        assert_eq!(
-            names[names.len() - 2..],
-            ["rss_mib_actor_0", "rss_mib_actor_1"]
-        );
+        assert!(names.ends_with(&["rss_mib_actor_0", "rss_mib_actor_1"].map(String::from)));
     }
 
     #[test]

@@ -2,17 +2,16 @@
 //! Nothing is served.
 
 use std::{
-    collections::BTreeMap,
-    fmt::{Display, Write},
+    collections::{BTreeMap, BTreeSet},
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{LearnerStatus, ReplayStatus, whole_file};
+use driml_protocol::{LearnerStatus, PartStatus, ReplayStatus, whole_file};
 use serde::Serialize;
 
 use super::advice::{needed, waits};
 use crate::{
-    metrics::{self, COLUMNS, Value},
+    metrics::{self, COLUMNS, Column, Value},
     run_view::{Plan, RunView, ServerAnswer},
 };
 
@@ -89,37 +88,23 @@ fn prometheus(view: &RunView) -> String {
             escaped(&endpoints.collect::<Vec<_>>().join(" "))
         ),
     };
-    let flag = |is_set: bool| f64::from(u8::from(is_set));
-    let up = flag(view.is_answered());
+    let up = view.is_answered().into();
     page.gauge("up", "Whether all replay servers of the run answered.", up);
     // What only some of them count is not the run's.
     if view.is_answered() {
         page.columns(view);
         page.processes(view);
-        for (name, help, value) in [
-            (
-                "frames_planned",
-                "Frames of the whole run.",
-                plan.frames_planned as f64,
-            ),
-            (
-                "updates_planned",
-                "Updates of the whole run.",
-                plan.updates_planned as f64,
-            ),
-            (
-                "finished",
-                "Whether everything is learned and saved.",
-                flag(view.is_finished()),
-            ),
-            (
-                "well",
-                "Whether no process of the run is missing.",
-                flag(needed(view).is_empty()),
-            ),
-        ] {
-            page.gauge(name, help, value);
-        }
+        let planned = [plan.frames_planned, plan.updates_planned].map(|it| it as f64);
+        page.gauge("frames_planned", "Frames of the whole run.", planned[0]);
+        page.gauge("updates_planned", "Updates of the whole run.", planned[1]);
+        let finished = view.is_finished().into();
+        page.gauge(
+            "finished",
+            "Whether everything is learned and saved.",
+            finished,
+        );
+        let well = needed(view).is_empty().into();
+        page.gauge("well", "Whether no process of the run is missing.", well);
     }
     page.text
 }
@@ -130,99 +115,70 @@ struct Page {
 }
 
 impl Page {
-    fn head(&mut self, name: &str, kind: &str, help: &str) {
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            self.text,
-            "# HELP driml_{name} {help}\n# TYPE driml_{name} {kind}"
-        );
-    }
-
-    fn sample(&mut self, name: &str, more: &str, value: impl Display) {
-        let labels = &self.labels;
-        let _ = writeln!(self.text, "driml_{name}{{{labels}{more}}} {value}");
-    }
-
-    fn gauge(&mut self, name: &str, help: &str, value: f64) {
-        self.head(name, "gauge", help);
-        self.sample(name, "", value);
-    }
-
-    /// One sample for each member of a family that has a value; nothing if none has.
-    fn family(
+    /// A metric: its head, and a sample for each member that has a value; nothing if none has. `label` tells several members apart.
+    fn metric(
         &mut self,
-        (name, kind, help): (&str, &str, &str),
+        kind: &str,
+        name: &str,
+        help: &str,
         label: &str,
         members: &[(String, f64)],
     ) {
         if !members.is_empty() {
-            self.head(name, kind, help);
+            self.text += &format!("# HELP driml_{name} {help}\n# TYPE driml_{name} {kind}\n");
         }
         for (member, value) in members {
-            self.sample(name, &format!(",{label}=\"{}\"", escaped(member)), value);
+            let more = match label {
+                "" => String::new(),
+                label => format!(",{label}=\"{}\"", escaped(member)),
+            };
+            self.text += &format!("driml_{name}{{{}{more}}} {value}\n", self.labels);
         }
+    }
+
+    fn gauge(&mut self, name: &str, help: &str, value: f64) {
+        self.metric("gauge", name, help, "", &[(String::new(), value)]);
     }
 
     fn columns(&mut self, view: &RunView) {
         let moment = view.moment();
         for column in COLUMNS {
-            let known = column.members(&moment).into_iter();
-            let known = known.filter_map(|it| Some((it.name, it.value?)));
+            let Column {
+                name, help, value, ..
+            } = column;
+            let members = column.members(&moment).into_iter();
+            let known = members.filter_map(|it| Some((it.name, it.value?)));
+            let (kind, label, ending) = match value {
+                Value::Counter(_) => ("counter", "", "_total"),
+                Value::Each { label, .. } => ("gauge", *label, ""),
+                Value::Gauge(_) | Value::Words(_) => ("gauge", "", ""),
+            };
             let known: Vec<_> = known.collect();
-            match (column.value, &known[..]) {
-                (Value::Each { label, .. }, members) => {
-                    self.family((column.name, "gauge", column.help), label, members);
-                }
-                (Value::Counter(_), [(name, value)]) => {
-                    let name = format!("{name}_total");
-                    self.head(&name, "counter", column.help);
-                    self.sample(&name, "", value);
-                }
-                (_, [(name, value)]) => self.gauge(name, column.help, *value),
-                _ => {}
-            }
+            self.metric(kind, &format!("{name}{ending}"), help, label, &known);
         }
     }
 
     fn processes(&mut self, view: &RunView) {
         let accounts = view.servers.iter().filter_map(|it| it.parts.as_ref());
         // With several shards the learner takes part in each.
-        let mut seen = std::collections::BTreeSet::new();
+        let mut seen = BTreeSet::new();
         let parts = accounts.flat_map(|it| &it.parts);
         let parts: Vec<_> = parts.filter(|it| seen.insert(it.who)).collect();
-        let each = |value: fn(&driml_protocol::PartStatus) -> Option<f64>| -> Vec<_> {
+        let mut each = |kind, name, help, value: fn(&PartStatus) -> Option<f64>| {
             let known = parts.iter();
             let known = known.filter_map(|it| Some((it.who.to_string(), value(it)?)));
-            known.collect()
+            self.metric(kind, name, help, "part", &known.collect::<Vec<_>>());
         };
-        for (family, members) in [
-            (
-                (
-                    "part_connected",
-                    "gauge",
-                    "Whether a process that has joined the run is connected.",
-                ),
-                each(|it| Some(u8::from(it.connected).into())),
-            ),
-            (
-                (
-                    "part_joined_total",
-                    "counter",
-                    "How often a process has joined the run.",
-                ),
-                each(|it| Some(it.lives.into())),
-            ),
-            (
-                (
-                    "part_silent_seconds",
-                    "gauge",
-                    "Seconds since the last chunk or request for a batch of a process.",
-                ),
-                each(|it| it.heard_s),
-            ),
-        ] {
-            self.family(family, "part", &members);
-        }
+        let connected = "Whether a process that has joined the run is connected.";
+        each("gauge", "part_connected", connected, |it| {
+            Some(it.connected.into())
+        });
+        let joined = "How often a process has joined the run.";
+        each("counter", "part_joined_total", joined, |it| {
+            Some(it.lives.into())
+        });
+        let silent = "Seconds since the last chunk or request for a batch of a process.";
+        each("gauge", "part_silent_seconds", silent, |it| it.heard_s);
     }
 }
 
