@@ -135,10 +135,9 @@ mod tests {
 
     #[test]
     fn the_examples_are_commands() {
-        let examples: Vec<_> = EXAMPLES
-            .lines()
-            .filter_map(|line| line.strip_prefix("  "))
-            .collect();
+        let examples = EXAMPLES.lines();
+        let examples = examples.filter_map(|line| line.strip_prefix("  "));
+        let examples: Vec<_> = examples.collect();
         assert_eq!(examples.len(), 3);
         for example in examples {
             let parsed = Cli::try_parse_from(example.split(' '));

@@ -29,19 +29,13 @@ fn entry(arg: &Arg) -> String {
     };
     let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
     let mut help = first_clause(&help).to_owned();
-    let defaults: Vec<_> = arg
-        .get_default_values()
-        .iter()
-        .map(|it| it.to_string_lossy().into_owned())
-        .collect();
+    let defaults = arg.get_default_values().iter();
+    let defaults: Vec<_> = defaults.map(|it| it.to_string_lossy()).collect();
     if takes_values && !defaults.is_empty() {
         write!(help, " [default: {}]", defaults.join(", ")).unwrap();
     }
-    let possible: Vec<_> = arg
-        .get_possible_values()
-        .iter()
-        .map(|it| it.get_name().to_owned())
-        .collect();
+    let possible = arg.get_possible_values();
+    let possible: Vec<_> = possible.iter().map(|it| it.get_name()).collect();
     if takes_values && !possible.is_empty() {
         write!(help, " [values: {}]", possible.join(", ")).unwrap();
     }

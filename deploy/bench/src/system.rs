@@ -15,7 +15,7 @@ use driml_launch::{
     view::{Poller, Reached},
 };
 use driml_machine::units::number;
-use driml_protocol::{Keys, LearnerStatus, ReplayStatus, session};
+use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient, session};
 use tempfile::TempDir;
 
 use crate::{
@@ -221,10 +221,10 @@ impl Run {
         let reached = Reached {
             name: "replay-server".into(),
             endpoint,
-            session,
+            client: RunClient::new(session, keys, config.run.hash()),
         };
         Ok(Self {
-            poller: Poller::new(&config, vec![reached], &keys),
+            poller: Poller::new(&config, vec![reached]),
             launcher,
             folder,
         })

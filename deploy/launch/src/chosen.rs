@@ -52,7 +52,7 @@ impl FromStr for Which {
 }
 
 /// The settings of the run in `folder`.
-pub(crate) fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
+pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     let path = folder.config();
     let text = std::fs::read_to_string(&path).map_err(|e| {
         usage!(

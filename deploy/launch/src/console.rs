@@ -12,7 +12,7 @@ use std::{
 use anyhow::Context as _;
 use console::Term;
 use driml_protocol::last_warning;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tracing::{
     Event, Level, Subscriber,
     field::{Field, Visit},
@@ -33,9 +33,6 @@ pub fn line(text: &str) {
 }
 
 /// Writes a command's result to stdout; a reader that has gone away is no error.
-///
-/// # Errors
-/// A full disk, for example.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -45,9 +42,6 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 }
 
 /// [`print`] of lines that a narrow terminal would break inside words: a line goes on after `indent` blanks.
-///
-/// # Errors
-/// As [`print`].
 pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     match io::stdout().is_terminal() {
         true => print(&wrapped(text, " ", indent)),
@@ -242,11 +236,8 @@ impl Screen {
     /// # Panics
     /// If the template is none: it is a constant, and tests make each.
     pub fn new(length: u64, template: &str) -> Self {
-        let bar = stderr().is_terminal().then(|| {
-            let target = ProgressDrawTarget::term_like_with_hz(
-                Box::new(Terminal(Term::buffered_stderr())),
-                DRAWS_PER_SECOND,
-            );
+        let target = ProgressDrawTarget::stderr_with_hz(DRAWS_PER_SECOND);
+        let bar = (!target.is_hidden()).then(|| {
             let bar = ProgressBar::with_draw_target(Some(length), target);
             let style = ProgressStyle::with_template(template);
             bar.set_style(style.expect("the template is a constant, and a test makes one"));
@@ -306,9 +297,6 @@ impl Pages {
     }
 
     /// Shows one.
-    ///
-    /// # Errors
-    /// As [`print`].
     pub fn show(&self, text: &str) -> anyhow::Result<()> {
         if let Some(term) = &self.0 {
             term.clear_screen().or_else(|e| match is_gone(&e) {
@@ -318,58 +306,6 @@ impl Pages {
         }
         print(text)
     }
-}
-
-/// A terminal on which drawing never fails: one that was closed in the middle of a run shows nothing.
-#[derive(Debug)]
-struct Terminal(Term);
-
-impl TermLike for Terminal {
-    fn width(&self) -> u16 {
-        TermLike::width(&self.0)
-    }
-
-    fn height(&self) -> u16 {
-        TermLike::height(&self.0)
-    }
-
-    fn move_cursor_up(&self, n: usize) -> io::Result<()> {
-        ignore(self.0.move_cursor_up(n))
-    }
-
-    fn move_cursor_down(&self, n: usize) -> io::Result<()> {
-        ignore(self.0.move_cursor_down(n))
-    }
-
-    fn move_cursor_right(&self, n: usize) -> io::Result<()> {
-        ignore(self.0.move_cursor_right(n))
-    }
-
-    fn move_cursor_left(&self, n: usize) -> io::Result<()> {
-        ignore(self.0.move_cursor_left(n))
-    }
-
-    fn write_line(&self, text: &str) -> io::Result<()> {
-        ignore(self.0.write_line(text))
-    }
-
-    fn write_str(&self, text: &str) -> io::Result<()> {
-        ignore(self.0.write_str(text))
-    }
-
-    fn clear_line(&self) -> io::Result<()> {
-        ignore(self.0.clear_line())
-    }
-
-    fn flush(&self) -> io::Result<()> {
-        ignore(self.0.flush())
-    }
-}
-
-/// Drops an error of drawing.
-fn ignore(drawn: io::Result<()>) -> io::Result<()> {
-    drop(drawn);
-    Ok(())
 }
 
 #[cfg(test)]
@@ -434,12 +370,8 @@ mod tests {
         assert!(is_due("a.csv: No space left on device (os error 28)", 601));
         assert_eq!(full.left_out, 1);
 
-        let lost = [
-            "2 rows of a are lost: full",
-            "x",
-            "1 rows of b are lost: full",
-        ];
-        let joined = join_losses(lost.map(str::to_owned));
+        let lost = "2 rows of a are lost: full\nx\n1 rows of b are lost: full";
+        let joined = join_losses(lost.lines().map(str::to_owned));
         assert_eq!(joined, ["x", "2 rows of a, 1 rows of b are lost: full"]);
     }
 
@@ -448,13 +380,12 @@ mod tests {
         let pty = nix::pty::openpty(None, None).unwrap();
         let slave = std::fs::File::from(pty.slave);
         let term = Term::read_write_pair(slave.try_clone().unwrap(), slave);
-        let target = ProgressDrawTarget::term_like(Box::new(Terminal(term)));
+        let target = ProgressDrawTarget::term(term, DRAWS_PER_SECOND);
         let bar = ProgressBar::with_draw_target(Some(10), target);
         bar.tick();
         drop(pty.master);
         bar.set_message("one\ntwo");
         bar.suspend(|| ());
-        bar.set_tab_width(4);
         bar.finish_and_clear();
     }
 }

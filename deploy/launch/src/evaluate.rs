@@ -68,17 +68,11 @@ pub struct Player {
 impl Player {
     /// Reads what a user wants to play of a run's folder: the averaged weights of the newest checkpoint if there are some, else its
     /// online ones.
-    ///
-    /// # Errors
-    /// As [`Player::load_at`].
     pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
         Self::load_at(folder, Which::default(), Weights::default())
     }
 
     /// Reads one of the checkpoints in a run's folder.
-    ///
-    /// # Errors
-    /// A folder that is no run's or does not have that checkpoint, a damaged checkpoint.
     pub fn load_at(folder: &RunFolder, which: Which, weights: Weights) -> anyhow::Result<Self> {
         Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
     }
@@ -89,14 +83,10 @@ impl Player {
         checkpoint: &Path,
         weights: Weights,
     ) -> anyhow::Result<Self> {
-        let mut agent = checkpoint::load(
-            checkpoint,
-            &config.model,
-            &config.learner.update,
-            &Compute::CPU,
-            config.run.hash(),
-        )?
-        .agent;
+        let (model, update) = (&config.model, &config.learner.update);
+        let hash = config.run.hash();
+        let loaded = checkpoint::load(checkpoint, model, update, &Compute::CPU, hash)?;
+        let mut agent = loaded.agent;
         let is_averaged = weights == Weights::Average && agent.take_average()?;
         Ok(Self {
             weights: agent.weights_as(config.learner.publish_as)?,
@@ -117,9 +107,6 @@ impl Player {
     }
 
     /// The same with f32 weights and arithmetic, whatever the actors of the run have.
-    ///
-    /// # Errors
-    /// A weight that is not finite.
     pub fn exact(mut self) -> anyhow::Result<Self> {
         self.weights = self.network.without_dim()?.to_safetensors(|_| true)?;
         self.config.learner.publish_as = StoredAs::F32;
@@ -159,9 +146,6 @@ impl Player {
     }
 
     /// [`Player::play`], with every step shown to `watch`, which may end it before all episodes are over.
-    ///
-    /// # Errors
-    /// As [`Player::play`].
     pub fn play_watched(
         &self,
         who: Who,
@@ -171,12 +155,16 @@ impl Player {
         watch: Watch<'_>,
     ) -> anyhow::Result<Vec<f64>> {
         let mut policy: Box<dyn Policy> = match who {
-            Who::Agent => Box::new(NetworkPolicy::new(
-                &self.config.model,
-                self.enlarge()?,
-                &self.weights,
-                self.config.actor.precision,
-            )?),
+            Who::Agent => {
+                let (model, precision) = (&self.config.model, self.config.actor.precision);
+                let enlarge = self.enlarge()?;
+                Box::new(NetworkPolicy::new(
+                    model,
+                    enlarge,
+                    &self.weights,
+                    precision,
+                )?)
+            }
             Who::Random => Box::new(random_policy(&self.config)?),
         };
         play_with(&self.config, policy.as_mut(), world, episodes, seed, watch)
@@ -188,21 +176,15 @@ impl Player {
     }
 
     /// What the network that plays makes of the states it sees.
-    ///
-    /// # Errors
-    /// Settings that do not fit each other.
     pub fn viewer(&self) -> anyhow::Result<Viewer> {
         let mut model = self.config.model.clone();
         if self.network.len() < model.parameter_shapes().len() {
             model = model.without_dim();
         }
+        let compute = Compute::cpu(self.config.actor.precision);
+        let update = &self.config.learner.update;
         Ok(Viewer {
-            insight: Insight::new(
-                &model,
-                &self.config.learner.update,
-                &self.network,
-                Compute::cpu(self.config.actor.precision),
-            )?,
+            insight: Insight::new(&model, update, &self.network, compute)?,
             enlarge: self.enlarge()?,
             enlarged: Vec::new(),
         })
@@ -215,9 +197,6 @@ impl Player {
 }
 
 /// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
-///
-/// # Errors
-/// The world failed, or episodes do not end.
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
     let mut policy = random_policy(config)?;
@@ -273,9 +252,6 @@ pub struct Viewer {
 
 impl Viewer {
     /// What the network makes of a step's states.
-    ///
-    /// # Errors
-    /// Bytes that are not whole states.
     pub fn look(&mut self, states: &[u8]) -> Result<Seen, UpdateError> {
         let Some(enlarge) = &self.enlarge else {
             return self.insight.look(states);
@@ -296,9 +272,6 @@ fn policy_rng(seed: u64) -> ChaCha8Rng {
 }
 
 /// The world with the levels asked for.
-///
-/// # Errors
-/// The world does not have them.
 pub fn levels(world: &WorldConfig, levels: Levels) -> Result<WorldConfig, Usage> {
     let levels = match levels {
         Levels::Train => driml_envs::Levels::Train,

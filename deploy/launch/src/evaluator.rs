@@ -71,15 +71,12 @@ impl Evaluator {
 
     /// Begins to play the newest checkpoint if it is due. Says whether it did.
     fn begin(&mut self, is_last: bool, screen: &Screen) -> bool {
-        let newest = match checkpoint::list(&self.run_dir.checkpoints()) {
-            Ok(all) => all.last().map(|(updates, _)| *updates),
-            Err(e) => {
-                tracing::debug!("looking for a checkpoint to play: {e}");
-                None
-            }
-        };
-        let Some(updates) = newest.filter(|&it| self.config.is_due(it, self.newest, is_last))
-        else {
+        let all = checkpoint::list(&self.run_dir.checkpoints()).unwrap_or_else(|e| {
+            tracing::debug!("looking for a checkpoint to play: {e}");
+            Vec::new()
+        });
+        let is_due = |&updates: &u64| self.config.is_due(updates, self.newest, is_last);
+        let Some(updates) = all.last().map(|it| it.0).filter(is_due) else {
             return false;
         };
         self.newest = updates;

@@ -3,7 +3,7 @@
 
 use std::{
     ops::ControlFlow,
-    sync::{Arc, Condvar, Mutex},
+    sync::{Arc, Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
@@ -21,9 +21,6 @@ pub struct Interrupts {
 impl Interrupts {
     /// Starts to listen for signs that this process should end, for the rest of its life; the death of the process `parent` is
     /// one.
-    ///
-    /// # Errors
-    /// As [`end_signs::listen`].
     pub fn listen(parent: Option<u32>) -> std::io::Result<Self> {
         let this = Self::default();
         let counted = this.clone();
@@ -49,36 +46,27 @@ impl Interrupts {
         }
     }
 
+    fn lock(&self) -> MutexGuard<'_, u32> {
+        let count = self.state.0.lock();
+        count.expect("no thread panics while holding the count")
+    }
+
     fn add(&self) {
-        *self
-            .state
-            .0
-            .lock()
-            .expect("no thread panics while holding the count") += 1;
+        *self.lock() += 1;
         self.state.1.notify_all();
     }
 
     /// How many there were.
     pub fn count(&self) -> u32 {
-        *self
-            .state
-            .0
-            .lock()
-            .expect("no thread panics while holding the count")
+        *self.lock()
     }
 
     /// Sleeps for `timeout`, or until there is one more; returns how many there were.
     pub fn wait_timeout(&self, timeout: Duration) -> u32 {
-        let count = self
-            .state
-            .0
-            .lock()
-            .expect("no thread panics while holding the count");
+        let count = self.lock();
         let before = *count;
-        let waited = self
-            .state
-            .1
-            .wait_timeout_while(count, timeout, |count| *count == before);
+        let (_, changed) = &*self.state;
+        let waited = changed.wait_timeout_while(count, timeout, |count| *count == before);
         *waited.expect("no thread panics while holding the count").0
     }
 }

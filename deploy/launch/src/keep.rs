@@ -31,9 +31,6 @@ pub struct Judged {
 ///
 /// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
 /// does not take its place.
-///
-/// # Errors
-/// As [`Player::load_at`] and [`Player::play`], and a file system that refuses.
 pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
     let path = checkpoint_at(folder, which)?;
     let candidate = Candidate::hold(folder, &path)?;

@@ -91,23 +91,17 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
 
 #[cfg(test)]
 mod tests {
-    use driml_machine::resources::Machine;
-    use driml_settings::{
-        presets::preset,
-        resolve::{Flags, Source, resolve},
-    };
-
     use super::*;
     use crate::{
         moment::Episodes,
         run_folder::Outcome,
         run_view::{Plan, RunView},
+        testing::config,
     };
 
     #[test]
     fn what_cannot_be_played_fails_no_run() {
-        let source = Source::Layers(preset("smoke").unwrap(), "chain".parse().unwrap(), "c51");
-        let mut config = resolve(&source, &Flags::default(), &Machine::this()).unwrap();
+        let mut config = config("smoke", "chain", "c51", &[]);
         assert!(!config.local.play, "a run that tests parts is not played");
         config.local.play = true;
         let view = RunView::new(Plan::of(&config));

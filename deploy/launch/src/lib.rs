@@ -48,5 +48,7 @@ pub mod run_folder;
 pub mod run_view;
 pub mod shared_memory;
 pub mod stats;
+#[cfg(test)]
+mod testing;
 pub mod view;
 pub mod watch;

@@ -9,6 +9,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_machine::units::kib;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -60,9 +61,6 @@ pub fn exit_with_this_process() -> [String; 2] {
 impl ManagedProcess {
     /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it. It ends when
     /// this process does.
-    ///
-    /// # Errors
-    /// The log cannot be written, or the process not started.
     pub fn start(
         name: &str,
         args: &[String],
@@ -76,13 +74,9 @@ impl ManagedProcess {
         } = surroundings;
         let log = ProcessLog::open(name, logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let stdin = match meeting {
-            Some(meeting) => {
-                let held = meeting.hold();
-                held.with_context(|| format!("starting {name}"))?.into()
-            }
-            None => Stdio::null(),
-        };
+        let held = meeting.map(Meeting::hold).transpose();
+        let held = held.with_context(|| format!("starting {name}"))?;
+        let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);
         set_thread_env(&mut command, threads);
         command
@@ -104,11 +98,10 @@ impl ManagedProcess {
             .process_group(0)
             .spawn()
             .with_context(|| format!("starting {name}"))?;
-        let (out, err) = (child.stdout.take(), child.stderr.take());
-        if let Some(pipe) = out {
+        if let Some(pipe) = child.stdout.take() {
             log.follow(pipe, screen)?;
         }
-        if let Some(pipe) = err {
+        if let Some(pipe) = child.stderr.take() {
             log.follow(pipe, screen)?;
         }
         Ok(Self {
@@ -193,7 +186,8 @@ impl ManagedProcess {
         if self.end().is_some() {
             return None;
         }
-        rss_mib(&std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?)
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?;
+        Some(kib(&status, "VmRSS:")? as f64 / 1024.0)
     }
 
     /// What to say about lines of its log that could not be written; `None` if all were.
@@ -221,11 +215,8 @@ impl ManagedProcess {
             (None, tail) if tail.is_empty() => String::new(),
             (None, tail) => format!("; its last lines:\n  {}", tail.join("\n  ")),
         };
-        format!(
-            "{} {how} (log: {}){last}",
-            self.name,
-            self.log.path().display()
-        )
+        let (name, log) = (&self.name, self.log.path().display());
+        format!("{name} {how} (log: {log}){last}")
     }
 }
 
@@ -233,25 +224,5 @@ impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
         let _ = self.child.wait();
-    }
-}
-
-/// Resident memory in MiB from `/proc/PID/status`.
-pub fn rss_mib(status: &str) -> Option<f64> {
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("VmRSS:"))?;
-    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    Some(kib / 1024.0)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn resident_memory_is_read_from_the_kernels_table() {
-        assert_eq!(rss_mib("Name:\tdriml\nVmRSS:\t    2048 kB\n"), Some(2.0));
-        assert_eq!(rss_mib("Name:\tdriml\n"), None);
     }
 }

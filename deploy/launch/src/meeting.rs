@@ -97,27 +97,24 @@ pub fn leave() {
 fn sweep(place: &Path) {
     let entries = fs::read_dir(place).into_iter().flatten().flatten();
     for entry in entries.filter(|it| it.file_name().to_string_lossy().starts_with(PREFIX)) {
-        let is_ours = entry
-            .metadata()
-            .is_ok_and(|it| it.is_dir() && it.uid() == geteuid().as_raw());
-        if is_ours && is_unused(&entry.path()) {
-            match fs::remove_dir_all(entry.path()) {
-                Ok(()) => tracing::debug!("removed {}", entry.path().display()),
-                Err(e) => tracing::debug!("removing {}: {e}", entry.path().display()),
-            }
+        let is_ours = |it: fs::Metadata| it.is_dir() && it.uid() == geteuid().as_raw();
+        let is_ours = entry.metadata().is_ok_and(is_ours);
+        if is_ours && is_free(&entry.path()) == Some(true) {
+            let removed = fs::remove_dir_all(entry.path());
+            tracing::debug!("removing {}: {removed:?}", entry.path().display());
         }
     }
 }
 
-fn is_unused(folder: &Path) -> bool {
-    let lock = File::open(folder.join(IN_USE));
-    lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(true)))
+/// Whether the lock of the folder at `path` can be had; none if that is not known.
+fn is_free(path: &Path) -> Option<bool> {
+    let lock = File::open(path.join(IN_USE)).ok()?;
+    lock_file::try_lock(&lock).ok()
 }
 
 /// Whether a process still uses the folder at `path`.
 pub(crate) fn is_used(path: &Path) -> bool {
-    let lock = File::open(path.join(IN_USE));
-    lock.is_ok_and(|lock| matches!(lock_file::try_lock(&lock), Ok(false)))
+    is_free(path) == Some(false)
 }
 
 #[cfg(test)]
@@ -173,9 +170,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let meeting = Meeting::create_in(place.path()).unwrap();
         let path = meeting.folder.path().display().to_string();
-        assert_eq!(
-            meeting.endpoint("learner"),
-            format!("unixsock-stream/{path}/learner.sock")
-        );
+        let endpoint = format!("unixsock-stream/{path}/learner.sock");
+        assert_eq!(meeting.endpoint("learner"), endpoint);
     }
 }

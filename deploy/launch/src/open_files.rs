@@ -18,10 +18,8 @@ fn of_server(actors: u64, shared_memory: bool) -> u64 {
 
 /// Checks that the launcher and its replay servers may open as many files as the run's actors take.
 pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
-    let (actors, shards) = (
-        u64::from(config.local.actors),
-        u64::from(config.replay.shards),
-    );
+    let actors = u64::from(config.local.actors);
+    let shards = u64::from(config.replay.shards);
     let of_launcher = BASE + OF_LAUNCHER * (actors + shards + 1);
     let of_server = of_server(actors.div_ceil(shards), config.transport.shared_memory);
     let (needed, whose) = match of_server > of_launcher {

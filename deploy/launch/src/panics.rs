@@ -92,7 +92,7 @@ mod tests {
     use std::{
         fs::File,
         os::unix::process::ExitStatusExt,
-        process::Command,
+        process::{Command, Output},
         sync::atomic::{AtomicBool, Ordering},
         time::{Duration, Instant},
     };
@@ -106,6 +106,12 @@ mod tests {
 
     /// Set where this test is the process that panics, to what it says before.
     const CHILD: &str = "DRIML_TEST_PANICS";
+
+    /// Runs one of these tests as the process that panics.
+    fn run_as_child(command: &mut Command, name: &str, says: &str) -> Output {
+        let command = command.args(["--exact", name, "--nocapture"]);
+        command.env(CHILD, says).output().unwrap()
+    }
 
     #[test]
     fn a_panic_while_the_process_ends_does_not_change_how() {
@@ -129,10 +135,7 @@ mod tests {
         let child = |says: &str| {
             let name = "panics::tests::a_panic_while_the_process_ends_does_not_change_how";
             let mut command = Command::new(std::env::current_exe().unwrap());
-            command
-                .args(["--exact", name, "--nocapture"])
-                .env(CHILD, says);
-            let ended = command.output().unwrap();
+            let ended = run_as_child(&mut command, name, says);
             let stderr = String::from_utf8(ended.stderr).unwrap();
             (ended.status, stderr.contains("panicked at"))
         };
@@ -153,23 +156,16 @@ mod tests {
             let _ = pool.alloc(1).wait();
             std::process::exit(5);
         }
-        let ended = Command::new("sh")
+        let name = "panics::tests::a_library_s_panic_names_what_was_scarce";
+        let mut command = Command::new("sh");
+        command
             .args(["-c", "ulimit -n 60 && exec \"$0\" \"$@\""])
-            .arg(std::env::current_exe().unwrap())
-            .args([
-                "--exact",
-                "panics::tests::a_library_s_panic_names_what_was_scarce",
-            ])
-            .arg("--nocapture")
-            .env(CHILD, "")
-            .output()
-            .unwrap();
+            .arg(std::env::current_exe().unwrap());
+        let ended = run_as_child(&mut command, name, "");
         assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
         let stderr = String::from_utf8(ended.stderr).unwrap();
-        let line = stderr
-            .lines()
-            .find(|line| line.starts_with("error: "))
-            .unwrap();
+        let mut lines = stderr.lines();
+        let line = lines.find(|line| line.starts_with("error: ")).unwrap();
         assert!(line.contains("zenoh-shm"), "{line}");
         let scarce = "; the program ends here, and the system is short of this: 60 of at most 60 files are open: raise the limit";
         assert!(line.contains(scarce), "{line}");

@@ -60,6 +60,7 @@ pub fn describe(
     let bytes = compressed.min(held * replay_bytes_each(run));
     let done = resume_point.updates as f64 / config.updates().max(1) as f64;
     let left = (1.0 - done).max(0.0);
+    let threads = local.learner_threads;
     let processes = if lockstep {
         "one, with everything in lockstep".into()
     } else {
@@ -67,23 +68,25 @@ pub fn describe(
             1 => "replay server".into(),
             shards => format!("{shards} replay servers"),
         };
-        let learner = match local.learner_device {
-            DeviceName::Cpu if learner.precision == Precision::F32 => {
-                format!("with {} threads", local.learner_threads)
-            }
-            DeviceName::Cpu => {
-                let (threads, precision) = (local.learner_threads, learner.precision);
-                format!("with {threads} threads, in {precision}")
-            }
-            gpu => format!("on {gpu}"),
+        let learner = match (local.learner_device, learner.precision) {
+            (DeviceName::Cpu, Precision::F32) => format!("with {threads} threads"),
+            (DeviceName::Cpu, precision) => format!("with {threads} threads, in {precision}"),
+            (gpu, _) => format!("on {gpu}"),
         };
-        let actors = if local.actors == 1 { "actor" } else { "actors" };
+        let (count, envs) = (local.actors, actor.envs);
+        let actors = if count == 1 { "actor" } else { "actors" };
         format!(
-            "{servers}; learner {learner}; {} {actors} with {} copies of the world each",
-            local.actors, actor.envs
+            "{servers}; learner {learner}; {count} {actors} with {envs} copies of the world each"
         )
     };
-    let lines = [
+    let (frames, updates, ratio) = (config.frames(), config.updates(), replay.replay_ratio);
+    let disk = match local.durable || lockstep {
+        true => " and about as much of disk, in the run folder",
+        false => "",
+    };
+    let time = about(estimate(config, machine.cores).mul_f64(left));
+    let mut text = String::new();
+    for (name, fact) in [
         (
             "trains",
             format!(
@@ -94,40 +97,28 @@ pub fn describe(
         (
             "frames",
             format!(
-                "{} in all, with {} updates of {} rows (replay ratio {})",
-                config.frames(),
-                config.updates(),
-                learner.batch_size,
-                replay.replay_ratio
+                "{frames} in all, with {updates} updates of {} rows (replay ratio {ratio})",
+                learner.batch_size
             ),
         ),
         ("processes", processes),
         (
             "replay",
             format!(
-                "the newest {held} transitions, up to {} of memory{}",
-                size(bytes),
-                match local.durable || lockstep {
-                    true => " and about as much of disk, in the run folder",
-                    false => "",
-                }
+                "the newest {held} transitions, up to {} of memory{disk}",
+                size(bytes)
             ),
         ),
         ("run folder", run_dir.display().to_string()),
         (
             "time",
-            format!(
-                "{} (coarse: from the network's arithmetic)",
-                about(estimate(config, machine.cores).mul_f64(left))
-            ),
+            format!("{time} (coarse: from the network's arithmetic)"),
         ),
-    ];
-    let mut text: String = lines
-        .iter()
-        .map(|(name, fact)| format!("{name:<INDENT$}{fact}\n"))
-        .collect();
+    ] {
+        text += &format!("{name:<INDENT$}{fact}\n");
+    }
     for note in &config.notes {
-        text.push_str(&format!("{:<INDENT$}{note}\n", "note"));
+        text += &format!("{:<INDENT$}{note}\n", "note");
     }
     text
 }
@@ -157,39 +148,16 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
-    use driml_settings::{
-        presets::PRESETS,
-        resolve::{Flags, Source, resolve},
-    };
-
-    const MACHINE: Machine = Machine {
-        cores: 2,
-        memory_bytes: 16 << 30,
-        fast_bf16: false,
-    };
-
-    fn config(world: &str, agent: &'static str) -> RunConfig {
-        let source = Source::Layers(&PRESETS[0], world.parse().unwrap(), agent);
-        resolve(&source, &Flags::default(), &MACHINE).unwrap()
-    }
+    use crate::testing::{MACHINE, config};
 
     #[test]
     fn the_plan_says_what_will_be_done() {
-        let config = config("procgen:bigfish", "driml-fix");
-        let plan = describe(
-            &config,
-            "preset paper",
-            &RunFolder::new("runs/x"),
-            false,
-            ResumePoint::default(),
-            &MACHINE,
-        );
+        let config = config("paper", "procgen:bigfish", "driml-fix", &[]);
+        let (folder, point) = (RunFolder::new("runs/x"), ResumePoint::default());
+        let plan = describe(&config, "preset paper", &folder, false, point, &MACHINE);
         // The time depends on a measured constant.
-        let plan: String = plan
-            .lines()
-            .filter(|line| !line.starts_with("time"))
-            .map(|line| format!("{line}\n"))
-            .collect();
+        let plan = plan.lines().filter(|line| !line.starts_with("time"));
+        let plan: String = plan.map(|line| format!("{line}\n")).collect();
         expect![[r#"
             trains      driml-fix on procgen:bigfish, seed 1, from preset paper
             frames      200000 in all, with 6218 updates of 256 rows (replay ratio 8)
@@ -201,8 +169,12 @@ mod tests {
 
     #[test]
     fn more_cores_and_less_to_learn_take_less_time() {
-        let time = |agent| estimate(&config("procgen:bigfish", agent), 2);
-        assert!(estimate(&config("procgen:bigfish", "driml-ada"), 4) < time("driml-ada"));
+        let time = |agent, cores| {
+            let config = config("paper", "procgen:bigfish", agent, &[]);
+            estimate(&config, cores)
+        };
+        assert!(time("driml-ada", 4) < time("driml-ada", 2));
+        let time = |agent| time(agent, 2);
         let ascending = ["c51", "driml-ada", "driml-fix", "cpc"].map(time);
         assert!(ascending.is_sorted(), "{ascending:?}");
         assert!(time("c51") < time("curl") && time("curl") < time("cpc"));
@@ -210,15 +182,14 @@ mod tests {
 
     #[test]
     fn estimates_are_not_precise() {
-        let texts =
-            [5, 600, 7_300, 90_000, 86_400].map(|seconds| about(Duration::from_secs(seconds)));
-        let expected = [
-            "under a minute",
-            "about 10 min",
-            "about 3 h",
-            "about 1 d 1 h",
-            "about 1 d",
-        ];
-        assert_eq!(texts, expected);
+        for (seconds, text) in [
+            (5, "under a minute"),
+            (600, "about 10 min"),
+            (7_300, "about 3 h"),
+            (90_000, "about 1 d 1 h"),
+            (86_400, "about 1 d"),
+        ] {
+            assert_eq!(about(Duration::from_secs(seconds)), text);
+        }
     }
 }

@@ -110,9 +110,6 @@ fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
 }
 
 /// The network that plays, without DIM's heads, as the bytes of a file that [`find`] reads.
-///
-/// # Errors
-/// A weight that f16 cannot hold.
 pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
     let config = &player.config;
     let exported = Exported {
@@ -130,21 +127,18 @@ pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
-    use driml_machine::resources::Machine;
-    use driml_settings::{
-        presets::preset,
-        resolve::{Flags, Source, resolve},
-    };
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::evaluate::{Levels, Who};
+    use crate::{
+        evaluate::{Levels, Who},
+        testing::config,
+    };
 
     /// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
     fn untrained(world: &str, agent: &'static str) -> Player {
-        let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
-        let config = resolve(&source, &Flags::default(), &Machine::this()).unwrap();
+        let config = config("smoke", world, agent, &[]);
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
         let weights = network.without_dim().unwrap();
@@ -187,10 +181,8 @@ mod tests {
             for (rounded, exact) in both[0].iter().zip(&both[1]) {
                 let size = exact.abs().max(StoredAs::F16.least_normal());
                 let error = StoredAs::F16.error() as f32 * size;
-                assert!(
-                    (rounded - exact).abs() <= error,
-                    "{name}: {rounded}, {exact}"
-                );
+                let is_near = (rounded - exact).abs() <= error;
+                assert!(is_near, "{name}: {rounded}, {exact}");
             }
         }
         assert_eq!(played(&read).len(), 4);
@@ -206,18 +198,21 @@ mod tests {
         let bytes = export(&untrained("chain", "c51")).unwrap();
         let other = export(&untrained("mspacman", "c51")).unwrap();
         let all: &[(&str, &[u8])] = &[("chain", &bytes[..]), ("ising", &other[..])];
-        assert_eq!(
-            said(all, "chian"),
-            "there are no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising"
-        );
-        assert_eq!(
-            said(&[], "chain"),
-            "there are no pretrained weights of \"chain\"; this program has none"
-        );
-        assert_eq!(
-            said(all, "ising"),
-            "pretrained:ising holds weights of mspacman"
-        );
+        for (all, game, why) in [
+            (
+                all,
+                "chian",
+                "there are no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising",
+            ),
+            (
+                &[],
+                "chain",
+                "there are no pretrained weights of \"chain\"; this program has none",
+            ),
+            (all, "ising", "pretrained:ising holds weights of mspacman"),
+        ] {
+            assert_eq!(said(all, game), why);
+        }
         assert!(said(&[("chain", &bytes[..99])], "chain").contains("is not an exported network"));
 
         // Weights of one network beside the settings of another.

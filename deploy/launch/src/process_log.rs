@@ -167,15 +167,21 @@ mod tests {
 
     #[test]
     fn warnings_and_worse_reach_the_screen() {
-        assert!(is_warning(
-            "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused"
-        ));
-        assert!(is_warning("2026-01-01T00:00:00.1Z ERROR driml_actor: gone"));
-        assert!(!is_warning("error: it is in the exit report"));
-        assert!(!is_warning(
-            "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here"
-        ));
-        assert!(!is_warning(""));
+        for (line, is_one) in [
+            (
+                "2026-01-01T00:00:00.1Z  WARN driml_actor: weights were refused",
+                true,
+            ),
+            ("2026-01-01T00:00:00.1Z ERROR driml_actor: gone", true),
+            ("error: it is in the exit report", false),
+            (
+                "2026-01-01T00:00:00.1Z  INFO driml_actor: ERROR is a word here",
+                false,
+            ),
+            ("", false),
+        ] {
+            assert_eq!(is_warning(line), is_one, "{line}");
+        }
     }
 
     #[test]

@@ -29,11 +29,8 @@ impl Rates {
     pub(crate) fn speed(&self) -> Speed {
         let rate = |count: fn(&(Instant, u64, u64)) -> u64| {
             let (first, last) = (self.samples.front()?, self.samples.back()?);
-            let idle = self
-                .samples
-                .iter()
-                .rev()
-                .find(|it| count(it) == count(first))?;
+            let mut newest_first = self.samples.iter().rev();
+            let idle = newest_first.find(|it| count(it) == count(first))?;
             let seconds = (last.0 - idle.0).as_secs_f64();
             (seconds > 0.0).then(|| count(last).saturating_sub(count(idle)) as f64 / seconds)
         };
@@ -53,11 +50,8 @@ mod tests {
         let (mut rates, start) = (Rates::default(), Instant::now());
         assert_eq!(rates.speed(), Speed::default());
         for second in 0..100 {
-            rates.add(
-                start + Duration::from_secs(second),
-                if second < 50 { 0 } else { (second - 50) * 10 },
-                0,
-            );
+            let frames = if second < 50 { 0 } else { (second - 50) * 10 };
+            rates.add(start + Duration::from_secs(second), frames, 0);
         }
         assert_eq!(rates.speed().frames, 10.0);
         assert!(rates.samples.len() <= 22);

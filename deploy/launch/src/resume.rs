@@ -62,42 +62,42 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
 pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     folder.lock()?;
     let checkpoints = folder.checkpoints();
-    let started = Instant::now();
-    let mut said = false;
-    while checkpoints.is_dir() {
-        match checkpoint::lock(&checkpoints) {
-            Err(CheckpointError::InUse(_)) if started.elapsed() < SAVING_MAX => {
-                if !std::mem::replace(&mut said, true) {
-                    console::line(&format!(
-                        "a learner still saves in {}: waiting",
-                        checkpoints.display()
-                    ));
-                }
-                std::thread::sleep(LOOK);
-            }
-            locked => {
-                locked?;
-                break;
-            }
-        }
+    let is_saved = || match checkpoints.is_dir().then(|| checkpoint::lock(&checkpoints)) {
+        Some(Err(CheckpointError::InUse(_))) => Ok(false),
+        locked => locked.transpose().map(|_| true),
+    };
+    let why = format!("a learner still saves in {}", checkpoints.display());
+    if !wait_until(is_saved, SAVING_MAX, &why)? {
+        checkpoint::lock(&checkpoints)?;
     }
     // The replay server is the last: it holds its replay, and where it listens.
-    let is_used = || {
+    let is_left = || {
         let place = std::fs::read(folder.meeting());
-        place.is_ok_and(|place| meeting::is_used(Path::new(OsStr::from_bytes(&place))))
+        let is_used = |place: Vec<u8>| meeting::is_used(Path::new(OsStr::from_bytes(&place)));
+        Ok(!place.is_ok_and(is_used))
     };
-    let saved = Instant::now();
+    let why = format!("processes of the run in {} still end", folder.display());
+    wait_until(is_left, ENDING_MAX, &why).map(drop)
+}
+
+/// Waits until it `is_so`, and says at first `why`. False if that takes too long.
+fn wait_until(
+    is_so: impl Fn() -> Result<bool, CheckpointError>,
+    max: Duration,
+    why: &str,
+) -> anyhow::Result<bool> {
+    let started = Instant::now();
     let mut said = false;
-    while is_used() && saved.elapsed() < ENDING_MAX {
+    while !is_so()? {
+        if started.elapsed() >= max {
+            return Ok(false);
+        }
         if !std::mem::replace(&mut said, true) {
-            console::line(&format!(
-                "processes of the run in {} still end: waiting",
-                folder.display()
-            ));
+            console::line(&format!("{why}: waiting"));
         }
         std::thread::sleep(LOOK);
     }
-    Ok(())
+    Ok(true)
 }
 
 /// How a run is resumed.
@@ -170,9 +170,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         });
     }
     let is_complete = updates >= config.updates();
-    // The last chunk is stored whole, so that a run may have more frames than its plan.
-    let is_shortened = config.frames() < frames.min(before.frames());
-    if is_complete && (is_shortened || Summary::is_finished(folder)) {
+    if is_complete && (config.frames() < frames || Summary::is_finished(folder)) {
         let run = folder.display();
         return Ok(Found::Nothing(format!(
             "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\

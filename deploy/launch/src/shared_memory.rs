@@ -19,16 +19,11 @@ pub fn remove_own() {
         let path = entry.path();
         let is_segment = path.extension().is_some_and(|it| it == EXTENSION);
         let file = entry.metadata().ok().filter(|_| is_segment);
-        if file.is_some_and(|file| {
-            let file = FileId {
-                major: major(file.dev()),
-                minor: minor(file.dev()),
-                inode: file.ino(),
-            };
-            is_held_by_alone(&locks, &file, std::process::id())
-        }) && !is_mapped_elsewhere(&path)
-        {
-            remove(&path);
+        let is_held_by_alone =
+            |file| is_held_by_alone(&locks, &FileId::of(&file), std::process::id());
+        if file.is_some_and(is_held_by_alone) && !is_mapped_elsewhere(&path) {
+            let removed = fs::remove_file(&path);
+            tracing::debug!("removing {}: {removed:?}", path.display());
         }
     }
 }
@@ -50,18 +45,21 @@ fn is_mapped_elsewhere(path: &Path) -> bool {
         .any(|maps| maps.lines().any(|line| line.ends_with(&*path)))
 }
 
-fn remove(path: &Path) {
-    match fs::remove_file(path) {
-        Ok(()) => tracing::debug!("removed {}", path.display()),
-        Err(e) => tracing::debug!("removing {}: {e}", path.display()),
-    }
-}
-
 /// What tells a file from all others.
 struct FileId {
     major: u64,
     minor: u64,
     inode: u64,
+}
+
+impl FileId {
+    fn of(file: &fs::Metadata) -> Self {
+        Self {
+            major: major(file.dev()),
+            minor: minor(file.dev()),
+            inode: file.ino(),
+        }
+    }
 }
 
 /// Whether the process `pid` alone holds a lock on the file, by the kernel's table of locks.
@@ -112,19 +110,13 @@ mod tests {
     fn the_kernel_s_table_is_as_this_reads_it() {
         let file = tempfile::tempfile().unwrap();
         file.lock().unwrap();
-        let data = file.metadata().unwrap();
-        let id = FileId {
-            major: major(data.dev()),
-            minor: minor(data.dev()),
-            inode: data.ino(),
-        };
+        let id = FileId::of(&file.metadata().unwrap());
         let locks = fs::read_to_string("/proc/locks").unwrap();
+        let is_held = is_held_by_alone(&locks, &id, std::process::id());
         assert!(
-            is_held_by_alone(&locks, &id, std::process::id()),
+            is_held,
             "{}:{}:{} in\n{locks}",
-            id.major,
-            id.minor,
-            id.inode
+            id.major, id.minor, id.inode
         );
     }
 }

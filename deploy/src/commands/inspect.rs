@@ -5,18 +5,13 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_envs::WorldName;
 use driml_launch::{
+    chosen::config_of,
     console::print,
     inspect::{Inspection, describe_worlds},
     run_folder::RunFolder,
 };
-use driml_machine::{
-    error::{Usage, usage},
-    resources::Machine,
-};
-use driml_settings::{
-    config::RunConfig,
-    flags::{RunFlags, resolve},
-};
+use driml_machine::resources::Machine;
+use driml_settings::flags::{RunFlags, resolve};
 
 #[derive(Debug, Args)]
 pub(crate) struct InspectArgs {
@@ -43,7 +38,7 @@ pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
         };
     }
     let config = match &args.run {
-        Some(folder) => of_run(&RunFolder::new(folder))?,
+        Some(folder) => config_of(&RunFolder::new(folder))?,
         None => resolve(&args.settings, &Machine::this())?.0,
     };
     let inspection = Inspection::of(&config)?;
@@ -63,17 +58,4 @@ fn in_every_world(settings: &RunFlags) -> anyhow::Result<Vec<Inspection>> {
         Inspection::of(&resolve(&flags, &machine)?.0)
     };
     WorldName::all().map(of_world).collect()
-}
-
-/// The settings of a run.
-fn of_run(folder: &RunFolder) -> Result<RunConfig, Usage> {
-    let path = folder.config();
-    let name = path.display().to_string();
-    let text = std::fs::read_to_string(&path).map_err(|e| {
-        usage!(
-            "{} is not the folder of a run: reading {name}: {e}",
-            folder.display()
-        )
-    })?;
-    RunConfig::parse(&name, &text)
 }

@@ -89,23 +89,17 @@ pub(crate) struct TrainArgs {
 /// Trains on this machine.
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
-    if let Some(device) = args.device {
-        args.run
-            .over
-            .sets
-            .push(format!("local.learner_device={device}"));
-    }
-    if args.durable {
-        args.run.over.sets.push("local.durable=true".into());
-    }
-    if args.tensorboard {
-        args.run.over.sets.push("local.tensorboard=true".into());
-    }
-    if args.no_play {
-        args.run.over.sets.push("local.play=false".into());
+    let sets = &mut args.run.over.sets;
+    sets.extend((args.device).map(|device| format!("local.learner_device={device}")));
+    for (is_set, set) in [
+        (args.durable, "local.durable=true"),
+        (args.tensorboard, "local.tensorboard=true"),
+        (args.no_play, "local.play=false"),
+    ] {
+        sets.extend(is_set.then(|| set.to_owned()));
     }
     if let Some(every) = args.evaluate_every {
-        let (sets, episodes) = (&mut args.run.over.sets, args.evaluate_episodes);
+        let episodes = args.evaluate_episodes;
         // Before what the user sets: checkpoints may be more frequent.
         sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
         sets.push(format!(
@@ -163,12 +157,13 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             run_dir
         }
     };
+    let from_point = resume_point.unwrap_or_default();
     let plan = plan::describe(
         &config,
         &from,
         &run_dir,
         args.lockstep,
-        resume_point.unwrap_or_default(),
+        from_point,
         &machine,
     );
     print_wrapped(&plan, plan::INDENT)?;
@@ -176,17 +171,13 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     if args.lockstep {
         lockstep::run(&config, &run_dir, resume_point, args.exit_with_parent)
     } else {
-        launcher::run(
-            &config,
-            &run_dir,
-            resume_point,
-            launcher::Outside {
-                listen: args.listen,
-                tls_dir: args.tls.tls_dir,
-                insecure_network: args.network.insecure_network,
-            },
-            args.exit_with_parent,
-        )
+        let outside = launcher::Outside {
+            listen: args.listen,
+            tls_dir: args.tls.tls_dir,
+            insecure_network: args.network.insecure_network,
+        };
+        let parent = args.exit_with_parent;
+        launcher::run(&config, &run_dir, resume_point, outside, parent)
     }
 }
 

@@ -1,14 +1,23 @@
 //! The rows of the table: parameters, FLOPs and bytes, of a configuration and of the same with everything on.
 //! What a layer or an update costs is counted in the crates of the model and the learner.
 
-use driml_learner::cost::{UpdateCost, UpdateShape};
-use driml_model::{LayerCost, ModelConfig, StoredAs};
+use driml_learner::{
+    Lambda,
+    auxiliary::loss::Passes,
+    cost::{UpdateCost, UpdateShape},
+};
+use driml_model::{DimHeads, HeadConfig, LayerCost, ModelConfig, StoredAs};
 use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 use serde::Serialize;
 
-use super::everything::Everything;
-
+/// What the second column stands for.
+pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
+     a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
+/// Positives of a row if everything is on: those of the agent that has most, cpc.
+const EVERY_POSITIVES: usize = 5;
+/// Rainbow's; no size depends on it.
+const NOISY_SIGMA: f64 = 0.5;
 /// The row of a whole batch.
 pub(super) const BATCH: &str = "a batch";
 
@@ -23,11 +32,154 @@ pub struct Line {
     pub everything: u64,
 }
 
-fn line(what: impl Into<String>, [is, everything]: [u64; 2]) -> Line {
-    Line {
-        what: what.into(),
-        is,
-        everything,
+/// What is counted, and how much of it.
+type Counts = Vec<(String, u64)>;
+
+/// What a column counts.
+pub(super) struct Counted<'a> {
+    config: &'a RunConfig,
+    model: ModelConfig,
+    shape: UpdateShape,
+    run: RunSpec,
+    /// Bytes of the weights as they are broadcast.
+    broadcast: usize,
+}
+
+impl<'a> Counted<'a> {
+    /// The configuration itself.
+    pub(super) fn of(config: &'a RunConfig) -> driml_model::Result<Self> {
+        Ok(Self {
+            config,
+            model: config.model.clone(),
+            shape: UpdateShape::of(&config.learner, config.run.horizon.positives()),
+            run: config.run.clone(),
+            broadcast: config.weights_bytes()?,
+        })
+    }
+
+    /// The same world and sizes with everything on, which no agent is.
+    pub(super) fn with_everything_on(config: &'a RunConfig) -> driml_model::Result<Self> {
+        let (frame, input) = (config.world.frame_shape(), config.input);
+        let model = ModelConfig {
+            height: input.height as usize,
+            width: input.width as usize,
+            num_actions: config.world.num_actions(),
+            dim: DimHeads {
+                psi3: true,
+                phi3: true,
+                psi4: true,
+                phi4: true,
+                action: true,
+            },
+            head: HeadConfig {
+                dueling: true,
+                noisy_sigma: Some(NOISY_SIGMA),
+            },
+            ..config.model.clone()
+        };
+        // A stack's frames as one, of the size that the network takes.
+        let run = RunSpec {
+            frame_height: input.height,
+            frame_width: input.width,
+            frame_channels: frame.channels as u32 * config.run.frame_stack,
+            frame_stack: 1,
+            horizon: Horizon::All {
+                k_max: EVERY_POSITIVES as u32,
+            },
+            ..config.run.clone()
+        };
+        let shape = UpdateShape {
+            rows: config.learner.batch_size.into(),
+            every_action: true,
+            double_dqn: true,
+            passes: Passes {
+                keys: 1,
+                ..Passes::of_pairs(Lambda::EVERY, EVERY_POSITIVES, true)
+            },
+        };
+        Ok(Self {
+            config,
+            broadcast: model.weights_bytes(StoredAs::F32)?,
+            model,
+            shape,
+            run,
+        })
+    }
+
+    /// The units in which the layers of all its networks are shown.
+    pub(super) fn units(&self) -> Vec<String> {
+        units(&self.model)
+    }
+
+    /// Scalars of all networks that the learner holds; `units` are those of the model that has most.
+    pub(super) fn parameters(&self, units: &[String]) -> Counts {
+        let layers = self.model.layer_costs();
+        let scalars = |part: &str| sum(&layers, part, |layer| layer.parameters);
+        let mut counts = by_unit(units, scalars);
+        let key = match self.shape.passes.keys {
+            0 => 0,
+            _ => scalars("torso") + scalars("dim.psi4"),
+        };
+        counts.push(("target network".into(), scalars("torso") + scalars("head")));
+        counts.push(("key encoder".into(), key));
+        counts
+    }
+
+    /// Arithmetic of one decision of an actor, where the network takes it and not chance.
+    pub(super) fn decision_flops(&self) -> Counts {
+        let layers = self.model.without_dim().layer_costs();
+        let forward = |part: &str| sum(&layers, part, |layer| layer.forward);
+        by_unit(&units(&self.model.without_dim()), forward)
+    }
+
+    /// Arithmetic of one update.
+    pub(super) fn update_flops(&self) -> Counts {
+        let cost = UpdateCost::of(&self.model, &self.shape);
+        named([
+            ("s_t, torso", cost.online),
+            ("s_t, C51 head", cost.head),
+            ("s_{t+n}, target network", cost.target),
+            ("s_{t+n}, online network", cost.double_dqn),
+            ("more states, torso", cost.states),
+            ("states, key encoder", cost.keys),
+            ("psi and phi", cost.heads),
+            ("scores", cost.scores),
+        ])
+    }
+
+    /// Bytes of a transition, a batch whose rows have every state, and a broadcast. Compression and the socket's own are not counted.
+    pub(super) fn bytes(&self) -> Counts {
+        let header = |run: &RunSpec| {
+            let header = BatchHeader::of(run, self.config.learner.batch_size);
+            header.sampled_by(&self.config.replay.sampling)
+        };
+        let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
+        let numbers = |run: &RunSpec| {
+            let without_states = BatchHeader {
+                state_bytes: 0,
+                stacked: None,
+                ..header(run)
+            };
+            without_states.payload_bytes() as u64
+        };
+        let states = |run: &RunSpec| batch(run) - numbers(run);
+        let run = &self.run;
+        let first_states = states(&RunSpec {
+            horizon: Horizon::None,
+            ..run.clone()
+        });
+        named([
+            (
+                "a transition in a chunk",
+                (run.frame_bytes() + TRANSITION_BYTES) as u64,
+            ),
+            ("a transition in the replay", replay_bytes_each(run)),
+            (BATCH, batch(run)),
+            ("  s_t and s_{t+n}", first_states),
+            ("  s_{t+k}", states(run) - first_states),
+            ("  numbers", numbers(run)),
+            ("a broadcast", self.broadcast as u64),
+        ])
     }
 }
 
@@ -52,102 +204,10 @@ fn units(model: &ModelConfig) -> Vec<String> {
     units
 }
 
-fn shape_of(config: &RunConfig) -> UpdateShape {
-    UpdateShape::of(&config.learner, config.run.horizon.positives())
+fn by_unit(units: &[String], count: impl Fn(&str) -> u64) -> Counts {
+    units.iter().map(|it| (it.clone(), count(it))).collect()
 }
 
-/// Scalars of all networks that the learner holds.
-pub(super) fn parameters(config: &RunConfig, every: &Everything) -> Vec<Line> {
-    let models = [&config.model, &every.model].map(ModelConfig::layer_costs);
-    let scalars = |parts: &[&str]| {
-        let of = |layers: &Vec<LayerCost>| {
-            let each = parts
-                .iter()
-                .map(|part| sum(layers, part, |layer| layer.parameters));
-            each.sum()
-        };
-        models.each_ref().map(of)
-    };
-    let units = units(&every.model).into_iter();
-    let mut lines: Vec<_> = units
-        .map(|unit| line(unit.as_str(), scalars(&[&unit])))
-        .collect();
-    lines.push(line("target network", scalars(&["torso", "head"])));
-    let [is, everything] = scalars(&["torso", "dim.psi4"]);
-    let has_key = shape_of(config).passes.keys > 0;
-    let is = if has_key { is } else { 0 };
-    lines.push(line("key encoder", [is, everything]));
-    lines
-}
-
-/// Arithmetic of one decision of an actor, where the network takes it and not chance.
-pub(super) fn decision_flops(config: &RunConfig, every: &Everything) -> Vec<Line> {
-    let models = [&config.model, &every.model].map(ModelConfig::without_dim);
-    let layers = models.each_ref().map(ModelConfig::layer_costs);
-    let forward = |part: &str| {
-        layers
-            .each_ref()
-            .map(|it| sum(it, part, |layer| layer.forward))
-    };
-    let units = units(&models[0]).into_iter();
-    units
-        .map(|unit| line(unit.as_str(), forward(&unit)))
-        .collect()
-}
-
-/// Arithmetic of one update.
-pub(super) fn update_flops(config: &RunConfig, every: &Everything) -> Vec<Line> {
-    let is = UpdateCost::of(&config.model, &shape_of(config));
-    let all = UpdateCost::of(&every.model, &every.shape);
-    vec![
-        line("s_t, torso", [is.online, all.online]),
-        line("s_t, C51 head", [is.head, all.head]),
-        line("s_{t+n}, target network", [is.target, all.target]),
-        line("s_{t+n}, online network", [is.double_dqn, all.double_dqn]),
-        line("more states, torso", [is.states, all.states]),
-        line("states, key encoder", [is.keys, all.keys]),
-        line("psi and phi", [is.heads, all.heads]),
-        line("scores", [is.scores, all.scores]),
-    ]
-}
-
-/// Bytes of a transition, a batch whose rows have every state, and a broadcast. Compression and the socket's own are not counted.
-pub(super) fn bytes(config: &RunConfig, every: &Everything) -> driml_model::Result<Vec<Line>> {
-    let header = |run: &RunSpec| {
-        BatchHeader::of(run, config.learner.batch_size).sampled_by(&config.replay.sampling)
-    };
-    let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
-    let numbers = |run: &RunSpec| {
-        let without_states = BatchHeader {
-            state_bytes: 0,
-            stacked: None,
-            ..header(run)
-        };
-        without_states.payload_bytes() as u64
-    };
-    let states = |run: &RunSpec| batch(run) - numbers(run);
-    let first_states = |run: &RunSpec| {
-        states(&RunSpec {
-            horizon: Horizon::None,
-            ..run.clone()
-        })
-    };
-    let later_states = |run: &RunSpec| states(run) - first_states(run);
-    let transition = |run: &RunSpec| (run.frame_bytes() + TRANSITION_BYTES) as u64;
-    let of = |what: &str, count: &dyn Fn(&RunSpec) -> u64| {
-        line(what, [&config.run, &every.run].map(count))
-    };
-    let broadcast = [
-        config.weights_bytes()?,
-        every.model.weights_bytes(StoredAs::F32)?,
-    ];
-    Ok(vec![
-        of("a transition in a chunk", &transition),
-        of("a transition in the replay", &replay_bytes_each),
-        of(BATCH, &batch),
-        of("  s_t and s_{t+n}", &first_states),
-        of("  s_{t+k}", &later_states),
-        of("  numbers", &numbers),
-        line("a broadcast", broadcast.map(|bytes| bytes as u64)),
-    ])
+fn named<const N: usize>(counts: [(&str, u64); N]) -> Counts {
+    counts.map(|(what, n)| (what.to_owned(), n)).into()
 }

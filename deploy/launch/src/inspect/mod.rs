@@ -2,14 +2,13 @@
 //! It counts from the settings: it builds no network, plays no world and measures no time.
 
 mod count;
-mod everything;
 
 use anyhow::Context;
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
 pub use count::Line;
-use everything::{EVERYTHING, Everything};
+use count::{Counted, EVERYTHING};
 
 /// Columns of the names; a longer name pushes its row to the right.
 const WHAT_COLUMNS: usize = 26;
@@ -36,19 +35,28 @@ pub struct Inspection {
 
 impl Inspection {
     /// Counts for the settings of a run.
-    ///
-    /// # Errors
-    /// The weights' file cannot be laid out.
     pub fn of(config: &RunConfig) -> anyhow::Result<Self> {
-        let every = Everything::of(config);
+        let counted = Counted::of(config)
+            .and_then(|is| Ok([is, Counted::with_everything_on(config)?]))
+            .context("computing the size of the weights")?;
+        let units = counted[1].units();
+        let lines = |count: &dyn Fn(&Counted<'_>) -> Vec<(String, u64)>| -> Vec<Line> {
+            let [is, all] = counted.each_ref().map(count);
+            let line = |((what, is), (_, everything))| Line {
+                what,
+                is,
+                everything,
+            };
+            is.into_iter().zip(all).map(line).collect()
+        };
         Ok(Self {
             world: config.run.world.clone(),
             agent: config.run.agent.clone(),
             everything: EVERYTHING,
-            parameters: count::parameters(config, &every),
-            update_flops: count::update_flops(config, &every),
-            decision_flops: count::decision_flops(config, &every),
-            bytes: count::bytes(config, &every).context("computing the size of the weights")?,
+            parameters: lines(&|it| it.parameters(&units)),
+            update_flops: lines(&|it| it.update_flops()),
+            decision_flops: lines(&|it| it.decision_flops()),
+            bytes: lines(&|it| it.bytes()),
         })
     }
 
@@ -66,13 +74,8 @@ impl Inspection {
                 row(heading, ["is", "everything"].map(str::to_owned))
             );
             let sum = is_summed.then(|| sum("all", lines));
-            for Line {
-                what,
-                is,
-                everything,
-            } in lines.iter().chain(&sum)
-            {
-                text += &row(what, [*is, *everything].map(thousands));
+            for line in lines.iter().chain(&sum) {
+                text += &row(&line.what, [line.is, line.everything].map(thousands));
             }
         }
         format!("{text}\neverything: {}\n", self.everything)

@@ -1,29 +1,12 @@
 //! An inspection against what a learner builds and sends.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
-use driml_machine::resources::Machine;
 use driml_protocol::{Batch, BatchHeader, Buffer, RowScalars};
-use driml_settings::{
-    presets::{AGENTS, PRESETS},
-    resolve::{Flags, Source, resolve},
-};
+use driml_settings::presets::AGENTS;
 use expect_test::expect;
 
 use super::*;
-
-fn config(world: &str, agent: &'static str, preset: usize, sets: &[&str]) -> RunConfig {
-    let machine = Machine {
-        cores: 2,
-        memory_bytes: 64 << 30,
-        fast_bf16: false,
-    };
-    let source = Source::Layers(&PRESETS[preset], world.parse().unwrap(), agent);
-    let flags = Flags {
-        sets: sets.iter().map(|&set| set.into()).collect(),
-        ..Flags::default()
-    };
-    resolve(&source, &flags, &machine).unwrap()
-}
+use crate::testing::config;
 
 fn find<'a>(lines: &'a [Line], what: &str) -> &'a Line {
     lines.iter().find(|line| line.what.trim() == what).unwrap()
@@ -31,7 +14,7 @@ fn find<'a>(lines: &'a [Line], what: &str) -> &'a Line {
 
 #[test]
 fn the_paper_s_agent_is_described() {
-    let inspection = Inspection::of(&config("procgen:bigfish", "driml-ada", 0, &[])).unwrap();
+    let inspection = Inspection::of(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
     expect![[r#"
         driml-ada on procgen:bigfish
 
@@ -86,7 +69,7 @@ fn the_paper_s_agent_is_described() {
 
 #[test]
 fn a_line_a_world_has_the_sums() {
-    let inspection = Inspection::of(&config("procgen:bigfish", "driml-ada", 0, &[])).unwrap();
+    let inspection = Inspection::of(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
     let text = describe_worlds(&[inspection.clone(), inspection]);
     assert_eq!(text.matches("\nprocgen:bigfish ").count(), 2, "{text}");
     for sum in [
@@ -103,10 +86,9 @@ fn a_line_a_world_has_the_sums() {
 #[test]
 fn what_is_counted_is_what_is_built() {
     let small = ["model.hidden=16", "model.rkhs=8", "learner.batch_size=4"];
-    let smoke = PRESETS.iter().position(|it| it.name == "smoke").unwrap();
     for world in ["procgen:bigfish", "mspacman", "ising", "chain"] {
         for agent in AGENTS.iter().map(|agent| agent.name) {
-            let config = config(world, agent, smoke, &small);
+            let config = config("smoke", world, agent, &small);
             let inspection = Inspection::of(&config).unwrap();
             let settings = LearnerConfig::from_toml(&config.to_toml()).unwrap();
             let mut learner = Learner::new(settings, &Compute::CPU).unwrap();
@@ -150,28 +132,21 @@ fn what_is_counted_is_what_is_built() {
                     assert_eq!(said_states.iter().sum::<usize>(), frames + stacks);
                 }
             }
-            for line in inspection.parameters.iter().chain(&inspection.bytes) {
-                assert!(line.is <= line.everything, "{agent} on {world}: {line:?}");
-            }
         }
     }
 }
 
 #[test]
 fn no_agent_has_more_than_everything() {
-    for agent in AGENTS.iter().map(|agent| agent.name) {
-        let sets: &[&str] = if agent == "c51" {
-            &["learner.update.double_dqn=true"]
-        } else {
-            &[]
-        };
-        let inspection = Inspection::of(&config("procgen:bigfish", agent, 0, sets)).unwrap();
-        for line in inspection
-            .update_flops
-            .iter()
-            .chain(&inspection.decision_flops)
-        {
-            assert!(line.is <= line.everything, "{agent}: {line:?}");
+    for world in ["procgen:bigfish", "mspacman", "ising", "chain"] {
+        for agent in AGENTS.iter().map(|agent| agent.name) {
+            let double = ["learner.update.double_dqn=true"];
+            let sets = if agent == "c51" { &double[..] } else { &[] };
+            let it = Inspection::of(&config("paper", world, agent, sets)).unwrap();
+            let tables = [it.parameters, it.update_flops, it.decision_flops, it.bytes];
+            for line in tables.concat() {
+                assert!(line.is <= line.everything, "{agent} on {world}: {line:?}");
+            }
         }
     }
 }

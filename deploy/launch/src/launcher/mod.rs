@@ -14,7 +14,7 @@ use driml_machine::{
     error::{Interrupted, Usage},
     units::duration,
 };
-use driml_protocol::{Keys, Waiting, config::Settings, session, shared_memory};
+use driml_protocol::{Keys, RunClient, Waiting, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -79,11 +79,10 @@ pub fn run(
     let names = process_names(config);
     let recorded = Recorded::of(config, names.clone());
     // Opening the recorder removes it.
-    let restarts_before = resumed
-        .and_then(|_| Summary::read(run_dir).ok())
-        .map_or([0; 2], |it| {
-            [it.replay_servers_restarted, it.actors_restarted]
-        });
+    let before = resumed.and_then(|_| Summary::read(run_dir).ok());
+    let restarts_before = before.map_or([0; 2], |it| {
+        [it.replay_servers_restarted, it.actors_restarted]
+    });
     let mut recorder = match resumed {
         Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
         None => RunRecorder::create(run_dir, recorded)?,
@@ -92,10 +91,9 @@ pub fn run(
         recorder.write_events(run_dir)?;
     }
     let resume_point = resumed.unwrap_or_default();
-    let evaluator = config.local.evaluation;
-    let evaluator = evaluator
-        .map(|it| Evaluator::new(it, run_dir))
-        .transpose()?;
+    let evaluation = config.local.evaluation;
+    let evaluator = evaluation.map(|it| Evaluator::new(it, run_dir));
+    let evaluator = evaluator.transpose()?;
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
@@ -232,6 +230,8 @@ impl Launch<'_> {
             let server = self.start_server(shard)?;
             self.processes.replay_servers.push(server);
         }
+        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
+        let hash = self.config.run.hash();
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
             match connect(endpoint, &self.interrupts, || {
@@ -240,13 +240,12 @@ impl Launch<'_> {
                 Some(session) => reached.push(Reached {
                     name: name.clone(),
                     endpoint: endpoint.clone(),
-                    session,
+                    client: RunClient::new(session, keys.clone(), hash),
                 }),
                 None => return Ok(Outcome::Interrupted),
             }
         }
-        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
-        let mut poller = Poller::new(self.config, reached, &keys);
+        let mut poller = Poller::new(self.config, reached);
         let ResumePoint {
             frames, updates, ..
         } = self.resume_point;
@@ -342,20 +341,15 @@ impl Launch<'_> {
         let abort = move || interrupts.count() > 1;
         let finished = matches!(ran, Ok(Outcome::Finished));
         // Once a process has failed, what the actors still have will hardly be learned from.
-        let actors_max = if ran.is_ok() {
-            ACTORS_DRAIN_MAX
-        } else {
-            FAILED_DRAIN_MAX
+        let actors_max = match ran {
+            Ok(_) => ACTORS_DRAIN_MAX,
+            Err(_) => FAILED_DRAIN_MAX,
         };
         // When the run is finished, actors hear it from the replay server and end by themselves.
         let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
         self.wait_for_final_checkpoint(&abort);
-        let mut others = stop(
-            self.processes.learner.as_mut_slice(),
-            true,
-            LEARNER_DRAIN_MAX,
-            &abort,
-        );
+        let learner = self.processes.learner.as_mut_slice();
+        let mut others = stop(learner, true, LEARNER_DRAIN_MAX, &abort);
         if let Some(poller) = &mut self.poller {
             if let Err(e) = poller.ask_replay() {
                 tracing::debug!("the replay server's last answer: {e:#}");
@@ -364,30 +358,24 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             poller.close();
         }
-        others.extend(stop(
-            &mut self.processes.replay_servers,
-            true,
-            REPLAY_DRAIN_MAX,
-            &abort,
-        ));
+        let servers = &mut self.processes.replay_servers;
+        others.extend(stop(servers, true, REPLAY_DRAIN_MAX, &abort));
         let is_complete = finished || self.is_complete();
         let result = match ran {
             _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
                 "stopped at once by a second interrupt: what was not saved is lost"
             )),
-            Ok(_) if !others.is_empty() => Err(anyhow::anyhow!(
-                "at the end of the run, {}",
-                others.join("; ")
-            )),
+            Ok(_) if !others.is_empty() => {
+                let others = others.join("; ");
+                Err(anyhow::anyhow!("at the end of the run, {others}"))
+            }
             Ok(outcome) => self.run_dir.check_whole().map(|()| outcome),
             Err(e) => Err(e),
         };
         // What an actor could not deliver is in the count of lost transitions; all that was learned is still saved.
-        let error = result
-            .as_ref()
-            .err()
-            .map_or(String::new(), |e| format!("{e:#}"));
+        let error = result.as_ref().err();
+        let error = error.map_or(String::new(), |e| format!("{e:#}"));
         let mut warnings: Vec<_> = actors.into_iter().chain(others).collect();
         let failed = failed.filter(|it| !warnings.contains(it));
         warnings.extend(failed);

@@ -19,8 +19,11 @@ const ACTOR_RESTARTS_MAX: u32 = 16;
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
 
-fn words(args: &[&str]) -> Vec<String> {
-    args.iter().map(|&arg| arg.to_owned()).collect()
+/// A command of this program and flags with their values.
+fn call<'a>(command: &str, flags: impl IntoIterator<Item = (&'a str, &'a str)>) -> Vec<String> {
+    let flags = flags.into_iter().flat_map(|(flag, value)| [flag, value]);
+    let words = command.split(' ').chain(flags);
+    words.map(str::to_owned).collect()
 }
 
 impl Outside {
@@ -28,8 +31,10 @@ impl Outside {
     fn flags(&self) -> Vec<String> {
         let mut flags = Vec::new();
         if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
-            flags.extend(["--listen".into(), listen.clone()]);
-            flags.extend(["--tls-dir".into(), folder.display().to_string()]);
+            let folder = folder.display().to_string();
+            flags = ["--listen", listen, "--tls-dir", &folder]
+                .map(str::to_owned)
+                .to_vec();
         }
         if self.insecure_network {
             flags.push("--insecure-network".into());
@@ -51,37 +56,25 @@ impl Launch<'_> {
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
-        let mut args = words(&[
-            "learner",
-            "--stay",
-            "--run-dir",
-            &folder,
-            "--device",
-            &device,
-        ]);
-        for endpoint in &self.endpoints {
-            args.extend(words(&["--connect", endpoint]));
-        }
-        ManagedProcess::start(
-            "learner",
-            &args,
-            self.config.local.learner_threads,
-            self.surroundings(&self.run_dir.logs()),
-        )
+        let connect = self.endpoints.iter().map(|it| ("--connect", it.as_str()));
+        let flags = [("--run-dir", folder.as_str()), ("--device", &device)];
+        let args = call("learner --stay", flags.into_iter().chain(connect));
+        let logs = self.run_dir.logs();
+        let threads = self.config.local.learner_threads;
+        ManagedProcess::start("learner", &args, threads, self.surroundings(&logs))
     }
 
     /// Starts an actor.
     pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let mut args = words(&[
-            "actor",
-            "--connect",
+        let (number, endpoint) = (
+            id.to_string(),
             &self.endpoints[id as usize % self.endpoints.len()],
-            "--id",
-            &id.to_string(),
-        ]);
+        );
+        let mut flags = vec![("--connect", endpoint.as_str()), ("--id", &number)];
         if self.config.world.name().foreign_code().is_some() {
-            args.extend(words(&["--env", &self.config.run.world]));
+            flags.push(("--env", &self.config.run.world));
         }
+        let args = call("actor", flags);
         let logs = self.run_dir.logs();
         let name = format!("actor-{id}");
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
@@ -124,25 +117,21 @@ impl Launch<'_> {
     pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
         let config = self.run_dir.config().display().to_string();
         let number = shard.to_string();
-        let mut args = words(&[
-            "replay-server",
-            "--stay",
-            "--listen",
-            &self.endpoints[shard],
-            "--shard",
-            &number,
-            "--config",
-            &config,
-        ]);
-        if shard == 0 {
-            args.extend(self.outside.flags());
-        }
+        let folder = self.run_dir.replay().display().to_string();
+        let mut flags = vec![
+            ("--listen", self.endpoints[shard].as_str()),
+            ("--shard", &number),
+            ("--config", &config),
+        ];
         if self.config.transport.shared_memory && !self.shared_memory {
-            args.extend(words(&["--set", "transport.shared_memory=false"]));
+            flags.push(("--set", "transport.shared_memory=false"));
         }
         if self.config.local.durable {
-            let folder = self.run_dir.replay().display().to_string();
-            args.extend(words(&["--replay-dir", &folder]));
+            flags.push(("--replay-dir", &folder));
+        }
+        let mut args = call("replay-server --stay", flags);
+        if shard == 0 {
+            args.extend(self.outside.flags());
         }
         let logs = self.run_dir.logs();
         let name = &self.servers[shard];

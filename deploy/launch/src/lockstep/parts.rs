@@ -14,7 +14,7 @@ use driml_protocol::{
 use driml_replay_server::{Mark, PersistArgs, Replay, Unready};
 use driml_settings::config::RunConfig;
 
-use super::saved::SavedParts;
+use super::saved::{SavedParts, Turn};
 use crate::{console, run_folder::RunFolder};
 
 /// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
@@ -45,17 +45,11 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
 /// The components of a run, which take turns.
 pub(super) struct Lockstep {
     actors: Vec<Collector>,
-    next_actor: usize,
     replay: Replay,
     learner: Learner,
-    status: LearnerStatus,
     batch_size: u32,
     steps_per_chunk: u32,
-    /// Transitions of each actor that came after the run's last.
-    unwanted: Vec<u64>,
-    /// The weights with which the actors act, and the updates after which they were published.
-    acting: Weights,
-    published: u64,
+    turn: Turn,
 }
 
 impl Lockstep {
@@ -96,15 +90,16 @@ impl Lockstep {
         let learner_config = LearnerConfig::from_toml(&text)?;
         let batch_size = learner_config.learner.batch_size;
         let replay = Replay::new(&config.run, &config.replay, batch_size)?;
-        let compute = config
-            .local
-            .learner_device
-            .open(learner_config.learner.precision)?;
+        let device = config.local.learner_device;
+        let compute = device.open(learner_config.learner.precision)?;
         let mut learner = Learner::new(learner_config, &compute)?;
-        let acting = learner.next_weights()?;
+        let Weights {
+            header,
+            safetensors,
+        } = learner.next_weights()?;
         let status = LearnerStatus {
-            weights_version: acting.header.version,
-            weights_sha256: acting.header.sha256_hex(),
+            weights_version: header.version,
+            weights_sha256: header.sha256_hex(),
             ..LearnerStatus::default()
         };
         let actor = |actor| {
@@ -114,28 +109,25 @@ impl Lockstep {
                 after_updates: 0,
                 earlier_incarnations: 0,
             };
-            Collector::new(
-                settings.clone(),
-                BufferPool::new(1),
-                life,
-                acting.header.version,
-                &acting.safetensors,
-            )
+            let (settings, pool) = (settings.clone(), BufferPool::new(1));
+            Collector::new(settings, pool, life, header.version, &safetensors)
         };
         let actors = (0..config.local.actors)
             .map(actor)
             .collect::<Result<Vec<_>, _>>()?;
         let mut this = Self {
-            unwanted: vec![0; actors.len()],
+            turn: Turn {
+                next_actor: 0,
+                unwanted: vec![0; actors.len()],
+                status,
+                acting: (header, safetensors),
+                published: 0,
+            },
             actors,
-            next_actor: 0,
             replay,
             learner,
-            status,
             batch_size,
             steps_per_chunk: settings.actor.steps_per_chunk,
-            acting,
-            published: 0,
         };
         this.join_actors()?;
         Ok(this)
@@ -158,24 +150,17 @@ impl Lockstep {
     }
 
     /// Takes back what [`Lockstep::save`] kept.
-    fn take(&mut self, saved: SavedParts) -> anyhow::Result<()> {
-        let count = self.actors.len();
-        if saved.actors.len() != count || saved.unwanted.len() != count || saved.next_actor >= count
-        {
-            bail!(
-                "it holds {} actors, and this run has {count}",
-                saved.actors.len()
-            );
+    fn take(&mut self, SavedParts { actors, turn, .. }: SavedParts) -> anyhow::Result<()> {
+        let (found, count) = (actors.len(), self.actors.len());
+        if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
+            bail!("it holds {found} actors, and this run has {count}");
         }
-        for (actor, state) in self.actors.iter_mut().zip(saved.actors) {
-            actor.set_weights(saved.acting.header.version, &saved.acting.safetensors)?;
+        let (header, safetensors) = &turn.acting;
+        for (actor, state) in self.actors.iter_mut().zip(actors) {
+            actor.set_weights(header.version, safetensors)?;
             actor.go_on_from(state)?;
         }
-        self.next_actor = saved.next_actor;
-        self.unwanted = saved.unwanted;
-        self.status = saved.status;
-        self.acting = saved.acting;
-        self.published = saved.published;
+        self.turn = turn;
         Ok(())
     }
 
@@ -191,7 +176,7 @@ impl Lockstep {
 
     /// What replay and learner say of themselves.
     pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
-        (self.replay.status(), &self.status)
+        (self.replay.status(), &self.turn.status)
     }
 
     /// Episodes that ended after the first `since`.
@@ -220,25 +205,21 @@ impl Lockstep {
 
     /// [`Lockstep::save`] of a run whose replay is marked in its log.
     fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
-        let actors = self
-            .actor_states()
-            .context("saving the worlds for a checkpoint; at the run's start it could be done")?;
+        let actors = self.actor_states();
         let saved = SavedParts {
-            actors,
-            next_actor: self.next_actor,
-            unwanted: self.unwanted.clone(),
+            actors: actors.context(
+                "saving the worlds for a checkpoint; at the run's start it could be done",
+            )?,
             replay: mark,
-            status: self.status.clone(),
-            acting: self.acting.clone(),
-            published: self.published,
+            turn: self.turn.clone(),
         };
         Ok(self.learner.save_with(folder, Some(&saved.to_bytes()?))?)
     }
 
     /// One chunk of the next actor, then every update that it allows; `false` once all updates are done.
     pub(super) fn round(&mut self) -> anyhow::Result<bool> {
-        let id = self.next_actor;
-        self.next_actor = (id + 1) % self.actors.len();
+        let id = self.turn.next_actor;
+        self.turn.next_actor = (id + 1) % self.actors.len();
         let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
         loop {
             match self.replay.insert(&chunk) {
@@ -253,7 +234,7 @@ impl Lockstep {
                     Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
                 },
                 InsertReply::Finished { .. } => {
-                    self.unwanted[id] += chunk.header.transitions() as u64;
+                    self.turn.unwanted[id] += chunk.header.transitions() as u64;
                     break;
                 }
                 InsertReply::OutOfOrder { expected } => {
@@ -288,7 +269,7 @@ impl Lockstep {
             set.map_err(anyhow::Error::msg)
                 .context("the replay rejected priorities")?;
         }
-        self.learner.note(&report, &mut self.status);
+        self.learner.note(&report, &mut self.turn.status);
         if let Some(affinity) = self.learner.affinity_update(LEARNER) {
             let set = self.replay.set_affinity(&affinity);
             set.map_err(anyhow::Error::msg)?;
@@ -300,26 +281,27 @@ impl Lockstep {
     }
 
     fn publish(&mut self) -> anyhow::Result<()> {
-        self.acting = self.learner.next_weights()?;
         let Weights {
             header,
             safetensors,
-        } = &self.acting;
+        } = self.learner.next_weights()?;
         for actor in &mut self.actors {
-            actor.set_weights(header.version, safetensors)?;
+            actor.set_weights(header.version, &safetensors)?;
         }
-        self.published = self.learner.updates();
-        self.status.weights_version = header.version;
-        self.status.weights_sha256 = header.sha256_hex();
+        let turn = &mut self.turn;
+        turn.published = self.learner.updates();
+        turn.status.weights_version = header.version;
+        turn.status.weights_sha256 = header.sha256_hex();
+        turn.acting = (header, safetensors);
         Ok(())
     }
 
     /// The last weights and everyone's last word.
     pub(super) fn end(&mut self) -> anyhow::Result<()> {
-        if self.published != self.learner.updates() {
+        if self.turn.published != self.learner.updates() {
             self.publish()?;
         }
-        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.unwanted).enumerate() {
+        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
             let produced = actor.produced() - unwanted;
             self.replay.goodbye(&Goodbye {
                 actor: id as u32,
@@ -327,7 +309,7 @@ impl Lockstep {
                 produced,
             });
         }
-        self.status.finished = true;
+        self.turn.status.finished = true;
         Ok(())
     }
 }

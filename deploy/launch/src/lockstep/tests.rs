@@ -1,27 +1,12 @@
 //! What a run in lockstep computes, and that one that was interrupted computes the same.
 
-use driml_machine::resources::Machine;
-use driml_settings::{
-    presets::preset,
-    resolve::{Flags, Source, resolve},
-};
-
 use super::*;
+use crate::testing;
 
 fn config(world: &str, agent: &'static str, frames: u64, sets: &[&str]) -> RunConfig {
-    let machine = Machine {
-        cores: 2,
-        memory_bytes: 16 << 30,
-        fast_bf16: false,
-    };
-    let source = Source::Layers(preset("smoke").unwrap(), world.parse().unwrap(), agent);
-    let flags = Flags {
-        frames: Some(frames),
-        actors: Some(2),
-        sets: sets.iter().map(|&set| set.into()).collect(),
-        ..Flags::default()
-    };
-    resolve(&source, &flags, &machine).unwrap()
+    let frames = format!("replay.transitions_max={frames}");
+    let sets = [sets, &["local.actors=2", &frames]].concat();
+    testing::config("smoke", world, agent, &sets)
 }
 
 fn frame(config: &RunConfig) -> (u32, u32) {
@@ -34,36 +19,34 @@ fn sha256(lockstep: &Lockstep) -> String {
 
 /// The SHA-256 of the weights after a whole run.
 fn weights(config: &RunConfig) -> String {
-    let mut lockstep = Lockstep::in_memory(config).unwrap();
+    ended(Lockstep::in_memory(config).unwrap())
+}
+
+/// The SHA-256 of the weights with which it ends.
+fn ended(mut lockstep: Lockstep) -> String {
     while lockstep.round().unwrap() {}
     lockstep.end().unwrap();
     sha256(&lockstep)
 }
 
+const WIDE_CHAIN: [&str; 4] = [
+    "world.height=15",
+    "world.width=17",
+    "input.height=15",
+    "input.width=17",
+];
+
 /// Worlds that are made so large that a convolution leaves a border out: as it is drawn, and enlarged.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
-    let chain = [
-        "world.height=15",
-        "world.width=17",
-        "input.height=15",
-        "input.width=17",
-    ];
     let pacman = ["input.height=88", "input.width=90"];
     for (world, sets, cut, whole) in [
-        ("chain", &chain[..], (14, 16), (15, 17)),
+        ("chain", &WIDE_CHAIN[..], (14, 16), (15, 17)),
         ("mspacman", &pacman, (20, 18), (21, 19)),
     ] {
         for precision in ["f32", "bf16"] {
-            let precision = [
-                format!("learner.precision={precision}"),
-                format!("actor.precision={precision}"),
-            ];
-            let sets: Vec<&str> = sets
-                .iter()
-                .copied()
-                .chain(precision.iter().map(String::as_str))
-                .collect();
+            let precision = ["learner", "actor"].map(|it| format!("{it}.precision={precision}"));
+            let sets = [sets, &precision.each_ref().map(String::as_str)].concat();
             let config = config(world, "driml-ada", 400, &sets);
             let before = config.with_whole_frames().unwrap();
             assert_eq!((frame(&config), frame(&before)), (cut, whole));
@@ -75,13 +58,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 /// A random crop reads what no convolution of the whole frame does.
 #[test]
 fn where_states_are_augmented_frames_stay_whole() {
-    let sets = [
-        "world.height=15",
-        "world.width=17",
-        "input.height=15",
-        "input.width=17",
-    ];
-    let config = config("chain", "curl", 400, &sets);
+    let config = config("chain", "curl", 400, &WIDE_CHAIN);
     assert_eq!(frame(&config), (15, 17));
     assert_eq!((config.model.height, config.model.width), (15, 17));
     weights(&config);
@@ -96,10 +73,7 @@ fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
     lockstep.save(&run_dir.checkpoints()).unwrap();
     (0..lost).for_each(|_| assert!(lockstep.round().unwrap()));
     drop(lockstep);
-    let mut lockstep = Lockstep::resume(config, &run_dir).unwrap();
-    while lockstep.round().unwrap() {}
-    lockstep.end().unwrap();
-    sha256(&lockstep)
+    ended(Lockstep::resume(config, &run_dir).unwrap())
 }
 
 /// The numbers of Rainbow.
@@ -123,10 +97,8 @@ fn a_run_that_was_interrupted_computes_what_it_would_have() {
         let whole = weights(&config);
         for (rounds, lost) in [(1, 3), (14, 5)] {
             let resumed = resumed_weights(&config, rounds, lost);
-            assert_eq!(
-                resumed, whole,
-                "{world} {agent} {sets:?} after {rounds} rounds"
-            );
+            let what = format!("{world} {agent} {sets:?} after {rounds} rounds");
+            assert_eq!(resumed, whole, "{what}");
         }
     }
 }
@@ -139,18 +111,26 @@ fn rows_that_are_drawn_by_priority_are_others() {
     assert_eq!(weights(&prioritised), weights(&prioritised));
     assert_ne!(weights(&prioritised), weights(&uniform));
 
+    let (_folder, run_dir) = begun(&uniform);
+    let why = refused(&prioritised, &run_dir);
+    let another = "replay.sampling is another rule than it was";
+    assert!(why.contains(another), "{why}");
+}
+
+/// A run that was interrupted after its first checkpoint.
+fn begun(config: &RunConfig) -> (tempfile::TempDir, RunFolder) {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
-    let mut lockstep = Lockstep::begin(&uniform, &run_dir).unwrap();
+    let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
     (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
     lockstep.save(&run_dir.checkpoints()).unwrap();
-    drop(lockstep);
-    let error = Lockstep::resume(&prioritised, &run_dir).map(drop);
-    let why = format!("{:#}", error.unwrap_err());
-    assert!(
-        why.contains("replay.sampling is another rule than it was"),
-        "{why}"
-    );
+    (folder, run_dir)
+}
+
+/// Why a run cannot be resumed.
+fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
+    let error = Lockstep::resume(config, run_dir).map(drop).unwrap_err();
+    format!("{error:#}")
 }
 
 /// Each resumption begins where the one before it saved.
@@ -182,27 +162,13 @@ fn a_finished_run_that_goes_on_computes_what_a_longer_one_would_have() {
     lockstep.end().unwrap();
     drop(lockstep);
     let long = config("mspacman", "driml-ada", 1024, &[]);
-    let mut lockstep = Lockstep::resume(&long, &run_dir).unwrap();
-    while lockstep.round().unwrap() {}
-    lockstep.end().unwrap();
-    assert_eq!(sha256(&lockstep), weights(&long));
+    let resumed = Lockstep::resume(&long, &run_dir).unwrap();
+    assert_eq!(ended(resumed), weights(&long));
 }
 
 #[test]
 fn what_cannot_go_on_says_why() {
     let config = config("chain", "c51", 800, &[]);
-    let begun = || {
-        let folder = tempfile::tempdir().unwrap();
-        let run_dir = RunFolder::new(folder.path());
-        let mut lockstep = Lockstep::begin(&config, &run_dir).unwrap();
-        (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
-        lockstep.save(&run_dir.checkpoints()).unwrap();
-        (folder, run_dir)
-    };
-    let said = |run_dir: &RunFolder| {
-        let error = Lockstep::resume(&config, run_dir).map(drop).unwrap_err();
-        format!("{error:#}")
-    };
     let segments = |run_dir: &RunFolder| {
         let files = std::fs::read_dir(run_dir.replay()).unwrap();
         let mut paths: Vec<_> = files.map(|it| it.unwrap().path()).collect();
@@ -211,22 +177,20 @@ fn what_cannot_go_on_says_why() {
         paths
     };
     // The newest segment begins with the mark, the one before it has the transitions.
-    let (_folder, run_dir) = begun();
+    let (_folder, run_dir) = begun(&config);
     std::fs::remove_file(segments(&run_dir).pop().unwrap()).unwrap();
-    let why = said(&run_dir);
-    assert!(
-        why.contains("is missing or damaged: the replay cannot go back"),
-        "{why}"
-    );
-    let (_folder, run_dir) = begun();
+    let why = refused(&config, &run_dir);
+    let missing = "is missing or damaged: the replay cannot go back";
+    assert!(why.contains(missing), "{why}");
+    let (_folder, run_dir) = begun(&config);
     std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
-    let why = said(&run_dir);
+    let why = refused(&config, &run_dir);
     assert!(why.contains("cannot resume to the same weights"), "{why}");
     // A learner's own checkpoint.
-    let (_folder, run_dir) = begun();
+    let (_folder, run_dir) = begun(&config);
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();
     unkept.save(&run_dir.checkpoints()).unwrap();
-    let why = said(&run_dir);
+    let why = refused(&config, &run_dir);
     assert!(why.contains("not a checkpoint of a lockstep run"), "{why}");
 }

@@ -14,7 +14,7 @@ struct Shard {
 }
 
 impl Shard {
-    const fn of(frames: u64, let_go: u64, ended: u64, first: u64) -> Self {
+    const fn of((frames, let_go, ended, first): (u64, u64, u64, u64)) -> Self {
         Self {
             frames,
             ended,
@@ -52,6 +52,14 @@ impl Shard {
     }
 }
 
+/// A run that begins.
+fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
+    let root = tempfile::tempdir().unwrap();
+    let folder = RunFolder::new(root.path());
+    let episodes = TrainingEpisodes::create(&folder).unwrap();
+    (root, folder, episodes)
+}
+
 fn hear(episodes: &mut TrainingEpisodes, shards: &[Shard]) -> Vec<String> {
     let statuses: Vec<_> = shards.iter().map(Shard::status).collect();
     let ask = |shard: usize, since| Ok::<_, Infallible>(shards[shard].reply(since));
@@ -65,23 +73,16 @@ fn rows(folder: &RunFolder) -> Vec<String> {
 
 #[test]
 fn every_episode_is_taken_once_from_every_shard() {
-    let root = tempfile::tempdir().unwrap();
-    let folder = RunFolder::new(root.path());
-    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
+    let (_root, folder, mut episodes) = begun();
     assert_eq!(episodes.mean(), None);
-    hear(
-        &mut episodes,
-        &[Shard::of(10, 0, 1, 0), Shard::of(5, 0, 0, 50)],
-    );
-    hear(
-        &mut episodes,
-        &[Shard::of(20, 1, 3, 0), Shard::of(5, 0, 1, 50)],
-    );
-    // Nothing has ended since.
-    hear(
-        &mut episodes,
-        &[Shard::of(20, 1, 3, 0), Shard::of(5, 0, 1, 50)],
-    );
+    // The last time nothing has ended since.
+    for [one, other] in [
+        [(10, 0, 1, 0), (5, 0, 0, 50)],
+        [(20, 1, 3, 0), (5, 0, 1, 50)],
+        [(20, 1, 3, 0), (5, 0, 1, 50)],
+    ] {
+        hear(&mut episodes, &[one, other].map(Shard::of));
+    }
     assert_eq!(
         rows(&folder),
         [
@@ -101,11 +102,9 @@ fn every_episode_is_taken_once_from_every_shard() {
 
 #[test]
 fn what_the_server_has_let_go_is_counted_and_said() {
-    let root = tempfile::tempdir().unwrap();
-    let folder = RunFolder::new(root.path());
-    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
-    hear(&mut episodes, &[Shard::of(10, 0, 5, 0)]);
-    let said = hear(&mut episodes, &[Shard::of(90, 155, 255, 0)]);
+    let (_root, folder, mut episodes) = begun();
+    hear(&mut episodes, &[Shard::of((10, 0, 5, 0))]);
+    let said = hear(&mut episodes, &[Shard::of((90, 155, 255, 0))]);
     assert!(
         said[0].starts_with("150 episodes have no row in episodes.csv"),
         "{said:?}"
@@ -127,10 +126,8 @@ fn what_the_server_has_let_go_is_counted_and_said() {
 
 #[test]
 fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
-    let root = tempfile::tempdir().unwrap();
-    let folder = RunFolder::new(root.path());
-    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
-    let shard = Shard::of(10, 0, 1, 0);
+    let (_root, folder, mut episodes) = begun();
+    let shard = Shard::of((10, 0, 1, 0));
     let ask = |_, since| {
         let mut reply = shard.reply(since);
         reply.episodes[0].played = None;
@@ -146,13 +143,11 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
 
 #[test]
 fn a_run_that_goes_on_has_the_episodes_before() {
-    let root = tempfile::tempdir().unwrap();
-    let folder = RunFolder::new(root.path());
-    let mut episodes = TrainingEpisodes::create(&folder).unwrap();
-    hear(&mut episodes, &[Shard::of(1_000, 0, 60, 0)]);
-    hear(&mut episodes, &[Shard::of(2_000, 60, 70, 0)]);
+    let (_root, folder, mut episodes) = begun();
+    hear(&mut episodes, &[Shard::of((1_000, 0, 60, 0))]);
+    hear(&mut episodes, &[Shard::of((2_000, 60, 70, 0))]);
     // What came after the checkpoint does not count, nor what was cut off.
-    hear(&mut episodes, &[Shard::of(3_000, 70, 90, 0)]);
+    hear(&mut episodes, &[Shard::of((3_000, 70, 90, 0))]);
     let path = folder.episodes();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text + "1.5,3000,91").unwrap();
@@ -160,30 +155,23 @@ fn a_run_that_goes_on_has_the_episodes_before() {
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, false).unwrap();
     assert_eq!(episodes.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
     // Another server, which counts from the start; the replay fills again.
-    hear(&mut episodes, &[Shard::of(1_500, 0, 40, 1_000)]);
+    hear(&mut episodes, &[Shard::of((1_500, 0, 40, 1_000))]);
     let expected: f64 = (10..70).chain(1_000..1_040).map(f64::from).sum();
-    assert_eq!(
-        episodes.mean().unwrap(),
-        MeanReturn {
-            mean: expected / 100.0,
-            of: 100
-        }
-    );
+    let mean = expected / 100.0;
+    assert_eq!(episodes.mean(), Some(MeanReturn { mean, of: 100 }));
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
     // A server that knows of those before, and of four more; it hands out all that it keeps.
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, true).unwrap();
-    hear(&mut episodes, &[Shard::of(2_600, 0, 114, 0)]);
-    hear(&mut episodes, &[Shard::of(2_600, 114, 115, 0)]);
+    hear(&mut episodes, &[Shard::of((2_600, 0, 114, 0))]);
+    hear(&mut episodes, &[Shard::of((2_600, 114, 115, 0))]);
     let text = rows(&folder);
     assert_eq!(text[text.len() - 5], "1.500,2600,111,4,2,110,9");
     assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");
 
     fs::remove_file(&path).unwrap();
-    assert_eq!(
-        TrainingEpisodes::go_on(&folder, 9, false).unwrap().mean(),
-        None
-    );
+    let nothing = TrainingEpisodes::go_on(&folder, 9, false).unwrap();
+    assert_eq!(nothing.mean(), None);
     fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
     let said = TrainingEpisodes::go_on(&folder, 9, false).unwrap_err();
     assert!(

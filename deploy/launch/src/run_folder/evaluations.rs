@@ -8,7 +8,9 @@ use std::{
 };
 
 use anyhow::Context;
+use csv::StringRecord;
 use driml_machine::error::usage;
+use serde::Deserialize;
 
 use super::{
     folder::RunFolder,
@@ -29,7 +31,7 @@ const HEADER: [&str; 6] = [
 const HELD: &str = ".playing-";
 
 /// What a checkpoint earned over whole episodes.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 pub struct Evaluated {
     /// Seconds of the run at the checkpoint, by the metrics; none without them.
     pub seconds: Option<f64>,
@@ -40,8 +42,10 @@ pub struct Evaluated {
     /// Whole episodes played.
     pub episodes: u32,
     /// Their mean undiscounted return.
+    #[serde(rename = "evaluated_return")]
     pub mean_return: f64,
     /// Its standard deviation over episodes; 0 for one.
+    #[serde(rename = "evaluated_return_sd")]
     pub deviation: f64,
 }
 
@@ -53,18 +57,9 @@ impl Evaluated {
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
         let table = Table::read(&path)?;
-        let rows = table.rows.iter().map(|row| {
-            let number = |name| table.value::<f64>(row, name);
-            let whole = |name| table.value::<u64>(row, name);
-            Some(Self {
-                seconds: number("seconds"),
-                frames: whole("frames"),
-                updates: whole("updates")?,
-                episodes: table.value(row, "episodes")?,
-                mean_return: number("evaluated_return")?,
-                deviation: number("evaluated_return_sd")?,
-            })
-        });
+        let header = StringRecord::from(table.header);
+        let rows = table.rows.iter();
+        let rows = rows.map(|row| row.deserialize(Some(&header)).ok());
         rows.collect::<Option<_>>().with_context(|| {
             usage!(
                 "{} is not a table of evaluations: move it away",
@@ -96,11 +91,12 @@ impl Evaluated {
         (mean_return, deviation): (f64, f64),
     ) -> Self {
         let metrics = Table::read(&folder.metrics()).unwrap_or_default();
-        let before = metrics.rows.iter().rev().find(|row| {
+        let is_before = |row: &&_| {
             metrics
-                .value::<u64>(row, "updates")
-                .is_some_and(|at| at <= updates)
-        });
+                .value(row, "updates")
+                .is_some_and(|at: u64| at <= updates)
+        };
+        let before = metrics.rows.iter().rev().find(is_before);
         let row = before.or(metrics.rows.first());
         Self {
             seconds: row.and_then(|row| metrics.value(row, "seconds")),
@@ -162,13 +158,8 @@ impl Candidate {
         let name = PathBuf::from(checkpoint.file_name().unwrap_or_default());
         let held = best.join(format!("{HELD}{}-{}", std::process::id(), name.display()));
         let this = Self { best, held, name };
-        let doing = || {
-            format!(
-                "holding {} in {}",
-                checkpoint.display(),
-                this.held.display()
-            )
-        };
+        let (from, to) = (checkpoint.display(), this.held.display());
+        let doing = || format!("holding {from} in {to}");
         fs::create_dir_all(&this.held).with_context(doing)?;
         for entry in fs::read_dir(checkpoint).with_context(doing)? {
             let entry = entry.with_context(doing)?;
@@ -278,52 +269,40 @@ mod tests {
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
         // What a process that was killed left.
-        let left = folder
-            .best()
-            .join(format!("{HELD}{}-checkpoint-7", u32::MAX));
-        let other = folder.best().join(format!("{HELD}1-checkpoint-7"));
+        let left = |pid: u32| folder.best().join(format!("{HELD}{pid}-checkpoint-7"));
+        let (left, other) = (left(u32::MAX), left(1));
         for folder in [&left, &other] {
             fs::create_dir(folder).unwrap();
         }
         sweep(&folder);
         assert!(!left.exists() && other.exists(), "process 1 lives");
         let all = Evaluated::all(&folder).unwrap();
-        let at: Vec<_> = all
-            .iter()
-            .map(|it| (it.frames, it.updates, it.mean_return))
-            .collect();
-        assert_eq!(
-            at,
-            [
-                (Some(300), 10, -1.0),
-                (Some(300), 20, 3.0),
-                (Some(500), 30, 3.0),
-                (Some(500), 40, 9.0)
-            ]
+        let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
+        let expected = [
+            (300, 10, -1.0),
+            (300, 20, 3.0),
+            (500, 30, 3.0),
+            (500, 40, 9.0),
+        ];
+        assert!(
+            at.eq(expected.map(|it| (Some(it.0), it.1, it.2))),
+            "{all:?}"
         );
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
-        assert!(
-            Evaluated::all(&folder)
-                .unwrap_err()
-                .to_string()
-                .contains("is not a table of evaluations")
-        );
+        let said = Evaluated::all(&folder).unwrap_err().to_string();
+        assert!(said.contains("is not a table of evaluations"), "{said}");
     }
 
     #[test]
-    fn a_checkpoint_from_before_the_first_row_has_that_row_s_frames() {
+    fn a_checkpoint_from_before_the_first_row_has_that_row_s_frames_if_there_is_one() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let metrics = "seconds,frames,updates\n1.0,300,120\n2.0,500,240\n";
         fs::write(folder.metrics(), metrics).unwrap();
         let earned = Evaluated::at(&folder, 100, 1, (2.0, 0.0));
         assert_eq!((earned.frames, earned.seconds), (Some(300), Some(1.0)));
-    }
 
-    #[test]
-    fn without_metrics_the_frames_are_unknown() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = RunFolder::new(root.path());
+        fs::remove_file(folder.metrics()).unwrap();
         let earned = Evaluated::at(&folder, 5, 1, (2.0, 0.0));
         assert_eq!((earned.frames, earned.seconds), (None, None));
         earned.add(&folder).unwrap();

@@ -97,9 +97,6 @@ impl RunFolder {
 
     /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
     /// that is corrected takes its folder again.
-    ///
-    /// # Errors
-    /// Says what to do.
     pub fn check_free(&self) -> Result<(), Usage> {
         let taken = match fs::read_dir(&self.path) {
             Ok(entries) => !self.is_empty_run(entries),
@@ -127,10 +124,10 @@ impl RunFolder {
             self.logs(),
             self.path.join(LOCK),
         ];
-        let frames = |path: PathBuf| -> u64 {
+        let has_frames = |path: PathBuf| {
             let text = fs::read(path).unwrap_or_default();
             let rows = Table::parse(&text).ok();
-            rows.and_then(|it| it.last("frames")).unwrap_or(0)
+            rows.is_some_and(|it| it.last("frames").is_some_and(|frames: u64| frames > 0))
         };
         let entries: Vec<_> = entries.flatten().collect();
         if entries.is_empty() {
@@ -143,9 +140,9 @@ impl RunFolder {
         };
         entries.iter().all(is_made)
             && self.config().exists()
-            && [self.metrics(), self.episodes()]
+            && ![self.metrics(), self.episodes()]
                 .into_iter()
-                .all(|it| frames(it) == 0)
+                .any(has_frames)
             && saved.is_ok_and(|all| all.is_empty())
     }
 
@@ -175,12 +172,9 @@ impl RunFolder {
         let path = self.path.join(LOCK);
         let doing = || format!("locking {}", path.display());
         let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
+        let folder = self.display();
         lock.ok_or_else(|| {
-            usage!(
-                "the run in {} is still running: stop it first, or wait",
-                self.display()
-            )
-            .into()
+            usage!("the run in {folder} is still running: stop it first, or wait").into()
         })
     }
 
@@ -206,9 +200,6 @@ impl RunFolder {
 }
 
 /// Writes a file whole or not at all.
-///
-/// # Errors
-/// A file system that refuses.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
@@ -226,10 +217,8 @@ mod tests {
         assert!(check_free(folder.path()).is_ok());
         fs::write(folder.path().join("x"), "").unwrap();
         let said = check_free(folder.path()).unwrap_err().to_string();
-        assert!(
-            said.contains("exists and is not empty: choose another --run-dir"),
-            "{said}"
-        );
+        let why = "exists and is not empty: choose another --run-dir";
+        assert!(said.contains(why), "{said}");
         assert!(check_free(&folder.path().join("x")).is_err());
     }
 
@@ -278,16 +267,11 @@ mod tests {
         // Root may write everywhere.
         if !nix::unistd::geteuid().is_root() {
             let said = refused(&closed.join("one"));
-            assert!(
-                said.contains("cannot be written: Permission denied"),
-                "{said}"
-            );
+            let why = "cannot be written: Permission denied";
+            assert!(said.contains(why), "{said}");
         }
-        assert!(
-            RunFolder::new(folder.path().join("a/b/c"))
-                .check_free()
-                .is_ok()
-        );
+        let new = RunFolder::new(folder.path().join("a/b/c"));
+        assert!(new.check_free().is_ok());
     }
 
     #[test]

@@ -94,9 +94,6 @@ pub struct RunRecorder {
 
 impl RunRecorder {
     /// Makes the folder and writes the settings; the clock starts.
-    ///
-    /// # Errors
-    /// A folder in which something lies, or a file system that refuses.
     pub fn create(folder: &RunFolder, run: Recorded) -> anyhow::Result<Self> {
         folder.check_free()?;
         fs::create_dir_all(folder.path())
@@ -271,6 +268,7 @@ impl RunRecorder {
         let frames = of_view.frames.max(self.resume_point.frames);
         let updates = of_view.updates.max(self.resume_point.updates);
         let rss = self.run.processes.iter().zip(&self.rss_max);
+        let rss = rss.map(|(name, mib)| (name.clone(), mib.map(f64::round).into()));
         Summary {
             resumed_after_updates: self.resume_point.updates,
             frames,
@@ -278,9 +276,7 @@ impl RunRecorder {
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
             mean_k: moment.k.map(|it| it.mean),
-            rss_mib_max: rss
-                .map(|(name, mib)| (name.clone(), mib.map(f64::round).into()))
-                .collect(),
+            rss_mib_max: rss.collect(),
             ..of_view
         }
     }

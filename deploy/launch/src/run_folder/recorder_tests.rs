@@ -3,28 +3,26 @@
 use std::convert::Infallible;
 
 use driml_actor::Schedule;
-use driml_protocol::{
-    EndedEpisode, Horizon, LearnerStatus, Played, Returns, RunSpec, TimeoutRule, Waiting,
-};
+use driml_protocol::{EndedEpisode, LearnerStatus, Played, Returns, RunSpec, Waiting};
 use expect_test::expect;
 
 use super::*;
-use crate::run_folder::{Earned, LastPlay};
+use crate::{
+    run_folder::{Earned, LastPlay},
+    testing::config,
+};
 
 fn spec() -> RunSpec {
-    RunSpec {
-        world: "chain".into(),
-        agent: "driml-ada".into(),
-        seed: 3,
-        frame_height: 12,
-        frame_width: 12,
-        frame_channels: 1,
-        frame_stack: 1,
-        num_actions: 3,
-        n_step: 7,
-        gamma: 0.99,
-        horizon: Horizon::Nhg { k_max: 5 },
-        timeout: TimeoutRule::Terminal,
+    config("smoke", "chain", "driml-ada", &[]).run
+}
+
+/// Where a run is resumed, with 16 rows an update.
+fn point(updates: u64) -> ResumePoint {
+    ResumePoint {
+        updates,
+        rows: 31 * 16,
+        frames: 2_000,
+        replay_is_kept: false,
     }
 }
 
@@ -111,10 +109,8 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let summary = recorder.summarise(Outcome::Finished, &spec(), &all);
     summary.write(&run).unwrap();
     assert!(Summary::is_finished(&run));
-    assert_eq!(
-        (summary.frames, summary.replay_ratio, summary.mean_k),
-        (2_000, Some(8.0), Some(1.5))
-    );
+    let counts = (summary.frames, summary.replay_ratio, summary.mean_k);
+    assert_eq!(counts, (2_000, Some(8.0), Some(1.5)));
 
     let csv = fs::read_to_string(run.metrics()).unwrap();
     let header = recorded(&["replay-server", "actor-0"]).header();
@@ -123,25 +119,11 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let epsilons = table.rows.iter().map(|row| table.value(row, "epsilon"));
     assert_eq!(epsilons.collect::<Vec<_>>(), [Some(0.5), Some(0.3)]);
 
-    let json: serde_json::Value =
-        serde_json::from_slice(&fs::read(run.summary()).unwrap()).unwrap();
-    for key in [
-        "frames",
-        "updates",
-        "transitions_inserted",
-        "transitions_lost",
-        "transitions_duplicated",
-        "rows_sampled",
-        "replay_ratio",
-        "episodes",
-        "mean_return",
-        "wall_seconds",
-        "frames_per_second",
-        "updates_per_second",
-        "mean_k",
-        "weights_version",
-        "weights_sha256",
-    ] {
+    let json = fs::read(run.summary()).unwrap();
+    let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
+    let keys = "frames updates transitions_inserted transitions_lost transitions_duplicated rows_sampled replay_ratio episodes \
+                mean_return wall_seconds frames_per_second updates_per_second mean_k weights_version weights_sha256";
+    for key in keys.split(' ') {
         assert!(!json[key].is_null(), "{key}");
     }
     assert_eq!(json["outcome"], "finished");
@@ -161,13 +143,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
         learner.updates = updates;
         recorder.record(&view(&replay, &learner), &[]);
     }
-    let resume_point = ResumePoint {
-        updates: 31,
-        rows: 31 * 16,
-        frames: 2_000,
-        replay_is_kept: false,
-    };
-    let said = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap_err();
+    let said = RunRecorder::go_on(&run, recorded(&processes), point(31), 9_999).unwrap_err();
     assert!(said.to_string().contains("is still running"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &spec(), &view(&replay, &learner));
     summary.write(&run).unwrap();
@@ -177,7 +153,7 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
-    let mut recorder = RunRecorder::go_on(&run, recorded(&processes), resume_point, 9_999).unwrap();
+    let mut recorder = RunRecorder::go_on(&run, recorded(&processes), point(31), 9_999).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (2_000, 1);
@@ -194,12 +170,8 @@ fn a_resumed_run_goes_on_in_its_metrics() {
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
-    let all = ResumePoint {
-        updates: 99,
-        ..resume_point
-    };
-    let read =
-        |frames_max| rows_up_to(&path, recorded(&processes).header(), all, frames_max).unwrap();
+    let header = recorded(&processes).header();
+    let read = |frames_max| rows_up_to(&path, header.clone(), point(99), frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
@@ -228,45 +200,30 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         let folder = tempfile::tempdir().unwrap();
         let run = RunFolder::new(folder.path());
         fs::write(run.episodes(), episodes).unwrap();
-        metrics
-            .iter()
-            .for_each(|text| fs::write(run.metrics(), text).unwrap());
-        let point = ResumePoint {
-            updates: 31,
-            rows: 31 * 16,
-            frames: 2_000,
-            replay_is_kept: false,
-        };
-        let recorder = RunRecorder::go_on(&run, recorded(&["actor-0"]), point, 9_999).unwrap();
+        if let Some(text) = metrics {
+            fs::write(run.metrics(), text).unwrap();
+        }
+        let recorder = RunRecorder::go_on(&run, recorded(&["actor-0"]), point(31), 9_999).unwrap();
         let rows = |name: &str| {
             let text = fs::read(run.path().join(name)).unwrap_or_default();
             Table::parse(&text).unwrap().rows.len()
         };
         assert_eq!(rows("episodes.csv"), 2, "{what}");
         assert_eq!(rows("episodes.aside-1.csv"), 1, "{what}");
-        assert_eq!(
-            (rows("metrics.csv"), rows("metrics.aside-1.csv")),
-            (kept, kept / 2),
-            "{what}"
-        );
+        let rows_of_metrics = (rows("metrics.csv"), rows("metrics.aside-1.csv"));
+        assert_eq!(rows_of_metrics, (kept, kept / 2), "{what}");
         let nothing = ReplayStatus::default();
         assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
-        let summary = recorder.summarise(
-            Outcome::Finished,
-            &spec(),
-            &view(&nothing, &LearnerStatus::default()),
-        );
-        assert!(
-            summary.wall_seconds >= seconds,
-            "{what}: {}",
-            summary.wall_seconds
-        );
+        let view = view(&nothing, &LearnerStatus::default());
+        let summary = recorder.summarise(Outcome::Finished, &spec(), &view);
+        let took = summary.wall_seconds;
+        assert!(took >= seconds, "{what}: {took}");
         assert_eq!(summary.frames, 2_000, "{what}");
         drop(recorder);
 
         // A run resumed twice from there sets aside beside what was set aside before.
         fs::write(run.episodes(), episodes).unwrap();
-        RunRecorder::go_on(&run, recorded(&["actor-0"]), point, 9_999).unwrap();
+        RunRecorder::go_on(&run, recorded(&["actor-0"]), point(31), 9_999).unwrap();
         assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
     }
 }
@@ -282,19 +239,12 @@ fn next_steps_stand_in_columns() {
         transitions_inserted: 1_280,
         ..ReplayStatus::default()
     };
+    let earned = |mean, low, high| Earned { mean, low, high };
     let played = LastPlay {
         weights: "averaged".into(),
         episodes: 100,
-        agent: Earned {
-            mean: 45.123,
-            low: 41.8,
-            high: 48.4,
-        },
-        random: Earned {
-            mean: 3.9,
-            low: 3.1,
-            high: 4.7,
-        },
+        agent: earned(45.123, 41.8, 48.4),
+        random: earned(3.9, 3.1, 4.7),
     };
     let mut summary = summary(&replay);
     summary.played = Some(played);

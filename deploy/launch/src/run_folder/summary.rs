@@ -213,9 +213,6 @@ impl Summary {
     }
 
     /// Writes it into the run folder, whole or not at all.
-    ///
-    /// # Errors
-    /// A file system that refuses.
     pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.summary();
         let doing = || format!("writing {}", path.display());
@@ -225,9 +222,6 @@ impl Summary {
     }
 
     /// Reads that of the run in `folder`.
-    ///
-    /// # Errors
-    /// There is none, or it is not one.
     pub fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         let path = folder.summary();
         let doing = || format!("reading {}", path.display());
@@ -255,11 +249,9 @@ impl Summary {
     pub fn next_steps(&self, run_dir: &RunFolder) -> String {
         let run = run_dir.display();
         let more = self.frames.saturating_mul(2);
+        let film = "films it, and plays a random policy beside it";
         let commands = commands(&[
-            (
-                format!("evaluate {run} --record play.gif"),
-                "films it, and plays a random policy beside it",
-            ),
+            (format!("evaluate {run} --record play.gif"), film),
             plot(run_dir),
             (format!("train --resume {run} --frames {more}"), "trains on"),
         ]);
@@ -268,19 +260,14 @@ impl Summary {
 
     /// How it ended and what its weights earn.
     pub fn describe(&self, run_dir: &RunFolder) -> String {
-        format!(
-            "{}\n{}{}\n",
-            self.counts(),
-            self.earned(),
-            run_dir.display()
-        )
+        let (counts, earned) = (self.counts(), self.earned());
+        format!("{counts}\n{earned}{}\n", run_dir.display())
     }
 
     /// The line about what was played; empty if nothing was.
     fn earned(&self) -> String {
-        self.played
-            .as_ref()
-            .map_or(String::new(), LastPlay::describe)
+        let played = self.played.as_ref();
+        played.map(LastPlay::describe).unwrap_or_default()
     }
 
     /// How the run ended and what it counted, in one line.
@@ -293,10 +280,9 @@ impl Summary {
                 self.mean_return_of, self.episodes
             ),
         };
-        let how = if self.outcome == Outcome::Finished {
-            "finished"
-        } else {
-            "interrupted"
+        let how = match self.outcome {
+            Outcome::Finished => "finished",
+            _ => "interrupted",
         };
         format!(
             "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
@@ -318,11 +304,8 @@ pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
 
 /// Commands and what each does, in columns.
 pub(crate) fn commands(commands: &[(String, &str)]) -> String {
-    let width = commands
-        .iter()
-        .map(|(command, _)| command.chars().count())
-        .max();
-    let width = width.unwrap_or(0);
+    let widths = commands.iter().map(|(command, _)| command.chars().count());
+    let width = widths.max().unwrap_or(0);
     let line = |(command, what): &(String, &str)| format!("  driml {command:width$}   {what}\n");
     commands.iter().map(line).collect()
 }

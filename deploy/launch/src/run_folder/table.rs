@@ -31,9 +31,6 @@ pub struct Table {
 
 impl Table {
     /// Reads a file's text. What follows the last line's end is still being written, or was cut off, and is left out.
-    ///
-    /// # Errors
-    /// Rows of different lengths, or text that is no UTF-8.
     pub fn parse(text: &[u8]) -> Result<Self, csv::Error> {
         let whole = text.iter().rposition(|&byte| byte == b'\n');
         let mut reader = csv::Reader::from_reader(&text[..whole.map_or(0, |end| end + 1)]);
@@ -126,14 +123,11 @@ impl AppendLog {
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
         let doing = || format!("writing {}", path.display());
         whole_file::write(path, first).with_context(doing)?;
-        let file = File::options()
-            .append(true)
-            .open(path)
-            .with_context(doing)?;
+        let file = File::options().append(true).open(path);
         let name = path.file_name().unwrap_or_default();
         Ok(Self {
             name: name.to_string_lossy().into_owned(),
-            file,
+            file: file.with_context(doing)?,
             length: first.len() as u64,
             waiting: VecDeque::new(),
             lost: 0,
@@ -153,11 +147,9 @@ impl AppendLog {
         self.waiting.drain(..more);
         self.lost += more as u64;
         let error = self.write().err()?;
+        let name = &self.name;
         let said = self.failed.is_none().then(|| {
-            format!(
-                "{} cannot be written: {error}; its rows wait in memory until it can be",
-                self.name
-            )
+            format!("{name} cannot be written: {error}; its rows wait in memory until it can be")
         });
         self.failed.get_or_insert(error);
         said
@@ -202,10 +194,8 @@ mod tests {
     fn values_are_found_by_name_in_whole_rows_alone() {
         let read = Table::parse(b"frames,loss\n1,\n2,0.5\n3,0.2").unwrap();
         assert_eq!(read.rows.len(), 2);
-        assert_eq!(
-            (read.last("frames"), read.last("loss")),
-            (Some(2), Some(0.5))
-        );
+        let last = (read.last("frames"), read.last("loss"));
+        assert_eq!(last, (Some(2), Some(0.5)));
         assert_eq!(read.value::<f64>(&read.rows[0], "loss"), None);
         assert_eq!(read.last::<u64>("k"), None);
         assert!(Table::parse(b"frames,lo").unwrap().header.is_empty());
@@ -237,16 +227,12 @@ mod tests {
         let mut table = full(&path);
         let row = |n: u32| format!("\"{n}, of five\"\n").into_bytes();
         let said = table.add(row(1)).unwrap();
-        assert!(
-            said.starts_with("metrics.csv cannot be written: No space left"),
-            "{said}"
-        );
+        let why = "metrics.csv cannot be written: No space left";
+        assert!(said.starts_with(why), "{said}");
         assert_eq!(table.add(row(2)), None, "it is said once");
         let missing = table.missing().unwrap();
-        assert!(
-            missing.starts_with("2 rows of metrics.csv are lost: "),
-            "{missing}"
-        );
+        let why = "2 rows of metrics.csv are lost: ";
+        assert!(missing.starts_with(why), "{missing}");
 
         table.file = File::options().append(true).open(&path).unwrap();
         assert_eq!((table.add(row(3)), table.missing()), (None, None));

@@ -122,14 +122,14 @@ impl Display {
         let updates = moment.learner.map_or(0, |it| it.updates);
         // Before the first update there are none.
         let learned = moment.learner.filter(|_| self.learns_since.is_some());
-        let losses = learned.map_or(String::new(), |it| {
+        let losses = learned.map(|it| {
             let others = it.losses.iter();
             let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
             format!("  C51 {:.3}{}", it.c51_kl, others.collect::<String>())
         });
-        let k = moment
-            .k
-            .map_or(String::new(), |k| format!("  mean k {:.2}", k.mean));
+        let losses = losses.unwrap_or_default();
+        let k = moment.k.map(|k| format!("  mean k {:.2}", k.mean));
+        let k = k.unwrap_or_default();
         let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
         let left = self.learns_since.filter(is_steady).and_then(|_| {
             let frames = self.plan.frames_planned.saturating_sub(frames);

@@ -90,7 +90,8 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
     };
     let most = log
         .bytes_max
-        .map_or(String::new(), |max| format!(" of at most {:.1}", mib(max)));
+        .map(|max| format!(" of at most {:.1}", mib(max)));
+    let most = most.unwrap_or_default();
     let bytes = mib(log.bytes);
     let flushed = seconds(log.flushed_s);
     let mut line = format!(
@@ -147,16 +148,14 @@ fn part_row(part: &PartStatus) -> Vec<String> {
         false => format!("GONE for {}", seconds(part.since_s)),
     };
     let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
-    let doing = part
-        .doing
-        .as_ref()
-        .map_or("-".into(), |(doing, since, said)| {
-            let doing = format!("{doing} since {}", seconds(*since));
-            match *said > REPORT_AGE_MAX {
-                true => format!("{doing} (reported {} ago)", seconds(*said)),
-                false => doing,
-            }
-        });
+    let doing = part.doing.as_ref();
+    let doing = doing.map_or("-".into(), |(doing, since, said)| {
+        let doing = format!("{doing} since {}", seconds(*since));
+        match *said > REPORT_AGE_MAX {
+            true => format!("{doing} (reported {} ago)", seconds(*said)),
+            false => doing,
+        }
+    });
     vec![
         part.who.to_string(),
         state,
@@ -171,17 +170,13 @@ fn part_row(part: &PartStatus) -> Vec<String> {
 /// Rows with columns as wide as their widest cell.
 fn table(rows: &[Vec<String>]) -> String {
     let width = |column: usize| {
-        let cells = rows.iter().filter_map(|row: &Vec<String>| row.get(column));
-        cells
-            .map(|cell: &String| cell.chars().count())
-            .max()
-            .unwrap_or(0)
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
     };
     let line = |row: &Vec<String>| {
         let cells = row.iter().enumerate();
-        let cells: Vec<_> = cells
-            .map(|(column, cell)| format!("{cell:0$}", width(column)))
-            .collect();
+        let cells = cells.map(|(column, cell)| format!("{cell:0$}", width(column)));
+        let cells: Vec<_> = cells.collect();
         format!("{}\n", cells.join("  ").trim_end())
     };
     rows.iter().map(line).collect()

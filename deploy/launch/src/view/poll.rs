@@ -19,15 +19,15 @@ use crate::run_view::{Plan, RunView, ServerAnswer};
 /// How long an answer may take; a process that is busy answers the next time.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
 
-/// A replay server and the session to it.
+/// A replay server that is reached.
 #[derive(Debug)]
 pub struct Reached {
     /// What it is called in messages.
     pub name: String,
     /// Where it listens.
     pub endpoint: String,
-    /// An open session to it, which the poller closes.
-    pub session: Session,
+    /// Asks it, through a session that the poller closes.
+    pub client: RunClient,
 }
 
 /// Asks a run's processes.
@@ -37,28 +37,16 @@ pub struct Poller {
     /// What they have answered.
     pub view: RunView,
     /// One for each shard of the replay.
-    servers: Vec<Server>,
-}
-
-struct Server {
-    name: String,
-    endpoint: String,
-    client: RunClient,
+    servers: Vec<Reached>,
 }
 
 impl Poller {
     /// Of the run with these settings, whose replay servers are reached already, one for each shard.
-    pub fn new(config: &RunConfig, servers: Vec<Reached>, keys: &Keys) -> Self {
-        let spec_hash = config.run.hash();
-        let server = |it: Reached| Server {
-            client: RunClient::new(it.session, keys.clone(), spec_hash),
-            name: it.name,
-            endpoint: it.endpoint,
-        };
+    pub fn new(config: &RunConfig, servers: Vec<Reached>) -> Self {
         Self {
             view: RunView::new(Plan::of(config)),
             config: config.clone(),
-            servers: servers.into_iter().map(server).collect(),
+            servers,
         }
     }
 
@@ -94,18 +82,18 @@ impl Poller {
             servers.push(Reached {
                 name: endpoint.clone(),
                 endpoint: endpoint.clone(),
-                session,
+                client: RunClient::new(session, keys.clone(), hash),
             });
         }
         let first = first.context("no endpoint to ask")?;
-        let mut this = Self::new(&first.config, servers, &keys);
+        let mut this = Self::new(&first.config, servers);
         this.view.after_updates = first.after_updates;
         Ok(this)
     }
 
     /// Asks all processes. Those that do not answer are named in the view.
     pub fn ask(&mut self) -> &RunView {
-        let servers: Vec<_> = self.servers.iter().map(Server::ask).collect();
+        let servers: Vec<_> = self.servers.iter().map(Reached::ask).collect();
         // The learner is asked through the first of them.
         let first = self.servers.first();
         let first = first.filter(|_| servers[0].replay.is_some());
@@ -130,9 +118,6 @@ impl Poller {
     }
 
     /// Asks the replay servers for their counts alone.
-    ///
-    /// # Errors
-    /// No answer in time, or one that is not of this run.
     pub fn ask_replay(&mut self) -> anyhow::Result<()> {
         let answers = self.servers.iter().map(|it| it.client.fetch(ANSWER_MAX));
         let shards = answers.collect::<Result<Vec<ReplayStatus>, _>>()?;
@@ -141,9 +126,6 @@ impl Poller {
     }
 
     /// Asks the learner alone.
-    ///
-    /// # Errors
-    /// No answer in time, or one that is not of this run.
     pub fn ask_learner(&mut self) -> anyhow::Result<()> {
         let first = self.servers.first();
         let first = first.context("a run has at least one replay server")?;
@@ -168,16 +150,13 @@ impl Poller {
     }
 }
 
-impl Server {
+impl Reached {
     fn ask(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
         let answers = replay.and_then(|it| Ok((it, self.client.fetch::<PartsStatus>(ANSWER_MAX)?)));
         let is_another_run = matches!(
             &answers,
-            Err(SessionError::Unreadable {
-                why: CodecError::RunSpec { .. },
-                ..
-            })
+            Err(SessionError::Unreadable { why, .. }) if matches!(why, CodecError::RunSpec { .. })
         );
         let (answers, recovering, error) = match answers {
             Ok(answers) => (Some(answers), None, None),

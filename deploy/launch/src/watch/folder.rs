@@ -78,10 +78,8 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
     let rows = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
     let last = |name| rows.last::<u64>(name).unwrap_or(0);
     let (frames, updates) = (last("frames"), last("updates"));
-    let (now, after_updates) = (
-        view.replay.transitions_inserted,
-        view.after_updates.unwrap_or(0),
-    );
+    let now = view.replay.transitions_inserted;
+    let after_updates = view.after_updates.unwrap_or(0);
     if after_updates == 0 && frames > now {
         return Err(usage!(
             "the run in {} had {frames} frames, and the watched run has {now}: it was restarted; choose another --run-dir",

@@ -7,6 +7,7 @@ mod report;
 mod tile;
 
 use std::{
+    fs::File,
     ops::ControlFlow,
     path::{Path, PathBuf},
 };
@@ -96,11 +97,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if args.keep {
         end_when_asked(folder.clone(), args.exit_with_parent)?;
         let judged = keep(&folder, which, args.episodes)?;
-        return print(&format!(
-            "{}{}\n",
-            judged.earned.describe(),
-            verdict(&judged)
-        ));
+        let earned = judged.earned.describe();
+        return print(&format!("{earned}{}\n", verdict(&judged)));
     }
     let mut player = match pretrained {
         Some(player) => player,
@@ -114,8 +112,12 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     player.config.world.install(&mut console::line)?;
     // Before an hour of playing.
-    let table = args.returns.as_deref().map(report::Table::begin);
-    let mut table = table.transpose()?;
+    let table = args.returns.as_ref().map(|path| {
+        let file = File::create(path);
+        let file = file.with_context(|| format!("--returns {}", path.display()))?;
+        anyhow::Ok((path, file))
+    });
+    let table = table.transpose()?;
     let world = levels(&player.config.world, args.levels)?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
@@ -152,16 +154,14 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     );
     drop(progress);
     let returns = match (returns, film) {
-        (Ok(returns), None) => returns,
-        (Ok(returns), Some(film)) => {
-            said(&film.finish()?)?;
-            returns
-        }
-        (Err(e), film) => {
-            if let Some(film) = film {
-                film.discard();
-            }
+        (Err(e), Some(film)) => {
+            film.discard();
             return Err(e);
+        }
+        (returns, film) => {
+            let returns = returns?;
+            film.map_or(Ok(()), |film| said(&film.finish()?))?;
+            returns
         }
     };
     said(&describe(&spec.agent, &returns))?;
@@ -174,8 +174,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     drop(progress);
     said(&describe("random", &random))?;
     let played = [(spec.agent.as_str(), returns), ("random", random)];
-    if let Some(table) = &mut table {
-        table.finish(&played)?;
+    if let Some((path, file)) = &table {
+        report::write(file, &played).with_context(|| format!("writing {}", path.display()))?;
     }
     if args.json {
         print(&report::json(&player, args.levels, args.seed, &played)?)?;

@@ -3,11 +3,9 @@
 
 use std::{
     fs::File,
-    io::{BufWriter, Write},
-    path::{Path, PathBuf},
+    io::{self, Write},
 };
 
-use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::{
     evaluate::{Levels, Player},
@@ -19,37 +17,15 @@ use serde_json::json;
 /// Who played, and the returns of the episodes.
 type Played<'a> = (&'a str, Vec<f64>);
 
-/// A file of returns.
-pub(super) struct Table {
-    path: PathBuf,
-    file: BufWriter<File>,
-}
-
-impl Table {
-    /// Makes the file, so that one that cannot be made is known before anything is played.
-    pub(super) fn begin(path: &Path) -> anyhow::Result<Self> {
-        let file = File::create(path).with_context(|| format!("--returns {}", path.display()))?;
-        Ok(Self {
-            path: path.to_owned(),
-            file: BufWriter::new(file),
-        })
-    }
-
-    /// Writes all returns.
-    pub(super) fn finish(&mut self, played: &[Played<'_>]) -> anyhow::Result<()> {
-        self.write(played)
-            .with_context(|| format!("writing {}", self.path.display()))
-    }
-
-    fn write(&mut self, played: &[Played<'_>]) -> std::io::Result<()> {
-        writeln!(self.file, "policy,episode,return")?;
-        for (name, returns) in played {
-            for (episode, value) in (1..).zip(returns) {
-                writeln!(self.file, "{name},{episode},{}", rounded(*value))?;
-            }
+/// Writes all returns as a table.
+pub(super) fn write(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
+    let mut text = "policy,episode,return\n".to_owned();
+    for (name, returns) in played {
+        for (episode, value) in (1..).zip(returns) {
+            text += &format!("{name},{episode},{}\n", rounded(*value));
         }
-        self.file.flush()
     }
+    file.write_all(text.as_bytes())
 }
 
 /// The object, on a line of its own.

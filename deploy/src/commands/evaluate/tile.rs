@@ -188,11 +188,8 @@ impl Layout {
     fn draw_panel(&self, picture: &mut Picture, area: Area, shot: &Shot, look: Look<'_>) {
         let action = usize::from(shot.action);
         let name = &self.action_names[action];
-        let best = look
-            .q_values
-            .iter()
-            .copied()
-            .fold(f32::NEG_INFINITY, f32::max);
+        let q_values = look.q_values.iter().copied();
+        let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let q = look.q_values[action];
         let chance = if q < best { " (by chance)" } else { "" };
         let lines = [
@@ -218,10 +215,8 @@ impl Layout {
             ..area
         };
         let probabilities = &look.probabilities[action * atoms..][..atoms];
-        let most = probabilities
-            .iter()
-            .copied()
-            .fold(f32::MIN_POSITIVE, f32::max);
+        let most = probabilities.iter().copied();
+        let most = most.fold(f32::MIN_POSITIVE, f32::max);
         let heights: Vec<_> = probabilities.iter().map(|p| f64::from(p / most)).collect();
         let (low, high) = (self.support[0], self.support[atoms - 1]);
         picture.bars(bars, &heights, Some(f64::from((q - low) / (high - low))));

@@ -82,22 +82,18 @@ impl Events {
         };
         let points = points.iter();
         let points = points.map(|(name, value)| (name.clone(), Value::Scalar(*value as f32)));
-        let said = self
-            .file
-            .add(encode::summary(at, &points.collect::<Vec<_>>()));
+        let points = encode::summary(at, &points.collect::<Vec<_>>());
+        let said = self.file.add(points);
         let was = self.slow_at;
         if !is_last && was.is_some_and(|last| last.elapsed() < SLOW_PERIOD) {
             return said;
         }
         self.slow_at = Some(Instant::now());
         let mut counted = Vec::new();
+        let (k, actions) = (&replay.k_histogram, &replay.action_histogram);
         for (name, now, before) in [
-            ("k/served", &replay.k_histogram, &mut self.k),
-            (
-                "actions/stored",
-                &replay.action_histogram,
-                &mut self.actions,
-            ),
+            ("k/served", k, &mut self.k),
+            ("actions/stored", actions, &mut self.actions),
         ] {
             let since = since(now, before);
             before.clone_from(now);
@@ -105,12 +101,11 @@ impl Events {
                 counted.push((name.to_owned(), since));
             }
         }
-        let histograms = counted
-            .iter()
-            .map(|(name, counts)| (name.clone(), Value::Counts(counts)));
+        let histograms = counted.iter();
+        let histograms = histograms.map(|(name, counts)| (name.clone(), Value::Counts(counts)));
         let histograms: Vec<_> = histograms.collect();
-        let more =
-            (!histograms.is_empty()).then(|| self.file.add(encode::summary(at, &histograms)));
+        let has_counted = !histograms.is_empty();
+        let more = has_counted.then(|| self.file.add(encode::summary(at, &histograms)));
         let drawn = self.affinity(at);
         said.or(more.flatten()).or(drawn)
     }
@@ -135,8 +130,8 @@ impl Events {
             height,
             png: &png,
         };
-        self.file
-            .add(encode::summary(at, &[("affinity/A".to_owned(), image)]))
+        let image = [("affinity/A".to_owned(), image)];
+        self.file.add(encode::summary(at, &image))
     }
 
     /// What is missing in the file, as [`AppendLog::missing`] says it.
@@ -153,11 +148,8 @@ fn now() -> f64 {
 /// What was counted since `before`; all of it where a counter is another one.
 fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
     let before = before.iter().copied().chain(std::iter::repeat(0));
-    let difference: Option<Vec<_>> = now
-        .iter()
-        .zip(before)
-        .map(|(now, before)| now.checked_sub(before))
-        .collect();
+    let both = now.iter().zip(before);
+    let difference: Option<Vec<_>> = both.map(|(now, before)| now.checked_sub(before)).collect();
     difference.unwrap_or_else(|| now.to_vec())
 }
 
@@ -218,10 +210,8 @@ mod tests {
         let again = Events::create(&folder, Some(70)).unwrap();
         assert_eq!(again.missing(), None);
         let mut counts = Vec::new();
-        let mut paths: Vec<_> = fs::read_dir(root.path())
-            .unwrap()
-            .map(|it| it.unwrap().path())
-            .collect();
+        let files = fs::read_dir(root.path()).unwrap();
+        let mut paths: Vec<_> = files.map(|it| it.unwrap().path()).collect();
         paths.sort();
         for path in paths {
             let text = fs::read(path).unwrap();
@@ -239,10 +229,7 @@ mod tests {
             }
             counts.push(records);
         }
-        assert_eq!(
-            counts,
-            [3, 2],
-            "version, curves, histogram; version, what is taken back"
-        );
+        let what = "version, curves, histogram; version, what is taken back";
+        assert_eq!(counts, [3, 2], "{what}");
     }
 }
