@@ -31,7 +31,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_700),
     ("replay-server", 11_500),
     ("learner", 26_000),
-    ("deploy", 39_620),
+    ("deploy", 38_500),
     ("tests", 12_300),
 ];
 /// Most lines of one file.
