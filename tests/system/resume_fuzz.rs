@@ -272,6 +272,22 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
     }
 }
 
+/// The last 32 of 1,280 frames are too few for another update, and the last update has a checkpoint already.
+#[test]
+fn the_last_checkpoint_counts_frames_that_came_after_its_last_update() {
+    let system = system();
+    for store in ["", "--durable", "--lockstep"] {
+        let dir = format!("run{store}");
+        let run = system.run_folder(&dir);
+        let flags = "--agent c51 --env chain --preset smoke --frames 1280 --set replay.replay_ratio=0.25 \
+             --set replay.slack_transitions=64 --set learner.checkpoint_period_updates=1";
+        let run_it = system.run(&format!("local {flags} {store} --run-dir {dir}"));
+        run_it.expect_code(0);
+        let last = saved(&run).unwrap();
+        assert_eq!((last.updates, last.frames), (16, 1_280), "{store}");
+    }
+}
+
 #[test]
 fn runs_stopped_anywhere_count_on_right() {
     (0..8).for_each(resume_once);

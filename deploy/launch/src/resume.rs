@@ -170,7 +170,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         });
     }
     let is_complete = updates >= config.updates();
-    if is_complete && (config.frames() < frames || Summary::is_finished(folder)) {
+    // The last chunk is stored whole, so that a run may have more frames than its plan.
+    let is_shortened = config.frames() < frames.min(before.frames());
+    if is_complete && (is_shortened || Summary::is_finished(folder)) {
         let run = folder.display();
         return Ok(Found::Nothing(format!(
             "nothing is left to do: the run in {run} has done {updates} updates and {frames} frames.\n\

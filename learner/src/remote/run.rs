@@ -236,8 +236,8 @@ fn learn(
 struct Saving {
     folder: PathBuf,
     counters: Arc<Counters>,
-    /// Updates in the newest checkpoint that was saved here.
-    saved: Option<u64>,
+    /// Updates and frames in the newest checkpoint that was saved here.
+    saved: Option<(u64, u64)>,
     /// The first failure since then.
     failed: Option<LearnerError>,
 }
@@ -255,7 +255,7 @@ impl Saving {
     fn save(&mut self, learner: &Learner) {
         match learner.save(&self.folder) {
             Ok(()) => {
-                self.saved = Some(learner.updates());
+                self.saved = Some(Self::counts(learner));
                 let saved = &self.counters.saved_updates;
                 saved.store(learner.updates(), Ordering::Release);
                 self.failed = None;
@@ -270,9 +270,13 @@ impl Saving {
         }
     }
 
-    /// Saves what is not saved yet.
+    fn counts(learner: &Learner) -> (u64, u64) {
+        (learner.updates(), learner.progress().frames())
+    }
+
+    /// Saves what is not saved yet: updates, and frames that were stored since.
     fn finish(mut self, learner: &Learner) -> Result<(), LearnerError> {
-        if self.saved != Some(learner.updates()) {
+        if self.saved != Some(Self::counts(learner)) {
             self.save(learner);
         }
         self.failed.map_or(Ok(()), Err)

@@ -71,9 +71,9 @@ pub fn run(
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
-    let mut saved = resumed.map(|point| point.updates);
+    let mut saved = resumed.map(|point| (point.updates, point.frames));
     // After how many updates a save was last tried.
-    let mut tried = saved.unwrap_or(0);
+    let mut tried = updates;
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
     while lockstep.round()? {
@@ -86,7 +86,7 @@ pub fn run(
                     "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
                 ));
             } else {
-                saved = Some(updates);
+                saved = Some((updates, lockstep.frames()));
                 evaluations.play(updates, false, &screen)?;
             }
         }
@@ -105,7 +105,8 @@ pub fn run(
             break;
         }
     }
-    if saved != Some(lockstep.updates()) || outcome == Outcome::Interrupted {
+    // Frames may have come since the last update.
+    if saved != Some((lockstep.updates(), lockstep.frames())) || outcome == Outcome::Interrupted {
         lockstep.save(&folder)?;
     }
     // After the last save: a longer run would go on from there without it.
