@@ -55,10 +55,7 @@ impl Report {
     pub fn check(&self, cuda: bool) -> anyhow::Result<()> {
         let is_missing = |state| state == State::Missing;
         let missing = lacking(&self.cpu, is_missing);
-        ensure!(
-            missing.is_empty(),
-            "training on the CPU needs: {missing}"
-        );
+        ensure!(missing.is_empty(), "training on the CPU needs: {missing}");
         let bad = lacking(&self.certificates, is_missing);
         ensure!(bad.is_empty(), "these certificates cannot be used: {bad}");
         let missing = lacking(&self.cuda, |state| state != State::Ok);
