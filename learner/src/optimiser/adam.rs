@@ -40,7 +40,7 @@ pub const STEP_ERROR: f64 = 0.004;
 
 /// Largest error of a moment against f64 while gradients go on, as a share of the decayed mean of their sizes, or of their squares:
 /// `beta` and each product and sum are rounded to f32, and 1 / (1 - beta) steps add up.
-pub fn moment_error(beta: f64) -> f64 {
+pub const fn moment_error(beta: f64) -> f64 {
     2e-7 / (1.0 - beta)
 }
 

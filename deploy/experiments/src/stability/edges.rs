@@ -1,7 +1,8 @@
-//! Numbers from all of an f32's range, and often from where its arithmetic changes its ways; and sums for references.
-//! The property tests beside each routine have a generator of their own, so that neither hides a gap of the other.
+//! Numbers from all of an f32's range, and often from where its arithmetic changes its ways; and what references are made of.
 
-use rand::Rng;
+use std::fmt;
+
+use rand::{Rng, seq::IndexedRandom};
 
 /// Ends of ranges.
 const ENDS: [f32; 11] = [
@@ -23,13 +24,14 @@ pub(super) fn finite(rng: &mut impl Rng) -> f32 {
     match rng.random_range(0..10) {
         0..4 => rng.random_range(-10.0f32..10.0),
         4..6 => {
-            // Every bit pattern is as likely but those that are not finite.
+            // Every bit pattern is as likely but those that are not finite, which lose a bit of their exponent.
             let bits = rng.random::<u32>();
-            f32::from_bits(if bits >> 23 & 0xff == 0xff {
-                bits ^ 0x4000_0000
+            let any = f32::from_bits(bits);
+            if any.is_finite() {
+                any
             } else {
-                bits
-            })
+                f32::from_bits(bits ^ 0x4000_0000)
+            }
         }
         6 => f32::from_bits(rng.random::<u32>() & 0x807f_ffff),
         7..9 => {
@@ -38,7 +40,7 @@ pub(super) fn finite(rng: &mut impl Rng) -> f32 {
                 f32::from_bits((exponent << 23).wrapping_add_signed(rng.random_range(-1..=1)));
             if rng.random() { -size } else { size }
         }
-        _ => ENDS[rng.random_range(0..ENDS.len())],
+        _ => one_of(&ENDS, rng),
     }
 }
 
@@ -52,7 +54,7 @@ pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
         3 => vec![finite(rng); count],
         4 => {
             let two = [finite(rng), finite(rng)];
-            (0..count).map(|_| two[rng.random_range(0..2)]).collect()
+            (0..count).map(|_| one_of(&two, rng)).collect()
         }
         _ => {
             let size = finite(rng);
@@ -61,6 +63,12 @@ pub(super) fn finites(count: usize, rng: &mut impl Rng) -> Vec<f32> {
                 .collect()
         }
     }
+}
+
+/// The same, none larger than `most`.
+pub(super) fn clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
+    let values = finites(count, rng).into_iter();
+    values.map(|x| x.clamp(-most, most)).collect()
 }
 
 /// Weights of `count` atoms that sum to 1, some of them 0 or tiny.
@@ -83,9 +91,25 @@ pub(super) fn probability(rng: &mut impl Rng) -> f32 {
         0 => rng.random(),
         1 => finite(rng).abs().min(1.0),
         2 => 1.0 - finite(rng).abs().min(1.0),
-        _ => [0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0][rng.random_range(0..6)],
+        _ => one_of(&[0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0], rng),
     }
 }
+
+/// Supports from one step of a float to 2e30 wide, near 0 and far from it.
+pub(super) const SUPPORTS: [(f32, f32); 12] = [
+    (-10.0, 10.0),
+    (0.0, 1.0),
+    (1000.0, 1001.0),
+    (1e6, 1e6 + 1.0),
+    (1.0, 1.0f32.next_up()),
+    (1e6, 1e6f32.next_up()),
+    (-1e-6, 1e-6),
+    (-1e6, 1e6),
+    (-1.0, 1e6),
+    (-1e30, 1e30),
+    (0.0, 1e30),
+    (0.0, 1e-45),
+];
 
 /// The ends of a support within 1e30: usual, one step of a float wide, or any.
 pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
@@ -93,12 +117,8 @@ pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
     match rng.random_range(0..4) {
         0 => (-10.0, 10.0),
         1 => {
-            let low = end(rng);
-            if low < 1e30 {
-                (low, low.next_up())
-            } else {
-                (low.next_down(), low)
-            }
+            let low = end(rng).min(1e30f32.next_down());
+            (low, low.next_up())
         }
         _ => loop {
             let (a, b) = (end(rng), end(rng));
@@ -129,11 +149,40 @@ pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
     sum + lost
 }
 
-/// The first of `values`, and how many they are.
-pub(super) fn shown(values: &[f32]) -> String {
-    let first: Vec<_> = values.iter().take(4).map(|x| format!("{x:e}")).collect();
-    let more = if values.len() > 4 { ", .." } else { "" };
-    format!("[{}{more}] ({})", first.join(", "), values.len())
+/// The error of `found` as a share of what it should be, or of the least normal number where that is larger.
+pub(super) fn off(found: f32, expected: f64) -> f64 {
+    (f64::from(found) - expected).abs() / expected.abs().max(f32::MIN_POSITIVE.into())
+}
+
+/// The largest of errors, and NaN if one is.
+pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
+    let larger = |a: f64, b: f64| if b.is_nan() || b > a { b } else { a };
+    errors
+        .into_iter()
+        .fold(0.0, |a, b| if a.is_nan() { a } else { larger(a, b) })
+}
+
+/// One of the numbers that are not finite.
+pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
+    one_of(&[f32::INFINITY, f32::NEG_INFINITY, f32::NAN], rng)
+}
+
+/// One of these.
+pub(super) fn one_of<T: Copy>(values: &[T], rng: &mut impl Rng) -> T {
+    *values
+        .choose(rng)
+        .expect("a list that is written out has an item")
+}
+
+/// Displays the first of `values`, and how many they are.
+pub(super) struct Shown<'a>(pub(super) &'a [f32]);
+
+impl fmt::Display for Shown<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let more = if self.0.len() > 4 { ", .." } else { "" };
+        let first: Vec<_> = self.0.iter().take(4).map(|x| format!("{x:e}")).collect();
+        write!(f, "[{}{more}] ({})", first.join(", "), self.0.len())
+    }
 }
 
 #[cfg(test)]

@@ -1,9 +1,18 @@
-//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once.
+//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once; and the
+//! settings of small runs.
 
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
+use driml_envs::WorldName;
+use driml_learner::{Agent, Compute, LearnerSettings, NetworkParameters};
+use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result};
+use driml_settings::{
+    config::RunConfig,
+    presets,
+    resolve::{Flags, Source, resolve},
+};
 
 /// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
 pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
@@ -42,16 +51,20 @@ pub(super) fn len(config: &ModelConfig) -> usize {
         .sum()
 }
 
-/// Parameters with these scalars, one tensor after the other.
-pub(super) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
-    let mut tensors = HashMap::new();
+/// Tensors with these scalars, one after the other.
+pub(super) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<String, Tensor>> {
     let mut rest = values;
-    for (name, shape) in config.parameter_shapes() {
+    let each = config.parameter_shapes().into_iter().map(|(name, shape)| {
         let (first, after) = rest.split_at(shape.iter().product());
         rest = after;
-        tensors.insert(name, Tensor::from_slice(first, shape, &Device::Cpu)?);
-    }
-    Parameters::from_tensors(config, tensors, &Device::Cpu)
+        Ok((name, Tensor::from_slice(first, shape, &Device::Cpu)?))
+    });
+    each.collect()
+}
+
+/// Parameters with these scalars, which are finite.
+pub(super) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
+    Parameters::from_tensors(config, tensors(config, values)?, &Device::Cpu)
 }
 
 /// The scalars of all parameters, in the order of [`parameters`].
@@ -63,4 +76,39 @@ pub(super) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Ve
         }
     }
     Ok(values)
+}
+
+/// A run of the first preset, with these settings as `--set` takes them.
+pub(super) fn run(
+    world: WorldName,
+    agent: &'static str,
+    sets: Vec<String>,
+) -> anyhow::Result<RunConfig> {
+    let source = Source::Layers(&presets::PRESETS[0], world, agent);
+    let flags = Flags {
+        sets,
+        ..Flags::default()
+    };
+    Ok(resolve(&source, &flags, &Machine::this())?)
+}
+
+/// An agent with these weights.
+pub(super) fn agent(
+    model: &ModelConfig,
+    settings: &LearnerSettings,
+    compute: &Compute,
+    online: &Parameters,
+    target: &Parameters,
+) -> anyhow::Result<Agent> {
+    let parameters = NetworkParameters {
+        online: online.copy()?,
+        target: target.copy()?,
+        key: None,
+    };
+    Ok(Agent::from_parameters(
+        model.clone(),
+        settings.clone(),
+        compute,
+        parameters,
+    )?)
 }

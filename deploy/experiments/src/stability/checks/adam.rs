@@ -1,0 +1,269 @@
+//! Adam: steps of any gradients, ten million of them, and the bias correction of any step number.
+
+use driml_learner::{
+    AdamSettings, Kernels,
+    optimiser::adam::{Adam, Rule, STEP_ERROR, step_floor},
+};
+use rand::Rng;
+
+use super::optimiser::gradients;
+use crate::stability::{
+    edges::{Shown, clamped, one_of},
+    property::{Cases, broken},
+    small,
+};
+
+/// As `driml-ada` on Procgen has them, but for the eps, which here is the one that rounds worst.
+pub(crate) const PRESET: AdamSettings = AdamSettings {
+    lr: 2.5e-4,
+    beta1: 0.9,
+    beta2: 0.999,
+    eps: 1e-8,
+};
+
+/// One parameter and its moments in float64.
+#[derive(Clone, Copy, Default)]
+struct Exact {
+    p: f64,
+    m: f64,
+    v: f64,
+    /// How far the parameter went, back and forth.
+    way: f64,
+    /// What f32 may add: [`step_floor`] of each step.
+    floor: f64,
+    /// Decayed mean of the gradients' sizes.
+    size: f64,
+}
+
+/// `N` parameters that start at 0, as the rule steps them in f32, and in float64.
+struct Run<const N: usize> {
+    settings: AdamSettings,
+    p: [f32; N],
+    m: [f32; N],
+    v: [f32; N],
+    exact: [Exact; N],
+    is_finite: bool,
+}
+
+impl<const N: usize> Run<N> {
+    fn new(settings: AdamSettings) -> Self {
+        Self {
+            settings,
+            p: [0.0; N],
+            m: [0.0; N],
+            v: [0.0; N],
+            exact: [Exact::default(); N],
+            is_finite: true,
+        }
+    }
+
+    fn step(&mut self, t: u64, g: [f32; N]) {
+        let rule = Rule::new(self.settings, t, 1.0);
+        self.is_finite &= rule.apply(&mut self.p, &g, &mut self.m, &mut self.v);
+        let AdamSettings {
+            lr,
+            beta1,
+            beta2,
+            eps,
+        } = self.settings;
+        // 1 - beta^t, which keeps its digits near beta = 1 and near t = 0.
+        let [first, second] = [beta1, beta2].map(|beta| match beta {
+            0.0 => 1.0,
+            _ => -(t as f64 * beta.ln()).exp_m1(),
+        });
+        for (it, g) in self.exact.iter_mut().zip(g.map(f64::from)) {
+            it.m = beta1 * it.m + (1.0 - beta1) * g;
+            it.v = beta2 * it.v + (1.0 - beta2) * g * g;
+            it.size = beta1 * it.size + (1.0 - beta1) * g.abs();
+            let step = lr * (it.m / first) / ((it.v / second).sqrt() + eps);
+            it.p -= step;
+            it.way += step.abs();
+            it.floor += step_floor(it.p.abs().max(step.abs()), eps);
+        }
+    }
+
+    /// The error of a parameter as a share of its way, [`step_floor`] apart.
+    fn error(&self, at: usize) -> f64 {
+        let it = self.exact[at];
+        match (f64::from(self.p[at]) - it.p).abs() - it.floor {
+            _ if !self.is_finite => f64::NAN,
+            error if error <= 0.0 => 0.0,
+            error => error / it.way,
+        }
+    }
+}
+
+/// The error of one parameter after these gradients.
+fn error_after(settings: AdamSettings, gradients: &[f32]) -> f64 {
+    let mut run = Run::<1>::new(settings);
+    (1..).zip(gradients).for_each(|(t, &g)| run.step(t, [g]));
+    run.error(0)
+}
+
+/// The largest `max_grad_norm`.
+const LARGEST: f32 = 1e15;
+
+pub(crate) fn sequences(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    for (beta1, beta2) in [(0.0, 0.0), (0.9, 0.999), (0.99999, 0.99999), (0.0, 0.99999)] {
+        for eps in [1e-15, 1e-8, 1.0, 1e30] {
+            for lr in [1e-30, 2.5e-4, 1.0] {
+                for g in [0.0, 1e-45, 1e-38, 1e-19, 1e-8, 1.0, 1e15] {
+                    let settings = AdamSettings {
+                        lr,
+                        beta1,
+                        beta2,
+                        eps,
+                    };
+                    for count in [1, 120] {
+                        let error = error_after(settings, &vec![g; count]);
+                        let extreme = "up to 120 equal gradients of 0, 1e-45, 1e-38, 1e-19, 1, 1e15; eps 1e-15, 1e-8, 1, 1e30; beta 0, 0.9, 0.99999";
+                        let input = format_args!("{settings:?}, {count} gradients of {g:e}");
+                        cases.see(extreme, input, [error])?;
+                    }
+                }
+            }
+        }
+    }
+    let betas = [
+        (0.0, 0.0),
+        (0.0, 0.9),
+        (0.9, 0.99),
+        (0.9, 0.999),
+        (0.5, 0.99999),
+    ];
+    for _ in cases.draws(0.5) {
+        let rng = &mut cases.rng;
+        let (beta1, beta2) = one_of(&betas, rng);
+        let settings = AdamSettings {
+            lr: one_of(&[1e-30, 1e-4, 1.0], rng),
+            beta1,
+            beta2,
+            eps: one_of(&[1e-15, 1e-8, 3.9e-5, 1.0, 1e30], rng),
+        };
+        let gradients = clamped(rng.random_range(1..120), LARGEST, rng);
+        let error = Some(error_after(settings, &gradients));
+        let input = format_args!("{settings:?}, gradients {}", Shown(&gradients));
+        cases.see("drawn, up to 120 gradients", input, [None, error])?;
+    }
+    Ok(())
+}
+
+/// A name, and the gradient of a step beside noise from -1 to 1.
+type Pattern = (&'static str, fn(u64, f32) -> f32);
+
+/// Patterns of gradients; of the first three, which never end, the moments promise something.
+const PATTERNS: [Pattern; 8] = [
+    ("0.02 for ever", |_, _| 0.02),
+    ("+-1e-5 in turn", |t, _| 1e-5 * turn(t)),
+    ("noise", |_, noise| noise * 1e-3),
+    ("one of 1 in a thousand, else 1e-6", |t, _| match t % 1000 {
+        0 => 1.0,
+        _ => 1e-6,
+    }),
+    ("falling to 0 within 1e5 steps", |t, _| {
+        (-(t as f32) / 1000.0).exp()
+    }),
+    ("1e-20 for ever", |_, _| 1e-20),
+    ("+-1e15 in turn", |t, _| 1e15 * turn(t)),
+    ("subnormal, 1e-40", |_, _| 1e-40),
+];
+
+const fn turn(t: u64) -> f32 {
+    if t.is_multiple_of(2) { 1.0 } else { -1.0 }
+}
+
+pub(crate) fn long_run(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let steps = cases.settings.adam_steps;
+    let extreme = format!("{steps} steps of eight patterns of gradients, 1e-40 to 1e15");
+    let mut run = Run::<8>::new(PRESET);
+    let mut next_look = 10;
+    for t in 1..=steps {
+        let noise = cases.rng.random_range(-1.0f32..1.0);
+        run.step(t, PATTERNS.map(|(_, gradient)| gradient(t, noise)));
+        if t == next_look || t == steps {
+            next_look *= 10;
+            for (at, it) in run.exact.iter().enumerate() {
+                let [p, m, v] = [run.p[at], run.m[at], run.v[at]].map(f64::from);
+                let is_fine = it.floor <= STEP_ERROR * it.way;
+                let errors = [
+                    Some(run.error(at)),
+                    is_fine.then_some((p - it.p) / it.way),
+                    (at < 3).then_some((m - it.m) / it.size),
+                    (at < 3).then_some((v - it.v) / it.v),
+                ];
+                let input = format_args!("{}, after {t} steps", PATTERNS[at].0);
+                cases.see(&extreme, input, errors)?;
+            }
+        }
+        if t.is_multiple_of(100_000) {
+            cases.pause()?;
+        }
+    }
+    Ok(())
+}
+
+pub(crate) fn states(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    // A step whose number is as large as numbers get.
+    let numbers = [
+        1,
+        2,
+        1000,
+        1 << 24,
+        1 << 31,
+        1 << 32,
+        1 << 33,
+        1 << 53,
+        u64::MAX,
+    ];
+    for step in numbers
+        .iter()
+        .flat_map(|&number| [(number - 1).max(1), number])
+    {
+        for beta2 in [0.9, 0.999, 0.99999] {
+            let mut run = Run::<1>::new(AdamSettings { beta2, ..PRESET });
+            (run.m, run.v) = ([0.25], [0.5]);
+            (run.exact[0].m, run.exact[0].v) = (0.25, 0.5);
+            run.step(step, [0.125]);
+            let extreme =
+                "step number 1, 2, 1000, 2^24, 2^31, 2^32, 2^33, 2^53, 2^64, and each less 1";
+            cases.see(
+                extreme,
+                format_args!("step {step}, beta2 {beta2}"),
+                [run.error(0)],
+            )?;
+        }
+    }
+    // A gradient that is gone leaves nothing that slows the steps.
+    for g in [1e-30f32, 1e-3, 1.0, 1e15] {
+        let mut run = Run::<1>::new(PRESET);
+        // The second moment of the largest begins 1e36 above 1, and falls by a factor of e in a thousand steps.
+        let steps = if g > 1.0 { 250_000 } else { 100_000 };
+        (1..=steps).for_each(|t| run.step(t, [if t <= 10 { g } else { 0.0 }]));
+        let is_gone = Some(broken(run.m == [0.0] && run.v == [0.0]));
+        let input = format_args!("gradient {g:e}: {:?}, {:?}", run.m, run.v);
+        cases.see(
+            "a gradient that is gone, 100,000 steps later",
+            input,
+            [None, is_gone],
+        )?;
+    }
+    // The optimiser as the learner calls it, on tensors.
+    let config = small::config(5, 7, (-1.0, 1.0));
+    let len = small::len(&config);
+    let (mut p, mut m, mut v) = (vec![0.5f32; len], vec![0f32; len], vec![0f32; len]);
+    let parameters = small::parameters(&config, &p)?;
+    let mut adam = Adam::new(PRESET, &parameters, Kernels::FUSED)?;
+    for step in 1..=100 {
+        let g = clamped(len, LARGEST, &mut cases.rng);
+        adam.step(&parameters, &gradients(&config, &g)?, 0.5)?;
+        Rule::new(PRESET, step, 0.5).apply(&mut p, &g, &mut m, &mut v);
+        let found = small::values(&config, &parameters)?;
+        for (at, (found, expected)) in found.iter().zip(&p).enumerate() {
+            let is_same = Some(broken(found.to_bits() == expected.to_bits()));
+            let extreme = "all parameters of a network, as the learner steps them, beside the rule";
+            let input = format_args!("step {step}, parameter {at}: {found:e}, {expected:e}");
+            cases.see(extreme, input, [None, is_same])?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,335 @@
+//! Products of the network in f32 and bf16, results and gradients, held to candle's in float64.
+//! The kernels themselves are the model's; what they are made of is tested there, against the stock ones.
+
+use candle_core::{DType, Device, Tensor, Var};
+use driml_model::{Precision, conv2d_relu, linear, linear_relu};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::stability::{
+    edges::{Shown, clamped, finite, not_finite, worst},
+    property::{Cases, broken},
+};
+
+/// From the maps to the hidden layer, from there to the atoms of 15 actions, and each place of a map to a score of DIM.
+const DENSE: [Layer; 3] = [
+    Layer::of([256, 1024, 512], [0; 3]),
+    Layer::of([256, 512, 765], [0; 3]),
+    Layer::of([4096, 64, 512], [0; 3]),
+];
+/// The three of Procgen's network, the border that the first would not read left out.
+const CONVOLUTIONS: [Layer; 3] = [
+    Layer::of([32, 3, 32], [60, 8, 4]),
+    Layer::of([32, 32, 64], [14, 4, 2]),
+    Layer::of([32, 64, 64], [6, 3, 1]),
+];
+/// No operand in bf16 is larger; beyond this it would be infinite.
+const BF16_MAX: f32 = 3.38e38;
+
+/// A fully connected layer, of one kernel without a side; or a convolution with ReLU of images [B, side, side, inputs].
+#[derive(Clone, Copy, Debug)]
+struct Layer {
+    rows: usize,
+    inputs: usize,
+    outputs: usize,
+    side: usize,
+    kernel: usize,
+    stride: usize,
+}
+
+/// Inputs, weights, biases, and the gradient of the results.
+type Operands = [Tensor; 4];
+
+/// What draws so many values.
+type Draw<'a> = &'a mut dyn FnMut(usize, &mut ChaCha8Rng) -> Vec<f32>;
+
+impl Layer {
+    const fn of([rows, inputs, outputs]: [usize; 3], [side, kernel, stride]: [usize; 3]) -> Self {
+        Self {
+            rows,
+            inputs,
+            outputs,
+            side,
+            kernel,
+            stride,
+        }
+    }
+
+    fn drawn_dense(rng: &mut ChaCha8Rng) -> Self {
+        let sizes = [40, 200, 40].map(|most| rng.random_range(1..most));
+        Self::of(sizes, [0; 3])
+    }
+
+    fn drawn_convolution(rng: &mut ChaCha8Rng) -> Self {
+        let kernel = rng.random_range(1..5);
+        let sizes = [3, rng.random_range(1..6), rng.random_range(1..20)];
+        let side = kernel + rng.random_range(0..6);
+        Self::of(sizes, [side, kernel, rng.random_range(1..4)])
+    }
+
+    const fn is_convolution(&self) -> bool {
+        self.kernel > 0
+    }
+
+    fn operands(&self, draw: Draw<'_>, rng: &mut ChaCha8Rng) -> anyhow::Result<Operands> {
+        let Self {
+            rows,
+            inputs,
+            outputs,
+            side,
+            kernel,
+            stride,
+        } = *self;
+        let [x, w, g] = match self.is_convolution() {
+            false => [
+                vec![rows, inputs],
+                vec![outputs, inputs],
+                vec![rows, outputs],
+            ],
+            true => {
+                let places = (side - kernel) / stride + 1;
+                [
+                    vec![rows, side, side, inputs],
+                    vec![outputs, inputs, kernel, kernel],
+                    vec![rows, places, places, outputs],
+                ]
+            }
+        };
+        let mut tensor = |shape: Vec<usize>| {
+            let values = draw(shape.iter().product(), rng);
+            Tensor::from_vec(values, shape, &Device::Cpu)
+        };
+        Ok([tensor(x)?, tensor(w)?, tensor(vec![outputs])?, tensor(g)?])
+    }
+
+    /// In float64 by candle's own operations, and before ReLU.
+    fn exact(&self, [x, w, b]: &[Var; 3]) -> candle_core::Result<Tensor> {
+        let y = match self.is_convolution() {
+            false => x.matmul(&w.t()?)?,
+            true => {
+                let images = x.permute((0, 3, 1, 2))?.contiguous()?;
+                let maps = images.conv2d(w, 0, self.stride, 1, 1)?;
+                maps.permute((0, 2, 3, 1))?.contiguous()?
+            }
+        };
+        y.broadcast_add(b)
+    }
+
+    /// The worst error of results and gradients, as a share of what is promised.
+    fn error(&self, operands: &Operands, precision: Precision) -> anyhow::Result<f64> {
+        let found = traced(operands, |[x, w, b]| match self.is_convolution() {
+            false => linear(x, w, b, precision),
+            true => conv2d_relu(x, w, b, self.stride, precision),
+        })?;
+        let in_f64 = |tensor: &Tensor| tensor.to_dtype(DType::F64);
+        let [x, w, b, g] = operands;
+        let with_bytes = x.dtype() == DType::U8;
+        let scale = if with_bytes { 1.0 / 255.0 } else { 1.0 };
+        let mut exact = [(in_f64(x)? * scale)?, in_f64(w)?, in_f64(b)?, in_f64(g)?];
+        if self.is_convolution() {
+            // Where a result is 0 its gradient is.
+            let y = Tensor::from_slice(&found[0], g.shape(), &Device::Cpu)?;
+            exact[3] = (&exact[3] * y.gt(0.0)?.to_dtype(DType::F64)?)?;
+        }
+        let traced = |operands: &Operands| traced(operands, |vars| self.exact(vars));
+        let [mut sizes, mut ones] = [exact.clone(), exact.clone()];
+        for (at, tensor) in exact.iter().enumerate() {
+            (sizes[at], ones[at]) = (tensor.abs()?, tensor.ones_like()?);
+        }
+        ones[2] = b.zeros_like()?.to_dtype(DType::F64)?;
+        // Both operands' sizes and 1, each summed over the terms of a sum.
+        let beside_ones = [0, 1, 3].map(|at| {
+            let mut operands = ones.clone();
+            operands[at] = sizes[at].clone();
+            traced(&operands)
+        });
+        let beside_ones: Vec<_> = beside_ones.into_iter().collect::<anyhow::Result<_>>()?;
+        let [exact, sizes, terms] = [traced(&exact)?, traced(&sizes)?, traced(&ones)?];
+        let mut errors = Vec::new();
+        for of in 0..4 {
+            // Sums of gradients are not products, and f32 in either precision.
+            let precision = if of == 3 { Precision::F32 } else { precision };
+            // A byte / 255 has two roundings.
+            let roundings = if with_bytes && of != 3 { 2.0 } else { 0.0 };
+            for (at, &found) in found[of].iter().enumerate() {
+                let (mut exact, size, terms) = (exact[of][at], sizes[of][at], terms[of][at]);
+                if of == 0 && self.is_convolution() {
+                    exact = exact.max(0.0);
+                }
+                let error = (found - exact).abs();
+                // Rounding to bf16 may add a 128th to a sum that is promised to be finite.
+                if error == 0.0 || size * 1.01 >= f64::from(f32::MAX) {
+                    continue;
+                }
+                // The promise is of the largest operand; their mean allows less.
+                let operands: f64 = beside_ones.iter().map(|sums| sums[of][at]).sum();
+                let mean = (operands - terms) / (2.0 * terms);
+                let terms = (terms + roundings) as usize;
+                let allowed = precision.product_error(terms) * size;
+                errors.push(error / (allowed + precision.product_floor(terms, mean)));
+            }
+        }
+        Ok(worst(errors))
+    }
+
+    fn see(
+        &self,
+        extreme: &str,
+        cases: &mut Cases<'_>,
+        operands: &Operands,
+        precision: Precision,
+    ) -> anyhow::Result<()> {
+        let w = operands[1].flatten_all()?.to_vec1()?;
+        let input = format_args!("{self:?}, {:?}, w {}", operands[0].dtype(), Shown(&w));
+        Ok(cases.see(extreme, input, [self.error(operands, precision)?])?)
+    }
+}
+
+/// Results, and the gradients of inputs, weights and biases, flat; bytes have none.
+fn traced(
+    [x, w, b, g]: &Operands,
+    layer: impl Fn(&[Var; 3]) -> candle_core::Result<Tensor>,
+) -> anyhow::Result<[Vec<f64>; 4]> {
+    let flat = |tensor: &Tensor| tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
+    let vars = [
+        Var::from_tensor(x)?,
+        Var::from_tensor(w)?,
+        Var::from_tensor(b)?,
+    ];
+    let y = layer(&vars)?;
+    let gradients = (&y * g)?.sum_all()?.backward()?;
+    let of = |var: &Var| match gradients.get(var) {
+        Some(gradient) => Ok(flat(gradient)?),
+        None if var.dtype() == DType::U8 => Ok(Vec::new()),
+        None => anyhow::bail!("a layer without a gradient"),
+    };
+    Ok([flat(&y)?, of(&vars[0])?, of(&vars[1])?, of(&vars[2])?])
+}
+
+fn usual(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
+}
+
+/// So large that no product of two leaves the finite numbers.
+fn moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    clamped(count, 1e17, rng)
+}
+
+fn bytes(operands: &mut Operands, rng: &mut ChaCha8Rng) -> anyhow::Result<()> {
+    let bytes: Vec<u8> = (0..operands[0].elem_count())
+        .map(|_| rng.random())
+        .collect();
+    operands[0] = Tensor::from_vec(bytes, operands[0].shape(), &Device::Cpu)?;
+    Ok(())
+}
+
+pub(crate) fn check(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+    for size in [0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17] {
+        for other in [1e-40f32, 1e-20, 1.0, 1e17] {
+            let layer = Layer::drawn_dense(&mut cases.rng);
+            let mut sizes = [other, size].into_iter().cycle();
+            let mut draw = |count: usize, rng: &mut ChaCha8Rng| {
+                let size = sizes.next().unwrap_or(size);
+                usual(count, rng).into_iter().map(|x| x * size).collect()
+            };
+            let operands = layer.operands(&mut draw, &mut cases.rng)?;
+            let extreme = "fully connected, results and gradients: operands of 0, 1e-45, 1e-40, 1e-38, 1e-20, 1, 1e17, one among others";
+            layer.see(extreme, cases, &operands, precision)?;
+        }
+    }
+    let most = if precision == Precision::Bf16 {
+        BF16_MAX
+    } else {
+        f32::MAX
+    };
+    for _ in cases.draws(0.02) {
+        let layer = Layer::drawn_dense(&mut cases.rng);
+        let mut draw = |count: usize, rng: &mut ChaCha8Rng| match rng.random_bool(0.7) {
+            true => moderate(count, rng),
+            false => clamped(count, most, rng),
+        };
+        let operands = layer.operands(&mut draw, &mut cases.rng)?;
+        let extreme = "fully connected, results and gradients, drawn";
+        layer.see(extreme, cases, &operands, precision)?;
+    }
+    for layer in DENSE {
+        for draw in [usual, moderate] {
+            let operands = layer.operands(&mut { draw }, &mut cases.rng)?;
+            let extreme = "the same at the sizes of Procgen's network and DIM's heads";
+            layer.see(extreme, cases, &operands, precision)?;
+        }
+    }
+    for _ in cases.draws(0.02) {
+        let layer = Layer::drawn_convolution(&mut cases.rng);
+        let mut operands = layer.operands(&mut { moderate }, &mut cases.rng)?;
+        let extreme = "convolution with ReLU, results and gradients, drawn";
+        layer.see(extreme, cases, &operands, precision)?;
+        bytes(&mut operands, &mut cases.rng)?;
+        layer.see("the same on bytes 0 to 255", cases, &operands, precision)?;
+    }
+    for layer in CONVOLUTIONS {
+        for draw in [usual, moderate] {
+            let mut operands = layer.operands(&mut { draw }, &mut cases.rng)?;
+            let extreme = "both at the sizes of Procgen's network, 32 images";
+            layer.see(extreme, cases, &operands, precision)?;
+            bytes(&mut operands, &mut cases.rng)?;
+            layer.see(extreme, cases, &operands, precision)?;
+        }
+    }
+    for _ in cases.draws(0.02) {
+        see_spoilt(cases, precision)?;
+    }
+    for _ in cases.draws(0.01) {
+        let inputs = cases.rng.random_range(1..200);
+        let large = finite(&mut cases.rng).abs().clamp(1e20, 1e38);
+        let line = |x: f32| Tensor::full(x, (1, inputs), &Device::Cpu);
+        let bias = Tensor::zeros(1, DType::F32, &Device::Cpu)?;
+        let y = linear(&line(large)?, &line(1e20)?, &bias, precision)?;
+        let y = y.flatten_all()?.to_vec1::<f32>()?[0];
+        let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
+        let shows = Some(broken(!y.is_finite()));
+        cases.see(
+            "products beyond 3.4e38, all of one sign",
+            input,
+            [None, shows],
+        )?;
+    }
+    Ok(())
+}
+
+/// A row with a number that is none spoils itself, visibly, and nothing else.
+fn see_spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+    let rng = &mut cases.rng;
+    let mut layer = Layer::drawn_dense(rng);
+    layer.rows += 1;
+    let mut positive = |count: usize, rng: &mut ChaCha8Rng| -> Vec<f32> {
+        (0..count).map(|_| rng.random_range(0.1f32..1.0)).collect()
+    };
+    let [clean, w, b, _] = layer.operands(&mut positive, rng)?;
+    let (bad, at) = (not_finite(rng), rng.random_range(0..clean.elem_count()));
+    let mut x = clean.flatten_all()?.to_vec1::<f32>()?;
+    x[at] = bad;
+    let spoilt = Tensor::from_vec(x, clean.shape(), &Device::Cpu)?;
+    for (apply, with_relu) in [
+        (linear as fn(&_, &_, &_, _) -> _, false),
+        (linear_relu, true),
+    ] {
+        let bits = |x: &Tensor| -> anyhow::Result<Vec<u32>> {
+            let y = apply(x, &w, &b, precision)?.flatten_all()?;
+            Ok(y.to_vec1::<f32>()?.iter().map(|y| y.to_bits()).collect())
+        };
+        let (before, spoilt, after) = (bits(&clean)?, bits(&spoilt)?, bits(&clean)?);
+        let row = at / layer.inputs;
+        let own = row * layer.outputs..(row + 1) * layer.outputs;
+        // The largest of 0 and -inf is 0.
+        let may_hide = with_relu && bad == f32::NEG_INFINITY;
+        let is_finite = |y: &u32| f32::from_bits(*y).is_finite();
+        let shows = may_hide || !spoilt[own.clone()].iter().any(is_finite);
+        let mut others = (0..before.len()).filter(|at| !own.contains(at));
+        let kept = shows && before == after && others.all(|at| before[at] == spoilt[at]);
+        let extreme = "one operand infinite or not a number, before and after ReLU";
+        let input = format_args!("{bad} at {at} of {layer:?}");
+        cases.see(extreme, input, [None, Some(broken(kept))])?;
+    }
+    Ok(())
+}

@@ -1,0 +1,281 @@
+//! What batches are drawn by: k along the stored actions, rows by priority, and the weights that undo their bias.
+
+use anyhow::Context;
+use driml_learner::importance::importance_weights;
+use driml_protocol::{
+    AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
+};
+use driml_replay_server::{
+    Config, PRIORITY_MIN, Replay,
+    horizon::{Affinity, nhg::draw_k},
+};
+use rand::{Rng, RngCore};
+
+use super::replay::{chunk, config, number, replay, spec};
+use crate::stability::{
+    edges::{Shown, exact_sum, finite, finites, off, probability},
+    property::Cases,
+};
+
+/// Gives every value that a float can be drawn as, one after the other.
+struct EveryFloat(u32);
+
+impl RngCore for EveryFloat {
+    fn next_u32(&mut self) -> u32 {
+        self.0 = self.0.wrapping_add(1 << 8);
+        self.0
+    }
+
+    fn next_u64(&mut self) -> u64 {
+        u64::from(self.next_u32())
+    }
+
+    fn fill_bytes(&mut self, bytes: &mut [u8]) {
+        bytes.fill(0);
+    }
+}
+
+fn affinity(num_actions: u32, matrix: Vec<f32>) -> anyhow::Result<Affinity> {
+    let mut affinity = Affinity::uniform(num_actions);
+    affinity.update(&AffinityUpdate {
+        learner: 1,
+        version: 1,
+        num_actions,
+        matrix,
+    })?;
+    Ok(affinity)
+}
+
+pub(crate) fn horizon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let mut probabilities = vec![0.0, -0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0];
+    for _ in 0..cases.settings.whole_draws {
+        probabilities.push(probability(&mut cases.rng));
+    }
+    for a in probabilities {
+        let affinity = affinity(1, vec![a])?;
+        let mut every = EveryFloat(0);
+        let draws = 1u32 << 24;
+        let further = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
+        let found = further.count() as f64 / f64::from(draws);
+        // Certain is certain, and impossible impossible.
+        let is_certain = a == 0.0 || a == 1.0;
+        let error = match found - f64::from(a) {
+            error if is_certain && error != 0.0 => f64::NAN,
+            error => error,
+        };
+        let extreme =
+            "A 0, 1e-45, 1e-9, 0.5, 1 - 6e-8, 1 and drawn; all 2^24 values that a draw can have";
+        cases.see(extreme, format_args!("A = {a:e}: {found}"), [error])?;
+    }
+    for steps in [1usize, 2, 5, 50, 255, 1000] {
+        for kind in 0..8 {
+            see_law_of_k(cases, steps, kind)?;
+        }
+    }
+    Ok(())
+}
+
+fn see_law_of_k(cases: &mut Cases<'_>, steps: usize, kind: usize) -> anyhow::Result<()> {
+    let rng = &mut cases.rng;
+    let mut draw = || match [0.0, 1e-9, 0.5, 0.99, 1.0 - f32::EPSILON / 2.0, 1.0].get(kind) {
+        Some(&a) => a,
+        None if kind == 6 => rng.random(),
+        None => probability(rng),
+    };
+    let matrix: Vec<f32> = (0..16).map(|_| draw()).collect();
+    let actions: Vec<u8> = (0..steps).map(|_| rng.random_range(0..4)).collect();
+    // P(k = i) for i = 1, .., H along this walk.
+    let (mut reached, mut law) = (1.0, Vec::new());
+    for pair in actions.windows(2) {
+        let a = f64::from(matrix[usize::from(pair[0]) * 4 + usize::from(pair[1])]);
+        law.push(reached * (1.0 - a));
+        reached *= a;
+    }
+    law.push(reached);
+    let affinity = affinity(4, matrix)?;
+    let mut counts = vec![0; steps];
+    for _ in 0..cases.settings.law_draws / 10 {
+        counts[draw_k(&affinity, &actions, rng) as usize - 1] += 1;
+    }
+    let extreme = "H 1, 2, 5, 50, 255, 1,000; A 0, 1e-9, 0.5, 0.99, 1 - 6e-8, 1, and drawn";
+    let input = format_args!("H = {steps}, kind {kind} of A");
+    Ok(cases.see(extreme, input, [None, Some(deviations(&counts, &law))])?)
+}
+
+/// How far counts are beyond a law, in standard deviations of a normal of the same tail; cells that expect less than 5 are one.
+///
+/// Pearson's chi-square by the cube root of Wilson and Hilferty 1931. Infinite where something was seen that cannot be.
+pub(super) fn deviations(counts: &[u64], law: &[f64]) -> f64 {
+    let total = counts.iter().sum::<u64>() as f64;
+    let (mut cells, mut few) = (Vec::new(), (0.0, 0.0));
+    for (&count, &p) in counts.iter().zip(law) {
+        match total * p {
+            0.0 if count > 0 => return f64::INFINITY,
+            expected if expected < 5.0 => few = (few.0 + count as f64, few.1 + expected),
+            expected => cells.push((count as f64, expected)),
+        }
+    }
+    if few.1 >= 5.0 {
+        cells.push(few);
+    }
+    let degrees = cells.len().saturating_sub(1) as f64;
+    if degrees == 0.0 {
+        return 0.0;
+    }
+    let square = exact_sum(
+        cells
+            .iter()
+            .map(|(have, want)| (have - want).powi(2) / want),
+    );
+    let spread = 2.0 / (9.0 * degrees);
+    (((square / degrees).cbrt() - (1.0 - spread)) / spread.sqrt()).max(0.0)
+}
+
+/// Transitions that can be drawn by priority.
+const HELD: usize = 300;
+const ROWS: u32 = 64;
+
+/// A replay that draws by one seed, whose transitions have these priorities, and the law of its draws.
+struct Prioritised {
+    replay: Replay,
+    law: Vec<f64>,
+    counts: Vec<u64>,
+}
+
+impl Prioritised {
+    fn new(seed: u64, alpha: f64, priorities: &[f32]) -> anyhow::Result<Self> {
+        let config = Config {
+            sampling: Sampling::Prioritised {
+                alpha,
+                beta_start: 0.4,
+                beta_end: 1.0,
+                beta_updates: 100,
+            },
+            // As often as the law is to be seen.
+            replay_ratio: 1e9,
+            ..config(4096)
+        };
+        let spec = RunSpec {
+            seed,
+            ..spec(1, 0.99, TimeoutRule::Terminal)
+        };
+        let mut replay = replay(&spec, ROWS, &config)?;
+        // The last one lacks a step that follows.
+        replay.insert(&chunk(&[(1.0, End::Running); HELD + 1]));
+        let batch = replay
+            .sample(ROWS)
+            .map_err(|why| anyhow::anyhow!("no batch: {why:?}"))?;
+        let update = PriorityUpdate {
+            learner: 1,
+            number: 1,
+            parts: vec![PriorityPart {
+                origin: batch.header.origin.context("rows drawn by priority")?,
+                transitions: (0..HELD as u64).collect(),
+                priorities: priorities.to_vec(),
+            }],
+        };
+        replay.set_priorities(&update).map_err(anyhow::Error::msg)?;
+        let mass = |&priority: &f32| (f64::from(priority) + PRIORITY_MIN).powf(alpha);
+        let sum = exact_sum(priorities.iter().map(mass));
+        let law = priorities.iter().map(|it| mass(it) / sum).collect();
+        Ok(Self {
+            replay,
+            law,
+            counts: vec![0; HELD],
+        })
+    }
+
+    /// Sees the chances of a batch's rows; counts which transitions they are.
+    fn see_batch(&mut self, extreme: &str, cases: &mut Cases<'_>) -> anyhow::Result<()> {
+        let batch = self
+            .replay
+            .sample(ROWS)
+            .map_err(|why| anyhow::anyhow!("no batch: {why:?}"))?;
+        let chances = batch.probabilities().context("rows drawn by priority")?;
+        for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
+            let transition = number(frame, 1, 0) as usize;
+            let expected = self.law[transition];
+            let input = format_args!("{chance:e}, which should be {expected:e}");
+            // A chance below the least normal number counts as that.
+            let error = f64::from(chance) / expected.max(f32::MIN_POSITIVE.into()) - 1.0;
+            cases.see(extreme, input, [error])?;
+            self.counts[transition] += 1;
+        }
+        Ok(())
+    }
+}
+
+pub(crate) fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let kinds: [fn(usize) -> f32; 6] = [
+        |_| 0.0,
+        |_| 1e-45,
+        |_| 1.0,
+        |_| f32::MAX,
+        |at| if at == HELD / 2 { f32::MAX } else { 0.0 },
+        |at| 10f64.powf(-45.0 + 83.5 * at as f64 / HELD as f64) as f32,
+    ];
+    for (number, kind) in (1..).zip(kinds) {
+        let priorities: Vec<f32> = (0..HELD).map(kind).collect();
+        for alpha in [0.0, 0.5, 1.0] {
+            let mut replay = Prioritised::new(cases.rng.random(), alpha, &priorities)?;
+            let extreme =
+                "all 0, 1e-45, 1, 3.4e38; one of 3.4e38 among 0; 1e-45 to 3.4e38; alpha 0, 0.5, 1";
+            for _ in 0..cases.settings.law_draws / u64::from(ROWS) {
+                replay.see_batch(extreme, cases)?;
+            }
+            let deviations = deviations(&replay.counts, &replay.law);
+            let input = format_args!("kind {number} of priorities, alpha {alpha}");
+            cases.see("the same", input, [None, Some(deviations)])?;
+        }
+    }
+    for _ in cases.draws(0.01) {
+        let rng = &mut cases.rng;
+        let sizes: Vec<f32> = finites(HELD, rng).into_iter().map(f32::abs).collect();
+        Prioritised::new(rng.random(), rng.random(), &sizes)?.see_batch("drawn", cases)?;
+    }
+    Ok(())
+}
+
+pub(crate) fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    for number in cases.draws(1.0) {
+        let rng = &mut cases.rng;
+        let mut chances = finites(rng.random_range(2..=64), rng);
+        if rng.random_bool(0.2) {
+            chances.fill(finite(rng));
+        }
+        chances
+            .iter_mut()
+            .for_each(|it| *it = it.abs().clamp(f32::MIN_POSITIVE, 1.0));
+        let beta = match number % 4 {
+            0 => 0.0,
+            1 => 1.0,
+            _ => rng.random(),
+        };
+        let least = chances.iter().copied().fold(f32::INFINITY, f32::min);
+        let found = importance_weights(&chances, beta);
+        for (&found, &chance) in found.iter().zip(&chances) {
+            let expected = (beta * (f64::from(least).ln() - f64::from(chance).ln())).exp();
+            let error = match chance == least && found != 1.0 {
+                true => f64::NAN,
+                false => off(found, expected),
+            };
+            let extreme =
+                "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and between, drawn";
+            let input = format_args!("beta {beta}, chances {}", Shown(&chances));
+            cases.see(extreme, input, [error])?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wrong_law_deviates_and_a_right_one_does_not() {
+        assert!(deviations(&[500, 510], &[0.5, 0.5]) < 1.0);
+        assert!(deviations(&[60_000, 40_000], &[0.5, 0.5]) > 10.0);
+        assert!(deviations(&[1, 99], &[0.0, 1.0]).is_infinite());
+    }
+}

@@ -1,0 +1,104 @@
+//! Weights as they travel: rounded to f16 or bf16, and read back.
+
+use candle_core::Device;
+use driml_model::{Parameters, StoredAs};
+use rand::Rng;
+
+use crate::stability::{
+    edges::clamped,
+    property::{Cases, broken},
+    small,
+};
+
+/// Scalars a row of the head's weight that carries the values.
+const HIDDEN: usize = 256;
+
+/// The step of the type at `x`.
+fn step_at(stored: StoredAs, x: f32) -> f64 {
+    // Bits of significand, and the exponent of the least normal number.
+    let (bits, least) = match stored {
+        StoredAs::F32 => (24, -126),
+        StoredAs::F16 => (11, -14),
+        StoredAs::Bf16 => (8, -126),
+    };
+    let mut exponent = least;
+    while f64::from(x.abs()) >= 2f64.powi(exponent + 1) {
+        exponent += 1;
+    }
+    2f64.powi(exponent - bits + 1)
+}
+
+/// The nearest number of the type, ties to even.
+fn nearest(stored: StoredAs, x: f32) -> f64 {
+    let step = step_at(stored, x);
+    (f64::from(x) / step).round_ties_even() * step
+}
+
+/// The values after a journey as weights.
+fn travelled(stored: StoredAs, values: &[f32]) -> anyhow::Result<Vec<f32>> {
+    let atoms = values.len().div_ceil(HIDDEN).max(2);
+    let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
+    let mut all = vec![0.0; small::len(&config)];
+    all[..values.len()].copy_from_slice(values);
+    let bytes = small::parameters(&config, &all)?.to_safetensors_as(stored, |_| true)?;
+    let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
+    Ok(small::values(&config, &read)?)
+}
+
+/// Every number of the type, the middle between it and the next, and the floats beside that: all places where rounding turns.
+fn turning_points(stored: StoredAs) -> Vec<f32> {
+    let mut values = Vec::new();
+    let mut x = 0.0f32;
+    while x < stored.largest() {
+        let step = step_at(stored, x);
+        let middle = (f64::from(x) + step / 2.0) as f32;
+        values.extend([x, middle.next_down(), middle, middle.next_up()]);
+        x = (f64::from(x) + step) as f32;
+    }
+    values.push(stored.largest());
+    values.retain(|x| *x <= stored.largest());
+    values.iter().flat_map(|&x| [x, -x]).collect()
+}
+
+pub(crate) fn check(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
+    let see = |cases: &mut Cases<'_>, extreme, values: &[f32]| -> anyhow::Result<()> {
+        for (&x, found) in values.iter().zip(travelled(stored, values)?) {
+            let has_its_sign = x.is_sign_negative() == found.is_sign_negative();
+            let is_nearest = has_its_sign && f64::from(found) == nearest(stored, x);
+            let scale = f64::from(x.abs().max(stored.least_normal()));
+            let error = (f64::from(found) - f64::from(x)) / scale;
+            let input = format_args!("{x:e} became {found:e}");
+            cases.see(extreme, input, [broken(is_nearest), error])?;
+        }
+        Ok(())
+    };
+    if stored != StoredAs::F32 {
+        let extreme =
+            "every number of the type, the middles between them and the floats beside those";
+        see(cases, extreme, &turning_points(stored))?;
+    }
+    for _ in cases.draws(0.005) {
+        let count = cases.rng.random_range(1..4096);
+        let values = clamped(count, stored.largest(), &mut cases.rng);
+        see(cases, "drawn", &values)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_reference_rounds_as_the_types_do() {
+        let ulp = |at: i32| 2f32.powi(at);
+        assert_eq!(nearest(StoredAs::F16, 1.0 + ulp(-11)), 1.0, "a tie");
+        assert_eq!(
+            nearest(StoredAs::F16, 1.0 + 3.0 * ulp(-11)),
+            1.0 + 2f64.powi(-9)
+        );
+        assert_eq!(nearest(StoredAs::Bf16, 1.0 + ulp(-8)), 1.0);
+        assert_eq!(nearest(StoredAs::F16, 4e-8), 2f64.powi(-24));
+        assert_eq!(turning_points(StoredAs::F16).len(), 2 * (4 * 0x7bff + 1));
+    }
+}
