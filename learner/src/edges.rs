@@ -21,17 +21,3 @@ pub(crate) fn any_finite() -> impl Strategy<Value = f32> + Clone {
     ]);
     prop_oneof![4 => -10.0f32..10.0, 2 => of_any_size, 2 => near_power, 1 => ends]
 }
-
-/// `count` finite numbers: each on its own, all the same, or each one of two.
-pub(crate) fn finites(
-    count: impl Into<prop::collection::SizeRange>,
-) -> impl Strategy<Value = Vec<f32>> {
-    let count = count.into();
-    let own = prop::collection::vec(any_finite(), count.clone());
-    let usual = prop::collection::vec(-10.0f32..10.0, count.clone());
-    let choices = prop::collection::vec(any::<bool>(), count);
-    let few = (any_finite(), any_finite(), choices.clone())
-        .prop_map(|(a, b, choices)| choices.iter().map(|&c| if c { a } else { b }).collect());
-    let same = (any_finite(), choices).prop_map(|(x, choices)| vec![x; choices.len()]);
-    prop_oneof![2 => own, 2 => usual, 1 => few, 1 => same]
-}

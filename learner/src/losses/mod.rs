@@ -5,7 +5,5 @@ pub mod c51;
 mod candle;
 pub mod info_nce;
 pub mod projection;
-#[cfg(test)]
-mod properties;
 mod scalar_op;
 pub mod scores;
