@@ -75,24 +75,15 @@ fn delivered(run: &RunFolder) -> u64 {
     // A run in lockstep has none.
     let logs = fs::read_dir(run.path().join("logs")).into_iter().flatten();
     let logs = logs.map(|entry| entry.unwrap().path());
-    let actors = logs.filter(|path| {
-        path.file_name()
-            .unwrap()
-            .to_str()
-            .unwrap()
-            .starts_with("actor")
-    });
-    actors
-        .map(|path| delivered_by(&fs::read_to_string(path).unwrap()))
-        .sum()
-}
-
-fn delivered_by(log: &str) -> u64 {
-    let lines = log
-        .lines()
-        .filter_map(|line| line.strip_suffix(" transitions delivered"));
-    let counts = lines.map(|line| line.rsplit(' ').next().unwrap().parse::<u64>().unwrap());
-    counts.sum()
+    let actors = logs.filter(|path| path.to_str().unwrap().contains("/actor"));
+    let texts = actors.map(|path| fs::read_to_string(path).unwrap());
+    let of_log = |log: String| {
+        let lines = log.lines();
+        let counts = lines.filter_map(|line| line.strip_suffix(" transitions delivered"));
+        let last = counts.map(|line| line.rsplit(' ').next().unwrap().parse::<u64>().unwrap());
+        last.sum::<u64>()
+    };
+    texts.map(of_log).sum()
 }
 
 /// Starts a run, stops it, resumes it, and checks the counts.
@@ -110,13 +101,10 @@ fn resume_once(seed: u64) {
         Stop::KillServer,
     ];
     // In lockstep there is one process.
-    let kinds = if store == "--lockstep" {
-        5
-    } else {
-        stops.len()
-    };
+    let is_lockstep = store == "--lockstep";
+    let kinds = if is_lockstep { 5 } else { stops.len() };
     let stop = *stops[..kinds].choose(&mut rng).unwrap();
-    let shards = if store == "--lockstep" {
+    let shards = if is_lockstep {
         1
     } else {
         rng.random_range(1..3)
@@ -129,7 +117,7 @@ fn resume_once(seed: u64) {
         ratio: *[RATIO, RATIO, 4].choose(&mut rng).unwrap(),
         actors: 2,
     };
-    if store != "--lockstep" {
+    if !is_lockstep {
         change.actors = rng.random_range(2..4);
     }
     let about = format!("seed {seed}: {store} {shards} shards, {stop:?}, {change:?}");
@@ -155,7 +143,7 @@ fn resume_once(seed: u64) {
     };
     let delivered_before = delivered(&run);
     let is_graceful = matches!(stop, Stop::End | Stop::Interrupt);
-    if is_graceful && store != "--lockstep" {
+    if is_graceful && !is_lockstep {
         assert_eq!(before.frames, delivered_before, "{about}: {before:?}");
     }
 
@@ -190,23 +178,17 @@ fn resume_once(seed: u64) {
     let after = run.summary();
     let said = format!("{about}\n{before:?}\n{after:#?}");
     assert_eq!(after.outcome, "finished", "{said}");
-    assert_eq!(
-        (after.transitions_lost, after.transitions_duplicated),
-        (0, 0),
-        "{said}"
-    );
+    let wrong = (after.transitions_lost, after.transitions_duplicated);
+    assert_eq!(wrong, (0, 0), "{said}");
     assert!(
         is_fresh || after.frames >= change.frames.max(before.frames),
         "{said}"
     );
     assert_eq!(after.updates, planned(after.frames), "{said}");
     let learned = (after.updates - before.updates) * change.rows;
-    assert_eq!(
-        after.rows_sampled,
-        before.rows * u64::from(!is_fresh) + learned,
-        "{said}"
-    );
-    if store != "--lockstep" && !is_fresh {
+    let rows = before.rows * u64::from(!is_fresh) + learned;
+    assert_eq!(after.rows_sampled, rows, "{said}");
+    if !is_lockstep && !is_fresh {
         let delivered = delivered(&run) - delivered_before;
         let counted = after.frames + after.transitions_refilled;
         match (is_graceful, store) {
@@ -220,14 +202,9 @@ fn resume_once(seed: u64) {
         );
     }
     let episodes = run.episodes();
-    assert!(
-        episodes.is_sorted_by_key(|row| (row.episode, row.frames)),
-        "{said}"
-    );
-    assert!(
-        episodes.iter().all(|row| row.frames <= after.frames),
-        "{said}"
-    );
+    let is_sorted = episodes.is_sorted_by_key(|row| (row.episode, row.frames));
+    let is_past = episodes.iter().all(|row| row.frames <= after.frames);
+    assert!(is_sorted && is_past, "{said}");
 }
 
 fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, moment: Duration) {
@@ -281,8 +258,8 @@ fn the_last_checkpoint_counts_frames_that_came_after_its_last_update() {
         let run = system.run_folder(&dir);
         let flags = "--agent c51 --env chain --preset smoke --frames 1280 --set replay.replay_ratio=0.25 \
              --set replay.slack_transitions=64 --set learner.checkpoint_period_updates=1";
-        let run_it = system.run(&format!("local {flags} {store} --run-dir {dir}"));
-        run_it.expect_code(0);
+        let ended = system.run(&format!("local {flags} {store} --run-dir {dir}"));
+        ended.expect_code(0);
         let last = saved(&run).unwrap();
         assert_eq!((last.updates, last.frames), (16, 1_280), "{store}");
     }
