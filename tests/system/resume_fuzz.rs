@@ -255,12 +255,11 @@ fn the_last_checkpoint_counts_frames_that_came_after_its_last_update() {
     let system = system();
     for store in ["", "--durable", "--lockstep"] {
         let dir = format!("run{store}");
-        let run = system.run_folder(&dir);
         let flags = "--agent c51 --env chain --preset smoke --frames 1280 --set replay.replay_ratio=0.25 \
              --set replay.slack_transitions=64 --set learner.checkpoint_period_updates=1";
-        let ended = system.run(&format!("local {flags} {store} --run-dir {dir}"));
-        ended.expect_code(0);
-        let last = saved(&run).unwrap();
+        let call = format!("local {flags} {store} --run-dir {dir}");
+        system.run(&call).expect_code(0);
+        let last = saved(&system.run_folder(&dir)).unwrap();
         assert_eq!((last.updates, last.frames), (16, 1_280), "{store}");
     }
 }
