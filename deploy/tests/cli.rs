@@ -63,7 +63,7 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
 fn calls_that_cannot_work_say_why() {
     let on_disk = "cannot work: this replay is in memory alone; add --durable to keep it on disk";
     let server_on_disk = on_disk.replace("--durable", "--replay-dir DIR");
-    let whole = "\"-1\" is no whole number; write one as";
+    let whole = "\"-1\" is not a whole number; write one as";
     for (call, why) in [
         // The sentence is that of the number's parser, and not that there is no flag -1.
         ("local --seed -1", whole),
