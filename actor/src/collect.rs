@@ -202,7 +202,7 @@ impl Collector {
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
     use driml_model::{
-        Compute, ConvLayer, DimHeads, HeadConfig, InputSize, ModelConfig, Parameters,
+        Compute, ConvLayer, DimHeads, HeadConfig, InputSize, ModelConfig, Parameters, TorsoName,
     };
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
@@ -250,16 +250,19 @@ mod tests {
             model: ModelConfig {
                 height: 12,
                 width: 12,
-                channels: 1,
+                input_channels: 1,
                 num_actions: 3,
                 atoms: 5,
                 v_min: -1.0,
                 v_max: 1.0,
+                torso: TorsoName::Nature,
                 conv: vec![ConvLayer {
                     out: 2,
                     kernel: 4,
                     stride: 4,
                 }],
+                channels: vec![],
+                scale_blocks: false,
                 hidden: 4,
                 rkhs: 4,
                 action_embed: 4,

@@ -155,7 +155,7 @@ impl Policy for NetworkPolicy {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters};
+    use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters, TorsoName};
     use rand::SeedableRng;
 
     use super::*;
@@ -175,16 +175,19 @@ mod tests {
         let model = ModelConfig {
             height: 4,
             width: 4,
-            channels: 1,
+            input_channels: 1,
             num_actions: ACTIONS,
             atoms: 5,
             v_min: -1.0,
             v_max: 1.0,
+            torso: TorsoName::Nature,
             conv: vec![ConvLayer {
                 out: 2,
                 kernel: 2,
                 stride: 2,
             }],
+            channels: vec![],
+            scale_blocks: false,
             hidden: 4,
             rkhs: 4,
             action_embed: 4,

@@ -87,6 +87,30 @@ class NoisyLinear(nn.Module):
         return functional.linear(x, self.weight_mu, self.bias_mu)
 
 
+class Residual(nn.Module):
+    """x + conv2(relu(conv1(relu(x))))."""
+
+    def __init__(self, width):
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x):
+        return x + self.conv2(functional.relu(self.conv1(functional.relu(x))))
+
+
+class Stage(nn.Module):
+    """A stage of the torsos impala and impoola."""
+
+    def __init__(self, inputs, width):
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, width, 3, padding=1)
+        self.block1, self.block2 = Residual(width), Residual(width)
+
+    def forward(self, x):
+        return self.block2(self.block1(functional.max_pool2d(self.conv(x), 3, 2, padding=1)))
+
+
 class Network(nn.Module):
     """Torso, C51 head and the DIM heads of a `[model]` table; parameters have the names and shapes of the checkpoint's."""
 
@@ -96,12 +120,17 @@ class Network(nn.Module):
         support = torch.linspace(model["v_min"], model["v_max"], self.atoms)
         self.register_buffer("support", support, persistent=False)
         self.torso = nn.ModuleDict()
-        height, width, channels = model["height"], model["width"], model["channels"]
-        for number, layer in enumerate(model["conv"], 1):
+        height, width, channels = model["height"], model["width"], model["input_channels"]
+        # f4 sees the mean of f3 over its locations.
+        self.takes_mean = model.get("torso") == "impoola"
+        for number, out in enumerate(model.get("channels", []), 1):
+            self.torso[f"stage{number}"] = Stage(channels, out)
+            height, width, channels = (height + 1) // 2, (width + 1) // 2, out
+        for number, layer in enumerate(model.get("conv", []), 1):
             kernel, stride = layer["kernel"], layer["stride"]
             self.torso[f"conv{number}"] = nn.Conv2d(channels, layer["out"], kernel, stride)
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, layer["out"]
-        self.torso["fc"] = nn.Linear(channels * height * width, model["hidden"])
+        self.torso["fc"] = nn.Linear(channels * (1 if self.takes_mean else height * width), model["hidden"])
         head = model.get("head", {})
         layer = NoisyLinear if "noisy_sigma" in head else nn.Linear
         self.dueling = head.get("dueling", False)
@@ -130,8 +159,9 @@ class Network(nn.Module):
         maps = states.permute(0, 3, 1, 2).float() / 255
         for name, layer in self.torso.items():
             if name != "fc":
-                maps = functional.relu(layer(maps))
-        return maps, self.torso["fc"](maps.flatten(1))
+                maps = layer(maps) if isinstance(layer, Stage) else functional.relu(layer(maps))
+        maps = functional.relu(maps)
+        return maps, self.torso["fc"](maps.mean((2, 3)) if self.takes_mean else maps.flatten(1))
 
     def logits(self, states):
         """Logits [B, A, N] of the returns at the atoms."""
@@ -181,7 +211,7 @@ def enlarge(frames, described):
 def export(network, described, path):
     """Writes the acting network as ONNX: `states` u8 [B, H, W, C] to `q_values` f32 [B, A], for any B."""
     model = described["model"]
-    blank = torch.zeros(2, model["height"], model["width"], model["channels"], dtype=torch.uint8)
+    blank = torch.zeros(2, model["height"], model["width"], model["input_channels"], dtype=torch.uint8)
     torch.onnx.export(
         network,
         (blank,),
@@ -202,7 +232,7 @@ def main():
     given = arguments.parse_args()
     network, described = load(given.run, given.checkpoint)
     model = described["model"]
-    shape = (1, model["height"], model["width"], model["channels"])
+    shape = (1, model["height"], model["width"], model["input_channels"])
     with torch.no_grad():
         values = network(torch.zeros(shape, dtype=torch.uint8))[0].tolist()
     print(f"{sum(p.numel() for p in network.parameters())} parameters, states u8 {list(shape)}, {model['num_actions']} actions")

@@ -307,7 +307,7 @@ impl LearnerConfig {
             ..this.model.clone()
         };
         // What is cut of the input is nothing that a layer reads.
-        let follows = this.model.channels == states
+        let follows = this.model.input_channels == states
             && this.model.num_actions == this.spec.num_actions as usize
             && this.model.local_shape() == whole.local_shape()
             && this.input.enlarge(sent, &this.model).is_ok();

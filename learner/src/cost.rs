@@ -114,7 +114,7 @@ impl UpdateCost {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, DimHeads, HeadConfig};
+    use driml_model::{ConvLayer, DimHeads, HeadConfig, TorsoName};
 
     use super::*;
     use crate::auxiliary::settings::Lambda;
@@ -124,16 +124,19 @@ mod tests {
         ModelConfig {
             height: 6,
             width: 6,
-            channels: 1,
+            input_channels: 1,
             num_actions: 2,
             atoms: 3,
             v_min: -1.0,
             v_max: 1.0,
+            torso: TorsoName::Nature,
             conv: vec![ConvLayer {
                 out: 3,
                 kernel: 4,
                 stride: 2,
             }],
+            channels: vec![],
+            scale_blocks: false,
             hidden: 5,
             rkhs: 4,
             action_embed: 2,

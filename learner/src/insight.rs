@@ -137,7 +137,7 @@ impl Insight {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, HeadConfig, PolicyNetwork, Precision};
+    use driml_model::{ConvLayer, HeadConfig, PolicyNetwork, Precision, TorsoName};
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
@@ -154,16 +154,19 @@ mod tests {
         let model = ModelConfig {
             height: 10,
             width: 12,
-            channels: 2,
+            input_channels: 2,
             num_actions: 3,
             atoms: 5,
             v_min: -1.0,
             v_max: 1.0,
+            torso: TorsoName::Nature,
             conv: vec![ConvLayer {
                 out: 4,
                 kernel: 4,
                 stride: 2,
             }],
+            channels: vec![],
+            scale_blocks: false,
             hidden: 8,
             rkhs: 8,
             action_embed: 2,

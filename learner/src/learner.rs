@@ -95,10 +95,10 @@ impl Learner {
             let ModelConfig {
                 height,
                 width,
-                channels,
+                input_channels,
                 ..
             } = config.model;
-            let size = (height, width, channels);
+            let size = (height, width, input_channels);
             Augment::new(settings, size, spec.frame_channels as usize)
         });
         Ok(Self {

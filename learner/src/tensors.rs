@@ -13,7 +13,7 @@ pub(crate) fn states<'a>(
 ) -> candle_core::Result<Tensor> {
     let bytes = bytes.into();
     let rows = bytes.len() / model.frame_len();
-    let shape = (rows, model.height, model.width, model.channels);
+    let shape = (rows, model.height, model.width, model.input_channels);
     match bytes {
         Cow::Borrowed(bytes) => Tensor::from_slice(bytes, shape, device),
         Cow::Owned(bytes) => Tensor::from_vec(bytes, shape, device),

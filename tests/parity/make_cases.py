@@ -47,12 +47,28 @@ def linear(p, name, x, noise):
     return F.linear(x, weight, bias)
 
 
+def stage(p, name, x):
+    """A stage of the torsos impala and impoola: convolution, max pool, two residual blocks."""
+
+    def conv(part, x):
+        return F.conv2d(x, p[f"{name}.{part}.weight"], p[f"{name}.{part}.bias"], padding=1)
+
+    x = F.max_pool2d(conv("conv", x), 3, 2, padding=1)
+    for block in ["block1", "block2"]:
+        x = x + conv(f"{block}.conv2", F.relu(conv(f"{block}.conv1", F.relu(x))))
+    return x
+
+
 def features(p, config, frames):
     """f3 [B, locations, channels] and f4 [B, hidden] of bytes [B, H, W, C]."""
     x = frames.double().permute(0, 3, 1, 2) / 255
-    for i, (_, _, stride) in enumerate(config["model"]["conv"], 1):
+    for i, (_, _, stride) in enumerate(config["model"].get("conv", []), 1):
         x = F.relu(F.conv2d(x, p[f"torso.conv{i}.weight"], p[f"torso.conv{i}.bias"], stride=stride))
-    f4 = F.linear(x.flatten(1), p["torso.fc.weight"], p["torso.fc.bias"])
+    for i, _ in enumerate(config["model"].get("channels", []), 1):
+        x = stage(p, f"torso.stage{i}", x)
+    x = F.relu(x)
+    flat = x.mean((2, 3)) if config["model"].get("torso") == "impoola" else x.flatten(1)
+    f4 = F.linear(flat, p["torso.fc.weight"], p["torso.fc.bias"])
     return x.flatten(2).transpose(1, 2), f4
 
 

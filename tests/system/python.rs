@@ -34,7 +34,7 @@ from driml_net import load
 network, described = load(sys.argv[2])
 model = described['model']
 states = torch.frombuffer(bytearray(open(sys.argv[3], 'rb').read()), dtype=torch.uint8)
-states = states.reshape(-1, model['height'], model['width'], model['channels'])
+states = states.reshape(-1, model['height'], model['width'], model['input_channels'])
 with torch.no_grad():
     values, logits = network(states), network.logits(states)
 print(json.dumps([values.flatten().tolist(), logits.softmax(-1).flatten().tolist()]))
@@ -51,11 +51,13 @@ print(json.dumps(session.run(['q_values'], {'states': states})[0].flatten().toli
 ";
 
 /// A run of each kind of network: with all heads of local and global DIM and enlarged stacks, C51 alone, and with Rainbow's streams
-/// of noisy layers.
-const RUNS: [&str; 3] = [
+/// of noisy layers; the residual torsos.
+const RUNS: [&str; 5] = [
     "--env mspacman --agent driml-ada --preset smoke --frames 320",
     "--env chain --agent c51 --preset smoke --frames 320",
     "--env chain --agent rainbow --preset smoke --frames 320",
+    "--env mspacman --agent driml-ada --preset smoke --frames 320 --set model.torso=impala --set model.channels=[4,6]",
+    "--env chain --agent c51 --preset smoke --frames 320 --set model.torso=impoola --set model.channels=[4,6]",
 ];
 
 /// A run, what its network is, and random states in a file beside it.
@@ -146,7 +148,10 @@ fn onnx_runtime_computes_what_driml_does() {
         let said = run(&python, &[&script], &[&folder, "--onnx", &net]);
         assert!(said.contains("wrote"), "{said}");
         let model = agent.model();
-        let shape = format!("-1,{},{},{}", model.height, model.width, model.channels);
+        let shape = format!(
+            "-1,{},{},{}",
+            model.height, model.width, model.input_channels
+        );
         let answer = run(&python, &["-c", ASK_ONNX], &[&net, &path("states"), &shape]);
         let off = largest_difference(&seen.q_values, &serde_json::from_str(&answer).unwrap());
         note(&format!("{flags}: ONNX values {off:.1e}"));

@@ -30,8 +30,8 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 9_400),
     ("actor", 13_700),
     ("replay-server", 11_500),
-    ("learner", 25_780),
-    ("deploy", 37_200),
+    ("learner", 27_610),
+    ("deploy", 37_240),
     ("tests", 12_300),
 ];
 /// Most lines of one file.

@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// What is measured: its name, agent, preset and further settings.
-const CASES: [(&str, &str, &str, &[&str]); 4] = [
+const CASES: [(&str, &str, &str, &[&str]); 5] = [
     ("C51, 64x64x3", "c51", "paper", &[]),
     (GLOBAL_DIM, AGENT, "paper", &[]),
     (
@@ -31,6 +31,12 @@ const CASES: [(&str, &str, &str, &[&str]); 4] = [
         AGENT,
         "paper-observation",
         &[],
+    ),
+    (
+        "C51, impala, 64x64x3",
+        "c51",
+        "paper",
+        &["model.torso=impala"],
     ),
 ];
 /// The update that is also computed with candle's own operations, as on a GPU, in place of our kernels.

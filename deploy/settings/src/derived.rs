@@ -4,14 +4,14 @@
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
-use driml_model::{ConvLayer, FrameSize, InputRead, InputSize};
+use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, TorsoName};
 use driml_protocol::config::in_words;
 use toml::{Table, Value};
 
 use crate::overrides::inline;
 
 const BY_ENV: &str = "is chosen by --env";
-const FROM_FRAME: &str = "follows from the world and what model.conv reads";
+const FROM_FRAME: &str = "follows from the world and what the torso reads";
 const FROM_ACTIONS: &str = "follows from the world and actor.actions";
 
 /// What follows, and from what.
@@ -29,14 +29,14 @@ const FOLLOWS: [(&str, &str); 16] = [
     ("input.frame", "follows from the world"),
     (
         "model.height",
-        "follows from input.height and what model.conv reads",
+        "follows from input.height and what the torso reads",
     ),
     (
         "model.width",
-        "follows from input.width and what model.conv reads",
+        "follows from input.width and what the torso reads",
     ),
     (
-        "model.channels",
+        "model.input_channels",
         "follows from the world and run.frame_stack",
     ),
     ("model.num_actions", FROM_ACTIONS),
@@ -100,6 +100,27 @@ pub(crate) fn keep_whole_frames(table: &mut Table) {
     }
 }
 
+/// Removes what the presets have for torsos that this network does not have. What `by_hand` set stays, for its check to name.
+pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result<(), Usage> {
+    let others = torso(table)?.settings_of_others();
+    if let Some(model) = table.get_mut("model").and_then(Value::as_table_mut) {
+        for key in others {
+            if !by_hand.contains(&format!("model.{key}")) {
+                model.remove(*key);
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The torso that is chosen.
+fn torso(table: &Table) -> Result<TorsoName, Usage> {
+    match find(table, "model.torso") {
+        Some(_) => table_at(table, "model.torso"),
+        None => Ok(TorsoName::Nature),
+    }
+}
+
 /// Refuses a `--set` of something that follows from something else.
 pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
     match followed(path) {
@@ -148,8 +169,12 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         // A crop reads the borders too.
         if find(table, "learner.augment").is_none() {
             let input: InputSize = table_at(table, "input")?;
-            let conv: Vec<ConvLayer> = table_at(table, "model.conv")?;
-            read = input.read(&conv, frame);
+            let torso = torso(table)?;
+            let conv: Vec<ConvLayer> = match find(table, "model.conv") {
+                Some(_) => table_at(table, "model.conv")?,
+                None => Vec::new(),
+            };
+            read = input.read(torso, &conv, frame);
         }
     }
     let set: ActionSet = match find(table, "actor.actions") {
@@ -169,7 +194,7 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         ("model.height", size(read.input.0)),
         ("model.width", size(read.input.1)),
         (
-            "model.channels",
+            "model.input_channels",
             Value::Integer(stack.saturating_mul(shape.channels as i64)),
         ),
         ("model.num_actions", size(num_actions)),

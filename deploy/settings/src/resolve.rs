@@ -106,7 +106,12 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             Override::number(path, value)?.apply(&mut table)?;
         }
     }
-    let capacity_set = set(&mut table, &flags.sets)? || !sized_by_machine;
+    let by_hand = set(&mut table, &flags.sets)?;
+    let is_set = |path: &str| by_hand.iter().any(|set| set == path);
+    if sized_by_machine || is_set("model.torso") {
+        derived::drop_other_torsos(&mut table, &by_hand)?;
+    }
+    let capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
     derived::precision(&mut table, machine.fast_bf16);
     let note = memory::fit(&mut table, capacity_set, machine)?;
     derive(&mut table)?;
@@ -121,13 +126,12 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     Ok(config)
 }
 
-/// Applies every `--set`; returns whether the replay's capacity was among them.
-fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
-    let mut capacity_set = false;
+/// Applies every `--set`; returns the paths that were set.
+fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
+    let mut paths = Vec::with_capacity(sets.len());
     for text in sets {
         let one = Override::parse(text)?;
         derived::refuse(&one.path)?;
-        capacity_set |= one.path == "replay.capacity_transitions";
         let mut tried = table.clone();
         let new = one.apply(&mut tried)?;
         // A key that was not there may be an optional one. The type of its table decides.
@@ -140,8 +144,9 @@ fn set(table: &mut Table, sets: &[String]) -> Result<bool, Usage> {
             }
         }
         *table = tried;
+        paths.push(one.path);
     }
-    Ok(capacity_set)
+    Ok(paths)
 }
 
 #[cfg(test)]

@@ -7,8 +7,8 @@ use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::{
-    candle::{self, ConvLayerTensors},
-    conv, dots, grouped, linear,
+    candle::{self, BorderedTensors, ConvLayerTensors},
+    conv, dots, grouped, impala, linear,
     precision::Precision,
 };
 
@@ -42,6 +42,18 @@ impl Kernels {
         match self {
             Self::Fused(precision) => conv::conv_stack(images, layers, precision),
             Self::Candle => candle::conv_stack(images, layers),
+        }
+    }
+
+    /// Stages of an IMPALA torso, of whose convolutions `layers` has [`STAGE_CONVOLUTIONS`](crate::geometry::STAGE_CONVOLUTIONS) each.
+    pub(crate) fn residual_stages(
+        self,
+        images: &Tensor,
+        layers: &[BorderedTensors<'_>],
+    ) -> candle_core::Result<Tensor> {
+        match self {
+            Self::Fused(precision) => impala::residual_stages(images, layers, precision),
+            Self::Candle => candle::residual_stages(images, layers),
         }
     }
 

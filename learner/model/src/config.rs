@@ -9,6 +9,7 @@ pub(crate) use crate::heads::config::HeadConfig;
 use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::init::InitialLaw;
 use crate::layers::LayerShape;
+use crate::torso::{TorsoName, TorsoSettings, interface::Torso};
 
 /// Largest size of any one dimension; a configuration beyond it is rejected.
 const DIMENSION_MAX: usize = 1 << 16;
@@ -28,7 +29,7 @@ pub struct ModelConfig {
     /// Width of the network's input in pixels.
     pub width: usize,
     /// Channels of the network's input, after frames were stacked.
-    pub channels: usize,
+    pub input_channels: usize,
     /// Number of actions, 1 to 255.
     pub num_actions: usize,
     /// Atoms of each return distribution, at least 2.
@@ -37,8 +38,19 @@ pub struct ModelConfig {
     pub v_min: f32,
     /// Return at the last atom, within +-1e30.
     pub v_max: f32,
-    /// The convolutions, first to last, each followed by ReLU; at least one. The last one's output is f3.
+    /// Which torso makes f3. Settings of earlier versions do not have it: `nature`.
+    #[serde(default)]
+    pub torso: TorsoName,
+    /// Of `nature`, the convolutions, first to last, each followed by ReLU; at least one. The last one's output is f3.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub conv: Vec<ConvLayer>,
+    /// Of `impala` and `impoola`, the channels of each stage, first to last; at least one. The last one's output, after ReLU, is f3.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub channels: Vec<usize>,
+    /// Of `impala` and `impoola`, whether the second convolution of each residual block starts smaller, by the square root of the number
+    /// of blocks; not there: it does not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub scale_blocks: bool,
     /// Width of the fully connected layer f4.
     pub hidden: usize,
     /// Width of the space in which DIM scores are dot products, and of its heads' hidden layers.
@@ -90,13 +102,13 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::Config`] names the field: a size of 0 or above 65,536, a kernel larger than its input, a parameter
     /// of more than 2^28 scalars, more than 255 actions, fewer than 2 atoms, a `head.noisy_sigma` out of its range, `v_min` not below `v_max`, one of them beyond 1e30, no
-    /// convolution.
+    /// convolution or stage, a setting of another torso.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
         let sizes = [
             ("height", self.height),
             ("width", self.width),
-            ("channels", self.channels),
+            ("input_channels", self.input_channels),
             ("num_actions", self.num_actions),
             ("atoms", self.atoms),
             ("hidden", self.hidden),
@@ -131,10 +143,15 @@ impl ModelConfig {
             ));
         }
         self.head.validate()?;
-        if self.conv.is_empty() {
-            return fail("conv is empty, at least one convolution is needed".to_owned());
+        self.torso.check(&self.torso_settings())?;
+        for (index, &width) in self.channels.iter().enumerate() {
+            if width == 0 || width > DIMENSION_MAX {
+                return fail(format!(
+                    "channels[{index}] is {width}, must be 1 to {DIMENSION_MAX}"
+                ));
+            }
         }
-        let mut input = (self.height, self.width, self.channels);
+        let mut input = (self.height, self.width, self.input_channels);
         for (index, layer) in self.conv.iter().enumerate() {
             for (name, size) in [
                 ("out", layer.out),
@@ -178,26 +195,28 @@ impl ModelConfig {
         }
     }
 
-    /// Sizes of the convolutions, first to last. Of a configuration that is not valid, those before the first that does not fit.
-    pub fn conv_shapes(&self) -> Vec<ConvShape> {
-        let mut input = (self.height, self.width, self.channels);
-        let shapes = self.conv.iter().map_while(|layer| {
-            let shape = ConvShape::new(input, *layer)?;
-            input = shape.output();
-            Some(shape)
-        });
-        shapes.collect()
+    fn torso_settings(&self) -> TorsoSettings<'_> {
+        TorsoSettings {
+            conv: &self.conv,
+            channels: &self.channels,
+            scale_blocks: self.scale_blocks,
+        }
     }
 
-    /// Shape of f3: height, width, channels of the last convolution's output. Meaningful for a valid configuration.
+    /// The torso. Of a configuration that is not valid, one that cannot be used.
+    pub(crate) fn torso(&self) -> Box<dyn Torso> {
+        let input = (self.height, self.width, self.input_channels);
+        self.torso.build(input, &self.torso_settings())
+    }
+
+    /// Shape of f3: height, width, channels. Meaningful for a valid configuration.
     pub fn local_shape(&self) -> (usize, usize, usize) {
-        let input = (self.height, self.width, self.channels);
-        self.conv_shapes().last().map_or(input, ConvShape::output)
+        self.torso().local_shape()
     }
 
     /// Bytes of one input frame: height * width * channels.
     pub fn frame_len(&self) -> usize {
-        self.height * self.width * self.channels
+        self.height * self.width * self.input_channels
     }
 
     /// The atoms z_i = v_min + i (v_max - v_min) / (atoms - 1); the last is `v_max` itself.
@@ -235,31 +254,30 @@ impl ModelConfig {
     pub(crate) fn layers(&self) -> Vec<LayerShape> {
         use InitialLaw::{Orthogonal, Uniform};
         let mut layers = Vec::new();
+        let torso = self.torso();
+        for convolution in torso.convolutions() {
+            layers.push(LayerShape {
+                name: convolution.name,
+                weight: convolution.weight.to_vec(),
+                bias: true,
+                initial: Orthogonal,
+                initial_scale: convolution.initial_scale,
+                noisy_sigma: None,
+            });
+        }
         let mut layer = |name: &str, weight: Vec<usize>, bias: bool, initial: InitialLaw| {
             layers.push(LayerShape {
                 name: name.to_owned(),
                 weight,
                 bias,
                 initial,
+                initial_scale: 1.0,
                 noisy_sigma: self.head.noisy_sigma.filter(|_| name.starts_with(HEAD)),
             });
         };
-
-        let mut channels_in = self.channels;
-        for (index, conv) in self.conv.iter().enumerate() {
-            layer(
-                &format!("torso.conv{}", index + 1),
-                vec![conv.out, channels_in, conv.kernel, conv.kernel],
-                true,
-                Orthogonal,
-            );
-            channels_in = conv.out;
-        }
-        let (local_height, local_width, local_channels) = self.local_shape();
-        let flat = local_height
-            .saturating_mul(local_width)
-            .saturating_mul(local_channels);
-        layer("torso.fc", vec![self.hidden, flat], true, Orthogonal);
+        let (_, _, local_channels) = torso.local_shape();
+        let fc = vec![self.hidden, torso.fc_inputs()];
+        layer("torso.fc", fc, true, Orthogonal);
         // The means of noisy layers too, as Fortunato et al. 2018 draw them.
         for (name, outputs) in self.head_layers() {
             layer(name, vec![outputs, self.hidden], true, Uniform);

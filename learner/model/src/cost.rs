@@ -38,7 +38,7 @@ impl ModelConfig {
     /// What each layer that this configuration has costs, in the order of [`ModelConfig::parameter_shapes`]. Meaningful for a valid
     /// configuration.
     pub fn layer_costs(&self) -> Vec<LayerCost> {
-        let convolutions = self.conv_shapes();
+        let convolutions = self.torso().convolutions();
         let (height, width, channels) = self.local_shape();
         let layers = self.layers().into_iter().enumerate();
         let costs = layers.map(|(index, layer)| {
@@ -53,8 +53,8 @@ impl ModelConfig {
             let products = if layer.name == VALUE {
                 // Added to the advantage's weight before any product.
                 0
-            } else if let Some(shape) = convolutions.get(index) {
-                shape.locations() * weight_len
+            } else if let Some(convolution) = convolutions.get(index) {
+                convolution.locations * weight_len
             } else if is_of("dim.psi3.") || is_of("dim.phi3.") {
                 let joined = layer.weight[1].saturating_sub(channels) * outputs;
                 let features = weight_len - joined;
@@ -110,6 +110,7 @@ mod tests {
     use crate::config::{DimHeads, HeadConfig};
     use crate::geometry::ConvLayer;
     use crate::parameters::Parameters;
+    use crate::torso::TorsoName;
 
     /// 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every head.
     fn every_head() -> ModelConfig {
@@ -121,12 +122,15 @@ mod tests {
         ModelConfig {
             height: 8,
             width: 8,
-            channels: 1,
+            input_channels: 1,
             num_actions: 3,
             atoms: 6,
             v_min: -1.0,
             v_max: 1.0,
+            torso: TorsoName::Nature,
             conv: vec![conv(4, 4, 2), conv(5, 2, 1)],
+            channels: vec![],
+            scale_blocks: false,
             hidden: 7,
             rkhs: 8,
             action_embed: 2,
@@ -213,7 +217,7 @@ mod tests {
         let model = ModelConfig {
             height: 84,
             width: 84,
-            channels: 4,
+            input_channels: 4,
             conv: vec![conv(32, 8, 4), conv(64, 4, 2), conv(64, 3, 1)],
             hidden: 512,
             ..every_head().without_dim()
@@ -227,6 +231,38 @@ mod tests {
             512 * 18,
         ];
         assert!(forward.eq(by_hand.map(|products| 2 * products)));
+    }
+
+    /// The residual network of the Procgen paper on 64 x 64 x 3: maps of 64 x 64, and pooled 32 x 32, 16 x 16 and 8 x 8.
+    #[test]
+    fn a_residual_torso_is_counted() {
+        let of = |torso| ModelConfig {
+            height: 64,
+            width: 64,
+            input_channels: 3,
+            torso,
+            conv: vec![],
+            channels: vec![16, 32, 32],
+            hidden: 512,
+            ..every_head().without_dim()
+        };
+        let by_hand = [(64, 3, 16), (32, 16, 32), (16, 32, 32)];
+        let convolutions = by_hand.map(|(side, channels_in, out): (usize, usize, usize)| {
+            let block = (side / 2).pow(2) * 9 * out * out;
+            side.pow(2) * 9 * channels_in * out + 4 * block
+        });
+        let convolutions: usize = convolutions.iter().sum();
+        for (torso, fc) in [
+            (TorsoName::Impala, 2048 * 512),
+            (TorsoName::Impoola, 32 * 512),
+        ] {
+            let costs = of(torso).layer_costs();
+            let torso = costs.iter().filter(|layer| layer.is_of("torso"));
+            let forward: u64 = torso.map(|layer| layer.forward).sum();
+            assert_eq!(forward, 2 * (convolutions + fc) as u64);
+            assert_eq!(costs[1].name, "torso.stage1.block1.conv1");
+        }
+        assert_eq!(convolutions, 30_081_024);
     }
 
     #[test]

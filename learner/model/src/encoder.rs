@@ -6,16 +6,16 @@ use candle_core::Tensor;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
+use crate::features::FeatureLayers;
 use crate::heads::dim::Head;
 use crate::parameters::Parameters;
-use crate::torso::Torso;
 
 /// The part of a network that encodes a state as psi_4(f4).
 ///
 /// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this encoder.
 #[derive(Debug)]
 pub struct Encoder {
-    torso: Torso,
+    torso: FeatureLayers,
     psi4: Head,
 }
 
@@ -32,7 +32,7 @@ impl Encoder {
     pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         Ok(Self {
-            torso: Torso::new(config, parameters, kernels)?,
+            torso: FeatureLayers::new(config, parameters, kernels)?,
             psi4: Head::new("dim.psi4", parameters, kernels)?,
         })
     }

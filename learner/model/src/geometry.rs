@@ -55,6 +55,22 @@ impl ConvShape {
         })
     }
 
+    /// The sizes of a convolution of 3 x 3 on an input of (height, width, channels) with a border of zeros, a pixel wide: those of one
+    /// without padding, on the input with its border. The output is as large as the input.
+    pub(crate) const fn bordered(
+        (height, width, channels_in): (usize, usize, usize),
+        channels_out: usize,
+    ) -> Self {
+        Self {
+            height: height + 2,
+            width: width + 2,
+            channels_in,
+            channels_out,
+            kernel: 3,
+            stride: 1,
+        }
+    }
+
     /// Rows of the output.
     pub fn out_height(&self) -> usize {
         (self.height - self.kernel) / self.stride + 1
@@ -101,11 +117,37 @@ impl ConvShape {
     }
 }
 
+/// Convolutions of a stage of an IMPALA torso: the one before the pool, and two of each residual block.
+pub(crate) const STAGE_CONVOLUTIONS: usize = 5;
+
+/// Height, width and channels of what a 3 x 3 max pool of stride 2, with a border that is never the largest, makes of maps.
+pub(crate) const fn pooled(
+    (height, width, channels): (usize, usize, usize),
+) -> (usize, usize, usize) {
+    (height.div_ceil(2), width.div_ceil(2), channels)
+}
+
+/// The sizes of all convolutions of stages of these widths on an input of (height, width, channels), in the order in which they are
+/// applied, and those of what comes out.
+pub(crate) fn stages(
+    input: (usize, usize, usize),
+    widths: &[usize],
+) -> (Vec<ConvShape>, (usize, usize, usize)) {
+    let (mut shapes, mut maps) = (Vec::new(), input);
+    for &width in widths {
+        let first = ConvShape::bordered(maps, width);
+        maps = pooled(first.output());
+        shapes.push(first);
+        shapes.extend([ConvShape::bordered(maps, width); STAGE_CONVOLUTIONS - 1]);
+    }
+    (shapes, maps)
+}
+
 /// Rows and columns, from the upper left corner of an image of (height, width), that windows of the layers of `conv` reach: what
 /// lies beyond them changes no output. `None` if a kernel does not fit.
 ///
 /// The last layer's whole output is read; a layer that gives n rows reads `stride * (n - 1) + kernel` of its input's.
-pub fn reach(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+pub(crate) fn reach(conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
     let mut size = (image.0, image.1, 1);
     for layer in conv {
         size = ConvShape::new(size, *layer)?.output();

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::geometry::{ConvLayer, reach};
+use crate::geometry::ConvLayer;
+use crate::torso::TorsoName;
 
 /// The size at which the network sees a world's frame: the `[input]` table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -52,10 +53,11 @@ impl InputSize {
             .map_or(sent, |whole| (whole.height as usize, whole.width as usize))
     }
 
-    /// What the layers of `conv` read of a frame of (height, width) that is enlarged to this size; all of it if they do not fit.
-    pub fn read(&self, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
+    /// What `torso`, with the layers of `conv` if it is made of them, reads of a frame of (height, width) that is enlarged to this size;
+    /// all of it if they do not fit.
+    pub fn read(&self, torso: TorsoName, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
         let whole = self.whole_input();
-        let Some(input) = reach(conv, whole) else {
+        let Some(input) = torso.reach(conv, whole) else {
             return InputRead {
                 input: whole,
                 frame,
@@ -79,7 +81,7 @@ impl InputSize {
         let (frame, whole) = (self.whole_frame(sent), self.whole_input());
         let taken = (model.height, model.width);
         if frame != whole {
-            let enlarge = Enlarge::new(frame, whole, model.channels)?;
+            let enlarge = Enlarge::new(frame, whole, model.input_channels)?;
             return enlarge.part(sent, taken).map(Some);
         }
         if sent == taken {
@@ -269,7 +271,7 @@ mod tests {
                     width: frame.1 as u32,
                 }),
             };
-            let found = size.read(&conv, frame);
+            let found = size.read(TorsoName::Nature, &conv, frame);
             assert_eq!((found.input, found.frame), read);
             let image: Vec<u8> = (0..frame.0 * frame.1)
                 .map(|at| (at * 7 % 251) as u8)
@@ -280,12 +282,15 @@ mod tests {
             let model = ModelConfig {
                 height: found.input.0,
                 width: found.input.1,
-                channels: 1,
+                input_channels: 1,
                 num_actions: 1,
                 atoms: 2,
                 v_min: 0.0,
                 v_max: 1.0,
+                torso: TorsoName::Nature,
                 conv: conv.to_vec(),
+                channels: vec![],
+                scale_blocks: false,
                 hidden: 1,
                 rkhs: 1,
                 action_embed: 1,

@@ -15,6 +15,8 @@ pub(crate) struct LayerShape {
     pub(crate) weight: Vec<usize>,
     pub(crate) bias: bool,
     pub(crate) initial: InitialLaw,
+    /// What the weight is multiplied by after it is drawn.
+    pub(crate) initial_scale: f32,
     /// sigma_0 of a noisy layer, which has a mean and a sigma of weight and bias in place of these.
     pub(crate) noisy_sigma: Option<f64>,
 }
@@ -41,7 +43,8 @@ impl LayerShape {
     ///
     /// Source: Fortunato et al. 2018, section 3.2 (b).
     pub(crate) fn initial_values(&self, rng: &mut ChaCha8Rng) -> Vec<Vec<f32>> {
-        let weight = self.initial.weight(&self.weight, rng);
+        let mut weight = self.initial.weight(&self.weight, rng);
+        weight.iter_mut().for_each(|it| *it *= self.initial_scale);
         let outputs = self.weight[0];
         let sigma = self.noisy_sigma.map(|sigma_0| {
             let fan_in = weight.len() / outputs;

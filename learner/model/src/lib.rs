@@ -1,4 +1,4 @@
-//! The network that actor and learner share: a convolutional torso, the C51 head and the DIM heads, with their own CPU kernels.
+//! The network that actor and learner share: a convolutional torso, one of several, the C51 head and the DIM heads, with their own CPU kernels.
 //! It has never heard of processes, replay or worlds, and it computes no loss.
 //!
 //! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
@@ -9,13 +9,14 @@
 //!
 //! ```
 //! use candle_core::{Device, Tensor};
-//! use driml_model::{HeadConfig, ConvLayer, DimHeads, ModelConfig, Network, Parameters};
+//! use driml_model::{HeadConfig, ConvLayer, DimHeads, ModelConfig, Network, Parameters, TorsoName};
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
 //! let no_heads = DimHeads { psi3: false, phi3: false, psi4: false, phi4: false, action: false };
 //! let config = ModelConfig {
-//!     height: 8, width: 8, channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
-//!     conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
+//!     height: 8, width: 8, input_channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
+//!     torso: TorsoName::Nature, conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
+//!     channels: vec![], scale_blocks: false,
 //!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
@@ -34,6 +35,7 @@ mod config;
 mod cost;
 mod encoder;
 mod error;
+mod features;
 mod geometry;
 mod gradients;
 mod heads;
@@ -52,7 +54,7 @@ pub use config::{DimHeads, ModelConfig};
 pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
-pub use geometry::{ConvLayer, ConvShape, reach};
+pub use geometry::{ConvLayer, ConvShape};
 pub use gradients::Backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use heads::config::HeadConfig;
@@ -67,3 +69,4 @@ pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;
 pub use stored::StoredAs;
+pub use torso::TorsoName;

@@ -6,12 +6,12 @@ use candle_core::Tensor;
 use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
+use crate::features::FeatureLayers;
 use crate::heads::c51::C51Head;
 use crate::heads::dim::{ActionEmbedding, Head};
 use crate::heads::noise::HeadNoise;
 use crate::kernels::rows::select_rows;
 use crate::parameters::Parameters;
-use crate::torso::Torso;
 
 /// What the torso makes of a batch of frames.
 #[derive(Clone, Debug)]
@@ -62,7 +62,7 @@ impl Features {
 #[derive(Debug)]
 pub struct Network {
     kernels: Kernels,
-    torso: Torso,
+    torso: FeatureLayers,
     head: C51Head,
     action: Option<ActionEmbedding>,
     psi3: Option<Head>,
@@ -104,7 +104,7 @@ impl Network {
             .transpose()?;
         Ok(Self {
             kernels,
-            torso: Torso::new(config, parameters, kernels)?,
+            torso: FeatureLayers::new(config, parameters, kernels)?,
             head: C51Head::new(config, parameters, kernels)?,
             action,
             psi3: head(config.dim.psi3, "dim.psi3")?,

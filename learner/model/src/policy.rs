@@ -4,7 +4,7 @@
 //! It runs the same kernels as `Network`. The batch is split over the rayon pool once, not layer by layer, so that a
 //! task's maps stay in its core's cache.
 
-use std::fmt;
+use std::{convert::Infallible, fmt};
 
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -15,13 +15,11 @@ use crate::heads::acting::{ActingHead, InputsFirst};
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{Convolution, forward};
-use crate::kernels::images::{Images, Pixels};
-use crate::kernels::linear::relu_of;
-use crate::kernels::panels::{Matrix, Panels, Threads};
+use crate::kernels::dense::{Dense, activate};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{Element, ForUnit, Left, Mode, Unit, vectorized, with_unit};
+use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
 use crate::parameters::{decode, is_dim};
+use crate::torso::interface::{ActingTorso, TorsoParameters};
 
 /// Frames that go through the network together on one thread.
 const TILE_FRAMES: usize = 32;
@@ -162,35 +160,33 @@ fn weights(
     safetensors: &[u8],
     precision: Precision,
 ) -> Result<Box<dyn Weights>> {
-    struct Decode<'a>(&'a ModelConfig, &'a [u8]);
+    struct Decode<'a>(&'a ModelConfig, &'a [u8], Precision);
     impl ForUnit for Decode<'_> {
         type Output = Result<Box<dyn Weights>>;
         fn run<U: Unit>(self, unit: U) -> Self::Output {
-            Ok(Box::new(UnitWeights::decode(unit, self.0, self.1)?))
+            Ok(Box::new(UnitWeights::decode(unit, self.0, self.1, self.2)?))
         }
     }
-    with_unit(precision, Decode(config, safetensors))
+    with_unit(precision, Decode(config, safetensors, precision))
 }
 
 struct UnitWeights<U: Unit> {
     unit: U,
-    convolutions: Vec<Convolution<U::Element>>,
-    fc: Dense<U>,
+    /// Bytes of a frame.
+    frame_len: usize,
+    torso: Box<dyn ActingTorso>,
     head: Dense<U>,
     /// What `head` is made of, with every noise anew; there if it is noisy.
     noisy: Option<ActingHead>,
 }
 
-/// A fully connected layer.
-struct Dense<U: Unit> {
-    /// Of [in, out].
-    weight: Panels<U::Element>,
-    bias: Vec<f32>,
-    inputs: usize,
-}
-
 impl<U: Unit> UnitWeights<U> {
-    fn decode(unit: U, config: &ModelConfig, safetensors: &[u8]) -> Result<Self> {
+    fn decode(
+        unit: U,
+        config: &ModelConfig,
+        safetensors: &[u8],
+        precision: Precision,
+    ) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
         let mut take = |name: &str| {
             let (_, values) = parameters
@@ -198,90 +194,41 @@ impl<U: Unit> UnitWeights<U> {
                 .expect("decode returns every parameter of the configuration");
             values
         };
-        let convolutions = (1..)
-            .zip(config.conv_shapes())
-            .map(|(number, shape)| {
-                let weight = take(&format!("torso.conv{number}.weight"));
-                let bias = take(&format!("torso.conv{number}.bias"));
-                Convolution::new(unit, shape, &weight, &bias, false)
-            })
-            .collect();
-        let (height, width, channels) = config.local_shape();
-        // The inputs in our maps' order, row, column, channel, instead of PyTorch's channel, row, column.
-        let column = |input: usize| input % channels * height * width + input / channels;
-        let fc_weight = transposed(&take("torso.fc.weight"), config.hidden, column);
-        let fc = Dense::new(unit, &fc_weight, take("torso.fc.bias"));
+        let torso = config.torso();
+        let Ok(of_torso) = TorsoParameters::of(&*torso, |layer, part| {
+            Ok::<_, Infallible>(take(&format!("{layer}.{part}")))
+        });
         let head = ActingHead::new(config, &mut take);
-        let dense = Dense::of(unit, &head.layer(None));
         Ok(Self {
             unit,
-            convolutions,
-            fc,
-            head: dense,
+            frame_len: config.frame_len(),
+            torso: torso.acting(precision, of_torso),
+            head: dense(unit, &head.layer(None)),
             noisy: config.head.noisy_sigma.map(|_| head),
         })
     }
 
     fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
-        let unit = self.unit;
-        let count = values.len() * support.len() / self.head.bias.len();
-        let mut maps = Buffer::<U::Element>::new(0);
-        for (index, layer) in self.convolutions.iter().enumerate() {
-            let mut output = Buffer::<U::Element>::new(count * layer.shape.map_len());
-            let images = match index {
-                0 => Images::Pixels(Pixels::Bytes(frames)),
-                _ => Images::Maps(&maps),
-            };
-            forward(unit, layer, images, &mut output);
-            maps = output;
-        }
-        let hidden = self
-            .fc
-            .forward(unit, &whole_steps(maps, self.fc.inputs), count);
-        let stride = self.fc.bias.len().next_multiple_of(U::Element::DEPTH);
+        let count = values.len() * support.len() / self.head.outputs();
+        let hidden = self.torso.f4(frames);
+        let width = self.head.inputs();
+        let stride = width.next_multiple_of(U::Element::DEPTH);
         let mut active = Buffer::<U::Element>::new(count * stride);
-        activate(unit, &hidden, self.fc.bias.len(), &mut active);
-        let logits = self.head.forward(unit, &active, count);
+        activate(self.unit, &hidden, width, &mut active);
+        let logits = self.head.forward(self.unit, &active, count);
         expected_returns(&logits, support, values);
     }
 }
 
-/// Rows of `len` scalars as rows of whole steps.
-fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
-    let stride = len.next_multiple_of(E::DEPTH);
-    if stride == len {
-        return rows;
-    }
-    let mut padded = Buffer::new(rows.len() / len * stride);
-    for (padded, row) in padded.chunks_exact_mut(stride).zip(rows.chunks_exact(len)) {
-        padded[..len].copy_from_slice(row);
-        padded[len..].fill(E::default());
-    }
-    padded
-}
-
-vectorized! {
-    /// relu of `hidden` [rows, cols] as rows of whole steps.
-    fn activate<U>(unit, hidden: &'a [f32], cols: usize, active: &'a mut [U::Element]) {
-        let rows = active.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
-        for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
-            row.fill(U::Element::default());
-            for (value, &hidden) in row.iter_mut().zip(hidden) {
-                *value = U::Element::of(relu_of(hidden));
-            }
-        }
-    }
+fn dense<U: Unit>(unit: U, layer: &InputsFirst) -> Dense<U> {
+    Dense::new(unit, &layer.weight, layer.bias.clone())
 }
 
 impl<U: Unit> Weights for UnitWeights<U> {
     fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
-        let frame_len = self
-            .convolutions
-            .first()
-            .map_or(1, |first| first.shape.image_len());
-        let actions = self.head.bias.len() / support.len();
+        let actions = self.head.outputs() / support.len();
         let tiles = frames
-            .chunks(TILE_FRAMES * frame_len)
+            .chunks(TILE_FRAMES * self.frame_len)
             .zip(values.chunks_mut(TILE_FRAMES * actions));
         for (frames, values) in tiles {
             self.tile_q_values(support, frames, values);
@@ -290,57 +237,7 @@ impl<U: Unit> Weights for UnitWeights<U> {
 
     fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         if let Some(noisy) = &self.noisy {
-            self.head = Dense::of(self.unit, &noisy.layer(noise));
+            self.head = dense(self.unit, &noisy.layer(noise));
         }
     }
-}
-
-impl<U: Unit> Dense<U> {
-    fn of(unit: U, layer: &InputsFirst) -> Self {
-        Self::new(unit, &layer.weight, layer.bias.clone())
-    }
-
-    /// `weight` [in, out], `bias` [out].
-    fn new(unit: U, weight: &[f32], bias: Vec<f32>) -> Self {
-        let inputs = weight.len() / bias.len();
-        let weight = Matrix::new(weight, inputs, bias.len());
-        Self {
-            weight: Panels::pack(unit, weight, Threads::Caller),
-            bias,
-            inputs,
-        }
-    }
-
-    /// [count, out] of `x` [count, in], whose rows begin at whole steps.
-    fn forward(&self, unit: U, x: &[U::Element], count: usize) -> Buffer<f32> {
-        let outputs = self.bias.len();
-        let mut y = Buffer::new(count * outputs);
-        for row in y.chunks_exact_mut(outputs) {
-            row.copy_from_slice(&self.bias);
-        }
-        let depth = U::Element::DEPTH;
-        let row_stride = self.inputs.next_multiple_of(depth);
-        let left = Left {
-            values: x,
-            start: 0,
-            row_stride,
-            step: depth,
-            steps: row_stride / depth,
-            run_stride: 0,
-            runs: 1,
-        };
-        self.weight
-            .multiply_rows(unit, count, left, Mode::Add, &mut y, outputs);
-        y
-    }
-}
-
-/// A weight [out, in] as [in, out], whose input i is column `column(i)` of the original.
-fn transposed(weight: &[f32], outputs: usize, column: impl Fn(usize) -> usize) -> Vec<f32> {
-    let inputs = weight.len() / outputs;
-    let mut result = Vec::with_capacity(weight.len());
-    for input in 0..inputs {
-        result.extend((0..outputs).map(|output| weight[output * inputs + column(input)]));
-    }
-    result
 }

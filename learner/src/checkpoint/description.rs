@@ -1,7 +1,7 @@
 //! What a checkpoint's networks say of themselves in safetensors' metadata, so that a file alone can be loaded elsewhere.
 //! This program reads it to say which setting of a checkpoint differs; one without it is as good.
 
-use driml_model::{InputSize, ModelConfig};
+use driml_model::{InputSize, ModelConfig, TorsoName};
 use driml_protocol::RunSpec;
 use serde::Serialize;
 use serde_json::Value;
@@ -12,9 +12,25 @@ pub const KEY: &str = "driml";
 const FORMAT: u32 = 1;
 /// For a reader who has nothing but the file. More: `deploy/docs/src/reference/weights.md`.
 const CONVENTIONS: &str = "Input: states u8 [B, height, width, channels] of [model], divided by 255; channels are the newest frame_stack \
-    frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k] without padding, each \
-    followed by ReLU; torso.fc takes their output as channel, row, column; HEAD. \
+    frames of [run], oldest first. Parameters have PyTorch's names and shapes: convolutions [out, in, k, k]TORSO; HEAD. \
     Atoms: v_min to v_max, evenly. Value of an action: sum of softmax(logits) * atoms.";
+
+/// What the torso does, in [`CONVENTIONS`].
+const fn torso(model: &ModelConfig) -> &'static str {
+    match model.torso {
+        TorsoName::Nature => {
+            " without padding, each followed by ReLU; torso.fc takes their output as channel, row, column"
+        }
+        TorsoName::Impala => {
+            " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
+             and block2; torso.fc takes ReLU of the last stage's output as channel, row, column"
+        }
+        TorsoName::Impoola => {
+            " with zero padding 1: a stage is conv, max pool 3x3 of stride 2 and padding 1, and x + conv2(ReLU(conv1(ReLU(x)))) for block1 \
+             and block2; torso.fc takes the mean over the locations of ReLU of the last stage's output"
+        }
+    }
+}
 
 /// What the C51 head does, in [`CONVENTIONS`].
 const fn head(model: &ModelConfig) -> &'static str {
@@ -46,7 +62,9 @@ struct Description<'a> {
 pub fn describe(run: &RunSpec, model: &ModelConfig, input: &InputSize) -> String {
     let description = Description {
         format: FORMAT,
-        conventions: CONVENTIONS.replace("HEAD", head(model)),
+        conventions: CONVENTIONS
+            .replace("TORSO", torso(model))
+            .replace("HEAD", head(model)),
         model,
         input,
         run,

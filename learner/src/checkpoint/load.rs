@@ -119,7 +119,9 @@ fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> 
         return Ok(());
     };
     let ours = serde_json::to_value(model).unwrap_or_default();
-    match description::difference("model", saved, &ours) {
+    // What follows from another torso is not worth a word beside it.
+    let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
+    match torso.or_else(|| description::difference("model", saved, &ours)) {
         None => Ok(()),
         Some((key, found, expected)) => Err(CheckpointError::OtherModel {
             folder: path.to_owned(),

@@ -9,7 +9,7 @@ use std::{
 };
 
 use candle_core::{DType, Device, Tensor, WithDType};
-use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, HeadNoise, ModelConfig, TorsoName};
 use driml_protocol::NO_ACTION;
 use safetensors::SafeTensors;
 use serde::Deserialize;
@@ -96,7 +96,13 @@ struct Observation {
 
 #[derive(Debug, Deserialize)]
 struct Sizes {
+    /// Not there: `nature`.
+    #[serde(default)]
+    torso: TorsoName,
+    #[serde(default)]
     conv: Vec<ConvLayer>,
+    #[serde(default)]
+    channels: Vec<usize>,
     hidden: usize,
     rkhs: usize,
     action_embed: usize,
@@ -157,12 +163,15 @@ impl Case {
         ModelConfig {
             height: it.obs.height,
             width: it.obs.width,
-            channels: it.obs.channels,
+            input_channels: it.obs.channels,
             num_actions: it.actions,
             atoms: it.atoms,
             v_min: it.v_min,
             v_max: it.v_max,
+            torso: it.model.torso,
             conv: it.model.conv.clone(),
+            channels: it.model.channels.clone(),
+            scale_blocks: false,
             hidden: it.model.hidden,
             rkhs: it.model.rkhs,
             action_embed: it.model.action_embed,

@@ -109,7 +109,7 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     let evaluation = agent.evaluate_with(&case.batch(), &case.noise(agent.model())?)?;
     let mut check = Check {
         case,
-        allowed: Tolerances::of(compute.kernels),
+        allowed: Tolerances::of(compute.kernels, agent.model().torso),
         lines: Vec::new(),
     };
     check.targets(&agent, &evaluation)?;

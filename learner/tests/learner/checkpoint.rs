@@ -12,7 +12,7 @@ use driml_learner::{
     LearnedSettings, Progress,
     checkpoint::{self, CheckpointError, RunState, list, load_latest, lock, save},
 };
-use driml_model::{Compute, ModelConfig, Parameters, Precision};
+use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
 use driml_protocol::Tally;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -175,6 +175,15 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
         said.contains(&differs) && !said.contains("damaged"),
         "{said}"
     );
+    let other = ModelConfig {
+        torso: TorsoName::Impala,
+        conv: vec![],
+        channels: vec![4],
+        ..ours.clone()
+    };
+    let said = load(&other).unwrap_err().to_string();
+    let differs = "was saved with model.torso = \"nature\", this run has model.torso = \"impala\"";
+    assert!(said.contains(differs), "{said}");
 }
 
 #[test]

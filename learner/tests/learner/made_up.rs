@@ -8,7 +8,7 @@ use driml_learner::{
     AdamSettings, Agent, Batch, Lambda, LearnerSettings, NetworkParameters, Objective,
     auxiliary::{cpc, curl, dim},
 };
-use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters};
+use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters, TorsoName};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -29,11 +29,12 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
     ModelConfig {
         height: 20,
         width: 24,
-        channels: 2,
+        input_channels: 2,
         num_actions: ACTIONS,
         atoms: 21,
         v_min: -5.0,
         v_max: 5.0,
+        torso: TorsoName::Nature,
         conv: vec![
             ConvLayer {
                 out: 5,
@@ -46,6 +47,8 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
                 stride: 1,
             },
         ],
+        channels: vec![],
+        scale_blocks: false,
         hidden: 16,
         rkhs: 12,
         action_embed: 7,

@@ -7,7 +7,7 @@ use candle_core::{Device, Tensor};
 use driml_envs::WorldName;
 use driml_learner::{Agent, Compute, LearnerSettings, NetworkParameters};
 use driml_machine::resources::Machine;
-use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
 use driml_settings::{
     config::RunConfig,
     presets,
@@ -19,16 +19,19 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
     ModelConfig {
         height: 1,
         width: 1,
-        channels: 1,
+        input_channels: 1,
         num_actions: 1,
         atoms,
         v_min: support.0,
         v_max: support.1,
+        torso: TorsoName::Nature,
         conv: vec![ConvLayer {
             out: 1,
             kernel: 1,
             stride: 1,
         }],
+        channels: vec![],
+        scale_blocks: false,
         hidden,
         rkhs: 1,
         action_embed: 1,

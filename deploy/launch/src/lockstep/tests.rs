@@ -36,6 +36,20 @@ const WIDE_CHAIN: [&str; 4] = [
     "input.width=17",
 ];
 
+#[test]
+fn every_torso_learns_the_same_again() {
+    for torso in ["impala", "impoola"] {
+        let torso = format!("model.torso={torso}");
+        let sets = [&*torso, "model.channels=[4,6]"];
+        let config = config("chain", "driml-ada", 400, &sets);
+        assert_eq!(frame(&config), (12, 12));
+        let first = weights(&config);
+        assert_eq!(first, weights(&config), "{torso}");
+        let other = self::config("chain", "driml-ada", 400, &[&*torso, "run.seed=2", sets[1]]);
+        assert_ne!(first, weights(&other), "{torso}");
+    }
+}
+
 /// Worlds that are made so large that a convolution leaves a border out: as it is drawn, and enlarged.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {

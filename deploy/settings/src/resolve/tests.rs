@@ -2,6 +2,7 @@
 //! `tests/snapshots/refusals.txt` has the sentences.
 
 use driml_envs::WorldConfig;
+use driml_model::TorsoName;
 use driml_protocol::{Horizon, Sampling};
 use expect_test::{expect, expect_file};
 
@@ -125,7 +126,7 @@ fn frames_are_cut_where_nothing_reads_them() {
     let wrong = cut
         .to_toml()
         .replace("frame_height = 60", "frame_height = 64");
-    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what model.conv reads and is 60; correct the one or the other"]
+    expect!["wrong.toml: run.frame_height = 64, but it follows from the world and what the torso reads and is 60; correct the one or the other"]
         .assert_eq(&RunConfig::parse("wrong.toml", &wrong).unwrap_err().to_string());
 }
 
@@ -380,4 +381,36 @@ fn rows_are_drawn_by_the_rule_that_is_set() {
     assert_eq!(learner.sampling, expected);
     // The hash of what all parts agree on is that of every other rule: checkpoints stay good.
     assert_eq!(config.run, with("chain", "c51", &[]).unwrap().run);
+}
+
+#[test]
+fn a_torso_has_settings_of_its_own() {
+    let with = |sets: &[&str]| with("procgen:bigfish", "c51", sets);
+    let nature = with(&[]).unwrap();
+    assert_eq!(nature.model.torso, TorsoName::Nature);
+    assert!(nature.model.channels.is_empty() && !nature.model.scale_blocks);
+    let impala = with(&["model.torso=impala"]).unwrap();
+    let model = &impala.model;
+    assert_eq!(
+        (model.channels.as_slice(), model.scale_blocks),
+        (&[16, 32, 32][..], true)
+    );
+    assert!(model.conv.is_empty());
+    // Every pixel is read.
+    assert_eq!((impala.run.frame_height, model.width), (64, 64));
+    assert_eq!(RunConfig::parse("it", &impala.to_toml()).unwrap(), impala);
+    let wide = with(&["model.channels=[32,64]", "model.torso=impoola"]).unwrap();
+    assert_eq!(
+        (wide.model.torso, wide.model.channels.len()),
+        (TorsoName::Impoola, 2)
+    );
+
+    let of_file = |config: &RunConfig, set: &[&str]| {
+        let file = Source::File("it.toml".into(), config.to_toml());
+        resolve(&file, &sets(set), &MACHINE).map_err(|e| e.to_string())
+    };
+    let switched = of_file(&nature, &["model.torso=impala", "model.channels=[8]"]).unwrap();
+    assert!(switched.model.conv.is_empty() && switched.run.frame_height == 64);
+    expect!["model configuration: channels is empty, and torso = impala is made of it: set model.channels, or set model.torso to nature"]
+        .assert_eq(&of_file(&nature, &["model.torso=impala"]).unwrap_err());
 }

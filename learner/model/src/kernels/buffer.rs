@@ -26,7 +26,7 @@ macro_rules! pooled {
     )*};
 }
 
-pooled!(f32 bf16);
+pooled!(f32 bf16 u8);
 
 /// A slice of memory from the pool, to which it returns.
 pub(crate) struct Buffer<T: Pooled> {

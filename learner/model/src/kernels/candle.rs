@@ -6,19 +6,82 @@
 
 use candle_core::{DType, Result, Tensor};
 
+use crate::geometry::{STAGE_CONVOLUTIONS, pooled};
+
 /// Weight [out, in, k, k], bias [out] and stride of a convolution.
 pub(crate) type ConvLayerTensors<'a> = (&'a Tensor, &'a Tensor, usize);
 
+/// Weight [out, in, 3, 3] and bias [out] of a convolution with a border of zeros.
+pub(crate) type BorderedTensors<'a> = (&'a Tensor, &'a Tensor);
+
 /// As `conv::conv_stack`: images [B, H, W, C] to maps [B, h, w, c].
 pub(crate) fn conv_stack(images: &Tensor, layers: &[ConvLayerTensors<'_>]) -> Result<Tensor> {
-    let mut maps = match images.dtype() {
-        DType::U8 => images.to_dtype(DType::F32)?.affine(1.0 / 255.0, 0.0)?,
-        _ => images.clone(),
-    };
+    let mut maps = scaled(images)?;
     for &(weight, bias, stride) in layers {
         maps = relu(&conv2d(&maps, weight, bias, stride)?)?;
     }
     Ok(maps)
+}
+
+/// Bytes as floats from 0 to 1; floats as they are.
+fn scaled(images: &Tensor) -> Result<Tensor> {
+    match images.dtype() {
+        DType::U8 => images.to_dtype(DType::F32)?.affine(1.0 / 255.0, 0.0),
+        _ => Ok(images.clone()),
+    }
+}
+
+/// As `impala::residual_stages`: images [B, H, W, C] to f3 [B, h, w, c].
+pub(crate) fn residual_stages(images: &Tensor, layers: &[BorderedTensors<'_>]) -> Result<Tensor> {
+    let mut x = scaled(images)?;
+    for stage in layers.chunks_exact(STAGE_CONVOLUTIONS) {
+        x = max_pool(&bordered(&x, stage[0])?)?;
+        for block in stage[1..].chunks_exact(2) {
+            let inner = bordered(&relu(&x)?, block[0])?;
+            x = (x + bordered(&relu(&inner)?, block[1])?)?;
+        }
+    }
+    relu(&x)
+}
+
+/// A 3 x 3 convolution of images [B, H, W, in] with a border of zeros, without ReLU.
+fn bordered(images: &Tensor, (weight, bias): BorderedTensors<'_>) -> Result<Tensor> {
+    let images = images.pad_with_zeros(1, 1, 1)?.pad_with_zeros(2, 1, 1)?;
+    conv2d(&images, weight, bias, 1)
+}
+
+/// As `pool::pool`: the largest of 3 x 3 windows at a distance of 2, the first of equal ones; maps [B, H, W, C].
+///
+/// Between borders of minus infinity the maps are cut into blocks of 2 x 2 pixels: a window's pixels are then the same place of each of
+/// four neighbouring blocks, at most.
+fn max_pool(maps: &Tensor) -> Result<Tensor> {
+    let (batch, height, width, channels) = maps.dims4()?;
+    let (rows, cols, _) = pooled((height, width, channels));
+    let border = |maps: &Tensor, dim: usize, before: usize, after: usize| {
+        let part = |len: usize| {
+            let mut shape = maps.dims().to_vec();
+            shape[dim] = len;
+            Tensor::full(f32::NEG_INFINITY, shape, maps.device())?.to_dtype(maps.dtype())
+        };
+        Tensor::cat(&[&part(before)?, maps, &part(after)?], dim)
+    };
+    let maps = border(maps, 1, 1, 2 * rows + 1 - height)?;
+    let maps = border(&maps, 2, 1, 2 * cols + 1 - width)?;
+    let blocks = maps.reshape(vec![batch, rows + 1, 2, cols + 1, 2, channels])?;
+    let pixel = |row: usize, col: usize| {
+        let at = |blocks: &Tensor, dim: usize, at: usize, len: usize| {
+            blocks.narrow(dim, at / 2, len)?.narrow(dim + 1, at % 2, 1)
+        };
+        let pixel = at(&at(&blocks, 1, row, rows)?, 3, col, cols)?;
+        pixel.reshape((batch, rows, cols, channels))
+    };
+    let mut largest = pixel(0, 0)?;
+    for at in 1..9 {
+        let next = pixel(at / 3, at % 3)?;
+        let is_larger = next.gt(&largest)?.add(&next.ne(&next)?)?;
+        largest = is_larger.where_cond(&next, &largest)?;
+    }
+    Ok(largest)
 }
 
 /// As `linear::linear`: x [..., in], w [out, in], b [groups..., out].

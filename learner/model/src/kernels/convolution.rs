@@ -27,7 +27,7 @@ impl ConvShape {
     }
 
     /// Scalars from a window to its right neighbour.
-    fn shift(&self) -> usize {
+    pub(crate) fn shift(&self) -> usize {
         self.stride * self.channels_in
     }
 
@@ -67,7 +67,7 @@ pub(crate) struct Convolution<E: Element> {
     forward: Panels<E>,
     /// Of the product gradient x weight, for each row of the kernel; there if images get a gradient.
     backward: Vec<Panels<E>>,
-    bias: Vec<f32>,
+    pub(crate) bias: Vec<f32>,
 }
 
 impl<E: Element> Convolution<E> {
@@ -115,34 +115,50 @@ pub(crate) fn forward<U: Unit, M: Element>(
     // Where a run is odd, the last step of the last window reads one scalar further, times 0.
     let len = (shape.image_len(), shape.run() % U::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
-        let left = Left {
-            values: images.image(unit, index, len, &mut room),
-            start: 0,
-            row_stride: shape.shift(),
-            step: U::Element::DEPTH,
-            steps: shape.run().div_ceil(U::Element::DEPTH),
-            run_stride: shape.line(),
-            runs: shape.kernel,
-        };
-        for (y, maps) in maps.chunks_exact_mut(out_width * out).enumerate() {
-            let start = y * shape.stride * shape.line();
-            for (x, windows) in row_tiles::<U>(out_width, layer.forward.vecs()) {
-                let left = Left {
-                    start: start + x * shape.shift(),
-                    ..left
-                };
-                layer
-                    .forward
-                    .multiply(unit, windows, left, Mode::Replace, &mut row[x * out..]);
+        let image = images.image(unit, index, len, &mut room);
+        let mut lines = maps.chunks_exact_mut(out_width * out);
+        multiply_windows(unit, layer, image, &mut row, |_, row| {
+            if let Some(maps) = lines.next() {
+                finish_row(unit, row, &layer.bias, images.scale(), maps);
             }
-            finish_row(unit, &mut row, &layer.bias, images.scale(), maps);
+        });
+    }
+}
+
+/// Multiplies the windows of one image by the weight, row by row: `then` gets the number of each row of the map and its sums
+/// [out_width, out], which are in `row`. Where a run is odd, an image may have to have a scalar more.
+#[inline(always)]
+pub(crate) fn multiply_windows<U: Unit>(
+    unit: U,
+    layer: &Convolution<U::Element>,
+    image: &[U::Element],
+    row: &mut [f32],
+    mut then: impl FnMut(usize, &mut [f32]),
+) {
+    let shape = &layer.shape;
+    for y in 0..shape.out_height() {
+        for (x, windows) in row_tiles::<U>(shape.out_width(), layer.forward.vecs()) {
+            let left = Left {
+                values: image,
+                start: y * shape.stride * shape.line() + x * shape.shift(),
+                row_stride: shape.shift(),
+                step: U::Element::DEPTH,
+                steps: shape.run().div_ceil(U::Element::DEPTH),
+                run_stride: shape.line(),
+                runs: shape.kernel,
+            };
+            let to = &mut row[x * shape.channels_out..];
+            layer
+                .forward
+                .multiply(unit, windows, left, Mode::Replace, to);
         }
+        then(y, row);
     }
 }
 
 vectorized! {
     /// relu(scale * row + bias) for each location of `row` [locations, out], there and rounded into `maps`.
-    fn finish_row<U, M>(
+    pub(crate) fn finish_row<U, M>(
         unit,
         row: &'a mut [f32],
         bias: &'a [f32],
@@ -207,10 +223,10 @@ pub(crate) fn backward<U: Unit, M: Element>(
         .enumerate()
     {
         masked.mask(unit, maps, grad_maps, grads.bias);
-        masked.write_panels(unit, shape);
         let steps = images.steps(unit, image, (len, shape.shift()), &mut rooms);
         let mode = if image == 0 { Mode::Replace } else { Mode::Add };
-        weight_gradient(unit, shape, steps, &masked.panels, grads.packed, mode);
+        let (values, panels) = (&masked.values, &mut masked.panels);
+        weight_gradient(unit, shape, steps, values, panels, grads.packed, mode);
         if let Some(grad_images) = &mut grads.images {
             masked.write_rows(unit, shape.channels_out);
             let pixels = &mut grad_images[image * len..(image + 1) * len];
@@ -232,11 +248,10 @@ struct Masked<E: Element> {
 impl<E: Element> Masked<E> {
     fn new<U: Unit<Element = E>>(shape: &ConvShape) -> Self {
         let out = shape.channels_out;
-        let width = tile_vecs::<U>(out) * LANES;
         Self {
             values: Buffer::new(shape.map_len()),
             rows: Buffer::new(shape.locations() * out.next_multiple_of(E::DEPTH)),
-            panels: Buffer::new(panel_len::<E>(shape, width) * out.div_ceil(width)),
+            panels: gradient_panels::<U>(shape),
         }
     }
 
@@ -253,11 +268,6 @@ impl<E: Element> Masked<E> {
 
     fn write_rows<U: Unit<Element = E>>(&mut self, unit: U, out: usize) {
         write_rows(unit, &self.values, out, &mut self.rows);
-    }
-
-    fn write_panels<U: Unit<Element = E>>(&mut self, unit: U, shape: &ConvShape) {
-        let width = tile_vecs::<U>(shape.channels_out) * LANES;
-        write_panels(unit, &self.values, *shape, width, &mut self.panels);
     }
 }
 
@@ -314,18 +324,28 @@ fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
     steps * width * E::DEPTH
 }
 
-/// One image's part of the weight's gradient: windows, transposed, times masked gradients. `image` is from [`Images::steps`].
-fn weight_gradient<U: Unit>(
+/// Memory for the panels of an image's gradients.
+pub(crate) fn gradient_panels<U: Unit>(shape: &ConvShape) -> Buffer<U::Element> {
+    let width = tile_vecs::<U>(shape.channels_out) * LANES;
+    let panels = shape.channels_out.div_ceil(width);
+    Buffer::new(panel_len::<U::Element>(shape, width) * panels)
+}
+
+/// One image's part of the weight's gradient: windows, transposed, times the gradients `grad_map` [locations, out], for which `panels`
+/// is room from [`gradient_panels`]. `image` is from [`Images::steps`].
+pub(crate) fn weight_gradient<U: Unit>(
     unit: U,
     shape: &ConvShape,
     image: &[U::Element],
-    panels: &[U::Element],
+    grad_map: &[f32],
+    panels: &mut [U::Element],
     packed: &mut [f32],
     mode: Mode,
 ) {
     let (depth, out) = (U::Element::DEPTH, shape.channels_out);
     let vecs = tile_vecs::<U>(out);
     let width = vecs * LANES;
+    write_panels(unit, grad_map, *shape, width, panels);
     let steps = shape.out_width().div_ceil(depth);
     for kernel_y in 0..shape.kernel {
         let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];

@@ -1,25 +1,31 @@
 //! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
 //!
-//! From the outside in: [`torso`], [`conv`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
-//! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them, [`product`] a matrix product, both on
-//! operands of [`panels`] and in tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
+//! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
+//! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does, with
+//! [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of [`panels`] and in
+//! tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
 //! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`precision`] is the setting. [`candle`] needs none of them.
 
+pub(crate) mod bordered;
 pub(crate) mod buffer;
 pub(crate) mod candle;
 pub(crate) mod conv;
 pub(crate) mod convolution;
+pub(crate) mod dense;
 pub(crate) mod dots;
 pub(crate) mod exponentials;
 pub(crate) mod grouped;
 pub(crate) mod images;
+pub(crate) mod impala;
 pub(crate) mod linear;
 pub(crate) mod panels;
+pub(crate) mod pool;
 pub(crate) mod precision;
 pub(crate) mod product;
 pub(crate) mod residual;
 pub(crate) mod rounding;
 pub(crate) mod rows;
 pub(crate) mod stack;
+pub(crate) mod stages;
 pub(crate) mod torso;
 pub(crate) mod units;

@@ -4,12 +4,12 @@
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
     Backward, ConvLayer, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network,
-    Parameters, Precision,
+    Parameters, Precision, TorsoName,
 };
 
 use crate::support::{
-    DUELING, NOISY, NOISY_DUELING, assert_close, bits, floats, frames, parameters, rng, small,
-    small_with, variable, with_biases,
+    DUELING, NOISY, NOISY_DUELING, assert_close, bits, floats, frames, parameters, residual, rng,
+    small, small_with, variable, with_biases,
 };
 
 /// out(relu(hidden(x))) + skip(x) by candle's operations, x [rows, in].
@@ -78,6 +78,8 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
         small_with(DUELING),
         small_with(NOISY),
         small_with(NOISY_DUELING),
+        residual(TorsoName::Impala),
+        residual(TorsoName::Impoola),
     ] {
         let parameters = with_biases(&config);
         let (ours, mut our_gradients) =
@@ -169,6 +171,8 @@ fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
         the_same_bits_for_any_number_of_threads(precision, &small());
         the_same_bits_for_any_number_of_threads(precision, &small_with(DUELING));
         the_same_bits_for_any_number_of_threads(precision, &small_with(NOISY_DUELING));
+        the_same_bits_for_any_number_of_threads(precision, &residual(TorsoName::Impala));
+        the_same_bits_for_any_number_of_threads(precision, &residual(TorsoName::Impoola));
     }
 }
 
@@ -310,7 +314,7 @@ fn configurations_that_cannot_work_are_errors() {
     assert!(small().validate().is_ok());
     fails(|config| config.height = 0);
     fails(|config| config.height = 11);
-    fails(|config| config.channels = usize::MAX);
+    fails(|config| config.input_channels = usize::MAX);
     fails(|config| config.num_actions = 256);
     fails(|config| config.atoms = 1);
     fails(|config| config.v_max = config.v_min);
@@ -318,6 +322,28 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.v_min = -3e38);
     fails(|config| config.v_max = 1e38);
     fails(|config| config.conv.clear());
+    fails(|config| config.channels = vec![4]);
+    fails(|config| config.scale_blocks = true);
+    fails(|config| config.torso = TorsoName::Impala);
+    fails(|config| *config = residual(TorsoName::Nature));
+    for torso in [TorsoName::Impala, TorsoName::Impoola] {
+        let residual = residual(torso);
+        assert!(residual.validate().is_ok());
+        let with = |channels: &[usize]| ModelConfig {
+            channels: channels.to_vec(),
+            ..residual.clone()
+        };
+        for channels in [&[][..], &[0], &[8, 0], &[usize::MAX], &[65_536]] {
+            assert!(with(channels).validate().is_err(), "{channels:?}");
+        }
+        // The smallest frame that there is.
+        let one = ModelConfig {
+            height: 1,
+            width: 1,
+            ..with(&[1, 2, 3])
+        };
+        assert!(one.validate().is_ok() && one.local_shape() == (1, 1, 3));
+    }
     fails(|config| config.conv[1].kernel = 9);
     fails(|config| config.conv[0].stride = 0);
     fails(|config| config.conv[2].out = 0);

@@ -3,15 +3,20 @@
 
 use candle_core::{Device, Tensor};
 use driml_model::{
-    HeadConfig, HeadNoise, ModelConfig, ModelError, Network, PolicyNetwork, Precision,
+    HeadConfig, HeadNoise, ModelConfig, ModelError, Network, PolicyNetwork, Precision, TorsoName,
 };
 
-use crate::support::{DUELING, NOISY, NOISY_DUELING, bytes, parameters, rng, small, small_with};
+use crate::support::{
+    DUELING, NOISY, NOISY_DUELING, bytes, parameters, residual, rng, small, small_with,
+};
 
 #[test]
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
     for head in [HeadConfig::PLAIN, DUELING, NOISY, NOISY_DUELING] {
         it_agrees_with_the_network(small_with(head));
+    }
+    for torso in [TorsoName::Impala, TorsoName::Impoola] {
+        it_agrees_with_the_network(residual(torso));
     }
 }
 
@@ -26,7 +31,7 @@ fn it_agrees_with_the_network(config: ModelConfig) {
     .unwrap();
     for batch in [1, 2, 5, 33, 70] {
         let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
-        let shape = (batch, config.height, config.width, config.channels);
+        let shape = (batch, config.height, config.width, config.input_channels);
         let tensor = Tensor::from_slice(&frames, shape, &Device::Cpu).unwrap();
         let noise = HeadNoise::draw(&config, &mut rng(7 + batch as u64));
         policy.set_noise(noise.as_ref());
@@ -73,7 +78,7 @@ fn a_state_has_the_same_values_in_any_company() {
     // The last layer's maps are an even and an odd number of scalars.
     let mut odd = small();
     (odd.conv[2].out, odd.conv[2].kernel, odd.conv[2].stride) = (7, 3, 2);
-    for config in [small(), odd] {
+    for config in [small(), odd, residual(TorsoName::Impala)] {
         has_the_same_values_in_any_company(&config);
     }
 }

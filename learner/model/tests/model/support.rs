@@ -2,7 +2,7 @@
 //! No test lives here.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Precision};
+use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Precision, TorsoName};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -29,7 +29,7 @@ pub(crate) fn bytes(len: usize, rng: &mut ChaCha8Rng) -> Vec<u8> {
 }
 
 pub(crate) fn frames(config: &ModelConfig, batch: usize, rng: &mut ChaCha8Rng) -> Tensor {
-    let shape = (batch, config.height, config.width, config.channels);
+    let shape = (batch, config.height, config.width, config.input_channels);
     Tensor::from_vec(bytes(batch * config.frame_len(), rng), shape, &Device::Cpu).unwrap()
 }
 
@@ -74,11 +74,12 @@ pub(crate) fn small() -> ModelConfig {
     ModelConfig {
         height: 36,
         width: 44,
-        channels: 3,
+        input_channels: 3,
         num_actions: 5,
         atoms: 11,
         v_min: -2.0,
         v_max: 3.0,
+        torso: TorsoName::Nature,
         conv: vec![
             ConvLayer {
                 out: 5,
@@ -96,6 +97,8 @@ pub(crate) fn small() -> ModelConfig {
                 stride: 1,
             },
         ],
+        channels: vec![],
+        scale_blocks: false,
         hidden: 19,
         rkhs: 13,
         action_embed: 9,
@@ -107,6 +110,19 @@ pub(crate) fn small() -> ModelConfig {
             action: true,
         },
         head: HeadConfig::PLAIN,
+    }
+}
+
+/// [`small`] with a residual torso: maps of 11 x 14, 6 x 7 and 3 x 4.
+pub(crate) fn residual(torso: TorsoName) -> ModelConfig {
+    ModelConfig {
+        height: 11,
+        width: 14,
+        torso,
+        conv: vec![],
+        channels: vec![5, 7],
+        scale_blocks: true,
+        ..small()
     }
 }
 

@@ -4,9 +4,11 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Parameters, PolicyNetwork, Precision, StoredAs};
+use driml_model::{
+    ModelConfig, ModelError, Parameters, PolicyNetwork, Precision, StoredAs, TorsoName,
+};
 
-use crate::support::{bits, bytes, parameters, rng, small, values};
+use crate::support::{bits, bytes, parameters, residual, rng, small, values};
 
 fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
     parameters
@@ -114,6 +116,39 @@ fn names_and_shapes_are_the_configuration_s() {
     );
     assert!(parameters.get("dim.psi4.skip.bias").is_none());
     assert!(parameters.get("dim.action.skip.bias").is_some());
+}
+
+#[test]
+fn residual_blocks_start_smaller_where_that_is_asked_for() {
+    let config = residual(TorsoName::Impala);
+    let plain = ModelConfig {
+        scale_blocks: false,
+        ..config.clone()
+    };
+    let (scaled, plain) = (parameters(&config, 1), parameters(&plain, 1));
+    let mut smaller = Vec::new();
+    for (name, var) in plain.iter() {
+        let (found, wanted) = (values(scaled.get(name).unwrap()), values(var));
+        if found != wanted {
+            smaller.push(name);
+            for (found, wanted) in found.iter().zip(wanted) {
+                // Four blocks.
+                assert!((found - wanted / 2.0).abs() < 1e-7, "{name}");
+            }
+        }
+    }
+    let seconds = [(1, 1), (1, 2), (2, 1), (2, 2)]
+        .map(|(stage, block)| format!("torso.stage{stage}.block{block}.conv2.weight"));
+    assert_eq!(smaller, seconds);
+    let fc = |torso| {
+        parameters(&residual(torso), 1)
+            .get("torso.fc.weight")
+            .unwrap()
+            .dims()
+            .to_vec()
+    };
+    assert_eq!(fc(TorsoName::Impala), [19, 3 * 4 * 7]);
+    assert_eq!(fc(TorsoName::Impoola), [19, 7]);
 }
 
 #[test]

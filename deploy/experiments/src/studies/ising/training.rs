@@ -193,11 +193,11 @@ impl Scorer<'_> {
         let ModelConfig {
             height,
             width,
-            channels,
+            input_channels,
             ..
         } = self.task.model;
-        let rows = frames.len() / (height * width * channels);
-        let shape = (rows, height, width, channels);
+        let rows = frames.len() / (height * width * input_channels);
+        let shape = (rows, height, width, input_channels);
         let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
         Ok(self.learner.network.features(&frames)?)
     }

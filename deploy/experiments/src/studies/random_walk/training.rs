@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::{Lambda, auxiliary::dim::Dim};
-use driml_model::{ConvLayer, Features, HeadConfig, ModelConfig};
+use driml_model::{ConvLayer, Features, HeadConfig, ModelConfig, TorsoName};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -136,16 +136,19 @@ impl Heads {
         let model = ModelConfig {
             height: 1,
             width: 1,
-            channels: 1,
+            input_channels: 1,
             num_actions: 1,
             atoms: 2,
             v_min: 0.0,
             v_max: 1.0,
+            torso: TorsoName::Nature,
             conv: vec![ConvLayer {
                 out: 1,
                 kernel: 1,
                 stride: 1,
             }],
+            channels: vec![],
+            scale_blocks: false,
             hidden: states,
             rkhs: settings.rkhs,
             action_embed: 1,

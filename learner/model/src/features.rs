@@ -1,0 +1,54 @@
+//! Frames to f3 and f4 with gradients: a torso and its parameters.
+//! How f3 is made is the torso's, in `torso`.
+
+use candle_core::{DType, Tensor};
+
+use crate::compute::Kernels;
+use crate::config::ModelConfig;
+use crate::error::{ModelError, Result};
+use crate::parameters::Parameters;
+use crate::torso::interface::{Torso, TorsoParameters};
+
+#[derive(Debug)]
+pub(crate) struct FeatureLayers {
+    kernels: Kernels,
+    /// Height, width and channels of a frame.
+    input: [usize; 3],
+    torso: Box<dyn Torso>,
+    parameters: TorsoParameters<Tensor>,
+}
+
+impl FeatureLayers {
+    pub(crate) fn new(
+        config: &ModelConfig,
+        parameters: &Parameters,
+        kernels: Kernels,
+    ) -> Result<Self> {
+        let torso = config.torso();
+        let parameters =
+            TorsoParameters::of(&*torso, |layer, part| parameters.tensor(layer, part))?;
+        Ok(Self {
+            kernels,
+            input: [config.height, config.width, config.input_channels],
+            torso,
+            parameters,
+        })
+    }
+
+    /// f4 [B, hidden] before its ReLU, of `frames` [B, H, W, C] u8, which are scaled by 1/255; and f3 [B, h, w, c] after its ReLU, if
+    /// `local` features are wanted.
+    pub(crate) fn features(
+        &self,
+        frames: &Tensor,
+        local: bool,
+    ) -> Result<(Option<Tensor>, Tensor)> {
+        if frames.dtype() != DType::U8 || frames.dims().get(1..) != Some(&self.input[..]) {
+            let (dtype, shape, input) = (frames.dtype(), frames.shape(), self.input);
+            return Err(ModelError::Input(format!(
+                "frames {shape:?} of type {dtype:?}, wanted u8 [B, {input:?}]"
+            )));
+        }
+        let torso = &self.torso;
+        Ok(torso.features(self.kernels, &self.parameters, frames, local)?)
+    }
+}

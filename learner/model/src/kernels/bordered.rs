@@ -1,0 +1,204 @@
+//! 3 x 3 convolutions with a border of zeros, forward and backward, as unpadded ones of images that have the border in memory.
+//! It knows neither tensors nor threads, and nothing of what comes between two convolutions.
+
+use crate::geometry::ConvShape;
+use crate::kernels::buffer::Buffer;
+use crate::kernels::convolution::{
+    Convolution, gradient_panels, multiply_windows, weight_gradient,
+};
+use crate::kernels::images::{Images, Room};
+use crate::kernels::linear::relu_of;
+use crate::kernels::rounding::{store, store_bytes};
+use crate::kernels::units::{Element, Mode, Unit, vectorized};
+
+/// Maps [height, width, channels] with a border of zeros, a pixel wide.
+#[derive(Clone, Copy)]
+pub(crate) struct Border {
+    height: usize,
+    width: usize,
+    channels: usize,
+}
+
+/// What is put into a border.
+#[derive(Clone, Copy)]
+pub(crate) enum Inside<'a> {
+    /// Pixels, which products scale.
+    Bytes(&'a [u8]),
+    /// Maps as they are.
+    Maps(&'a [f32]),
+    /// max(x, 0) of maps.
+    Active(&'a [f32]),
+}
+
+impl Border {
+    /// Around the input of `shape`, which is one of [`ConvShape::bordered`].
+    pub(crate) const fn of_input(shape: &ConvShape) -> Self {
+        Self {
+            height: shape.height - 2,
+            width: shape.width - 2,
+            channels: shape.channels_in,
+        }
+    }
+
+    /// Scalars in memory: where a row of a window is an odd number of them, products of pairs read a zero behind the last one.
+    pub(crate) const fn len<E: Element>(self) -> usize {
+        (self.height + 2) * (self.width + 2) * self.channels + E::DEPTH - 1
+    }
+
+    /// Row `y` of the maps.
+    pub(crate) fn line(self, y: usize) -> std::ops::Range<usize> {
+        let start = ((y + 1) * (self.width + 2) + 1) * self.channels;
+        start..start + self.width * self.channels
+    }
+
+    /// Writes the zeros.
+    pub(crate) fn clear<E: Element>(self, room: &mut [E]) {
+        let mut end = 0;
+        for y in 0..self.height {
+            room[end..self.line(y).start].fill(E::default());
+            end = self.line(y).end;
+        }
+        room[end..].fill(E::default());
+    }
+
+    /// Writes the zeros, and `inside` between them.
+    pub(crate) fn put<U: Unit>(self, unit: U, inside: Inside<'_>, room: &mut [U::Element]) {
+        self.clear(room);
+        let len = self.width * self.channels;
+        for y in 0..self.height {
+            let (from, to) = (y * len..(y + 1) * len, &mut room[self.line(y)]);
+            match inside {
+                Inside::Bytes(bytes) => store_bytes(unit, &bytes[from], to),
+                Inside::Maps(maps) => store(unit, &maps[from], to),
+                Inside::Active(maps) => store_active(unit, &maps[from], to),
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Rounds max(x, 0) of `floats` into `values`, which is as long.
+    fn store_active<U>(unit, floats: &'a [f32], values: &'a mut [U::Element]) {
+        for (value, &float) in values.iter_mut().zip(floats) {
+            *value = U::Element::of(relu_of(float));
+        }
+    }
+}
+
+/// A convolution with its parameters as the kernels want them.
+pub(crate) struct BorderedConvolution<E: Element> {
+    forward: Convolution<E>,
+    /// What turns the gradient of its output into that of its input: the same with each kernel turned by 180 degrees.
+    backward: Option<Convolution<E>>,
+}
+
+impl<E: Element> BorderedConvolution<E> {
+    /// `shape` is one of [`ConvShape::bordered`], `weight` [out, in, 3, 3], `bias` [out]; `backward` says whether its input will need
+    /// a gradient.
+    pub(crate) fn new<U: Unit<Element = E>>(
+        unit: U,
+        shape: ConvShape,
+        weight: &[f32],
+        bias: &[f32],
+        backward: bool,
+    ) -> Self {
+        let turned = backward.then(|| {
+            let of = ConvShape {
+                channels_in: shape.channels_out,
+                channels_out: shape.channels_in,
+                ..shape
+            };
+            let bias = vec![0.0; shape.channels_in];
+            Convolution::new(unit, of, &turned(&shape, weight), &bias, false)
+        });
+        Self {
+            forward: Convolution::new(unit, shape, weight, bias, false),
+            backward: turned,
+        }
+    }
+
+    pub(crate) const fn shape(&self) -> &ConvShape {
+        &self.forward.shape
+    }
+
+    pub(crate) fn bias(&self) -> &[f32] {
+        &self.forward.bias
+    }
+
+    /// The border around its input.
+    pub(crate) const fn border(&self) -> Border {
+        Border::of_input(self.shape())
+    }
+
+    /// Convolves an image in its border, row by row: `then` gets the number of each row and its sums [width, out], without bias.
+    pub(crate) fn forward<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        image: &[E],
+        then: impl FnMut(usize, &mut [f32]),
+    ) {
+        let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_out);
+        multiply_windows(unit, &self.forward, image, &mut row, then);
+    }
+
+    /// The gradient of an image, row by row as [`BorderedConvolution::forward`], for that of its map, `grad_map` [height, width, out].
+    ///
+    /// # Panics
+    /// If it was not made for that.
+    pub(crate) fn image_gradient<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        grad_map: &[f32],
+        then: impl FnMut(usize, &mut [f32]),
+    ) {
+        let backward = self.backward.as_ref();
+        let backward = backward.expect("a convolution whose input has a gradient is made for it");
+        let border = Border::of_input(&backward.shape);
+        let mut room = Buffer::new(border.len::<E>());
+        border.put(unit, Inside::Maps(grad_map), &mut room);
+        let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_in);
+        multiply_windows(unit, backward, &room, &mut row, then);
+    }
+
+    /// Adds the gradients of weight [3, 3, in, out] and bias [out] for an image in its border, whose scale the weight's does not have
+    /// yet, and the gradient of its map.
+    pub(crate) fn parameter_gradients<U: Unit<Element = E>>(
+        &self,
+        unit: U,
+        image: &[E],
+        grad_map: &[f32],
+        weight: &mut [f32],
+        bias: &mut [f32],
+    ) {
+        let shape = self.shape();
+        let (len, shift) = (shape.image_len(), shape.shift());
+        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels::<U>(shape));
+        let images = Images::Maps(&image[..len]);
+        let steps = images.steps(unit, 0, (len, shift), &mut rooms);
+        weight_gradient(unit, shape, steps, grad_map, &mut panels, weight, Mode::Add);
+        add_locations(unit, grad_map, bias);
+    }
+}
+
+/// `weight` [out, in, 3, 3] as [in, out, 3, 3], each kernel turned by 180 degrees.
+fn turned(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
+    let (inputs, taps) = (shape.channels_in, shape.kernel * shape.kernel);
+    let mut turned = Vec::with_capacity(weight.len());
+    for input in 0..inputs {
+        for kernels in weight.chunks_exact(inputs * taps) {
+            turned.extend(kernels[input * taps..][..taps].iter().rev());
+        }
+    }
+    turned
+}
+
+vectorized! {
+    /// Adds each location of `map` [locations, out] to `sums` [out].
+    fn add_locations<U>(unit, map: &'a [f32], sums: &'a mut [f32]) {
+        for location in map.chunks_exact(sums.len()) {
+            for (sum, value) in sums.iter_mut().zip(location) {
+                *sum += value;
+            }
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! A fully connected layer as an actor applies it, on slices, on the calling thread.
+//! It has no gradient; `linear` is the layer with one.
+
+use crate::kernels::buffer::Buffer;
+use crate::kernels::linear::relu_of;
+use crate::kernels::panels::{Matrix, Panels, Threads};
+use crate::kernels::units::{Element, Left, Mode, Unit, vectorized};
+
+/// A fully connected layer.
+pub(crate) struct Dense<U: Unit> {
+    /// Of [in, out].
+    weight: Panels<U::Element>,
+    bias: Vec<f32>,
+    inputs: usize,
+}
+
+impl<U: Unit> Dense<U> {
+    /// `weight` [in, out], `bias` [out].
+    pub(crate) fn new(unit: U, weight: &[f32], bias: Vec<f32>) -> Self {
+        let inputs = weight.len() / bias.len();
+        let weight = Matrix::new(weight, inputs, bias.len());
+        Self {
+            weight: Panels::pack(unit, weight, Threads::Caller),
+            bias,
+            inputs,
+        }
+    }
+
+    /// A layer of `weight` [out, in] and `bias` [out] on maps of `channels`, whose inputs are row, column, channel here, and channel, row,
+    /// column in PyTorch's weight.
+    pub(crate) fn of_maps(unit: U, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
+        let inputs = weight.len() / bias.len();
+        let locations = inputs / channels;
+        let mut inputs_first = Vec::with_capacity(weight.len());
+        for input in 0..inputs {
+            let column = input % channels * locations + input / channels;
+            inputs_first.extend(weight[column..].iter().step_by(inputs));
+        }
+        Self::new(unit, &inputs_first, bias)
+    }
+
+    pub(crate) const fn inputs(&self) -> usize {
+        self.inputs
+    }
+
+    pub(crate) const fn outputs(&self) -> usize {
+        self.bias.len()
+    }
+
+    /// [count, out] of `x` [count, in], whose rows begin at whole steps.
+    pub(crate) fn forward(&self, unit: U, x: &[U::Element], count: usize) -> Buffer<f32> {
+        let outputs = self.bias.len();
+        let mut y = Buffer::new(count * outputs);
+        for row in y.chunks_exact_mut(outputs) {
+            row.copy_from_slice(&self.bias);
+        }
+        let depth = U::Element::DEPTH;
+        let row_stride = self.inputs.next_multiple_of(depth);
+        let left = Left {
+            values: x,
+            start: 0,
+            row_stride,
+            step: depth,
+            steps: row_stride / depth,
+            run_stride: 0,
+            runs: 1,
+        };
+        self.weight
+            .multiply_rows(unit, count, left, Mode::Add, &mut y, outputs);
+        y
+    }
+}
+
+/// Rows of `len` scalars as rows of whole steps.
+pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> {
+    let stride = len.next_multiple_of(E::DEPTH);
+    if stride == len {
+        return rows;
+    }
+    let mut padded = Buffer::new(rows.len() / len * stride);
+    for (padded, row) in padded.chunks_exact_mut(stride).zip(rows.chunks_exact(len)) {
+        padded[..len].copy_from_slice(row);
+        padded[len..].fill(E::default());
+    }
+    padded
+}
+
+vectorized! {
+    /// relu of `hidden` [rows, cols] as rows of whole steps.
+    pub(crate) fn activate<U>(unit, hidden: &'a [f32], cols: usize, active: &'a mut [U::Element]) {
+        let rows = active.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
+        for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
+            row.fill(U::Element::default());
+            for (value, &hidden) in row.iter_mut().zip(hidden) {
+                *value = U::Element::of(relu_of(hidden));
+            }
+        }
+    }
+}

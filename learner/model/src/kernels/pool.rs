@@ -1,0 +1,162 @@
+//! The 3 x 3 max pool of stride 2 with padding 1 over one image's maps, forward and backward.
+//! It knows neither tensors nor threads.
+//!
+//! What lies beyond the maps is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
+
+use crate::geometry::pooled;
+use crate::kernels::units::vectorized;
+
+/// Height, width and channels of maps.
+pub(crate) type Size = (usize, usize, usize);
+
+/// For each window: its first scalar in the pooled maps, and of each of its pixels the number and the first scalar in the maps.
+fn windows(size: Size) -> impl Iterator<Item = (usize, impl Iterator<Item = (u8, usize)>)> {
+    let (height, width, channels) = size;
+    let (rows, cols, _) = pooled(size);
+    (0..rows * cols).map(move |window| {
+        let (y, x) = (window / cols * 2, window % cols * 2);
+        let pixels = (0..9).filter_map(move |at: u8| {
+            let (row, col) = (y + usize::from(at / 3), x + usize::from(at % 3));
+            let inside = (1..=height).contains(&row) && (1..=width).contains(&col);
+            inside.then(|| (at, ((row - 1) * width + col - 1) * channels))
+        });
+        (window * channels, pixels)
+    })
+}
+
+vectorized! {
+    /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
+    pub(crate) fn pool<U>(
+        unit,
+        maps: &'a [f32],
+        size: Size,
+        largest: &'a mut [f32],
+        taken: &'a mut [u8],
+    ) {
+        let channels = size.2;
+        for (to, pixels) in windows(size) {
+            let (largest, taken) = (&mut largest[to..][..channels], &mut taken[to..][..channels]);
+            for (index, (at, from)) in pixels.enumerate() {
+                let values = &maps[from..][..channels];
+                if index == 0 {
+                    largest.copy_from_slice(values);
+                    taken.fill(at);
+                    continue;
+                }
+                for ((largest, taken), &value) in largest.iter_mut().zip(&mut *taken).zip(values) {
+                    let is_larger = value > *largest || value.is_nan();
+                    *largest = if is_larger { value } else { *largest };
+                    *taken = if is_larger { at } else { *taken };
+                }
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// The inverse of [`pool`] for gradients: adds that of each window, of `grads`, to the pixel it was taken from, in `grad_maps`.
+    pub(crate) fn unpool<U>(
+        unit,
+        grads: &'a [f32],
+        size: Size,
+        taken: &'a [u8],
+        grad_maps: &'a mut [f32],
+    ) {
+        let channels = size.2;
+        for (from, pixels) in windows(size) {
+            let (grads, taken) = (&grads[from..][..channels], &taken[from..][..channels]);
+            for (at, to) in pixels {
+                let sums = &mut grad_maps[to..][..channels];
+                for ((sum, &grad), &taken) in sums.iter_mut().zip(grads).zip(taken) {
+                    *sum += if taken == at { grad } else { 0.0 };
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::precision::Precision;
+    use crate::kernels::units::{ForUnit, Unit, with_every_unit};
+
+    #[derive(Clone, Copy)]
+    struct Run<'a>(&'a [f32], Size);
+
+    impl ForUnit for Run<'_> {
+        /// The largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
+        type Output = (Vec<f32>, Vec<f32>);
+
+        fn run<U: Unit>(self, unit: U) -> Self::Output {
+            let Self(maps, size) = self;
+            let (rows, cols, channels) = pooled(size);
+            let len = rows * cols * channels;
+            let (mut largest, mut taken) = (vec![f32::NAN; len], vec![u8::MAX; len]);
+            pool(unit, maps, size, &mut largest, &mut taken);
+            let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
+            let mut grad_maps = vec![0.0; maps.len()];
+            unpool(unit, &grads, size, &taken, &mut grad_maps);
+            (largest, grad_maps)
+        }
+    }
+
+    /// By the definition: the first of the largest pixels of each window, or the first NaN.
+    fn wanted(maps: &[f32], size: Size) -> (Vec<f32>, Vec<f32>) {
+        let ((height, width, channels), (rows, cols, _)) = (size, pooled(size));
+        let (mut largest, mut grads) = (Vec::new(), vec![0.0; maps.len()]);
+        for y in 0..rows {
+            for x in 0..cols {
+                for channel in 0..channels {
+                    let mut best: Option<usize> = None;
+                    for row in (2 * y).saturating_sub(1)..(2 * y + 2).min(height) {
+                        for col in (2 * x).saturating_sub(1)..(2 * x + 2).min(width) {
+                            let at = (row * width + col) * channels + channel;
+                            if best.is_none_or(|best| maps[at] > maps[best]) {
+                                best = Some(at);
+                            }
+                        }
+                    }
+                    let best = best.unwrap();
+                    largest.push(maps[best]);
+                    grads[best] += largest.len() as f32;
+                }
+            }
+        }
+        (largest, grads)
+    }
+
+    #[test]
+    fn the_first_of_the_largest_is_taken_whatever_the_size() {
+        for size in [(1, 1, 1), (2, 3, 5), (7, 4, 16), (6, 6, 33), (5, 1, 17)] {
+            let len = size.0 * size.1 * size.2;
+            // All different, a few values that tie everywhere, all the same; below 0, where a border of zeros would win.
+            for values in [1009, 3, 1] {
+                let maps: Vec<f32> = (0..len)
+                    .map(|at| (at * 383 % 1009 % values) as f32 - 2000.0)
+                    .collect();
+                for got in with_every_unit(Precision::F32, Run(&maps, size)) {
+                    assert_eq!(got, wanted(&maps, size), "{size:?}, {values} values");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_nan_shows() {
+        for at in 0..9 {
+            let mut maps = [1.0; 9];
+            maps[at] = f32::NAN;
+            for (largest, _) in with_every_unit(Precision::F32, Run(&maps, (3, 3, 1))) {
+                let touched = |window: usize| {
+                    let is_near =
+                        |window: usize, at: usize| window == 0 && at < 2 || window == 1 && at > 0;
+                    is_near(window / 2, at / 3) && is_near(window % 2, at % 3)
+                };
+                for (window, value) in largest.iter().enumerate() {
+                    assert_eq!(value.is_nan(), touched(window), "{at}, window {window}");
+                }
+            }
+        }
+    }
+}

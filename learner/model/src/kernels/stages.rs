@@ -1,0 +1,420 @@
+//! The stages of an IMPALA torso over one task's images, forward and backward, on slices: a convolution, a max pool, and two residual
+//! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors; `impala` splits the batch and `bordered` computes each convolution.
+
+use rayon::prelude::*;
+
+use crate::geometry::{STAGE_CONVOLUTIONS, pooled, stages};
+use crate::kernels::bordered::{BorderedConvolution, Inside};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::convolution::{ConvGradients, finish_row};
+use crate::kernels::linear::{relu_gradient, relu_of};
+use crate::kernels::pool::{pool, unpool};
+use crate::kernels::stack::parameters_len;
+use crate::kernels::units::{Element, Unit, vectorized};
+
+/// Every stage with its parameters as the kernels want them.
+pub(crate) struct Stages<U: Unit> {
+    unit: U,
+    /// Those of [`stages`].
+    convolutions: Vec<BorderedConvolution<U::Element>>,
+    output: (usize, usize, usize),
+}
+
+/// What the forward pass of some images leaves to the backward pass.
+pub(crate) struct Saved<E: Element> {
+    /// Of each image, in their borders, the inputs of all convolutions but the first: each is the operand of a product, and above 0 where a
+    /// gradient passes the ReLU before it.
+    inputs: Buffer<E>,
+    /// Of each image, the pixels that the pools took.
+    taken: Buffer<u8>,
+}
+
+impl<U: Unit> Stages<U> {
+    /// Stages of these widths on images of (height, width, channels); `parameters` has for each convolution its weight [out, in, 3, 3],
+    /// then its bias [out]. `backward` says whether there will be a backward pass.
+    pub(crate) fn new(
+        unit: U,
+        input: (usize, usize, usize),
+        widths: &[usize],
+        mut parameters: &[f32],
+        backward: bool,
+    ) -> Self {
+        let (shapes, output) = stages(input, widths);
+        let mut each = Vec::with_capacity(shapes.len());
+        for shape in shapes {
+            let (own, rest) = parameters.split_at(shape.parameters_len());
+            each.push((shape, own.split_at(shape.weight_len())));
+            parameters = rest;
+        }
+        // On the pool, which all wait for.
+        let each = each.into_par_iter().enumerate().with_max_len(1);
+        let convolutions = each.map(|(index, (shape, (weight, bias)))| {
+            BorderedConvolution::new(unit, shape, weight, bias, backward && index > 0)
+        });
+        Self {
+            unit,
+            convolutions: convolutions.collect(),
+            output,
+        }
+    }
+
+    /// Bytes of an image.
+    pub(crate) fn image_len(&self) -> usize {
+        let first = self.convolutions[0].shape();
+        (first.height - 2) * (first.width - 2) * first.channels_in
+    }
+
+    /// Height, width and channels of f3.
+    pub(crate) const fn output(&self) -> (usize, usize, usize) {
+        self.output
+    }
+
+    /// Scalars of f3.
+    pub(crate) const fn output_len(&self) -> usize {
+        self.output.0 * self.output.1 * self.output.2
+    }
+
+    /// Memory for what the forward pass of so many images leaves.
+    pub(crate) fn saved(&self, images: usize) -> Saved<U::Element> {
+        let (inputs, taken) = self.saved_lens();
+        Saved {
+            inputs: Buffer::new(images * inputs),
+            taken: Buffer::new(images * taken),
+        }
+    }
+
+    /// Scalars of an image in the two parts of [`Saved`].
+    fn saved_lens(&self) -> (usize, usize) {
+        let inputs = self.convolutions[1..].iter();
+        let inputs = inputs.map(|it| it.border().len::<U::Element>());
+        let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
+        (
+            inputs.sum(),
+            stages.map(|stage| pooled_len(&stage[0])).sum(),
+        )
+    }
+
+    /// f3 of some images, one after the other.
+    pub(crate) fn forward(&self, images: &[u8], saved: &mut Saved<U::Element>, f3: &mut [f32]) {
+        let (inputs, taken) = self.saved_lens();
+        images
+            .chunks_exact(self.image_len())
+            .zip(saved.inputs.chunks_exact_mut(inputs))
+            .zip(saved.taken.chunks_exact_mut(taken))
+            .zip(f3.chunks_exact_mut(self.output_len()))
+            .for_each(|(((image, inputs), taken), f3)| self.forward_one(image, inputs, taken, f3));
+    }
+
+    fn forward_one(
+        &self,
+        image: &[u8],
+        mut inputs: &mut [U::Element],
+        mut taken: &mut [u8],
+        f3: &mut [f32],
+    ) {
+        let unit = self.unit;
+        let mut first = Buffer::new(self.convolutions[0].border().len::<U::Element>());
+        let mut x = Buffer::new(0);
+        let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
+        for (stage, convolutions) in stages.enumerate() {
+            let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
+            let (input, inside, scale) = if stage == 0 {
+                (&mut first[..], Inside::Bytes(image), U::Element::BYTE_SCALE)
+            } else {
+                (cut_input(conv, &mut inputs), Inside::Maps(&x), 1.0)
+            };
+            conv.border().put(unit, inside, input);
+            let mut maps = Buffer::new(conv.shape().map_len());
+            conv.forward(unit, input, |y, row| {
+                let to = &mut maps[y * row.len()..][..row.len()];
+                add_bias(unit, row, scale, conv.bias(), to);
+            });
+            x = Buffer::new(pooled_len(conv));
+            let (own, rest) = std::mem::take(&mut taken).split_at_mut(x.len());
+            taken = rest;
+            pool(unit, &maps, conv.shape().output(), &mut x, own);
+            for block in blocks {
+                let (one, two) = (&block[0], &block[1]);
+                let outer = cut_input(one, &mut inputs);
+                one.border().put(unit, Inside::Active(&x), outer);
+                let inner = cut_input(two, &mut inputs);
+                two.border().clear(inner);
+                one.forward(unit, outer, |y, row| {
+                    finish_row(unit, row, one.bias(), 1.0, &mut inner[two.border().line(y)]);
+                });
+                two.forward(unit, inner, |y, row| {
+                    let to = &mut x[y * row.len()..][..row.len()];
+                    add_residual(unit, row, two.bias(), to);
+                });
+            }
+        }
+        activate(unit, &x, f3);
+    }
+
+    /// The gradients of all parameters for `grad_f3`, where `saved` and `f3` are from the forward pass of `images`: for each
+    /// convolution the weight's [3, 3, in, out], then the bias's.
+    pub(crate) fn backward(
+        &self,
+        images: &[u8],
+        saved: &Saved<U::Element>,
+        f3: &[f32],
+        grad_f3: &[f32],
+    ) -> Buffer<f32> {
+        let shapes: Vec<_> = self.convolutions.iter().map(|it| *it.shape()).collect();
+        let mut sums = Buffer::zeros(parameters_len(&shapes));
+        let ((inputs, taken), len) = (self.saved_lens(), self.output_len());
+        images
+            .chunks_exact(self.image_len())
+            .zip(saved.inputs.chunks_exact(inputs))
+            .zip(saved.taken.chunks_exact(taken))
+            .zip(f3.chunks_exact(len).zip(grad_f3.chunks_exact(len)))
+            .for_each(|(((image, inputs), taken), (f3, grad_f3))| {
+                let mut grad = Buffer::new(len);
+                pass_active(self.unit, f3, grad_f3, &mut grad);
+                self.backward_one(image, inputs, taken, grad, &mut sums);
+            });
+        // Products with bytes that are scaled after them.
+        for sum in &mut sums[..shapes[0].weight_len()] {
+            *sum *= U::Element::BYTE_SCALE;
+        }
+        sums
+    }
+
+    /// Adds one image's part to `sums`; `grad` is the gradient of the last stage's output.
+    fn backward_one(
+        &self,
+        image: &[u8],
+        mut inputs: &[U::Element],
+        mut taken: &[u8],
+        mut grad: Buffer<f32>,
+        mut sums: &mut [f32],
+    ) {
+        let unit = self.unit;
+        let mut own_sums =
+            |convolution: &BorderedConvolution<U::Element>, input: &[U::Element], grad: &[f32]| {
+                let own = ConvGradients::cut(&mut sums, convolution.shape(), None);
+                convolution.parameter_gradients(unit, input, grad, own.packed, own.bias);
+            };
+        let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
+        for (stage, convolutions) in stages.enumerate().rev() {
+            let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
+            for block in blocks.rev() {
+                let (one, two) = (&block[0], &block[1]);
+                let inner = last_input(two, &mut inputs);
+                let outer = last_input(one, &mut inputs);
+                own_sums(two, inner, &grad);
+                let mut between = Buffer::<f32>::new(one.shape().map_len());
+                two.image_gradient(unit, &grad, |y, row| {
+                    let to = &mut between[y * row.len()..][..row.len()];
+                    pass_active(unit, &inner[two.border().line(y)], row, to);
+                });
+                own_sums(one, outer, &between);
+                one.image_gradient(unit, &between, |y, row| {
+                    let to = &mut grad[y * row.len()..][..row.len()];
+                    add_active(unit, &outer[one.border().line(y)], row, to);
+                });
+            }
+            let before;
+            (taken, before) = cut_last(taken, grad.len());
+            let mut grad_maps = Buffer::zeros(conv.shape().map_len());
+            unpool(unit, &grad, conv.shape().output(), before, &mut grad_maps);
+            if stage == 0 {
+                let mut room = Buffer::new(conv.border().len::<U::Element>());
+                conv.border().put(unit, Inside::Bytes(image), &mut room);
+                own_sums(conv, &room, &grad_maps);
+                return;
+            }
+            own_sums(conv, last_input(conv, &mut inputs), &grad_maps);
+            grad = Buffer::new(conv.shape().locations() * conv.shape().channels_in);
+            conv.image_gradient(unit, &grad_maps, |y, row| {
+                grad[y * row.len()..][..row.len()].copy_from_slice(row);
+            });
+        }
+    }
+}
+
+/// Scalars of what the pool after `conv` makes.
+fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
+    let (height, width, channels) = pooled(conv.shape().output());
+    height * width * channels
+}
+
+/// Memory for the input of `of` at the start of `inputs`, which are shortened by it.
+fn cut_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a mut [E]) -> &'a mut [E] {
+    let (own, rest) = std::mem::take(inputs).split_at_mut(of.border().len::<E>());
+    *inputs = rest;
+    own
+}
+
+/// The input of `of` at the end of `inputs`, which are shortened by it.
+fn last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
+    let own;
+    (*inputs, own) = cut_last(inputs, of.border().len::<E>());
+    own
+}
+
+/// All but the last `len`, and those.
+fn cut_last<T>(values: &[T], len: usize) -> (&[T], &[T]) {
+    values.split_at(values.len() - len)
+}
+
+vectorized! {
+    /// scale * row + bias for each location of `row` [locations, out].
+    fn add_bias<U>(unit, row: &'a [f32], scale: f32, bias: &'a [f32], to: &'a mut [f32]) {
+        let locations = row.chunks_exact(bias.len());
+        for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
+            for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
+                *to = value * scale + bias;
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Adds row + bias for each location of `row` [locations, out].
+    fn add_residual<U>(unit, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
+        let locations = row.chunks_exact(bias.len());
+        for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
+            for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
+                *to += value + bias;
+            }
+        }
+    }
+}
+
+vectorized! {
+    fn activate<U>(unit, x: &'a [f32], to: &'a mut [f32]) {
+        for (to, &x) in to.iter_mut().zip(x) {
+            *to = relu_of(x);
+        }
+    }
+}
+
+vectorized! {
+    /// The gradients before a ReLU that gave `active`.
+    fn pass_active<U, M>(unit, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
+        for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
+            *to = relu_gradient(active.value(), grad);
+        }
+    }
+}
+
+vectorized! {
+    /// Adds the gradients before a ReLU that gave `active`.
+    fn add_active<U>(unit, active: &'a [U::Element], grads: &'a [f32], to: &'a mut [f32]) {
+        for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
+            *to += relu_gradient(active.value(), grad);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{DType, Device, Result, Tensor, Var};
+
+    use super::*;
+    use crate::kernels::candle::residual_stages;
+    use crate::kernels::precision::Precision;
+    use crate::kernels::stack::unpacked;
+    use crate::kernels::units::{ForUnit, with_every_unit};
+
+    const INPUT: (usize, usize, usize) = (9, 14, 3);
+    /// Odd runs, and channels beyond a register; maps of 5 x 7 and 3 x 4.
+    const WIDTHS: [usize; 2] = [5, 18];
+
+    fn values(len: usize, by: usize, scale: f32) -> Vec<f32> {
+        let value = |at: usize| ((at * by % 1009) as f32 / 504.0 - 1.0) * scale;
+        (0..len).map(value).collect()
+    }
+
+    #[derive(Clone, Copy)]
+    struct Run<'a> {
+        images: &'a [u8],
+        parameters: &'a [f32],
+        grad_f3: &'a [f32],
+    }
+
+    impl ForUnit for Run<'_> {
+        /// f3, and the gradients of parameters.
+        type Output = [Vec<f32>; 2];
+
+        fn run<U: Unit>(self, unit: U) -> Self::Output {
+            let stages = Stages::new(unit, INPUT, &WIDTHS, self.parameters, true);
+            let mut f3 = vec![f32::NAN; self.grad_f3.len()];
+            let mut saved = stages.saved(self.images.len() / stages.image_len());
+            stages.forward(self.images, &mut saved, &mut f3);
+            let sums = stages.backward(self.images, &saved, &f3, self.grad_f3);
+            let gradients = unpacked(&super::stages(INPUT, &WIDTHS).0, &sums);
+            [f3, gradients]
+        }
+    }
+
+    /// The same by candle's operations and derivatives, in f64.
+    fn reference(run: Run<'_>, count: usize) -> Result<[Vec<f64>; 2]> {
+        let shapes = super::stages(INPUT, &WIDTHS).0;
+        let (mut left, mut vars) = (run.parameters, Vec::new());
+        for shape in shapes {
+            let (own, rest) = left.split_at(shape.parameters_len());
+            let (weight, bias) = own.split_at(shape.weight_len());
+            let size = (shape.channels_out, shape.channels_in, 3, 3);
+            for part in [
+                Tensor::from_slice(weight, size, &Device::Cpu)?,
+                Tensor::from_slice(bias, shape.channels_out, &Device::Cpu)?,
+            ] {
+                vars.push(Var::from_tensor(&part.to_dtype(DType::F64)?)?);
+            }
+            left = rest;
+        }
+        let size = (count, INPUT.0, INPUT.1, INPUT.2);
+        let images = Tensor::from_slice(run.images, size, &Device::Cpu)?;
+        let images = (images.to_dtype(DType::F64)? / 255.0)?;
+        let layers = vars
+            .chunks(2)
+            .map(|it| (it[0].as_tensor(), it[1].as_tensor()));
+        let f3 = residual_stages(&images, &layers.collect::<Vec<_>>())?;
+        let grad_f3 = Tensor::from_slice(run.grad_f3, f3.dims(), &Device::Cpu)?;
+        let loss = (&f3 * grad_f3.to_dtype(DType::F64)?)?.sum_all()?;
+        let gradients = loss.backward()?;
+        let mut all = Vec::new();
+        for var in &vars {
+            let gradient = gradients.get(var).unwrap();
+            all.extend(gradient.flatten_all()?.to_vec1::<f64>()?);
+        }
+        Ok([f3.flatten_all()?.to_vec1()?, all])
+    }
+
+    #[test]
+    fn every_unit_gives_what_candle_does_in_f64() -> Result<()> {
+        let count = 3;
+        let (shapes, (height, width, channels)) = super::stages(INPUT, &WIDTHS);
+        // The last image is flat: most windows of the pools have nine equal values.
+        let image_len = INPUT.0 * INPUT.1 * INPUT.2;
+        let mut images: Vec<u8> = (0..count * image_len)
+            .map(|at| (at * 31 % 253) as u8)
+            .collect();
+        images[(count - 1) * image_len..].fill(77);
+        let run = Run {
+            images: &images,
+            parameters: &values(parameters_len(&shapes), 383, 0.4),
+            grad_f3: &values(count * height * width * channels, 571, 1.0),
+        };
+        let wanted = reference(run, count)?;
+        for precision in Precision::ALL {
+            let tolerance = match precision {
+                Precision::F32 => 3e-6,
+                // ReLUs and pools that choose otherwise, too.
+                Precision::Bf16 => 0.3,
+            };
+            for found in with_every_unit(precision, run) {
+                for (found, wanted) in found.iter().zip(&wanted) {
+                    let off = found.iter().zip(wanted).map(|(a, b)| f64::from(*a) - b);
+                    let error = off.map(|it| it * it).sum::<f64>().sqrt();
+                    let size = wanted.iter().map(|it| it * it).sum::<f64>().sqrt();
+                    let is_close = size > 0.0 && error <= tolerance * size;
+                    assert!(is_close, "{precision}: {error} of {size}");
+                }
+            }
+        }
+        Ok(())
+    }
+}

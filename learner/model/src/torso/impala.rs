@@ -1,0 +1,171 @@
+//! `impala`: stages of a convolution, a max pool and two residual blocks, and a fully connected layer on all of the last one's map.
+//! Source: Espeholt et al. 2018, the residual network of the Procgen paper (Cobbe et al. 2020).
+
+use candle_core::{Result, Tensor};
+
+use super::interface::{ActingTorso, Torso, TorsoConvolution, TorsoParameters};
+use crate::compute::Kernels;
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::dense::Dense;
+use crate::kernels::precision::Precision;
+use crate::kernels::rounding::write_rows;
+use crate::kernels::stages::Stages;
+use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
+
+/// The convolutions of a stage.
+const NAMES: [&str; STAGE_CONVOLUTIONS] = [
+    "conv",
+    "block1.conv1",
+    "block1.conv2",
+    "block2.conv1",
+    "block2.conv2",
+];
+
+#[derive(Debug)]
+pub(crate) struct Impala {
+    input: (usize, usize, usize),
+    /// Channels of each stage.
+    widths: Vec<usize>,
+    /// Whether the second convolution of each block starts smaller, by the square root of the number of blocks.
+    scale_blocks: bool,
+}
+
+impl Impala {
+    /// On an input of (height, width, channels).
+    pub(crate) fn new(input: (usize, usize, usize), widths: &[usize], scale_blocks: bool) -> Self {
+        Self {
+            input,
+            widths: widths.to_vec(),
+            scale_blocks,
+        }
+    }
+
+    /// f3 [B, h, w, c] of `frames`.
+    pub(super) fn f3(
+        &self,
+        kernels: Kernels,
+        parameters: &TorsoParameters<Tensor>,
+        frames: &Tensor,
+    ) -> Result<Tensor> {
+        let layers = parameters.convolutions.iter();
+        let layers: Vec<_> = layers.map(|it| (&it.weight, &it.bias)).collect();
+        kernels.residual_stages(frames, &layers)
+    }
+
+    /// The actor's torso, whose fully connected layer takes all of f3, or its mean over the locations.
+    pub(super) fn acting_on(
+        &self,
+        precision: Precision,
+        parameters: TorsoParameters<Vec<f32>>,
+        takes_mean: bool,
+    ) -> Box<dyn ActingTorso> {
+        struct Build<'a>(&'a Impala, TorsoParameters<Vec<f32>>, bool);
+        impl ForUnit for Build<'_> {
+            type Output = Box<dyn ActingTorso>;
+            fn run<U: Unit>(self, unit: U) -> Self::Output {
+                let Self(impala, TorsoParameters { convolutions, fc }, takes_mean) = self;
+                let layers = convolutions
+                    .into_iter()
+                    .map(|it| [it.weight, it.bias].concat());
+                let parameters = layers.collect::<Vec<_>>().concat();
+                let stages = Stages::new(unit, impala.input, &impala.widths, &parameters, false);
+                let channels = stages.output().2;
+                Box::new(ActingStages {
+                    unit,
+                    fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+                    stages,
+                    takes_mean,
+                })
+            }
+        }
+        with_unit(precision, Build(self, parameters, takes_mean))
+    }
+}
+
+impl Torso for Impala {
+    fn convolutions(&self) -> Vec<TorsoConvolution> {
+        let (shapes, _) = stages(self.input, &self.widths);
+        let blocks = 2 * self.widths.len();
+        let smaller = 1.0 / (blocks as f32).sqrt();
+        let convolution = |(index, shape): (usize, &ConvShape)| {
+            let name = NAMES[index % STAGE_CONVOLUTIONS];
+            let is_scaled = self.scale_blocks && name.ends_with(".conv2");
+            TorsoConvolution {
+                name: format!("torso.stage{}.{name}", index / STAGE_CONVOLUTIONS + 1),
+                weight: [
+                    shape.channels_out,
+                    shape.channels_in,
+                    shape.kernel,
+                    shape.kernel,
+                ],
+                locations: shape.locations(),
+                initial_scale: if is_scaled { smaller } else { 1.0 },
+            }
+        };
+        shapes.iter().enumerate().map(convolution).collect()
+    }
+
+    fn local_shape(&self) -> (usize, usize, usize) {
+        stages(self.input, &self.widths).1
+    }
+
+    fn features(
+        &self,
+        kernels: Kernels,
+        parameters: &TorsoParameters<Tensor>,
+        frames: &Tensor,
+        local: bool,
+    ) -> Result<(Option<Tensor>, Tensor)> {
+        let f3 = self.f3(kernels, parameters, frames)?;
+        let f4 = kernels.linear_of_maps(&f3, &parameters.fc.weight, &parameters.fc.bias)?;
+        Ok((local.then_some(f3), f4))
+    }
+
+    fn acting(
+        &self,
+        precision: Precision,
+        parameters: TorsoParameters<Vec<f32>>,
+    ) -> Box<dyn ActingTorso> {
+        self.acting_on(precision, parameters, false)
+    }
+}
+
+struct ActingStages<U: Unit> {
+    unit: U,
+    stages: Stages<U>,
+    fc: Dense<U>,
+    takes_mean: bool,
+}
+
+impl<U: Unit> ActingTorso for ActingStages<U> {
+    fn f4(&self, frames: &[u8]) -> Buffer<f32> {
+        let (unit, stages, inputs) = (self.unit, &self.stages, self.fc.inputs());
+        let images = frames.chunks_exact(stages.image_len());
+        let count = images.len();
+        let mut rows = Buffer::new(count * inputs.next_multiple_of(U::Element::DEPTH));
+        let (mut saved, mut f3) = (stages.saved(1), Buffer::new(stages.output_len()));
+        let each = rows.chunks_exact_mut(inputs.next_multiple_of(U::Element::DEPTH));
+        for (image, row) in images.zip(each) {
+            stages.forward(image, &mut saved, &mut f3);
+            if self.takes_mean {
+                write_rows(unit, &mean_of_locations(&f3, inputs), inputs, row);
+            } else {
+                write_rows(unit, &f3, inputs, row);
+            }
+        }
+        self.fc.forward(unit, &rows, count)
+    }
+}
+
+/// The mean of `map` [locations, channels] over its locations.
+fn mean_of_locations(map: &[f32], channels: usize) -> Vec<f32> {
+    let mut sums = vec![0.0; channels];
+    for location in map.chunks_exact(channels) {
+        for (sum, value) in sums.iter_mut().zip(location) {
+            *sum += value;
+        }
+    }
+    let locations = (map.len() / channels) as f32;
+    sums.iter().map(|sum| sum / locations).collect()
+}

@@ -1,0 +1,113 @@
+//! The menu of torsos: a file each, and a line of [`TorsoName::build`].
+//! What a torso is stands in `interface`.
+
+mod impala;
+mod impoola;
+pub(crate) mod interface;
+mod nature;
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use self::{impala::Impala, impoola::Impoola, interface::Torso, nature::Nature};
+use crate::error::{ModelError, Result};
+use crate::geometry::{ConvLayer, reach};
+
+/// Which torso a network has: `model.torso`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TorsoName {
+    /// The convolutions of `conv`. Source: Mnih et al. 2015.
+    #[default]
+    Nature,
+    /// A residual network, a stage for each width of `channels`. Source: Espeholt et al. 2018.
+    Impala,
+    /// The same, and f4 takes the mean of its map. Source: Trumpp et al. 2025.
+    Impoola,
+}
+
+/// The settings that torsos have, each those of its own.
+pub(crate) struct TorsoSettings<'a> {
+    pub(crate) conv: &'a [ConvLayer],
+    pub(crate) channels: &'a [usize],
+    pub(crate) scale_blocks: bool,
+}
+
+impl TorsoName {
+    /// The name that settings use.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Nature => "nature",
+            Self::Impala => "impala",
+            Self::Impoola => "impoola",
+        }
+    }
+
+    /// The settings that are others' alone.
+    pub const fn settings_of_others(self) -> &'static [&'static str] {
+        match self {
+            Self::Nature => &["channels", "scale_blocks"],
+            Self::Impala | Self::Impoola => &["conv"],
+        }
+    }
+
+    /// The torso on an input of (height, width, channels).
+    pub(crate) fn build(
+        self,
+        input: (usize, usize, usize),
+        settings: &TorsoSettings<'_>,
+    ) -> Box<dyn Torso> {
+        let impala = || Impala::new(input, settings.channels, settings.scale_blocks);
+        match self {
+            Self::Nature => Box::new(Nature::new(input, settings.conv)),
+            Self::Impala => Box::new(impala()),
+            Self::Impoola => Box::new(Impoola(impala())),
+        }
+    }
+
+    /// Rows and columns, from the upper left corner of an image of (height, width), that it reads; `None` if layers of `conv` do not fit.
+    pub fn reach(self, conv: &[ConvLayer], image: (usize, usize)) -> Option<(usize, usize)> {
+        match self {
+            Self::Nature => reach(conv, image),
+            // With a border of zeros around it, every pixel is in a window.
+            Self::Impala | Self::Impoola => Some(image),
+        }
+    }
+
+    /// Checks that `settings` has what this torso needs, and nothing that is another's.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] names the setting and the torso.
+    pub(crate) fn check(self, settings: &TorsoSettings<'_>) -> Result<()> {
+        let given = [
+            ("conv", !settings.conv.is_empty()),
+            ("channels", !settings.channels.is_empty()),
+            ("scale_blocks", settings.scale_blocks),
+        ];
+        let others = self.settings_of_others();
+        let (own, way) = match self {
+            Self::Nature => ("conv", "model.torso to impala or impoola"),
+            Self::Impala | Self::Impoola => ("channels", "model.torso to nature"),
+        };
+        for (name, is_given) in given {
+            if is_given && others.contains(&name) {
+                return Err(ModelError::Config(format!(
+                    "torso = {self} is made of model.{own}, and model.{name} is given too: leave model.{name} out, or set {way}"
+                )));
+            }
+            if !is_given && name == own {
+                return Err(ModelError::Config(format!(
+                    "{own} is empty, and torso = {self} is made of it: set model.{own}, or set {way}"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for TorsoName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}

@@ -1,0 +1,137 @@
+//! `nature`: convolutions without padding, each followed by ReLU, and a fully connected layer on all of the last one's map.
+//! Source: Mnih et al. 2015, the paper's network.
+
+use candle_core::{Result, Tensor};
+
+use super::interface::{ActingTorso, Torso, TorsoConvolution, TorsoParameters};
+use crate::compute::Kernels;
+use crate::geometry::{ConvLayer, ConvShape};
+use crate::kernels::buffer::Buffer;
+use crate::kernels::convolution::{Convolution, forward};
+use crate::kernels::dense::{Dense, whole_steps};
+use crate::kernels::images::{Images, Pixels};
+use crate::kernels::precision::Precision;
+use crate::kernels::torso::torso;
+use crate::kernels::units::{ForUnit, Unit, with_unit};
+
+#[derive(Debug)]
+pub(crate) struct Nature {
+    input: (usize, usize, usize),
+    /// Up to the first layer that does not fit.
+    shapes: Vec<ConvShape>,
+    /// All layers.
+    conv: Vec<ConvLayer>,
+}
+
+impl Nature {
+    /// On an input of (height, width, channels).
+    pub(crate) fn new(input: (usize, usize, usize), conv: &[ConvLayer]) -> Self {
+        let mut maps = input;
+        let shapes = conv.iter().map_while(|layer| {
+            let shape = ConvShape::new(maps, *layer)?;
+            maps = shape.output();
+            Some(shape)
+        });
+        Self {
+            input,
+            shapes: shapes.collect(),
+            conv: conv.to_vec(),
+        }
+    }
+}
+
+impl Torso for Nature {
+    fn convolutions(&self) -> Vec<TorsoConvolution> {
+        let mut channels_in = self.input.2;
+        let layers = self.conv.iter().enumerate().map(|(index, layer)| {
+            let weight = [layer.out, channels_in, layer.kernel, layer.kernel];
+            channels_in = layer.out;
+            TorsoConvolution {
+                name: format!("torso.conv{}", index + 1),
+                weight,
+                locations: self.shapes.get(index).map_or(0, ConvShape::locations),
+                initial_scale: 1.0,
+            }
+        });
+        layers.collect()
+    }
+
+    fn local_shape(&self) -> (usize, usize, usize) {
+        self.shapes.last().map_or(self.input, ConvShape::output)
+    }
+
+    fn features(
+        &self,
+        kernels: Kernels,
+        parameters: &TorsoParameters<Tensor>,
+        frames: &Tensor,
+        local: bool,
+    ) -> Result<(Option<Tensor>, Tensor)> {
+        let layers = parameters.convolutions.iter().zip(&self.conv);
+        let layers: Vec<_> = layers
+            .map(|(layer, conv)| (&layer.weight, &layer.bias, conv.stride))
+            .collect();
+        let (weight, bias) = (&parameters.fc.weight, &parameters.fc.bias);
+        match kernels {
+            Kernels::Fused(precision) if !local => {
+                Ok((None, torso(frames, &layers, weight, bias, precision)?))
+            }
+            with => {
+                let maps = with.conv_stack(frames, &layers)?;
+                let f4 = with.linear_of_maps(&maps, weight, bias)?;
+                Ok((local.then_some(maps), f4))
+            }
+        }
+    }
+
+    fn acting(
+        &self,
+        precision: Precision,
+        parameters: TorsoParameters<Vec<f32>>,
+    ) -> Box<dyn ActingTorso> {
+        struct Build<'a>(&'a [ConvShape], TorsoParameters<Vec<f32>>);
+        impl ForUnit for Build<'_> {
+            type Output = Box<dyn ActingTorso>;
+            fn run<U: Unit>(self, unit: U) -> Self::Output {
+                let Self(shapes, TorsoParameters { convolutions, fc }) = self;
+                let layers = shapes.iter().zip(&convolutions);
+                let channels = shapes.last().map_or(1, |last| last.channels_out);
+                Box::new(ActingNature {
+                    unit,
+                    convolutions: layers
+                        .map(|(&shape, it)| {
+                            Convolution::new(unit, shape, &it.weight, &it.bias, false)
+                        })
+                        .collect(),
+                    fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+                })
+            }
+        }
+        with_unit(precision, Build(&self.shapes, parameters))
+    }
+}
+
+struct ActingNature<U: Unit> {
+    unit: U,
+    convolutions: Vec<Convolution<U::Element>>,
+    fc: Dense<U>,
+}
+
+impl<U: Unit> ActingTorso for ActingNature<U> {
+    fn f4(&self, frames: &[u8]) -> Buffer<f32> {
+        let unit = self.unit;
+        let count = frames.len() / self.convolutions[0].shape.image_len();
+        let mut maps = Buffer::<U::Element>::new(0);
+        for (index, layer) in self.convolutions.iter().enumerate() {
+            let mut output = Buffer::<U::Element>::new(count * layer.shape.map_len());
+            let images = match index {
+                0 => Images::Pixels(Pixels::Bytes(frames)),
+                _ => Images::Maps(&maps),
+            };
+            forward(unit, layer, images, &mut output);
+            maps = output;
+        }
+        let rows = whole_steps(maps, self.fc.inputs());
+        self.fc.forward(unit, &rows, count)
+    }
+}
