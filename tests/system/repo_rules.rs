@@ -32,7 +32,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("replay-server", 11_500),
     ("learner", 27_610),
     ("deploy", 37_240),
-    ("tests", 12_300),
+    ("tests", 12_310),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 650;
