@@ -205,10 +205,8 @@ fn a_checkpoint_goes_on_with_other_operations_than_it_was_saved_by() {
         let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
         let restored = load_latest(&folder.0, &model, &settings, loader, SPEC).unwrap();
         let mut resumed = restored.expect("a checkpoint").agent;
-        assert!(
-            run.agent.weights().unwrap() == resumed.weights().unwrap(),
-            "the weights are the same bits"
-        );
+        let is_same = run.agent.weights().unwrap() == resumed.weights().unwrap();
+        assert!(is_same, "the weights are the same bits");
         let rows = Rows::random(6, 9);
         let (a, b) = (
             run.agent.update(&rows.batch()).unwrap(),
@@ -246,10 +244,8 @@ fn a_resumed_run_is_the_same_run_bit_for_bit() {
     // The optimiser's state, through its file.
     let (a, b) = (Folder::new("straight"), Folder::new("resumed"));
     let optimizer = |path: PathBuf| fs::read(path.join("optimizer.safetensors")).unwrap();
-    assert!(
-        optimizer(straight.save(&a.0, 1)) == optimizer(resumed.save(&b.0, 1)),
-        "the moments differ"
-    );
+    let is_same = optimizer(straight.save(&a.0, 1)) == optimizer(resumed.save(&b.0, 1));
+    assert!(is_same, "the moments differ");
 }
 
 #[test]
