@@ -16,22 +16,20 @@ use serde_json::Value;
 
 use crate::evaluate::Player;
 
+/// Each game with its file in `deploy/pretrained/`.
+macro_rules! built_in_games {
+    ($($game:literal),+) => {
+        &[$(($game, include_bytes!(concat!("../../pretrained/", $game, ".safetensors")))),+]
+    };
+}
+
 /// What stands before the name of a built-in network.
 const PREFIX: &str = "pretrained:";
 /// What the name of a file that is no run's folder ends with.
 const EXTENSION: &str = "safetensors";
-/// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and the line
-/// `("GAME", include_bytes!("../../pretrained/GAME.safetensors")),`.
-const BUILT_IN: &[(&str, &[u8])] = &[
-    (
-        "coinrun",
-        include_bytes!("../../pretrained/coinrun.safetensors"),
-    ),
-    (
-        "starpilot",
-        include_bytes!("../../pretrained/starpilot.safetensors"),
-    ),
-];
+/// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and its name
+/// here.
+const BUILT_IN: &[(&str, &[u8])] = built_in_games!["bigfish", "coinrun", "fruitbot", "starpilot"];
 
 /// The key of [`Exported`] in the file's description.
 const EXPORTED: &str = "exported";
