@@ -8,7 +8,7 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! // The tables [model] and [learner.update] of a run's config.toml.
-//! # const MODEL: &str = "height = 8\nwidth = 8\nchannels = 1\nnum_actions = 2\natoms = 5\nv_min = -1.0\nv_max = 1.0\n\
+//! # const MODEL: &str = "height = 8\nwidth = 8\ninput_channels = 1\nnum_actions = 2\natoms = 5\nv_min = -1.0\nv_max = 1.0\n\
 //! #     conv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nrkhs = 8\naction_embed = 2\n\
 //! #     dim = { psi3 = false, phi3 = false, psi4 = true, phi4 = true, action = true }";
 //! # const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
