@@ -153,7 +153,7 @@ fn files_and_runs_that_are_not_there() {
             "parity none.safetensors",
             "error: cannot read none.safetensors: No such file or directory (os error 2)\n",
         ),
-        ("actor --connect unixsock-stream/nobody.sock", "error: "),
+        ("actor --connect unixsock-stream/absent.sock", "error: "),
         ("man /proc/none/man1", "writing pages into /proc/none/man1"),
     ] {
         let text = said(folder.path(), call, 1);

@@ -14,9 +14,9 @@ pub enum FigureError {
     /// A picture or film of no area, or too large.
     #[error("a picture of {width} x {height} pixels cannot be made")]
     Size {
-        /// Pixels across.
+        /// Width in pixels.
         width: usize,
-        /// Pixels down.
+        /// Height in pixels.
         height: usize,
     },
     /// A picture cannot be encoded.

@@ -26,7 +26,7 @@ pub(super) fn encode(canvas: &Canvas, zoom: f32) -> Result<Vec<u8>, FigureError>
     packed(&pixmap)
 }
 
-/// Transparent pixels.
+/// A picture of transparent pixels, to draw on.
 pub(super) fn pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
     let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
     let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
@@ -65,7 +65,7 @@ pub(super) struct Outline {
 pub(super) enum Ink {
     /// Its inside, with soft edges or with hard ones.
     Fill { colour: Colour, smooth: bool },
-    /// Its line.
+    /// Its outline, as wide as the pen.
     Pen(Stroke),
 }
 

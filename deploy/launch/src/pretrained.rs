@@ -68,7 +68,7 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
             0 => "this program has none".into(),
             _ => format!("there are {PREFIX}{}", games.join(&format!(", {PREFIX}"))),
         };
-        return Err(usage!("there are no pretrained weights of {game:?}{near}; {known}").into());
+        return Err(usage!("no pretrained weights of {game:?}{near}; {known}").into());
     };
     let player = read(&format!("{PREFIX}{game}"), bytes.to_vec())?;
     let world = &player.config.run.world;
@@ -200,12 +200,12 @@ mod tests {
             (
                 all,
                 "chian",
-                "there are no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising",
+                "no pretrained weights of \"chian\" (did you mean \"chain\"?); there are pretrained:chain, pretrained:ising",
             ),
             (
                 &[],
                 "chain",
-                "there are no pretrained weights of \"chain\"; this program has none",
+                "no pretrained weights of \"chain\"; this program has none",
             ),
             (all, "ising", "pretrained:ising holds weights of mspacman"),
         ] {

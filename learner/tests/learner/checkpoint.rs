@@ -1,15 +1,13 @@
-//! Checkpoints: bit-exact resumption, and damage that is reported instead of skipped.
-//! Crashes are made up by what they leave on disk.
+//! Checkpoints: bit-exact resumption, which are kept, and what a crash leaves, made up by its files.
+//! Damage is tested in `checkpoint_damage`.
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
 
-use candle_core::{Device, Tensor};
 use driml_learner::{
-    AffinityEstimator, Agent, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity,
-    LearnedSettings, Progress,
+    AffinityEstimator, Agent, Alphabet, LearnedAffinity, LearnedSettings, Progress,
     checkpoint::{self, CheckpointError, RunState, list, load_latest, lock, save},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
@@ -18,12 +16,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
-use crate::{
-    errors::diverged,
-    made_up::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings},
-};
+use crate::made_up::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings};
 
-const SPEC: u64 = 0x0123_4567_89ab_cdef;
+pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
 /// A folder of this test's own, removed at its end.
 pub(crate) struct Folder(pub(crate) PathBuf);
@@ -43,14 +38,14 @@ impl Drop for Folder {
     }
 }
 
-struct Run {
-    agent: Agent,
-    affinity: AffinityEstimator,
-    rng: ChaCha8Rng,
+pub(crate) struct Run {
+    pub(crate) agent: Agent,
+    pub(crate) affinity: AffinityEstimator,
+    pub(crate) rng: ChaCha8Rng,
 }
 
 impl Run {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(99);
         let settings = LearnedSettings {
             hidden: 8,
@@ -69,7 +64,7 @@ impl Run {
         }
     }
 
-    fn updates(&mut self, count: u64) {
+    pub(crate) fn updates(&mut self, count: u64) {
         for _ in 0..count {
             let rows = Rows::random(6, self.agent.updates());
             self.agent.update(&rows.batch()).unwrap();
@@ -79,7 +74,7 @@ impl Run {
         }
     }
 
-    fn save(&self, folder: &Path, keep: usize) -> PathBuf {
+    pub(crate) fn save(&self, folder: &Path, keep: usize) -> PathBuf {
         let Self {
             agent,
             affinity,
@@ -117,7 +112,7 @@ impl Run {
 }
 
 /// A run of two shards.
-fn progress() -> Progress {
+pub(crate) fn progress() -> Progress {
     let tally = |inserted, rows_sampled| Tally {
         inserted,
         rows_sampled,
@@ -129,9 +124,11 @@ fn progress() -> Progress {
 }
 
 /// What the metadata says is for others: here it is any text.
-const DESCRIPTION: &str = r#"{"format":1}"#;
+pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
 
-fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, CheckpointError> {
+pub(crate) fn load(
+    folder: &Path,
+) -> Result<Option<driml_learner::checkpoint::Restored>, CheckpointError> {
     load_latest(
         folder,
         &model(ALL_DIM),
@@ -139,6 +136,26 @@ fn load(folder: &Path) -> Result<Option<driml_learner::checkpoint::Restored>, Ch
         &Compute::CPU,
         SPEC,
     )
+}
+
+pub(crate) fn sha256(bytes: &[u8]) -> String {
+    let digest = Sha256::digest(bytes);
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Writes state.json with `change` made to it, and its sum.
+pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value)) {
+    let file = path.join("state.json");
+    let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    change(&mut state);
+    let text = serde_json::to_vec_pretty(&state).unwrap();
+    let sum = sha256(&text);
+    fs::write(&file, text).unwrap();
+    fs::write(
+        path.join("state.json.sha256"),
+        format!("{sum}  state.json\n"),
+    )
+    .unwrap();
 }
 
 /// A network of other sizes is no damage: the setting that differs is named.
@@ -319,242 +336,6 @@ fn a_checkpoint_is_there_while_it_is_replaced() {
     assert_eq!(updates(), [1, 2]);
     run.save(&folder.0, 3);
     assert!(!replaced.exists());
-}
-
-#[test]
-fn every_kind_of_damage_is_reported_with_its_file() {
-    let folder = Folder::new("damage");
-    let mut run = Run::new();
-    run.updates(1);
-    let path = run.save(&folder.0, 1);
-    for name in [
-        "online.safetensors",
-        "target.safetensors",
-        "optimizer.safetensors",
-        "state.json",
-        "state.json.sha256",
-    ] {
-        let file = path.join(name);
-        let whole = fs::read(&file).unwrap();
-        let reported = || {
-            let error = load(&folder.0).expect_err(name);
-            assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
-            let text = error.to_string();
-            assert!(text.contains(name) && text.contains("remove"), "{text}");
-        };
-        fs::write(&file, &whole[..whole.len() / 2]).unwrap();
-        reported();
-        let mut flipped = whole.clone();
-        flipped[whole.len() / 2] ^= 1;
-        fs::write(&file, &flipped).unwrap();
-        if name != "state.json.sha256" || whole.len() / 2 < 64 {
-            reported();
-        }
-        fs::remove_file(&file).unwrap();
-        reported();
-        fs::write(&file, &whole).unwrap();
-    }
-    assert!(load(&folder.0).unwrap().is_some());
-}
-
-fn sha256(bytes: &[u8]) -> String {
-    let digest = Sha256::digest(bytes);
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// Writes state.json with `change` made to it, and its sum.
-pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value)) {
-    let file = path.join("state.json");
-    let mut state = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
-    change(&mut state);
-    let text = serde_json::to_vec_pretty(&state).unwrap();
-    let sum = sha256(&text);
-    fs::write(&file, text).unwrap();
-    fs::write(
-        path.join("state.json.sha256"),
-        format!("{sum}  state.json\n"),
-    )
-    .unwrap();
-}
-
-#[test]
-fn a_checkpoint_of_another_format_is_rejected() {
-    let folder = Folder::new("format");
-    let path = Run::new().save(&folder.0, 1);
-    for unknown in [0, 2, 4] {
-        change_state(&path, |state| state["format"] = unknown.into());
-        let said = load(&folder.0).unwrap_err().to_string();
-        assert!(
-            said.contains(&format!("its format is {unknown}, not 3")),
-            "{said}"
-        );
-    }
-}
-
-/// With one checkpoint kept, a save of what cannot be gone on from would remove the last good one.
-#[test]
-fn a_state_that_is_not_finite_is_not_saved() {
-    for compute in [&Compute::CPU, &CANDLE] {
-        let folder = Folder::new("not-finite");
-        let mut run = Run::new();
-        run.save(&folder.0, 1);
-        for name in ["head.bias", "dim.psi4.out.weight"] {
-            run.agent = diverged(compute, name).0;
-            let state = RunState {
-                agent: &run.agent,
-                affinity: None,
-                progress: &progress(),
-                rng: &run.rng,
-                weights_version: 8,
-                run_spec_hash: SPEC,
-                description: DESCRIPTION,
-                companion: None,
-            };
-            let said = save(&folder.0, &state, 1).unwrap_err().to_string();
-            assert!(
-                said.starts_with("nothing is saved") && said.contains(name),
-                "{said}"
-            );
-            let left: Vec<_> = fs::read_dir(&folder.0).unwrap().collect();
-            assert_eq!(left.len(), 1, "{left:?}");
-            assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 0);
-        }
-    }
-}
-
-/// Files whose sum is right, as somebody may write them who wants the learner to fall over.
-#[test]
-fn arrays_and_counts_that_no_learner_wrote_are_damage() {
-    let exact = ExactSettings {
-        decay: 0.99,
-        smoothing: 1.0,
-    };
-    let exact = ExactAffinity::new(Alphabet::raw(ACTIONS).unwrap(), exact).unwrap();
-    let mut run = Run::new();
-    let learned = run.affinity.clone();
-    let refused = |run: &Run, change: &dyn Fn(&mut serde_json::Value), said: &str| {
-        let folder = Folder::new("arrays");
-        let path = run.save(&folder.0, 1);
-        load(&folder.0).unwrap().unwrap();
-        change_state(&path, change);
-        let error = load(&folder.0).map(|_| ()).unwrap_err();
-        assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
-        let text = error.to_string();
-        assert!(
-            text.contains("state.json") && text.contains(said),
-            "{said}: {text}"
-        );
-    };
-    let array = |state: &mut serde_json::Value, name: &str| -> Vec<serde_json::Value> {
-        state["affinity"][name].as_array().unwrap().clone()
-    };
-    let kinds: [(AffinityEstimator, &[&str]); 2] = [
-        (
-            learned,
-            &[
-                "parameters",
-                "first_moments",
-                "second_moments",
-                "smoothed",
-                "matrix",
-            ],
-        ),
-        (AffinityEstimator::Exact(exact), &["counts", "matrix"]),
-    ];
-    for (affinity, arrays) in kinds {
-        run.affinity = affinity;
-        run.updates(1);
-        for name in arrays {
-            let change = |change: fn(&mut Vec<serde_json::Value>)| {
-                move |state: &mut serde_json::Value| {
-                    let mut values = array(state, name);
-                    change(&mut values);
-                    state["affinity"][*name] = values.into();
-                }
-            };
-            refused(&run, &change(|values| values.truncate(1)), name);
-            refused(&run, &change(|values| values.clear()), name);
-            refused(&run, &change(|values| values.push(0.into())), name);
-            // NaN in 64 bits; in 32 too many bits to be read at all.
-            let nan = change(|values| values[0] = f64::NAN.to_bits().into());
-            refused(
-                &run,
-                &nan,
-                if *name == "matrix" {
-                    "state.json"
-                } else {
-                    name
-                },
-            );
-            let nan = change(|values| values[0] = f32::NAN.to_bits().into());
-            if *name == "matrix" {
-                refused(&run, &nan, name);
-            }
-        }
-        for (raw, len) in [
-            (vec![], 0),
-            (vec![9, 9], 1),
-            (vec![0, 2], 3),
-            (vec![0; 300], 1),
-        ] {
-            let change = |state: &mut serde_json::Value| {
-                state["affinity"]["alphabet"]["index"] = raw.clone().into();
-                state["affinity"]["alphabet"]["len"] = len.into();
-            };
-            refused(&run, &change, "alphabet");
-        }
-    }
-    let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
-    refused(&run, &huge, "a decay of 2");
-    run.affinity = Run::new().affinity;
-    for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
-        let change =
-            |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
-        refused(&run, &change, &format!("{key} = "));
-    }
-    for key in ["updates", "adam_step", "weights_version"] {
-        let change = |state: &mut serde_json::Value| state[key] = u64::MAX.into();
-        refused(&run, &change, key);
-    }
-    for (key, value) in [
-        ("seed", serde_json::json!([1, 2])),
-        ("word_pos", (-1).into()),
-    ] {
-        let change = |state: &mut serde_json::Value| state["rng"][key] = value.clone();
-        refused(&run, &change, "state.json");
-    }
-}
-
-#[test]
-fn moments_that_no_optimiser_has_are_damage() {
-    let folder = Folder::new("moments");
-    let mut run = Run::new();
-    run.updates(1);
-    let path = run.save(&folder.0, 1);
-    let file = path.join("optimizer.safetensors");
-    let whole = fs::read(&file).unwrap();
-    for (name, number) in [
-        ("m.head.bias", f32::NAN),
-        ("m.head.bias", f32::INFINITY),
-        ("v.head.bias", f32::NAN),
-        ("v.head.bias", -1.0),
-    ] {
-        let mut tensors = candle_core::safetensors::load_buffer(&whole, &Device::Cpu).unwrap();
-        let moment = &tensors[name];
-        let poisoned = Tensor::full(number, moment.dims(), &Device::Cpu).unwrap();
-        tensors.insert(name.to_owned(), poisoned);
-        let bytes = safetensors::serialize(&tensors, None).unwrap();
-        fs::write(&file, &bytes).unwrap();
-        change_state(&path, |state| {
-            state["sha256"]["optimizer.safetensors"] = sha256(&bytes).into();
-        });
-        let said = load(&folder.0).map(|_| ()).unwrap_err().to_string();
-        let wanted = format!("the moment {name} is {number} at index 0");
-        assert!(
-            said.contains("optimizer.safetensors") && said.contains(&wanted),
-            "{said}"
-        );
-    }
 }
 
 #[test]

@@ -6,6 +6,7 @@
 mod agents;
 mod augment;
 mod checkpoint;
+mod checkpoint_damage;
 mod equal_states;
 mod errors;
 mod made_up;

@@ -90,7 +90,7 @@ impl KeptReplay {
         })
     }
 
-    /// Its folder.
+    /// The folder that holds its segments.
     pub(crate) fn dir(&self) -> &Path {
         &self.folder.path
     }

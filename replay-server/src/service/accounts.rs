@@ -289,9 +289,9 @@ mod tests {
             assert_eq!(accounts.missing(all_in), missing);
         };
         let (learner, actor) = (Alive::learner(5), actor(1));
-        let nobody = Some("no learner has joined yet");
-        check(learner, false, true, false, nobody);
-        check(actor, false, true, false, nobody);
+        let no_learner = Some("no learner has joined yet");
+        check(learner, false, true, false, no_learner);
+        check(actor, false, true, false, no_learner);
         check(learner, true, true, false, Some("no actor has joined yet"));
         check(learner, true, true, true, None);
         check(actor, true, true, false, None);

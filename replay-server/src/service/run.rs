@@ -160,7 +160,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             };
         }
     };
-    // Of this process alone: priorities of rows that an earlier one drew are not taken for those of others.
+    // Of this process alone, so that priorities of rows that an earlier one drew do not count for other rows.
     replay.origin.incarnation = rand::random();
     let service = Arc::new(Service {
         num_actions: spec.num_actions,

@@ -1,5 +1,5 @@
 //! A network with the objective DIM alone and its optimiser, which are the learner's: what both studies train.
-//! There is no return, no action and no replay.
+//! It has neither returns nor actions nor a replay.
 
 use candle_core::{DType, Device, Tensor};
 use driml_learner::{

@@ -1,5 +1,5 @@
 //! The stages of an IMPALA torso as one candle operation with gradients, its batch split over the rayon pool.
-//! It runs on the CPU only; what comes after f3 is a layer of its own.
+//! It runs on the CPU only; the layer after f3 is another operation.
 
 use std::sync::{Mutex, PoisonError};
 

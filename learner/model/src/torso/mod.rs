@@ -27,7 +27,7 @@ pub enum TorsoName {
     Impoola,
 }
 
-/// The settings that torsos have, each those of its own.
+/// The settings of all torsos; each reads its part.
 pub(crate) struct TorsoSettings<'a> {
     pub(crate) conv: &'a [ConvLayer],
     pub(crate) channels: &'a [usize],

@@ -19,7 +19,7 @@ pub(crate) struct Nature {
     input: (usize, usize, usize),
     /// Up to the first layer that does not fit.
     shapes: Vec<ConvShape>,
-    /// All layers.
+    /// All layers, those that do not fit included.
     conv: Vec<ConvLayer>,
 }
 

@@ -91,7 +91,7 @@ fn said<T, E: ToString>(result: Result<T, E>) -> String {
     result.err().map_or_else(String::new, |e| e.to_string())
 }
 
-/// What is said of one row with this return and discount, by an agent on one pixel, all of whose weights are this.
+/// The error, if any, for one row with this return and discount, by an agent on one pixel, all of whose weights are this.
 fn evaluated(weight: f32, n_step_return: f32, discount: f32) -> anyhow::Result<String> {
     let settings = small::run("chain".parse()?, "c51", Vec::new())?
         .learner
@@ -115,7 +115,7 @@ fn evaluated(weight: f32, n_step_return: f32, discount: f32) -> anyhow::Result<S
     })))
 }
 
-/// The name that a value must be refused by, and what is said of it.
+/// The name that the error for a value must contain, and that error.
 type Refusal = (&'static str, String);
 
 /// Batches of one row, and logits beyond 3.4e38.
