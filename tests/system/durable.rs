@@ -460,7 +460,9 @@ fn a_resumed_run_goes_on_with_its_replay() {
         log.contains("continues with the replay in run/replay"),
         "{log}"
     );
-    assert!(!log.contains("WARN"), "{log}");
+    // The log may have heard of updates that no checkpoint holds.
+    let warns = |line: &&str| line.contains("WARN") && !line.contains("to be learned again");
+    assert_eq!(log.lines().find(warns), None, "{log}");
 }
 
 /// Its parts still end while the next launcher starts: the replay server, which waits for a frozen actor, holds replay and endpoint.

@@ -153,7 +153,7 @@ impl State {
         let again = self.replay.join_learner(join).map_err(refused)?;
         if again > 0 {
             tracing::warn!(
-                "the learner resumes from its checkpoint after {updates} updates: the {again} updates since then are learned again"
+                "the learner resumes from its checkpoint after {updates} updates; updates since then, to be learned again: {again}"
             );
         }
         if served != Some(learner) {
