@@ -4,7 +4,7 @@
 use candle_core::{Device, Result, Tensor, Var};
 use driml_model::{Precision, linear, linear_relu, relu};
 
-use crate::support::{assert_close, double, floats, rng, rounded, values, variable};
+use crate::support::{assert_layer, double, floats, rng, rounded, values, variable};
 
 /// The layer by candle's operations: x [rows, in], b [groups, out].
 fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
@@ -42,27 +42,14 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
                 variable(&[groups, outputs], rng),
             ];
             let layer = if with_relu { linear_relu } else { linear };
-            let y = layer(&args[0], &args[1], &args[2], precision)?;
-            let grad_y = rounded(&floats(y.dims(), rng), precision).as_detached_tensor();
-            let grads = (&y * &grad_y)?.sum_all()?.backward()?;
-
-            let reference = args
-                .each_ref()
-                .map(|arg| Var::from_tensor(&double(arg).unwrap()).unwrap());
-            let wanted = stock(&reference[0], &reference[1], &reference[2], with_relu)?;
-            let wanted_grads = (&wanted * double(&grad_y)?)?.sum_all()?.backward()?;
-            assert_close("y", &y, &wanted, 1e-6);
-            for (index, (arg, reference)) in args.iter().zip(&reference).enumerate() {
-                let what = format!(
-                    "{precision} gradient of argument {index}, {rows}x{inputs} to {outputs}, {groups} groups"
-                );
-                assert_close(
-                    &what,
-                    grads.get(arg).unwrap(),
-                    wanted_grads.get(reference).unwrap(),
-                    3e-6,
-                );
-            }
+            assert_layer(
+                &format!("{precision}, {rows}x{inputs} to {outputs}, {groups} groups"),
+                &args,
+                precision,
+                rng,
+                |args| layer(&args[0], &args[1], &args[2], precision),
+                |args| stock(&args[0], &args[1], &args[2], with_relu),
+            )?;
         }
     }
     Ok(())

@@ -7,7 +7,8 @@ use driml_model::{
 };
 
 use crate::support::{
-    DUELING, NOISY, NOISY_DUELING, bytes, parameters, residual, rng, small, small_with,
+    DUELING, NOISY, NOISY_DUELING, bytes, parameters, policy, q_values, residual, rng, small,
+    small_with, values,
 };
 
 #[test]
@@ -23,12 +24,7 @@ fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
 fn it_agrees_with_the_network(config: ModelConfig) {
     let parameters = parameters(&config, 3);
     let network = Network::new(&config, &parameters).unwrap();
-    let mut policy = PolicyNetwork::new(
-        &config,
-        &parameters.to_safetensors(|_| true).unwrap(),
-        Precision::F32,
-    )
-    .unwrap();
+    let mut policy = policy(&config, &parameters, Precision::F32);
     for batch in [1, 2, 5, 33, 70] {
         let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
         let shape = (batch, config.height, config.width, config.input_channels);
@@ -37,13 +33,7 @@ fn it_agrees_with_the_network(config: ModelConfig) {
         policy.set_noise(noise.as_ref());
         let f4 = network.features(&tensor).unwrap().f4;
         let logits = network.noisy_logits(&f4, noise.as_ref()).unwrap();
-        let wanted: Vec<f32> = network
-            .q_values(&logits)
-            .unwrap()
-            .flatten_all()
-            .unwrap()
-            .to_vec1()
-            .unwrap();
+        let wanted = values(&network.q_values(&logits).unwrap());
         for threads in [1, 2, 3] {
             let pool = rayon::ThreadPoolBuilder::new()
                 .num_threads(threads)
@@ -57,7 +47,7 @@ fn it_agrees_with_the_network(config: ModelConfig) {
             });
             for (value, wanted) in values.iter().zip(&wanted) {
                 assert!(
-                    (value - wanted).abs() < 1e-5,
+                    (f64::from(*value) - wanted).abs() < 1e-5,
                     "batch {batch}, {threads} threads: {value}, {wanted}"
                 );
             }
@@ -84,12 +74,11 @@ fn a_state_has_the_same_values_in_any_company() {
 }
 
 fn has_the_same_values_in_any_company(config: &ModelConfig) {
-    let weights = parameters(config, 3).to_safetensors(|_| true).unwrap();
+    let parameters = parameters(config, 3);
     let frames = bytes(70 * config.frame_len(), &mut rng(1));
     for precision in Precision::ALL {
-        let mut policy = PolicyNetwork::new(config, &weights, precision).unwrap();
-        let mut all = vec![0.0; 70 * 5];
-        policy.q_values(&frames, &mut all).unwrap();
+        let mut policy = policy(config, &parameters, precision);
+        let all = q_values(&mut policy, config, &frames);
         for step in [2, 3, 7, 69] {
             let some: Vec<usize> = (0..70).step_by(step).collect();
             let states: Vec<u8> = some
@@ -97,8 +86,7 @@ fn has_the_same_values_in_any_company(config: &ModelConfig) {
                 .flat_map(|&at| &frames[at * config.frame_len()..][..config.frame_len()])
                 .copied()
                 .collect();
-            let mut values = vec![0.0; some.len() * 5];
-            policy.q_values(&states, &mut values).unwrap();
+            let values = q_values(&mut policy, config, &states);
             for (&at, values) in some.iter().zip(values.chunks(5)) {
                 let bits =
                     |values: &[f32]| values.iter().map(|it| it.to_bits()).collect::<Vec<_>>();
@@ -115,12 +103,7 @@ fn ties_go_to_the_lowest_action() {
     for (_, var) in parameters.iter() {
         var.set(&var.zeros_like().unwrap()).unwrap();
     }
-    let mut policy = PolicyNetwork::new(
-        &config,
-        &parameters.to_safetensors(|_| true).unwrap(),
-        Precision::F32,
-    )
-    .unwrap();
+    let mut policy = policy(&config, &parameters, Precision::F32);
     let mut actions = [9; 3];
     policy
         .greedy_actions(&bytes(3 * config.frame_len(), &mut rng(1)), &mut actions)
@@ -133,17 +116,12 @@ fn new_weights_take_effect() {
     let config = small();
     let file = |seed: u64| parameters(&config, seed).to_safetensors(|_| true).unwrap();
     let frames = bytes(4 * config.frame_len(), &mut rng(1));
-    let values = |policy: &mut PolicyNetwork| {
-        let mut values = [0.0; 20];
-        policy.q_values(&frames, &mut values).unwrap();
-        values
-    };
-    let mut policy = PolicyNetwork::new(&config, &file(1), Precision::F32).unwrap();
-    let first = values(&mut policy);
+    let mut policy = policy(&config, &parameters(&config, 1), Precision::F32);
+    let first = q_values(&mut policy, &config, &frames);
     policy.load(&file(2)).unwrap();
-    assert_ne!(values(&mut policy), first);
+    assert_ne!(q_values(&mut policy, &config, &frames), first);
     policy.load(&file(1)).unwrap();
-    assert_eq!(values(&mut policy), first);
+    assert_eq!(q_values(&mut policy, &config, &frames), first);
 }
 
 #[test]
@@ -154,12 +132,7 @@ fn wrong_lengths_and_overflow_are_errors() {
         ..small().without_dim()
     };
     let parameters = parameters(&config, 1);
-    let mut policy = PolicyNetwork::new(
-        &config,
-        &parameters.to_safetensors(|_| true).unwrap(),
-        Precision::F32,
-    )
-    .unwrap();
+    let mut policy = policy(&config, &parameters, Precision::F32);
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
     assert!(policy.greedy_actions(&frames, &mut []).is_err());
     assert!(policy.greedy_actions(&[], &mut []).is_ok(), "nothing to do");
@@ -184,32 +157,29 @@ fn wrong_lengths_and_overflow_are_errors() {
 #[test]
 fn noise_is_drawn_when_it_is_asked_for() {
     let config = small_with(NOISY_DUELING);
-    let weights = parameters(&config, 3).to_safetensors(|_| true).unwrap();
-    let mut policy = PolicyNetwork::new(&config, &weights, Precision::F32).unwrap();
+    let drawn = parameters(&config, 3);
+    let mut noisy = policy(&config, &drawn, Precision::F32);
     let frames = bytes(config.frame_len(), &mut rng(1));
-    let values = |policy: &mut PolicyNetwork| {
-        let mut values = [0.0; 5];
-        policy.q_values(&frames, &mut values).unwrap();
-        values
-    };
-    let mean = values(&mut policy);
+    let values = |policy: &mut PolicyNetwork| q_values(policy, &config, &frames);
+    let mean = values(&mut noisy);
     let generator = &mut rng(2);
-    policy.draw_noise(generator);
-    let first = values(&mut policy);
-    policy.draw_noise(generator);
-    let second = values(&mut policy);
+    noisy.draw_noise(generator);
+    let first = values(&mut noisy);
+    noisy.draw_noise(generator);
+    let second = values(&mut noisy);
     assert!(first != mean && second != mean && first != second);
-    policy.draw_noise(&mut rng(2));
-    assert_eq!(values(&mut policy), first);
-    policy.load(&weights).unwrap();
-    assert_eq!(values(&mut policy), mean);
+    noisy.draw_noise(&mut rng(2));
+    assert_eq!(values(&mut noisy), first);
+    noisy
+        .load(&drawn.to_safetensors(|_| true).unwrap())
+        .unwrap();
+    assert_eq!(values(&mut noisy), mean);
     // A head without noisy layers draws nothing.
     let plain = small();
-    let weights = parameters(&plain, 3).to_safetensors(|_| true).unwrap();
-    let mut policy = PolicyNetwork::new(&plain, &weights, Precision::F32).unwrap();
-    let mean = values(&mut policy);
+    let mut plain = policy(&plain, &parameters(&plain, 3), Precision::F32);
+    let mean = values(&mut plain);
     let generator = &mut rng(2);
-    policy.draw_noise(generator);
-    assert_eq!(values(&mut policy), mean);
+    plain.draw_noise(generator);
+    assert_eq!(values(&mut plain), mean);
     assert_eq!(*generator, rng(2));
 }

@@ -2,7 +2,9 @@
 //! No test lives here.
 
 use candle_core::{DType, Device, Result, Tensor, Var};
-use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Precision, TorsoName};
+use driml_model::{
+    ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, PolicyNetwork, Precision, TorsoName,
+};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 
@@ -67,6 +69,33 @@ pub(crate) fn assert_close(what: &str, found: &Tensor, wanted: &Tensor, toleranc
         error <= tolerance * norm,
         "{what}: error {error}, norm {norm}"
     );
+}
+
+/// Asserts that a layer of `args` and the gradients of their weighted sum are those of `reference`, which gets the same in f64.
+///
+/// The slopes are rounded to `precision`: where operands are rounded already, results are as exact in bf16 as in f32.
+pub(crate) fn assert_layer(
+    what: &str,
+    args: &[Var],
+    precision: Precision,
+    rng: &mut ChaCha8Rng,
+    layer: impl Fn(&[Var]) -> Result<Tensor>,
+    reference: impl Fn(&[Var]) -> Result<Tensor>,
+) -> Result<()> {
+    let y = layer(args)?;
+    let slope = rounded(&floats(y.dims(), rng), precision).as_detached_tensor();
+    let gradients = (&y * &slope)?.sum_all()?.backward()?;
+    let exact = args.iter().map(|arg| Var::from_tensor(&double(arg)?));
+    let exact = exact.collect::<Result<Vec<_>>>()?;
+    let wanted = reference(&exact)?;
+    let wanted_gradients = (&wanted * double(&slope)?)?.sum_all()?.backward()?;
+    assert_close(what, &y, &wanted, 1e-6);
+    for (index, (arg, exact)) in args.iter().zip(&exact).enumerate() {
+        let what = format!("{what}, gradient of argument {index}");
+        let wanted = wanted_gradients.get(exact).unwrap();
+        assert_close(&what, gradients.get(arg).unwrap(), wanted, 3e-6);
+    }
+    Ok(())
 }
 
 /// A small network with all heads; its sizes are no multiples of anything.
@@ -147,6 +176,27 @@ pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
 
 pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
+}
+
+/// A policy with these weights.
+pub(crate) fn policy(
+    config: &ModelConfig,
+    parameters: &Parameters,
+    precision: Precision,
+) -> PolicyNetwork {
+    let weights = parameters.to_safetensors(|_| true).unwrap();
+    PolicyNetwork::new(config, &weights, precision).unwrap()
+}
+
+/// The values of five actions for each of these frames.
+pub(crate) fn q_values(
+    policy: &mut PolicyNetwork,
+    config: &ModelConfig,
+    frames: &[u8],
+) -> Vec<f32> {
+    let mut values = vec![0.0; frames.len() / config.frame_len() * 5];
+    policy.q_values(frames, &mut values).unwrap();
+    values
 }
 
 /// A variable with the values of `tensor` rounded to `precision`.

@@ -8,7 +8,7 @@ use driml_model::{
     ModelConfig, ModelError, Parameters, PolicyNetwork, Precision, StoredAs, TorsoName,
 };
 
-use crate::support::{bits, bytes, parameters, residual, rng, small, values};
+use crate::support::{bits, bytes, parameters, policy, q_values, residual, rng, small, values};
 
 fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
     parameters
@@ -230,14 +230,11 @@ fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
         Parameters::load_safetensors(config, file, &Device::Cpu).is_err(),
         "{what}"
     );
-    let good = parameters(config, 1).to_safetensors(|_| true).unwrap();
-    let mut policy = PolicyNetwork::new(config, &good, Precision::F32).unwrap();
+    let mut policy = policy(config, &parameters(config, 1), Precision::F32);
     let frames = bytes(2 * config.frame_len(), &mut rng(1));
-    let (mut before, mut after) = ([0.0; 10], [0.0; 10]);
-    policy.q_values(&frames, &mut before).unwrap();
+    let before = q_values(&mut policy, config, &frames);
     assert!(policy.load(file).is_err(), "{what}");
-    policy.q_values(&frames, &mut after).unwrap();
-    assert_eq!(before, after, "{what}");
+    assert_eq!(q_values(&mut policy, config, &frames), before, "{what}");
 }
 
 #[test]
