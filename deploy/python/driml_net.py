@@ -156,7 +156,11 @@ class Network(nn.Module):
 
     def features(self, states):
         """f3 [B, c, h, w] after its ReLU and f4 [B, hidden] before it, of u8 states [B, H, W, C]."""
-        maps = states.permute(0, 3, 1, 2).float() / 255
+        return self.features_of_images(states.permute(0, 3, 1, 2))
+
+    def features_of_images(self, images):
+        """The same of u8 images [B, C, H, W] in any memory format."""
+        maps = images.float().div_(255)
         for name, layer in self.torso.items():
             if name != "fc":
                 maps = layer(maps) if isinstance(layer, Stage) else functional.relu(layer(maps))
@@ -165,7 +169,10 @@ class Network(nn.Module):
 
     def logits(self, states):
         """Logits [B, A, N] of the returns at the atoms."""
-        _, f4 = self.features(states)
+        return self.logits_of(self.features(states)[1])
+
+    def logits_of(self, f4):
+        """The same of f4 [B, hidden]."""
         x = functional.relu(f4)
         if not self.dueling:
             return self.head(x).view(-1, self.actions, self.atoms)
@@ -174,7 +181,11 @@ class Network(nn.Module):
 
     def forward(self, states):
         """Expected returns [B, A]; the agent takes the action of the largest."""
-        return (self.logits(states).softmax(-1) * self.support).sum(-1)
+        return self.expected_returns(self.logits(states))
+
+    def expected_returns(self, logits):
+        """Means [B, A] of the distributions of logits [B, A, N]."""
+        return (logits.softmax(-1) * self.support).sum(-1)
 
     def vectors(self, head, features, actions=None):
         """Psi (psi3, psi4, with actions [B] if it was trained with them) or Phi (phi3, phi4): [B, R] of f4, [B, L, R] of f3."""

@@ -9,10 +9,9 @@ import sys
 import torch
 
 import measure
-from torch_network import Network
-from torch_update import CONFIG, FORMATS
+from torch_update import CONFIG, FORMATS, IMPALA, NATURE, of
 
-SIZES = ((64, 64), (104, 80))
+NETWORKS = {"64x64x3": ((64, 64), NATURE), "104x80x3": ((104, 80), NATURE), "64x64x3, impala": ((64, 64), IMPALA)}
 BATCHES = (32, 256)
 
 
@@ -23,7 +22,7 @@ def rate(effort, network, frames, memory_format, bf16):
     def act():
         images = frames.permute(0, 3, 1, 2).contiguous(memory_format=memory_format)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            values = network.q_values(network.logits(network.features(images)[1]))
+            values = network.expected_returns(network.logits_of(network.features_of_images(images)[1]))
         values.argmax(1).numpy()
 
     return effort.rate_by_median(act)
@@ -34,16 +33,17 @@ def main():
     torch.set_num_threads(args.threads)
     torch.manual_seed(1)
     effort, figures, formats = measure.Effort(args.quick), {}, set()
-    for height, width in SIZES:
-        network = Network(dict(CONFIG, obs={"height": height, "width": width, "channels": 3}))
+    for name, ((height, width), torso) in NETWORKS.items():
+        obs = {"height": height, "width": width, "channels": 3}
+        network = of(dict(CONFIG, obs=obs, model=CONFIG["model"] | torso))
         for batch in BATCHES:
             frames = torch.randint(0, 256, (batch, height, width, 3), dtype=torch.uint8)
-            what, rates = f"{batch} frames of {height}x{width}x3", {}
+            what, rates = f"{batch} frames of {name}", {}
             for bf16 in (False, True):
-                for name, memory_format in FORMATS.items():
-                    name += ", bf16 autocast" if bf16 else ""
-                    rates[name] = batch * rate(effort, network, frames, memory_format, bf16)
-                    print(f"  {what}, {name}: {rates[name]:.4g} frames/s", file=sys.stderr, flush=True)
+                for form, memory_format in FORMATS.items():
+                    form += ", bf16 autocast" if bf16 else ""
+                    rates[form] = batch * rate(effort, network, frames, memory_format, bf16)
+                    print(f"  {what}, {form}: {rates[form]:.4g} frames/s", file=sys.stderr, flush=True)
                 best = max(rates, key=rates.get)
                 figures[what + (", bf16" if bf16 else "")] = rates[best]
                 formats.add(best)

@@ -14,9 +14,8 @@ import torch
 from torch.nn import functional
 
 import measure
-from torch_network import Network
+from driml_net import Network
 
-ROWS = 256
 # As the presets `paper` and `paper-observation` have it for Procgen.
 CONFIG = {
     "obs": {"height": 64, "width": 64, "channels": 3},
@@ -29,16 +28,36 @@ CONFIG = {
     "tanh_clip": 20.0,
     "max_grad_norm": 10.0,
     "adam": {"lr": 2.5e-4, "beta1": 0.9, "beta2": 0.999, "eps": 0.01 / 256},
-    "model": {"conv": [[32, 8, 4], [64, 4, 2], [64, 3, 1]], "hidden": 512, "rkhs": 512, "action_embed": 64},
+    "model": {"hidden": 512, "rkhs": 512, "action_embed": 64},
 }
+NATURE = {"torso": "nature", "conv": [[32, 8, 4], [64, 4, 2], [64, 3, 1]]}
+IMPALA = {"torso": "impala", "channels": [16, 32, 32]}
+# Rows, height and width, DIM pairs, torso.
 CASES = {
-    "C51, 64x64x3": ((64, 64), []),
-    "C51 + global-global DIM, 64x64x3": ((64, 64), ["4t4"]),
-    "C51 + local-local + global-global DIM, 64x64x3": ((64, 64), ["3t3", "4t4"]),
-    "C51 + global-global DIM, 104x80x3": ((104, 80), ["4t4"]),
+    "C51, 64x64x3": (256, (64, 64), [], NATURE),
+    "C51 + global-global DIM, 64x64x3": (256, (64, 64), ["4t4"], NATURE),
+    "C51 + local-local + global-global DIM, 64x64x3": (256, (64, 64), ["3t3", "4t4"], NATURE),
+    "C51 + global-global DIM, 104x80x3": (256, (104, 80), ["4t4"], NATURE),
+    "C51, impala, 64x64x3": (256, (64, 64), [], IMPALA),
+    "C51, impala, 64x64x3, 64 rows": (64, (64, 64), [], IMPALA),
+    "C51 + global-global DIM, impala, 64x64x3": (256, (64, 64), ["4t4"], IMPALA),
 }
 GAMMA, N_STEP = 0.99, 7
 FORMATS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
+
+
+def of(config, pairs=frozenset()):
+    """The network of a parity case's configuration, with the heads of these DIM pairs, such as {"4t4"}."""
+    obs, model = config["obs"], config["model"]
+    table = dict(model, num_actions=config["actions"], height=obs["height"], width=obs["width"], input_channels=obs["channels"])
+    table |= {name: config[name] for name in ("atoms", "v_min", "v_max")}
+    table["conv"] = [dict(zip(("out", "kernel", "stride"), layer)) for layer in model.get("conv", [])]
+    table["head"] = config.get("head", {})
+    table["dim"] = {"action": config.get("condition_on_action", True)}
+    for level in "34":
+        table["dim"]["psi" + level] = any(pair[0] == level for pair in pairs)
+        table["dim"]["phi" + level] = any(pair[2] == level for pair in pairs)
+    return Network(table)
 
 
 def project(probs, reward, discount, v_min, v_max):
@@ -74,7 +93,7 @@ class Learner:
     def __init__(self, config, memory_format, device, online=None, target=None, compiled=False, bf16=False):
         self.config, self.memory_format, self.device, self.bf16 = config, memory_format, device, bf16
         self.weights = {pair: weight for pair, weight in config["lambda"].items() if weight > 0}
-        self.online, self.target = Network(config, set(self.weights)), Network(config)
+        self.online, self.target = of(config, set(self.weights)), of(config)
         if online is None:
             target = {name: value for name, value in self.online.state_dict().items() if not name.startswith("dim.")}
         else:
@@ -101,11 +120,12 @@ class Learner:
     @torch.no_grad()
     def projected(self, batch):
         frames_n = self.images(batch["frames_n"])
-        logits = self.target.logits(self.target.features(frames_n)[1])
+        logits = self.target.logits_of(self.target.features_of_images(frames_n)[1])
         if self.config["double_dqn"]:
-            values = self.online.q_values(self.online.logits(self.online.features(frames_n)[1]))
+            online = self.online.logits_of(self.online.features_of_images(frames_n)[1])
+            values = self.online.expected_returns(online)
         else:
-            values = self.target.q_values(logits)
+            values = self.target.expected_returns(logits)
         probs = logits[torch.arange(len(logits), device=logits.device), values.argmax(1)].softmax(-1)
         discount, support = batch["bootstrap_discount"], (self.config["v_min"], self.config["v_max"])
         return project(probs, batch["n_step_return"], discount, *support)
@@ -113,12 +133,12 @@ class Learner:
     def losses(self, batch, all_valid):
         """The C51 loss, the DIM losses by pair, and their weighted sum; `all_valid`: whether every row has a positive."""
         target, action = self.projected(batch), batch["action"]
-        features_t = self.online.features(self.images(batch["frames_t"]))
-        logits = self.online.logits(features_t[1])[torch.arange(len(action), device=action.device), action]
+        features_t = self.online.features_of_images(self.images(batch["frames_t"]))
+        logits = self.online.logits_of(features_t[1])[torch.arange(len(action), device=action.device), action]
         kl = functional.kl_div(logits.log_softmax(-1), target, reduction="batchmean")
         dim, vectors = {}, {}
         if self.weights:
-            features_k = self.online.features(self.images(batch["frames_k"]))
+            features_k = self.online.features_of_images(self.images(batch["frames_k"]))
             valid = batch["positive_valid"].bool()
             for pair in self.weights:
                 for head, features, given in (("psi" + pair[0], features_t, action), ("phi" + pair[2], features_k, None)):
@@ -141,15 +161,15 @@ class Learner:
         return kl.item(), {pair: loss.item() for pair, loss in dim.items()}, total.item(), norm.item()
 
 
-def made_up(config, device):
+def made_up(config, rows, device):
     """A batch that no world gave, in the host's memory; pinned if it will be copied to a device."""
     obs = config["obs"]
-    shape = (ROWS, obs["height"], obs["width"], obs["channels"])
+    shape = (rows, obs["height"], obs["width"], obs["channels"])
     batch = {f"frames_{which}": torch.randint(0, 256, shape, dtype=torch.uint8) for which in "tkn"}
-    batch["action"] = torch.randint(0, config["actions"], (ROWS,))
-    batch["n_step_return"] = torch.rand(ROWS) * 4 - 2
-    batch["bootstrap_discount"] = torch.full((ROWS,), GAMMA**N_STEP)
-    batch["positive_valid"] = torch.ones(ROWS, dtype=torch.uint8)
+    batch["action"] = torch.randint(0, config["actions"], (rows,))
+    batch["n_step_return"] = torch.rand(rows) * 4 - 2
+    batch["bootstrap_discount"] = torch.full((rows,), GAMMA**N_STEP)
+    batch["positive_valid"] = torch.ones(rows, dtype=torch.uint8)
     return batch if device.type == "cpu" else {name: value.pin_memory() for name, value in batch.items()}
 
 
@@ -162,10 +182,10 @@ def timed(learner, batch):
 
 def bench(effort, device, compiled):
     figures, formats = {}, []
-    for what, ((height, width), pairs) in CASES.items():
-        config = dict(CONFIG, obs={"height": height, "width": width, "channels": 3})
+    for what, (rows, (height, width), pairs, torso) in CASES.items():
+        config = dict(CONFIG, obs={"height": height, "width": width, "channels": 3}, model=CONFIG["model"] | torso)
         config["lambda"] = {pair: float(pair in pairs) for pair in CONFIG["lambda"]}
-        batch, rates = made_up(config, device), {}
+        batch, rates = made_up(config, rows, device), {}
         for bf16 in (False, True) if device.type == "cpu" else (False,):
             for name, memory_format in FORMATS.items():
                 learner = Learner(config, memory_format, device, compiled=compiled, bf16=bf16)
@@ -204,10 +224,11 @@ def check(path, device):
 
     print(path)
     parameters = group("online.")
-    if config.get("objective", "dim") != "dim" or not config.get("condition_on_action", True):
-        print("  skipped: another agent's loss, which this script does not have")
+    others = config.get("objective", "dim") not in ("dim", "none") or "noisy_sigma" in config.get("head", {})
+    if others or "input.importance_weight" in tensors:
+        print("  skipped: another agent's loss, noisy layers or weighted rows, which this script does not have")
         return True
-    names = Network(config, {pair for pair, weight in config["lambda"].items() if weight > 0}).state_dict().keys()
+    names = of(config, {pair for pair, weight in config["lambda"].items() if weight > 0}).state_dict().keys()
     for name, memory_format in FORMATS.items():
         online, target = {key: parameters[key] for key in names}, group("target.")
         learner = Learner(config, memory_format, device, online, target)

@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// What is measured: its name, agent, preset and further settings.
-const CASES: [(&str, &str, &str, &[&str]); 5] = [
+const CASES: [(&str, &str, &str, &[&str]); 7] = [
     ("C51, 64x64x3", "c51", "paper", &[]),
     (GLOBAL_DIM, AGENT, "paper", &[]),
     (
@@ -35,6 +35,18 @@ const CASES: [(&str, &str, &str, &[&str]); 5] = [
     (
         "C51, impala, 64x64x3",
         "c51",
+        "paper",
+        &["model.torso=impala"],
+    ),
+    (
+        "C51, impala, 64x64x3, 64 rows",
+        "c51",
+        "paper",
+        &["model.torso=impala", "learner.batch_size=64"],
+    ),
+    (
+        "C51 + global-global DIM, impala, 64x64x3",
+        AGENT,
         "paper",
         &["model.torso=impala"],
     ),

@@ -15,15 +15,19 @@ use crate::{
 
 /// Frames that are given to the policy at once.
 const BATCHES: [usize; 2] = [32, 256];
-/// The two sizes of a frame, by their presets.
-const PRESETS: [&str; 2] = ["paper", "paper-observation"];
+/// What each network is called, its preset, and further settings.
+const NETWORKS: [(&str, &str, &[&str]); 3] = [
+    ("64x64x3", "paper", &[]),
+    ("104x80x3", "paper-observation", &[]),
+    ("64x64x3, impala", "paper", &["model.torso=impala"]),
+];
 
 /// Frames a second in each precision.
 pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     let mut figures = Vec::new();
     for precision in flags.precisions(DeviceName::Cpu) {
-        for preset in PRESETS {
-            let config = settings::of_run(settings::WORLD, "c51", preset, &[])?;
+        for (network, preset, sets) in NETWORKS {
+            let config = settings::of_run(settings::WORLD, "c51", preset, sets)?;
             let model = config.with_whole_frames()?.model;
             let mut rng = ChaCha8Rng::seed_from_u64(1);
             let parameters = Parameters::init(&model, &mut rng, &candle_core::Device::Cpu)?;
@@ -37,8 +41,7 @@ pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec
                     policy.greedy_actions(&frames, &mut actions)?;
                     Ok(())
                 })?;
-                let name = format!("{batch} frames of {}x{}x3", model.height, model.width);
-                let name = named(&name, precision);
+                let name = named(&format!("{batch} frames of {network}"), precision);
                 figures.push(Measurement::found(name, rate * batch as f64, "frames/s"));
             }
         }

@@ -51,6 +51,13 @@ pub(super) fn pairs() -> Vec<Pair> {
             None,
         ),
         ("C51 + global-global DIM, 104x80x3", Some(1.2), None),
+        ("C51, impala, 64x64x3", Some(1.5), Some(1.8)),
+        ("C51, impala, 64x64x3, 64 rows", Some(1.5), Some(1.8)),
+        (
+            "C51 + global-global DIM, impala, 64x64x3",
+            Some(1.5),
+            Some(1.8),
+        ),
     ] {
         add(Learner, name, name, f32);
         let name = format!("{name}, bf16");
@@ -58,12 +65,16 @@ pub(super) fn pairs() -> Vec<Pair> {
     }
     let candle = format!("{GLOBAL_DIM}, {CANDLE}");
     add(Learner, GLOBAL_DIM, &candle, None);
-    for size in ["64x64x3", "104x80x3"] {
+    for (network, f32, bf16) in [
+        ("64x64x3", 1.3, None),
+        ("104x80x3", 1.3, None),
+        ("64x64x3, impala", 1.5, Some(1.8)),
+    ] {
         for frames in [32, 256] {
-            let name = format!("{frames} frames of {size}");
-            add(Policy, &name, &name, Some(1.3));
+            let name = format!("{frames} frames of {network}");
+            add(Policy, &name, &name, Some(f32));
             let name = format!("{name}, bf16");
-            add(Policy, &name, &name, None);
+            add(Policy, &name, &name, bf16);
         }
     }
     for (wire, insert, batch) in [

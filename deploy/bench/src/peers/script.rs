@@ -18,10 +18,7 @@ use crate::{
 /// The scripts, which this program carries, so that it can be started anywhere.
 pub(super) const FILES: [(&str, &str); 6] = [
     ("measure.py", include_str!("../../peers/measure.py")),
-    (
-        "torch_network.py",
-        include_str!("../../peers/torch_network.py"),
-    ),
+    ("driml_net.py", include_str!("../../../python/driml_net.py")),
     (
         "torch_update.py",
         include_str!("../../peers/torch_update.py"),
