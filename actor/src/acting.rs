@@ -105,7 +105,7 @@ impl Acting {
         })
     }
 
-    /// Goes on where another one with the same world stood.
+    /// Restores a snapshot taken with the same world.
     ///
     /// # Errors
     /// A state of another world.

@@ -23,7 +23,7 @@ pub struct Incarnation {
     pub actor: u32,
     /// Tells it from the others of its actor; it does not influence what is computed.
     pub id: u64,
-    /// Updates after which the run goes on: a resumed run does not play the episodes of its start again.
+    /// Updates from which the run resumes: a resumed run does not play the episodes of its start again.
     pub after_updates: u64,
     /// Lives of this actor before this one: one that follows a dead one does not play its episodes again.
     pub earlier_incarnations: u32,
@@ -187,7 +187,7 @@ impl Collector {
         })
     }
 
-    /// Goes on where another one of the same settings stood: with the same weights it gives the same chunks.
+    /// Restores a snapshot taken with the same settings: with the same weights it gives the same chunks.
     ///
     /// # Errors
     /// A state of other settings.

@@ -67,7 +67,7 @@ pub struct EpsilonLadder {
 /// Everything an actor needs to know of a run.
 #[derive(Clone, Debug)]
 pub struct ActorSettings {
-    /// What all parts agree on.
+    /// What all processes agree on.
     pub spec: RunSpec,
     /// The world that its copies are of.
     pub world: driml_envs::WorldConfig,
@@ -141,7 +141,7 @@ impl ActorSettings {
     /// Takes the world's code from `world`, which a person on this machine has named, and not from the run's settings.
     ///
     /// # Errors
-    /// A world with code that nobody here has named, or the name of another world.
+    /// A world with code that was not named on this machine, or the name of another world.
     pub fn set_world(&mut self, world: Option<WorldName>) -> Result<(), EnvError> {
         let name = self.world.name();
         match world {

@@ -22,7 +22,7 @@ pub enum ActError {
         /// What the world says.
         source: EnvError,
     },
-    /// The world has another shape than the run's parts agreed on.
+    /// The world has another shape than the run's settings.
     #[error(
         "the world {world} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
          write the run's settings anew with `driml train`"
@@ -44,7 +44,7 @@ pub enum ActError {
     /// An actor for which the ladder has no epsilon.
     #[error(transparent)]
     BeyondLadder(#[from] BeyondLadder),
-    /// Episodes that go on and on.
+    /// Episodes that do not end.
     #[error(
         "only {ended} of {wanted} episodes ended within {steps_max} steps of each copy: ask for fewer"
     )]

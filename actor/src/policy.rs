@@ -293,7 +293,7 @@ mod tests {
         let first = steps(&mut noisy, rng);
         let others = first.iter().filter(|actions| **actions != greedy[0]);
         assert!(others.count() > 25, "{first:?}");
-        // It goes on where the generator stands, whatever noise was drawn before.
+        // It depends on the generator's state alone, not on noise drawn before.
         let mut again = policy_with(head, 1).with_noise();
         let saved = rng.clone();
         let second = steps(&mut noisy, rng);

@@ -91,7 +91,7 @@ impl ChunkRecorder {
         }
     }
 
-    /// Goes on with the numbers of another recorder of the same life.
+    /// Continues with the numbers of another recorder of the same incarnation.
     pub fn go_on_at(&mut self, next: ChunkNumbers) {
         self.header.sequence = next.sequence;
         self.header.first_transition = next.first_transition;

@@ -35,7 +35,7 @@ pub struct RunArgs {
     pub actor: u32,
     /// Copies of the world, if not as many as the settings say.
     pub envs: Option<u32>,
-    /// The world as this machine has it, where it is code that is no part of this program: nothing else of that kind is started
+    /// The world as this machine has it, where it is code outside this program: nothing else of that kind is started
     /// or loaded, whatever the replay server says.
     pub world: Option<WorldName>,
 }
@@ -43,7 +43,7 @@ pub struct RunArgs {
 /// Runs one actor until `shutdown`, or until the run has its transitions.
 ///
 /// # Errors
-/// Nobody to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
+/// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
     let endpoints = Endpoints {
@@ -180,7 +180,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
-/// Plays and queues what was played until `shutdown`, or until nobody wants more. `chunk_steps` says how many steps a chunk has,
+/// Plays and queues what was played until `shutdown`, or until the run needs no more. `chunk_steps` says how many steps a chunk has,
 /// of the number of actors in the run.
 fn play(
     collector: &mut Collector,

@@ -1,4 +1,4 @@
-//! With which probability an actor acts at random: one that falls over the run, or a fixed one of its own.
+//! The probability with which an actor acts at random: one that falls over the run, or one fixed for each actor.
 //! It does not count frames: the caller says how many the run has.
 
 use crate::config::{Config, EpsilonLadder};

@@ -1,4 +1,4 @@
-//! Keeps the newest weights at hand: hears of a new version, then pulls it from the replay server; a late joiner pulls at once.
+//! Keeps the newest weights: learns of a new version, then pulls it from the replay server; a late joiner pulls at once.
 //! It keeps one set alone, and the learner has no part in a pull.
 
 use std::{
@@ -22,7 +22,7 @@ const PULL_ANYWAY: Duration = Duration::from_secs(10);
 const TICK: Duration = Duration::from_millis(200);
 /// Pause between two questions for the first weights.
 const PAUSE: Duration = Duration::from_millis(200);
-/// How long the first weights may take before a person hears that they are waited for.
+/// How long the first weights may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(5);
 
 /// Why there are no weights, or no newer ones.
@@ -75,7 +75,7 @@ pub struct NewestWeights {
 
 #[derive(Debug)]
 struct State {
-    /// Version of the newest weights that were heard of.
+    /// Newest version that was announced.
     announced: u64,
     /// Version of the last ones that were pulled.
     pulled: u64,
@@ -146,7 +146,7 @@ impl NewestWeights {
                 state.pulled = weights.header.version;
                 state.slot = Some(weights);
             }
-            // Whoever announced them did not have them.
+            // The process that announced them did not have them.
             None => state.announced = state.pulled,
         }
         self.shared.1.notify_all();
@@ -198,7 +198,7 @@ impl WeightsSource {
         }
     }
 
-    /// Watches until `shutdown`, on a thread of its own.
+    /// Watches until `shutdown`, on its own thread.
     ///
     /// # Errors
     /// No subscription, or no thread.
@@ -320,7 +320,7 @@ mod tests {
     fn weights_are_pulled_once_for_each_time_they_are_asked_for() {
         let newest = NewestWeights::after(1);
         let wanted = || newest.wait_until_wanted(Duration::ZERO);
-        assert_eq!(wanted(), None, "nothing newer was heard of");
+        assert_eq!(wanted(), None, "nothing newer was announced");
         newest.announce(2);
         assert_eq!(wanted(), Some(1));
         newest.put(weights(2));
@@ -331,7 +331,7 @@ mod tests {
             2
         );
         assert_eq!(wanted(), Some(2));
-        // A stranger's announcement: nothing newer is there, and nobody waits for it.
+        // A foreign announcement: nothing newer exists, and nothing waits for it.
         newest.announce(1 << 60);
         newest.put(None);
         assert!(newest.take_within(Duration::from_secs(3600)).is_none());

@@ -1,5 +1,5 @@
 //! `driml`: every part of the system in one program.
-//! It holds nothing of its own; see the library.
+//! The library holds all code.
 
 use std::process::ExitCode;
 

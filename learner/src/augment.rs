@@ -1,5 +1,5 @@
 //! Augmentation: what the auxiliary objective sees of a state, cropped and recoloured at random; bytes in, bytes out.
-//! C51 never sees it. It knows neither networks nor losses, and keeps no generator of its own.
+//! C51 never sees it. It knows neither networks nor losses, and keeps no generator.
 
 use rand::Rng;
 use rayon::prelude::*;
@@ -177,7 +177,7 @@ impl Augment {
         }
     }
 
-    /// Writes each of `states` [n, H, W, C], changed by a draw of its own, to `seen`, which gets their length.
+    /// Writes each of `states` [n, H, W, C], each changed by a separate draw, to `seen`, which gets their length.
     ///
     /// The draws are made in order before the work is spread over the threads, so `rng` alone decides the bytes.
     pub fn apply(&mut self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {

@@ -8,7 +8,7 @@ use crate::{auxiliary::positives::Positives, error::UpdateError};
 
 /// Rows (s_t, a_t, a_{t+1}, n-step return, discount, s_{t+k}, s_{t+n}), plane by plane; B rows each.
 ///
-/// For CURL, whose positive is no later state, `anchors` and `states_k` are two views of s_t.
+/// For CURL, whose positive is not a later state, `anchors` and `states_k` are two views of s_t.
 #[derive(Clone, Copy, Debug)]
 pub struct Batch<'a> {
     /// Rows, B, at least 1.

@@ -255,7 +255,7 @@ pub enum LearnerConfigError {
 /// Everything a learner needs to know of a run.
 #[derive(Clone, Debug)]
 pub struct LearnerConfig {
-    /// What all parts agree on.
+    /// What all processes agree on.
     pub spec: RunSpec,
     /// The network's sizes: the `[model]` table.
     pub model: ModelConfig,

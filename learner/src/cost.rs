@@ -96,7 +96,7 @@ impl UpdateCost {
         }
     }
 
-    /// All parts together.
+    /// The sum of all layers.
     pub const fn total(&self) -> u64 {
         let Self {
             online,

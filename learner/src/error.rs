@@ -22,9 +22,9 @@ pub enum UpdateError {
         /// The first quantity in which it showed.
         what: String,
     },
-    /// The step itself left the finite numbers: this learner cannot go on, nor be published or saved.
+    /// The step itself left the finite numbers: this learner can neither continue nor be published or saved.
     #[error(
-        "update {update} took {name} beyond the finite numbers; the learner cannot go on from here: go on from the newest checkpoint with \
+        "update {update} took {name} beyond the finite numbers; the learner cannot continue: resume from the newest checkpoint with \
          a learner.update.adam.lr below {lr:e}"
     )]
     Diverged {

@@ -116,7 +116,7 @@ impl Learner {
         })
     }
 
-    /// A learner that goes on from the newest checkpoint in `folder`; one at its start if there is none.
+    /// A learner restored from the newest checkpoint in `folder`; a new one if there is none.
     ///
     /// # Errors
     /// Settings that cannot work, or a checkpoint that is damaged, of another run or of other settings.
@@ -180,7 +180,7 @@ impl Learner {
         &self.progress
     }
 
-    /// The same, for whoever counts: [`Learner::update`] does not know where a batch comes from.
+    /// The same, to add to: [`Learner::update`] does not know where a batch comes from.
     pub const fn progress_mut(&mut self) -> &mut Progress {
         &mut self.progress
     }
@@ -188,7 +188,7 @@ impl Learner {
     /// Learns from one batch: the network and the affinity.
     ///
     /// # Errors
-    /// A batch that does not fit, or arithmetic that left the finite numbers; all is then as it was, except after
+    /// A batch that does not fit, or arithmetic that left the finite numbers; nothing has changed then, except after
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
     pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
         // Stacks of frames are put together here, once an update.

@@ -38,7 +38,7 @@
 //! ```
 //!
 //! [`Learner`] is an agent in a run: it takes the replay server's batches, enlarges and augments states, estimates the action
-//! affinity ([`affinity`]), counts versions of the weights and keeps [`checkpoint`]s; lockstep mode runs it as it is.
+//! affinity ([`affinity`]), counts versions of the weights and keeps [`checkpoint`]s; lockstep mode runs it unchanged.
 //! [`run`] is the process around a learner; what it says to other processes stands in [`remote`], and nothing else here knows
 //! zenoh.
 //!

@@ -1,10 +1,10 @@
 //! The noise of the head's noisy layers in an update: made of the run's seed and the number of the update.
-//! So it has no state, and a resumed run goes on with the noise that it would have had.
+//! So it has no state, and a resumed run draws the same noise.
 
 use driml_model::{HeadNoise, ModelConfig};
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
-/// The noise of one update, a draw of its own for each use of the head, as all rows of the batch have it. None of a head without noisy
+/// The noise of one update, a separate draw for each use of the head, the same for all rows of the batch. None of a head without noisy
 /// layers, and none for means.
 ///
 /// Source: Fortunato et al. 2018, algorithm 1, with its third noise for the choice of the action by double DQN.

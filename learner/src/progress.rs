@@ -13,7 +13,7 @@ pub(crate) const COUNT_MAX: u64 = 1 << 53;
 pub struct Progress {
     /// Which run it is: a random number that its first learner drew; 0 before.
     pub run: u64,
-    /// Of each shard of the replay: transitions stored, as heard last, and rows learned.
+    /// Of each shard of the replay: transitions stored, by its last report, and rows learned.
     pub shards: Vec<Tally>,
 }
 

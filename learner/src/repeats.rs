@@ -71,7 +71,7 @@ impl Distinct {
             firsts: Vec::with_capacity(states.len()),
             of_state: Vec::with_capacity(states.len()),
         };
-        // By checksum. Of two that differ and have the same one, the second is never taken for a repeat, nor what repeats it.
+        // By checksum. Of two different states with the same checksum, the second never counts as a repeat, nor do its copies.
         let mut places = HashMap::with_capacity(states.len());
         for (at, (state, sum)) in states.iter().zip(sums).enumerate() {
             let new = distinct.firsts.len() as u32;

@@ -1,4 +1,4 @@
-//! One process's connection to a run: what it asks, answers, announces and hears, each message at its own key.
+//! One process's connection to a run: queries, replies, publications and subscriptions, each message at its own key.
 //! It decides neither what is asked nor how often: timeouts and retries are the caller's.
 
 use std::{marker::PhantomData, time::Duration};
@@ -23,7 +23,7 @@ use crate::{
     },
 };
 
-/// A session with a part of the run, the run's keys and its hash: all that a message needs to get there and be understood.
+/// A session, the run's keys and its hash: all that a message needs to arrive and be understood.
 /// Clones share the session.
 #[derive(Clone, Debug)]
 pub struct RunClient {
@@ -115,7 +115,7 @@ impl RunClient {
     /// Asks a request without payload and waits for its reply.
     ///
     /// # Errors
-    /// Nobody there, no reply in time, or one that cannot be read. All but the last may be tried again.
+    /// No process answers, no reply in time, or an unreadable one. All but the last may be tried again.
     pub fn ask<R: Request>(
         &self,
         request: &R,
@@ -124,7 +124,7 @@ impl RunClient {
         self.send(self.seal(request)?, timeout)?.wait()
     }
 
-    /// Fetches what is given to whoever asks, such as a status.
+    /// Fetches a message that takes no request, such as a status.
     ///
     /// # Errors
     /// As [`RunClient::ask`].

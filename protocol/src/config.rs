@@ -1,5 +1,5 @@
-//! How a part finds its own tables in the run's resolved settings.
-//! It does not know what the tables hold: each part has a Config of its own.
+//! How a process finds its own tables in the run's resolved settings.
+//! It does not know what the tables hold: each crate has its Config.
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -31,12 +31,12 @@ pub fn in_words(error: &toml::de::Error) -> String {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransportConfig {
-    /// Whether chunks and batches go through shared memory between parts on one host; everything else, and whatever goes to
-    /// another host or does not arrive, goes through sockets.
+    /// Whether chunks and batches go through shared memory between processes on one host. Everything else goes through sockets, and
+    /// so does what goes to another host or does not arrive.
     pub shared_memory: bool,
 }
 
-/// The resolved settings of a run, one table a part.
+/// The resolved settings of a run, one table a component.
 #[derive(Clone, Debug)]
 pub struct Settings(toml::Table);
 

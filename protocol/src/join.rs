@@ -1,5 +1,5 @@
 //! Joining a run: fetching its settings, and taking part in it as an actor or as the learner.
-//! What a part does afterwards is its own; so is saying that it leaves.
+//! It does not serve or leave the run; each process does that itself.
 
 use std::time::{Duration, Instant};
 
@@ -33,19 +33,19 @@ const TRY_MAX: Duration = Duration::from_secs(2);
 /// Pause between two tries.
 const PAUSE: Duration = Duration::from_millis(200);
 
-/// Why a part could not join a run.
+/// Why a process could not join a run.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
     /// No replay server answers.
     #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_MAX.as_secs())]
-    Nobody {
+    NoReplayServer {
         /// The last try's error.
         last: SessionError,
     },
     /// An answer that cannot be read.
     #[error("the replay server's greeting: {0}")]
     Codec(#[from] CodecError),
-    /// Another process plays the same part.
+    /// Another process has the same role.
     #[error("{why}, and has not ended within {} s", TAKEN_MAX.as_secs())]
     Taken {
         /// Who, and what to do.
@@ -59,7 +59,7 @@ pub enum JoinError {
     },
 }
 
-/// What the replay server says to a part that it takes.
+/// What the replay server tells a process that it admits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Welcome {
     /// Transitions that the run has stored.
@@ -74,7 +74,7 @@ pub struct Welcome {
 /// from disk; `None` if told to stop before.
 ///
 /// # Errors
-/// Nobody there within a minute, or another protocol version.
+/// No replay server answered within 60 s, or its protocol version differs.
 pub fn hello(
     session: &Session,
     keys: &Keys,
@@ -107,9 +107,9 @@ pub fn hello_within(
         .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(hello, _)| hello))
 }
 
-/// How long a part that joins waits for its replay server, and what it says meanwhile.
+/// How long a joining process waits for its replay server, and what it logs meanwhile.
 struct Patience {
-    /// Since when nobody has answered.
+    /// When the wait for an answer began.
     silent_since: Instant,
     silence_said: Seldom,
     recovery_said: Seldom,
@@ -132,7 +132,7 @@ impl Patience {
                 self.say_recovering(&recovering);
             }
             last if self.silent_since.elapsed() > SERVER_MAX => {
-                return Err(JoinError::Nobody { last });
+                return Err(JoinError::NoReplayServer { last });
             }
             e => self.say_silent(&e),
         }
@@ -149,9 +149,9 @@ impl Patience {
         let since = self.silent_since.elapsed();
         if since > SILENT_MAX && self.silence_said.due().is_some() {
             let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
-            // Whoever listens there may be a router between the parts, to which the replay server has yet to connect.
+            // A router may listen there, to which the replay server has yet to connect.
             let why = match e {
-                SessionError::Nobody { key } => format!(
+                SessionError::NoAnswerer { key } => format!(
                     "a process listens there, but does not answer at {key}: is it the replay server of this run, with the same --namespace?"
                 ),
                 other => other.to_string(),

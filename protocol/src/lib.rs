@@ -1,9 +1,9 @@
 //! Everything that crosses a process boundary: the run spec, the messages, their bytes, and where they travel.
 //! It holds no algorithm and no state; `deploy/docs/src/reference/protocol.md` has the table of messages.
 //!
-//! Start at [`RunClient`], which asks, fetches, announces and hears, and at [`QueryWorkers`], which answers. A [`Message`] is a
+//! Start at [`RunClient`], which queries, fetches, publishes and subscribes, and at [`QueryWorkers`], which reply. A [`Message`] is a
 //! header and perhaps a payload; [`codec`] turns both into bytes and back, and refuses what is damaged, foreign or of another
-//! kind. [`RunSpec`] is what all parts of a run agree on, and its hash is in every message.
+//! kind. [`RunSpec`] is what all processes of a run agree on, and its hash is in every message.
 //!
 //! ```
 //! use driml_protocol::{Goodbye, codec};

@@ -1,8 +1,8 @@
 //! Threads that answer queries, so that the threads on which zenoh receives never wait.
-//! What the replies are is each part's own.
+//! Each process decides what it replies.
 //!
 //! zenoh calls back on the thread that reads the socket. Were it to send megabytes from there, or to wait for anything, nothing
-//! would be read meanwhile, and where the other side is busy with sending here, both would wait for ever.
+//! would be read meanwhile, and if the other side is sending too, both would wait forever.
 
 use std::{
     marker::PhantomData,
@@ -34,10 +34,10 @@ use crate::{
     },
 };
 
-/// Queries that wait for a thread; whoever sends one more hears at once that nobody answers, and asks again.
+/// Queries that wait for a thread; one more is dropped, and its sender is told at once and retries.
 const WAITING_MAX: usize = 4096;
 /// Bytes of the queries that wait for a thread: a few hundred chunks of Procgen. Beyond it one query may wait, so that one of
-/// any size is answered in the end; whoever sends one more hears at once that nobody answers, and asks again.
+/// any size is answered in the end; one more is dropped, and its sender retries.
 const WAITING_BYTES_MAX: usize = 1 << 29;
 
 /// A request that has arrived and waits for its reply.
@@ -94,7 +94,7 @@ impl<R: Request> Incoming<R> {
     }
 }
 
-/// Somebody waits for a reply of type `M`; where this is dropped without one, they hear that nobody answers.
+/// The means to reply with an `M`; where it is dropped without a reply, the sender of the query is told at once.
 #[derive(Debug)]
 pub struct Responder<M> {
     query: Query,
@@ -161,7 +161,7 @@ impl<R: Request + 'static> QueryWorkers<R> {
 }
 
 impl<M: Keyed + 'static> QueryWorkers<M> {
-    /// Starts `threads` threads that give an `M` to whoever fetches it.
+    /// Starts `threads` threads that reply to each fetch with an `M`.
     ///
     /// # Errors
     /// The operating system gave no thread.
@@ -236,10 +236,10 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
                 return refused(bytes);
             }
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
-            // A query that is dropped ends: its asker hears that nobody answers.
+            // A dropped query ends: its sender is told at once.
             if before > WAITING_BYTES_MAX || queries.try_send(query).is_err() {
                 waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
-                tracing::debug!("more queries than can wait; whoever asked asks again");
+                tracing::debug!("more queries than can wait; the sender retries");
             }
         };
         client

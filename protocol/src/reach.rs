@@ -13,7 +13,7 @@ use std::{
 const TRY_MAX: Duration = Duration::from_secs(2);
 /// Pauses between tries: the first, which doubles, and the longest.
 const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(1)];
-/// How long somebody who is no driml may take to say something.
+/// How long a foreign server may take to send its first bytes.
 const SAYS_MAX: Duration = Duration::from_secs(1);
 
 /// Why an endpoint cannot be reached.
@@ -72,8 +72,8 @@ impl Unreachable {
     }
 }
 
-/// Looks once whether something accepts connections at `endpoint`. Of `quic/` endpoints only the host is looked up, as nobody says
-/// over UDP that nobody listens.
+/// Checks once whether something accepts connections at `endpoint`. For `quic/` only the host is resolved, because UDP does not
+/// report a closed port.
 ///
 /// # Errors
 /// Why nothing does, and what to do.
@@ -158,7 +158,7 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
     }
 }
 
-/// What somebody says who listens at `endpoint` and is no driml, if that is to be seen: the first words of an answer.
+/// The first words of a foreign server that listens at `endpoint`, if it sends any.
 pub(crate) fn what_listens(endpoint: &str) -> Option<String> {
     let ("tcp", address) = endpoint.split_once('/')? else {
         return None;

@@ -1,5 +1,5 @@
 //! The thread with which an actor or the learner tells the replay server what it does.
-//! Nobody waits for it, and a report that does not arrive is not sent again: the next one follows.
+//! Nothing waits for a report, and a lost one is not sent again: the next one follows.
 
 use std::{
     thread::JoinHandle,
@@ -12,7 +12,7 @@ use crate::{
     process::{activity::Activity, fault, last_warning, shutdown::Shutdown},
 };
 
-/// How often a part reports although nothing has changed.
+/// How often a process reports although nothing has changed.
 const PERIOD: Duration = Duration::from_secs(2);
 /// How often it looks whether something has.
 const TICK: Duration = Duration::from_millis(250);

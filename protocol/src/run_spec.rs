@@ -36,7 +36,7 @@ pub enum Horizon {
         /// Environment steps ahead, at least 1.
         k_max: u32,
     },
-    /// Every k of 1..=k_max, each a positive of its own (CPC); those past the end of the episode are missing.
+    /// Every k of 1..=k_max, one positive each (CPC); those past the end of the episode are missing.
     All {
         /// Environment steps ahead, 1 to 32.
         k_max: u32,

@@ -23,7 +23,7 @@ use crate::{
     wire::{codec, error::CodecError, keys::Keys},
 };
 
-/// How a part reaches the others.
+/// How a process reaches the others.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Endpoints {
@@ -49,9 +49,9 @@ pub enum SessionError {
     /// Nothing accepts connections where the session was to connect.
     #[error(transparent)]
     Unreachable(#[from] Unreachable),
-    /// Something listens, and does not speak as the parts of a run do.
+    /// Something listens that does not speak this protocol.
     #[error(
-        "something listens on {} that is no part of driml ({what}): is the endpoint right? If it is, its process may stand still",
+        "something listens on {} that is not driml ({what}): is the endpoint right? If it is, its process may be suspended",
         .connect.join(", ")
     )]
     NotDriml {
@@ -74,14 +74,14 @@ pub enum SessionError {
     /// A certificate is not good.
     #[error(transparent)]
     Tls(#[from] TlsError),
-    /// Nobody is there who could answer.
-    #[error("{key}: nobody is there to answer")]
-    Nobody {
+    /// No process answers at this key.
+    #[error("{key}: no process answers there")]
+    NoAnswerer {
         /// Where it was asked.
         key: String,
     },
-    /// Nobody answered in time.
-    #[error("{key}: nobody answered within {within_ms} ms")]
+    /// No answer in time.
+    #[error("{key}: no answer within {within_ms} ms")]
     NoReply {
         /// Where it was asked.
         key: String,
@@ -118,10 +118,10 @@ pub enum SessionError {
     },
 }
 
-/// What zenoh answers in the place of somebody who does not.
+/// What zenoh replies where a process does not.
 const TIMED_OUT: &str = "Timeout";
 /// What zenoh says where no endpoint could be connected to.
-const NOBODY_LISTENS: &str = "Unable to connect to any of";
+const NOTHING_LISTENS: &str = "Unable to connect to any of";
 
 /// How long one message may take to go out before its link is given up: below every time-out of a question, so that a peer that
 /// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
@@ -131,15 +131,15 @@ const STALLED_MAX: Duration = Duration::from_secs(8);
 const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// How long a first try may take to find that those who listen understand; then it is looked who they are.
 const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);
-/// Longest message accepted from a peer, bytes, where a part does not know its run's sizes yet.
+/// Longest message accepted from a peer, bytes, while a process does not know its run's sizes yet.
 pub const MESSAGE_BYTES_MAX: usize = 1 << 29;
-/// The same for whoever receives settings, status and pieces of weights alone.
+/// The same for a process that only receives settings, status and pieces of weights.
 pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 
-/// Opens a session. A part that listens is the run's router; one that only connects is a client.
+/// Opens a session. A process that listens is the run's router; one that only connects is a client.
 ///
 /// # Errors
-/// An endpoint that cannot be listened on; a client whose endpoint nobody listens on after ten seconds.
+/// An endpoint that cannot be listened on; a client with nothing listening on its endpoint after ten seconds.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     open_with(endpoints, MESSAGE_BYTES_MAX, &[])
 }
@@ -173,7 +173,7 @@ pub fn open_as(
     open_with(endpoints, message_bytes_max, &settings)
 }
 
-/// [`open_as`] of a part that has to wait for its replay server; `None` if it is told to stop before.
+/// [`open_as`] of a process that has to wait for its replay server; `None` if it is told to stop before.
 ///
 /// # Errors
 /// As [`open_as`].
@@ -242,8 +242,8 @@ fn open_with(
         ("scouting/gossip/enabled", "false"),
         ("transport/unicast/open_timeout", "2000"),
         ("transport/unicast/accept_timeout", "5000"),
-        // Long enough for a machine that is busy with much else: a part that got no processor for a while is not gone. One that
-        // died is known at once, as its connection closes; over QUIC, which has no system to close it, after this long.
+        // Long enough for a machine that is busy with much else: a process that got no processor for a while is not gone. One
+        // that died is known at once, as its connection closes; over QUIC, which has no system to close it, after this long.
         ("transport/link/tx/lease", "30000"),
         ("transport/link/tx/queue/size/data", "16"),
         (
@@ -252,7 +252,7 @@ fn open_with(
         ),
         ("transport/link/rx/max_message_size", &max),
         ("transport/link/rx/buffer_size", "4194304"),
-        // Only what a part itself puts into shared memory goes through it.
+        // Only what a process itself puts into shared memory goes through it.
         (
             "transport/shared_memory/transport_optimization/enabled",
             "false",
@@ -274,8 +274,8 @@ fn open_with(
     };
     let open = |connect_ms: &str| {
         open_within("true", connect_ms).or_else(|why| {
-            // Without shared memory nobody would be there either.
-            if why.contains(NOBODY_LISTENS) {
+            // Without shared memory nothing would listen either.
+            if why.contains(NOTHING_LISTENS) {
                 return Err(why);
             }
             tracing::debug!("trying again without shared memory: {why}");
@@ -296,25 +296,25 @@ fn open_with(
     };
     let milliseconds = |it: Duration| it.as_millis().to_string();
     let why = match open(&milliseconds(UNDERSTOOD_MAX)) {
-        Err(why) if why.contains(NOBODY_LISTENS) => why,
+        Err(why) if why.contains(NOTHING_LISTENS) => why,
         opened => return opened.map_err(fail),
     };
-    // A part of the run may be slow on a busy machine, and then it says nothing; somebody else may say who it is.
+    // A process of the run may be slow on a busy machine, and then sends nothing; a foreign server may introduce itself.
     let mut listening = endpoints.connect.iter();
     if let Some(words) = listening.find_map(|it| reach::what_listens(it)) {
         return Err(not_driml(format!("it says {words:?}")));
     }
     tracing::debug!("trying again: {why}");
     open(&milliseconds(CONNECT_MAX.saturating_sub(UNDERSTOOD_MAX))).map_err(|why| {
-        match why.contains(NOBODY_LISTENS) {
+        match why.contains(NOTHING_LISTENS) {
             true => not_driml("it says nothing that could be understood".into()),
             false => fail(why),
         }
     })
 }
 
-/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays. For whoever
-/// starts a run, or joins one by hand: many parts that start at once need not all look.
+/// Removes the shared memory of processes that ended without doing so, as killed ones do; that of living ones stays. For the
+/// launcher and for processes started by hand: many processes that start at once need not all look.
 pub fn sweep_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
 }
@@ -325,7 +325,7 @@ pub struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
-    /// Why what has come so far is no answer.
+    /// Why the replies so far are no answer.
     failed: Option<SessionError>,
 }
 
@@ -343,7 +343,7 @@ pub fn send(
     let replies = session
         .get(key)
         .payload(payload)
-        // Whoever answers in the replay server's place, too: of one alone zenoh might choose that one.
+        // Foreign processes that answer, too: with one target zenoh might choose one of them.
         .target(QueryTarget::All)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Block)
@@ -366,12 +366,12 @@ impl PendingBytes {
     /// Waits for the one answer.
     ///
     /// # Errors
-    /// Nobody there (at once), no answer in time, or the answerer's own error. All may be tried again.
+    /// No process answers (at once), no answer in time, or the answerer's error. All may be tried again.
     pub fn wait(mut self) -> Result<ZBytes, SessionError> {
         self.wait_for(|bytes| Ok(bytes.clone()))
     }
 
-    /// Waits for the one answer that `read` takes. Where there are no certificates others may answer too, what they like.
+    /// Waits for the one answer that `read` takes. Without certificates foreign processes may answer, too.
     pub(crate) fn wait_for<T>(
         &mut self,
         read: impl Fn(&ZBytes) -> Result<T, CodecError>,
@@ -411,8 +411,8 @@ impl PendingBytes {
     ) -> Result<Option<T>, SessionError> {
         let key = || self.key.clone();
         let Some(reply) = reply else {
-            let nobody = || SessionError::Nobody { key: key() };
-            return Err(self.failed.take().unwrap_or_else(nobody));
+            let none = || SessionError::NoAnswerer { key: key() };
+            return Err(self.failed.take().unwrap_or_else(none));
         };
         let failed = match reply.into_result() {
             Ok(sample) => match read(sample.payload()) {

@@ -10,7 +10,7 @@ use crate::config::Config;
 ///
 /// Its one quantity is the credit, in rows: replay ratio * transitions after the warm-up - rows sampled. A batch of B rows
 /// needs a credit of B; inserts wait while the credit is above slack * replay ratio. With slack * replay ratio >= B at least
-/// one side can always go on. Source: the rate limiter of Reverb (Cassirer et al. 2021), with the ratio counted exactly.
+/// one side can always proceed. Source: the rate limiter of Reverb (Cassirer et al. 2021), with the ratio counted exactly.
 ///
 /// `replay_ratio` is rlpyt's word for Reverb's `samples_per_insert`: rows sampled per transition inserted, not updates per step.
 #[derive(Clone, Debug)]
@@ -95,14 +95,14 @@ impl RateLimiter {
     ///
     /// # Errors
     /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person. `held_max` are
-    /// the transitions that a shard may store before it hears of the others.
+    /// the transitions that a shard may store before the others report.
     pub fn set_other_shards(&mut self, others: Tally, held_max: u64) -> Result<(), String> {
         let before = self.counts.other_shards;
         let max = self.transitions_max.unwrap_or(u64::MAX);
         let most = max.max(before.inserted).saturating_add(held_max);
         if others.inserted > most {
             return Err(format!(
-                "the other shards are said to have stored {} transitions; this run has at most {most}",
+                "the other shards' count of stored transitions is {}; this run has at most {most}",
                 others.inserted
             ));
         }
@@ -114,7 +114,7 @@ impl RateLimiter {
         let most_rows = allowed.max(before.rows_sampled as f64) + ahead;
         if others.rows_sampled as f64 > most_rows {
             return Err(format!(
-                "the other shards are said to have given {} rows; for {inserted} transitions a run gives at most {most_rows:.0}",
+                "the other shards' count of sampled rows is {}; for {inserted} transitions a run samples at most {most_rows:.0}",
                 others.rows_sampled
             ));
         }
@@ -214,7 +214,7 @@ impl RateLimiter {
         } else if !self.may_insert() && !self.all_in() {
             Waiting::ActorsWaitForLearner
         } else {
-            Waiting::Nobody
+            Waiting::Neither
         }
     }
 }

@@ -14,7 +14,7 @@ use zenoh::{Session, Wait, qos::Priority};
 
 use crate::waiting::{DEADLINE, wait_for};
 
-/// The prefix of a run's keys unless a part is told otherwise.
+/// The prefix of a run's keys unless a process is told otherwise.
 const NAMESPACE: &str = "driml";
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
@@ -25,7 +25,7 @@ pub struct Client {
     pub session: Session,
     /// The run's keys.
     pub keys: Keys,
-    /// What all parts of the run agree on.
+    /// What all processes of the run agree on.
     pub spec: RunSpec,
     /// The run's resolved settings.
     pub config_toml: String,
@@ -55,7 +55,7 @@ impl Client {
         let keys = Keys::new(NAMESPACE).unwrap();
         let hello = join::hello(&session, &keys, &Shutdown::default())
             .unwrap()
-            .expect("nobody tells this client to stop");
+            .expect("this client is not told to stop");
         let spec = Settings::parse(&hello.config_toml)
             .unwrap()
             .table("run")
@@ -91,7 +91,7 @@ impl Client {
     /// Sends bytes and gives the bytes of the answer.
     ///
     /// # Errors
-    /// Nobody answered.
+    /// No process answered.
     pub fn ask(&self, key: &str, payload: Vec<u8>) -> Result<Vec<u8>, SessionError> {
         session::ask(
             &self.session,
@@ -103,7 +103,7 @@ impl Client {
         .map(|answer| answer.to_bytes().into_owned())
     }
 
-    /// The session, keys and hash, as the parts of the run have them.
+    /// The session, keys and hash, as the processes of the run have them.
     pub fn run(&self) -> RunClient {
         RunClient::new(self.session.clone(), self.keys.clone(), self.spec.hash())
     }
@@ -170,7 +170,7 @@ impl Client {
     /// Sends bytes to the place where the chunks of `actor` go.
     ///
     /// # Panics
-    /// If nobody answers, or not in the run's own words.
+    /// If no process answers, or the answer cannot be read.
     pub fn insert_bytes(&self, actor: u32, bytes: Vec<u8>) -> InsertReply {
         let reply = self
             .ask(&self.keys.of_actor::<ChunkHeader>(actor), bytes)
@@ -179,7 +179,7 @@ impl Client {
     }
 }
 
-/// A chunk's bytes as a part of the run with this hash would send them.
+/// A chunk's bytes as a process of the run with this hash would send them.
 fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
     let (mut bytes, payload) = chunk.seal(spec_hash).unwrap();
     bytes.extend_from_slice(payload);
@@ -188,7 +188,7 @@ fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        // Its router may be gone already, which is no fault of the test's.
+        // Its router may be gone already, which is not the test's fault.
         let _ = self.session.close().wait();
     }
 }

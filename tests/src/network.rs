@@ -1,4 +1,4 @@
-//! Machines of their own on one: network namespaces with addresses, each on a link of its own to a router in the middle.
+//! Several machines on one: network namespaces with addresses, each linked to a router in the middle.
 //! It needs the right to make them, and changes nothing of the host's own network.
 
 use std::{
@@ -116,7 +116,7 @@ impl Network {
             .to_vec()
     }
 
-    /// Pulls a machine's cable: what is on its way is lost, and nobody hears of it.
+    /// Pulls a machine's cable: what is in flight is lost, without an error on either side.
     pub fn cut(&self, machine: &str) {
         self.set(machine, "down");
     }
@@ -151,7 +151,7 @@ impl Drop for Network {
     fn drop(&mut self) {
         let machines = self.machines.iter().map(|it| self.namespace(it));
         for namespace in machines.chain([self.router()]) {
-            // One that was not made yet is no loss.
+            // One that was not made yet does not matter.
             let _ = ip(&format!("netns del {namespace}"));
         }
     }

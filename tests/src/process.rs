@@ -135,7 +135,7 @@ impl Process {
     pub fn wait(mut self) -> Ended {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
-        // Its pipes close with it, as no child of its own holds them.
+        // Its pipes close with it, as it has no child that holds them.
         wait_for(&format!("the last output of {}", self.name), || {
             (self.stdout.reader.is_finished() && self.stderr.reader.is_finished()).then_some(())
         });

@@ -125,7 +125,7 @@ impl RunFolder {
         let row = |line: &str| {
             let cells: Vec<_> = line.split(',').collect();
             let [seconds, frames, episode, actor, copy, value, length] = cells[..] else {
-                panic!("{line:?} is no row of episodes");
+                panic!("{line:?} is not a row of episodes");
             };
             let count = |cell: &str| cell.parse().unwrap();
             EpisodeRow {
@@ -167,7 +167,7 @@ impl RunFolder {
         assert_eq!(rows.len() as u64, summary.episodes, "each has a row");
     }
 
-    /// A part's log.
+    /// A process's log.
     pub fn log(&self, part: &str) -> String {
         self.text(&format!("logs/{part}.log"))
     }

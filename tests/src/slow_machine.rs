@@ -24,7 +24,7 @@ pub struct SlowMachine {
 }
 
 impl SlowMachine {
-    /// Slows the process of this number down; one that has ended meanwhile is no error.
+    /// Slows the process of this number down; one that has ended meanwhile is ignored.
     pub fn for_process(pid: i32) -> Self {
         let done = Shutdown::default();
         let until = done.clone();

@@ -49,7 +49,7 @@ pub struct Survivor {
 }
 
 impl TestSystem {
-    /// A system of its own, in a fresh folder; `program` is the binary under test.
+    /// A new system, in a fresh folder; `program` is the binary under test.
     pub fn new(program: &str) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -73,7 +73,7 @@ impl TestSystem {
         self.held_at.store(updates, Ordering::Relaxed);
     }
 
-    /// Lets learners go on that are held, and holds no more.
+    /// Releases the learners that are held, and holds no more.
     pub fn let_go(&self) {
         fs::write(self.path(GO), "").unwrap();
     }
@@ -88,7 +88,7 @@ impl TestSystem {
         RunFolder::new(self.path(name))
     }
 
-    /// The endpoint at which this system's parts meet: a unix socket, so that no port can be taken.
+    /// The endpoint at which this system's processes meet: a unix socket, so that no port can be taken.
     pub fn endpoint(&self) -> String {
         format!("unixsock-stream/{}", self.path("s").display())
     }
@@ -98,7 +98,7 @@ impl TestSystem {
         Process::start(args.to_owned(), self.command(args))
     }
 
-    /// [`Self::start`] with one more variable in the environment, which all parts of a run inherit.
+    /// [`Self::start`] with one more variable in the environment, which all processes of a run inherit.
     pub fn start_with(&self, variable: &str, value: &str, args: &str) -> Process {
         let mut command = self.command(args);
         command.env(variable, value);
@@ -138,7 +138,7 @@ impl TestSystem {
         self.start(args).wait()
     }
 
-    /// Starts a part that would wait for signals for ever; it ends with this test, however that ends.
+    /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
     pub fn start_part(&self, args: &str) -> Process {
         let parent = std::process::id();
         self.start(&format!("{args} --exit-with-parent {parent}"))
@@ -236,7 +236,7 @@ impl TestSystem {
 }
 
 impl Survivor {
-    /// Sends a signal; a process that has ended meanwhile is no error.
+    /// Sends a signal; a process that has ended meanwhile is ignored.
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);
     }

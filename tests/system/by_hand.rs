@@ -1,4 +1,4 @@
-//! The parts as a person starts them in terminals: joined by an endpoint alone, ended by signals.
+//! Processes started by hand in terminals: joined by an endpoint alone, ended by signals.
 //! The launcher has no part in it.
 
 use std::fs;
@@ -18,7 +18,7 @@ fn parts_find_each_other_and_end_in_order() {
     let second = system.start_actor(7);
     let client = system.connect();
 
-    // Actors hear from the replay server that all is in, and end by themselves.
+    // Actors learn from the replay server that the run is complete, and exit.
     first.wait().expect_code(0).expect_said("actor 0 leaves");
     second.wait().expect_code(0).expect_said("actor 7 leaves");
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
@@ -155,7 +155,7 @@ fn parts_that_are_told_to_stop_lose_nothing() {
 }
 
 #[test]
-fn an_actor_killed_and_started_again_goes_on() {
+fn an_actor_killed_and_started_again_continues() {
     let system = system();
     // The first actor cannot finish it before it is killed.
     system.hold_at(100);
@@ -180,7 +180,7 @@ fn an_actor_killed_and_started_again_goes_on() {
     client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.replay().unwrap();
     assert!(replay.transitions_inserted >= 20_008 && replay.finished);
-    // A killed actor says no goodbye: what it had and did not deliver was never announced, and is missed by nobody.
+    // A killed actor sends no goodbye: what it had and did not deliver was never announced, and is in no count.
     assert_eq!(
         (
             replay.transitions_lost,
@@ -192,9 +192,9 @@ fn an_actor_killed_and_started_again_goes_on() {
     learner.stop().expect_code(0);
 }
 
-/// A learner that was killed goes on from its newest checkpoint, and the actors take its weights.
+/// A learner that was killed continues from its newest checkpoint, and the actors take its weights.
 #[test]
-fn a_killed_learner_s_successor_goes_on() {
+fn a_killed_learner_s_successor_continues() {
     let system = system();
     let settings = "--set learner.checkpoint_period_updates=50";
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG} {settings}"));
@@ -231,7 +231,7 @@ fn a_killed_learner_s_successor_goes_on() {
     server.stop().expect_code(0);
 }
 
-/// Whoever starts it, a part has the environment that candle and the C library read; what the user has set stays.
+/// However it is started, a process has the environment that candle and the C library read; what the user has set stays.
 #[test]
 fn a_part_by_hand_settles_its_environment() {
     let system = system();

@@ -96,7 +96,7 @@ fn end(child: &mut Child) -> ExitStatus {
     wait_for("the launcher's end", || child.try_wait().unwrap())
 }
 
-/// What is left is what an interrupt leaves: all is saved, no process runs.
+/// The result is that of an interrupt: everything is saved, no process runs.
 fn check_saved(system: &TestSystem, ended: ExitStatus) {
     assert_eq!(ended.code(), Some(130), "{ended}");
     assert_eq!(system.survivors(), []);
@@ -148,7 +148,7 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     check_saved(&system, end(&mut child));
 }
 
-/// A run of parts started by hand that has learned something: replay server, learner, actor.
+/// A run of processes started by hand that has learned something: replay server, learner, actor.
 fn by_hand(system: &TestSystem) -> [Process; 3] {
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let parts = [server, system.start_learner("run"), system.start_actor(0)];

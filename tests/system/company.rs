@@ -1,5 +1,5 @@
-//! Many parts at once: actors at a closed limiter, a client that stands still, two processes that play one part.
-//! What one server and one actor promise each other is in `by_hand`; how parts die is in `failures`.
+//! Many processes at once: actors at a closed limiter, a suspended client, two processes with one role.
+//! One server with one actor is in `by_hand`; dying processes are in `failures`.
 
 use std::time::{Duration, Instant};
 
@@ -98,7 +98,7 @@ impl SyntheticActor {
         }
     }
 
-    /// Sends chunk after chunk, as fast as it may, until it is told to stop; then delivers what it has, although nobody makes
+    /// Sends chunk after chunk, as fast as it may, until it is told to stop; then delivers what it has, although nothing makes
     /// room. Gives the number of its transitions.
     fn run(mut self, stop: &Shutdown) -> u64 {
         while !stop.is_set() {
@@ -152,10 +152,10 @@ fn an_actor_waits_for_as_long_as_it_must() {
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
 }
 
-/// A model whose weights are 5 MB, sent to the actors after each update: whoever is frozen is likely in the middle of a pull.
+/// A model whose weights are 5 MB, sent to the actors after each update: a frozen process is likely in the middle of a pull.
 const LARGE: &str = "--set model.hidden=4096 --set learner.publish_period_updates=1";
 
-/// An actor that is stopped in the middle of whatever it does holds up the others for seconds, and goes on when it is let go.
+/// An actor that is suspended in the middle of its work delays the others for seconds, and continues when it is released.
 #[test]
 fn a_frozen_actor_does_not_stop_the_others() {
     let system = system();

@@ -1,4 +1,4 @@
-//! A run folder on a disk that is full: the run goes on, says so once, and keeps the first error as the one it ends with.
+//! A run folder on a disk that is full: the run continues, logs it once, and ends with the first error.
 //! The disk is a small one in memory, which takes root's rights to mount; without them a line says what is skipped.
 
 use std::{
@@ -87,9 +87,9 @@ fn times(said: &str, words: &str) -> usize {
 }
 
 #[test]
-fn a_run_goes_on_while_the_disk_is_full() {
+fn a_run_continues_while_the_disk_is_full() {
     let system = system();
-    let name = "a_run_goes_on_while_the_disk_is_full";
+    let name = "a_run_continues_while_the_disk_is_full";
     let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
         return;
     };
@@ -154,7 +154,7 @@ fn the_first_error_is_the_one_shown() {
     for line in ended.stderr.lines() {
         assert!(
             times(line, "No space left") <= 1,
-            "a cause is said once: {line}"
+            "a cause is logged once: {line}"
         );
     }
     filler.remove();

@@ -1,4 +1,4 @@
-//! A run whose arithmetic leaves the finite numbers: it fails, says so, and leaves nothing that cannot be gone on from.
+//! A run whose arithmetic leaves the finite numbers: it fails, says so, and leaves only checkpoints that can be resumed.
 //! What an update refuses is the learner's own test.
 
 use std::fs;

@@ -67,7 +67,7 @@ fn session_with(system: &TestSystem) -> zenoh::Session {
     .unwrap()
 }
 
-/// Delivers all of one actor's chunks; each transition is an episode of its own whose return is its number.
+/// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
 fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
     let limits = DeliveryLimits {
         chunks_in_flight_max: 4,
@@ -143,7 +143,7 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     }
 }
 
-/// The numbers of all transitions in a replay that nobody uses any more: of rows that are drawn from it as often as need be.
+/// The numbers of all transitions in a replay that is no longer in use: of rows that are drawn from it as often as need be.
 fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
     let mut config: Config = Settings::parse(config_toml)
         .unwrap()
@@ -337,7 +337,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     assert_eq!(system.survivors(), []);
 }
 
-/// Whoever started the parts by hand starts the server again, with the same flags. An actor that starts then has weights although
+/// The processes were started by hand; the server is started again, with the same flags. An actor that starts then has weights although
 /// the learner, which waits for transitions, publishes none.
 #[test]
 fn parts_by_hand_go_on_when_the_server_is_started_again() {
@@ -416,7 +416,7 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
 }
 
 #[test]
-fn a_resumed_run_goes_on_with_its_replay() {
+fn a_resumed_run_continues_with_its_replay() {
     let system = system();
     let process = system.start(&format!(
         "local --durable --agent driml-ada {LONG} --listen {} --run-dir run",
@@ -460,14 +460,14 @@ fn a_resumed_run_goes_on_with_its_replay() {
         log.contains("continues with the replay in run/replay"),
         "{log}"
     );
-    // The log may have heard of updates that no checkpoint holds.
+    // The log may know of updates that no checkpoint holds.
     let warns = |line: &&str| line.contains("WARN") && !line.contains("to be learned again");
     assert_eq!(log.lines().find(warns), None, "{log}");
 }
 
-/// Its parts still end while the next launcher starts: the replay server, which waits for a frozen actor, holds replay and endpoint.
+/// Its processes still end while the next launcher starts: the replay server, which waits for a frozen actor, holds replay and endpoint.
 #[test]
-fn a_run_whose_launcher_was_killed_goes_on() {
+fn a_run_whose_launcher_was_killed_continues() {
     let system = system();
     let listen = format!("--listen {}", system.endpoint());
     let process = system.start(&format!(
@@ -491,11 +491,11 @@ fn a_run_whose_launcher_was_killed_goes_on() {
     check_exactly_once(&run);
 }
 
-/// While there is no room nothing is taken and nothing served; then all goes on, and nothing was lost.
+/// While there is no room nothing is stored and nothing served; then everything continues, and nothing was lost.
 #[test]
-fn a_full_disk_makes_everybody_wait_until_there_is_room() {
+fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();
-    let name = "a_full_disk_makes_everybody_wait_until_there_is_room";
+    let name = "a_full_disk_makes_all_processes_wait_until_there_is_room";
     let Some(disk) = Disk::mount(name, system.path("disk"), 20_000) else {
         return;
     };

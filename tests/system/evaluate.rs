@@ -212,9 +212,9 @@ fn a_finished_run_says_what_its_weights_earn() {
     }
 }
 
-/// Checkpoints of a run of processes, and of one in lockstep, are played as it goes on; the best is kept.
+/// Checkpoints of a run of processes, and of one in lockstep, are played during the run; the best is kept.
 #[test]
-fn it_plays_checkpoints_while_the_run_goes_on() {
+fn it_plays_checkpoints_while_the_run_continues() {
     let system = system();
     for (name, lockstep, rows_min) in [("processes", "", 1), ("lockstep", "--lockstep", 5)] {
         let flags = "--agent c51 --evaluate-every 100 --evaluate-episodes 4";
@@ -286,7 +286,7 @@ fn an_evaluation_can_be_kept_by_hand() {
     system
         .run("evaluate run --checkpoint best --episodes 1")
         .expect_code(0);
-    // The episodes that choose are none that anybody asks for.
+    // The episodes that choose are never those of a report.
     system
         .run(&format!("{keep} --seed 0"))
         .expect_code(64)

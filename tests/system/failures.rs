@@ -1,4 +1,4 @@
-//! Runs that end before their time: Ctrl-C, a part that dies, a launcher that dies. No process is ever left.
+//! Runs that end early: Ctrl-C, a process that dies, a launcher that dies. No process is ever left.
 //! What a dead part's successor may do is in `by_hand`.
 
 use std::{fs, process::Command};
@@ -31,7 +31,7 @@ fn a_second_interrupt_ends_at_once() {
     system.find_part("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
-    // Signals at nearly the same time are one wish, so this presses until it is heard.
+    // Signals at nearly the same time count as one request, so this repeats it until it is noticed.
     wait_for("the launcher's end", || {
         if process.is_running() {
             process.signal(Signal::SIGINT);
@@ -126,7 +126,7 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     assert_eq!(system.survivors(), []);
 }
 
-/// Kills one part of a run; the launcher must say which and how to go on, and end the others.
+/// Kills one process of a run; the launcher must name it, say how to continue, and end the others.
 fn dies(part: &str, name: &str) {
     let system = system();
     let process = launched(&system, 100);
@@ -222,7 +222,7 @@ fn parts_end_with_their_launcher() {
     let process = launched(&system, 100);
     process.signal(Signal::SIGKILL);
     process.wait();
-    wait_for("the end of all parts", || {
+    wait_for("the end of all processes", || {
         system.survivors().is_empty().then_some(())
     });
     assert!(
@@ -234,7 +234,7 @@ fn parts_end_with_their_launcher() {
 /// They all hear of it at once: the replay server stays until the others have delivered what they have and left.
 #[test]
 fn parts_whose_launcher_died_deliver_what_they_have() {
-    /// A launcher of three parts; each writes into a file what it says.
+    /// A launcher of three processes, each with a file for its output.
     const LAUNCHER: &str = "
         driml=$1 endpoint=$2; shift 2
         $driml replay-server --listen $endpoint $* --exit-with-parent $$ 2> server &
@@ -258,14 +258,14 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
     client.wait_for_learner("some updates", |learner| learner.updates > 100);
     drop(client);
     launcher.signal(Signal::SIGKILL);
-    wait_for("the end of all parts", || {
+    wait_for("the end of all processes", || {
         system.survivors().is_empty().then_some(())
     });
     let said = |part: &str| std::fs::read_to_string(system.path(part)).unwrap();
     for (part, words) in [
         ("actor", "actor 0 leaves: "),
         ("learner", "finished after "),
-        ("server", "this process is to end, and 0 parts are left"),
+        ("server", "this process is to end, and 0 processes are left"),
     ] {
         assert!(said(part).contains(words), "{}", said(part));
     }
@@ -284,7 +284,7 @@ fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
         (!system.survivors().contains(&server)).then_some(())
     });
     actor.signal(Signal::SIGKILL);
-    wait_for("the end of all parts", || {
+    wait_for("the end of all processes", || {
         system.survivors().is_empty().then_some(())
     });
 }

@@ -8,10 +8,10 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
 
-/// The parts of a run.
+/// The processes of a run.
 const PARTS: [&str; 3] = ["replay-server", "learner", "actor"];
 
-/// A run that has learned something, whose temporary folder is `tmp` in the system's; and its parts.
+/// A run that has learned something, whose temporary folder is `tmp` in the system's; and its processes.
 fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
     let temporary = system.path("tmp");
     fs::create_dir_all(&temporary).unwrap();
@@ -30,7 +30,7 @@ fn temporary(system: &TestSystem) -> Vec<PathBuf> {
 }
 
 fn wait_until_all_have_ended(system: &TestSystem) {
-    wait_for("the end of all parts", || {
+    wait_for("the end of all processes", || {
         system.survivors().is_empty().then_some(())
     });
 }
@@ -57,7 +57,7 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
     process.wait();
     wait_until_all_have_ended(&system);
-    assert_eq!(temporary(&system).len(), 1, "nobody could remove it");
+    assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
     let temporary_folder = system.path("tmp");
     let next = format!("local --agent c51 {SHORT} --run-dir next");
     system
@@ -109,11 +109,11 @@ fn shared_memory_of_killed_parts_is_removed() {
     check_gone(&segments);
 }
 
-/// The shared memory that the parts have open.
+/// The shared memory that the processes have open.
 fn all_shared_memory_of(parts: &[Survivor]) -> Vec<PathBuf> {
     let files = parts.iter().flat_map(|part| shared_memory_of(part.pid));
     let files: Vec<_> = files.collect();
-    assert!(files.len() > 1, "the parts share memory: {files:?}");
+    assert!(files.len() > 1, "the processes share memory: {files:?}");
     files
 }
 

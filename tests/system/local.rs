@@ -120,7 +120,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     let run = system.start(&format!(
         "local --agent c51 {LONG} --listen {endpoint} --run-dir run"
     ));
-    // It is the replay server of the run in which all parts meet.
+    // All processes of the run meet at this replay server.
     system.find_part("learner");
     let mut outside = system.start_part(&format!("actor --connect {endpoint} --id 5"));
     outside.wait_for_stderr("actor 5 steps 4 copies");
@@ -139,7 +139,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     assert_eq!(actors, BTreeSet::from([0, 5]));
 }
 
-/// An endpoint that nobody listens on, at a loopback address of this process's own so that nobody takes it meanwhile.
+/// An unused endpoint, at a loopback address of this process so that no other takes it meanwhile.
 fn free_tcp_endpoint() -> String {
     let [_, high, middle, low] = std::process::id().to_be_bytes();
     let address = Ipv4Addr::new(127, high, middle, low);
@@ -231,7 +231,7 @@ fn the_settings_that_a_run_leaves_repeat_it() {
     );
 }
 
-/// Two actors, each with a replay server of its own, and one learner: the counts are those of one replay.
+/// Two actors, one replay server each, and one learner: the counts are those of one replay.
 #[test]
 fn two_replay_shards_are_one_replay() {
     let system = system();
@@ -242,7 +242,7 @@ fn two_replay_shards_are_one_replay() {
         .expect_code(0);
     assert_eq!(system.survivors(), []);
     let summary = system.run_folder("run").check("finished");
-    // Each of the two limiters lets chunks in until it hears of the other's.
+    // Each of the two limiters admits chunks until it learns of the other's.
     assert!((1280..=1800).contains(&summary.frames), "{summary:#?}");
     assert_eq!(summary.updates * 16, summary.rows_sampled);
     let owed = (summary.frames - 200) * 8 / 16;

@@ -45,7 +45,7 @@ fn the_seed_decides_the_weights_in_bf16_too() {
     assert_ne!(first.weights_sha256, f32.weights_sha256);
 }
 
-/// Starts a run, ends it with `signal` once it has saved and goes on, and resumes it to its end.
+/// Starts a run, ends it with `signal` some time after a save, and resumes it to its end.
 fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
     system.hold_at(400);
     let process = system.start(&format!("local --lockstep {flags} --run-dir run"));
@@ -81,7 +81,7 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
                  --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=200";
     let of = |agent: &str| format!("{flags} --agent {agent}");
     let whole = run(&system(), &of("driml-ada"), "whole");
-    // Its noise goes on, in the learner and in the actors.
+    // Its noise continues, in the learner and in the actors.
     let rainbow = run(&system(), &of("rainbow"), "whole");
     for (agent, whole, signal) in [
         ("driml-ada", &whole, Signal::SIGINT),

@@ -175,7 +175,7 @@ fn deliver(actor: u32, delivery: &Delivery) {
         for row in 0..STEPS as usize {
             let number =
                 u64::from(actor) * CHUNKS * u64::from(STEPS) + first_transition + row as u64;
-            // Each is an episode of its own, so that its return is its own number.
+            // Each is one episode, so that its return is its number.
             chunk.set(row, 0, number as f32, End::Terminal);
         }
         assert!(delivery.send(chunk));

@@ -53,7 +53,7 @@ fn system() -> TestSystem {
 /// 1280 frames are whole chunks of one or two actors (4 copies x 8 steps), and (1280 - 200) * 8 / 16 is whole.
 const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.replay_ratio=8";
 
-/// A run on the chain that nobody waits for: it is ended from outside, long before its last frame.
+/// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
 
 /// Rows drawn by priority, with Rainbow's numbers.

@@ -1,4 +1,4 @@
-//! Worlds of a user's own: a process that the actor starts, through all parts of a run; and what is said when it fails.
+//! Custom worlds: a process that the actor starts, in a whole run; and the errors when it fails.
 //! What passes between an actor and such a process is tested beside the worlds.
 
 use std::{fs, path::Path};
@@ -87,7 +87,7 @@ fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
 }
 
 /// Runs it whole; ended by each signal and resumed; and finished after half of its frames and prolonged. All come to the same.
-fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
+fn lockstep_continues(env: &str, flags: &str, frames: u64) {
     let system = system();
     let run = |frames: u64, name: &str| {
         let args = format!("local --lockstep {flags} --frames {frames} --run-dir {name}");
@@ -133,11 +133,11 @@ fn lockstep_goes_on(env: &str, flags: &str, frames: u64) {
 }
 
 #[test]
-fn a_process_that_saves_its_state_goes_on_exactly_in_lockstep() {
+fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
     let flags = format!(
         "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
     );
-    lockstep_goes_on(&numbered("saves"), &flags, 4096);
+    lockstep_continues(&numbered("saves"), &flags, 4096);
 }
 
 #[test]
@@ -230,7 +230,7 @@ fn a_command_that_is_no_world_is_refused_before_anything_starts() {
 }
 
 #[test]
-fn an_actor_starts_no_command_that_nobody_on_its_machine_has_named() {
+fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let system = system();
     let flags = format!(
         "replay-server --listen {} {SMALL} --agent c51 --frames 100000000 --exit-with-parent {}",
@@ -261,7 +261,7 @@ fn an_actor_starts_no_command_that_nobody_on_its_machine_has_named() {
     wait_for("the world's hanging", || {
         hanging.stderr().contains("sleeping").then_some(())
     });
-    // A process that hears nothing does not outlive its actor, however that ends.
+    // A process that ignores its pipes does not outlive its actor, however that ends.
     let worlds = || {
         let is_world = |word: &String| word.ends_with("numbered.py");
         let all = system.survivors().into_iter();
@@ -341,8 +341,8 @@ fn atari_by_gymnasium_trains() {
 
 /// ALE's emulator, wrappers and generators come back as they were.
 #[test]
-fn atari_goes_on_exactly_in_lockstep() {
-    let Some(python) = gymnasium("own_worlds::atari_goes_on_exactly_in_lockstep") else {
+fn atari_continues_exactly_in_lockstep() {
+    let Some(python) = gymnasium("own_worlds::atari_continues_exactly_in_lockstep") else {
         return;
     };
     let env = format!(
@@ -352,7 +352,7 @@ fn atari_goes_on_exactly_in_lockstep() {
     let flags = format!(
         "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
     );
-    lockstep_goes_on(&env, &flags, 2048);
+    lockstep_continues(&env, &flags, 2048);
 }
 
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.

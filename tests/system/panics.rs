@@ -6,7 +6,7 @@ use driml_tests::{Ended, TestSystem};
 
 use crate::{LONG, PRIORITISED, system};
 
-/// The threads of the parts of an ordinary run: the part as the launcher calls it, and the point that the thread passes.
+/// The threads of an ordinary run: the process's name in the launcher, and the point that the thread passes.
 const THREADS: [(&str, &str); 22] = [
     ("replay-server", "insert"),
     ("replay-server", "claim"),
@@ -54,7 +54,7 @@ fn panicking(system: &TestSystem, point: &str, flags: &str) -> Ended {
     ended
 }
 
-/// A thread of a part that panics at `point`, after which the launcher names the part.
+/// A thread that panics at `point`, after which the launcher names the process.
 fn ends_the_run((part, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = panicking(&system, point, flags);
@@ -103,7 +103,7 @@ fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
     }
 }
 
-/// The launcher itself, after whose death the parts end by themselves.
+/// The launcher itself, after whose death the other processes exit.
 #[test]
 fn a_panic_in_the_launcher_ends_the_run() {
     if skipped("a_panic_in_the_launcher_ends_the_run") {
@@ -120,7 +120,7 @@ fn a_panic_in_the_launcher_ends_the_run() {
         );
         let said = format!("error: the thread {point} panicked");
         assert!(ended.stderr.contains(&said), "{point}: {ended:#?}");
-        driml_tests::wait_for("the end of all parts", || {
+        driml_tests::wait_for("the end of all processes", || {
             system.survivors().is_empty().then_some(())
         });
     }

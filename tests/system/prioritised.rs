@@ -48,9 +48,9 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
     }
 }
 
-/// Its transitions come back, with the highest priority each; losses of rows that it drew before are not taken for those of others.
+/// Its transitions come back, with the highest priority each; losses of rows that it drew before are not mistaken for those of others.
 #[test]
-fn a_replay_server_that_dies_goes_on_with_equal_priorities() {
+fn a_replay_server_that_dies_continues_with_equal_priorities() {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 6400");
     system.hold_at(1_000);

@@ -197,7 +197,7 @@ fn optuna_searches() {
         said.contains("best: ") && said.contains("replay_ratio"),
         "{said}"
     );
-    // It goes on: the second trial is number 1.
+    // It continues: the second trial is number 1.
     search();
     for trial in ["trial0-seed1", "trial0-seed2", "trial1-seed2"] {
         assert!(out.join(trial).join("summary.json").exists(), "{trial}");

@@ -1,4 +1,4 @@
-//! A replay server that has a long log to read back: everybody hears how far it is, waits, and goes on; nothing is lost or doubled.
+//! A replay server that has a long log to read back: all processes learn the progress, wait, and continue; nothing is lost or doubled.
 //! The log is real, and its server gets little of the processor, as on a slow machine: nothing in the program waits for these tests.
 
 use std::{borrow::Cow, fs, path::Path, time::Duration};
@@ -16,15 +16,15 @@ use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
 
-/// Transitions in the log, each in a record of its own.
+/// Transitions in the log, one record each.
 const KEPT: u64 = 1_000_000;
-/// Updates of a run that goes on with them: one of 16 rows for 1,024 transitions after the warm-up.
+/// Updates of a run that continues with them: one of 16 rows for 1,024 transitions after the warm-up.
 const UPDATES: u64 = 991;
 const WARMUP: u64 = 192;
 const FRAMES: u64 = WARMUP + 1024 * UPDATES;
-/// How long the parts of these runs would wait for a server that is silent, seconds.
+/// How long the processes of these runs would wait for an unresponsive server, seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
-/// What whoever waits says.
+/// What a waiting process logs.
 const WAITING: &str =
     "waiting for as long as it takes: the replay server reads its replay back from disk, ";
 
@@ -173,9 +173,9 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
     }
 }
 
-/// Parts that were there when the server died, and parts that come while it reads, for longer than they would wait for a silent one.
+/// Processes that were there when the server died, and others that come while it reads, longer than the limit for an absent server.
 #[test]
-fn everybody_waits_for_a_server_that_reads_its_replay_back() {
+fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let system = system();
     let spec = keep_for(&system, "replay");
     let serve = format!("{} --replay-dir replay", flags());
@@ -213,7 +213,7 @@ fn everybody_waits_for_a_server_that_reads_its_replay_back() {
     actors[1].wait_for_stderr(WAITING);
     actors[0].wait_for_stderr("the replay server reads its replay back from disk, ");
     learner.wait_for_stderr("the replay server reads its replay back from disk, ");
-    let last = wait_for("more than parts would wait for a silent server", || {
+    let last = wait_for("more than the limit for an absent server", || {
         let now = recovering(&system).expect("the log is long enough");
         (now["since_s"].as_f64() > Some(UNREACHABLE_MAX_S + 3.0)).then_some(now)
     });
@@ -269,7 +269,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     assert_eq!(replay.transitions_inserted, KEPT);
     server.stop().expect_code(0);
 
-    // What cannot be read at all ends it with a sentence, and nobody waits for it any more.
+    // An unreadable log ends it with an error, and no process waits for it any more.
     for entry in fs::read_dir(system.path("replay")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some_and(|it| it == "log") {
@@ -313,7 +313,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     assert_eq!(system.survivors(), []);
 }
 
-/// Each role hears it in the place of what it asked for.
+/// Each role receives it in place of the answer.
 #[test]
 fn roles_are_told_too() {
     let Some(tls) = TlsSystem::new("roles_are_told_too") else {

@@ -406,8 +406,19 @@ fn dangerous_words_stay_where_they_are_needed() {
         }
         assert!(
             seen > 0,
-            "nobody uses `{word}`: is this rule still about anything?"
+            "no file uses `{word}`: is this rule still needed?"
         );
+    }
+}
+
+#[test]
+fn comments_and_messages_say_who_does_what() {
+    // This file is looked at too.
+    let vague = ["no_body", "some_body", "every_body", "who_ever"].map(|it| it.replace('_', ""));
+    for (name, text) in rust_files() {
+        let text = text.to_lowercase();
+        let found = vague.iter().find(|it| text.contains(*it));
+        assert_eq!(found, None, "{name}: name the process or person");
     }
 }
 
@@ -416,7 +427,7 @@ fn nothing_points_at_the_machine_it_was_written_on() {
     // Put together here, as this file is looked at too.
     let places = ["work", "root"].map(|folder| format!("/{folder}/"));
     for (name, path) in files() {
-        // A file that is no text, such as a parity case, is none that a person follows.
+        // Binary files, such as parity cases, hold no paths.
         let Ok(text) = fs::read_to_string(path) else {
             continue;
         };

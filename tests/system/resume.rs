@@ -51,7 +51,7 @@ fn resumes(system: &TestSystem) -> Summary {
 }
 
 #[test]
-fn an_interrupted_run_goes_on() {
+fn an_interrupted_run_continues() {
     let system = system();
     // 1,000 updates are 2,200 frames, in which more than 100 episodes end.
     let process = launched(&system, 1_000);
@@ -70,7 +70,7 @@ fn an_interrupted_run_goes_on() {
     let since = summary.episodes - before.episodes;
     assert!((1..100).contains(&since), "{since} episodes since");
     assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
-    // And once more, as it is finished now and longer runs may be wished for.
+    // And once more, with more frames, now that it is finished.
     assert_eq!(resumes(&system).mean_return_of, 100);
     let ended = system.run("local --resume run").expect_code(0);
     assert!(
@@ -82,7 +82,7 @@ fn an_interrupted_run_goes_on() {
 
 /// Runs of earlier versions recorded whole frames where a border of them is cut today.
 #[test]
-fn a_run_with_whole_frames_goes_on_and_is_evaluated() {
+fn a_run_with_whole_frames_continues_and_is_evaluated() {
     let system = system();
     let border =
         "--set world.height=15 --set world.width=17 --set input.height=15 --set input.width=17";
@@ -108,14 +108,14 @@ fn a_run_with_whole_frames_goes_on_and_is_evaluated() {
 }
 
 #[test]
-fn a_run_whose_processes_were_all_killed_goes_on() {
+fn a_run_whose_processes_were_all_killed_continues() {
     let system = system();
     let process = launched(&system, 200);
     let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
     process.signal(Signal::SIGKILL);
     parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
     process.wait();
-    // A save may have been cut off; what it leaves is no checkpoint.
+    // A save may have been cut off; what it leaves is not a checkpoint.
     for entry in fs::read_dir(system.path("run/checkpoints")).unwrap() {
         let path = entry.unwrap().path();
         if path.extension().is_some() {

@@ -53,7 +53,7 @@ struct Saved {
 /// The newest checkpoint; none before the first.
 fn saved(run: &RunFolder) -> Option<Saved> {
     let entries = fs::read_dir(run.path().join("checkpoints")).ok()?;
-    // What a kill has cut off is no checkpoint.
+    // What a kill has cut off is not a checkpoint.
     let whole = entries.map(|it| it.unwrap().path()).filter(|path| {
         let name = path.file_name().unwrap().to_str().unwrap();
         name.starts_with("checkpoint-") && !name.ends_with(".tmp")

@@ -1,4 +1,4 @@
-//! A run whose parts are on machines of their own, joined by a router: cables that are pulled, links that are narrow.
+//! A run whose processes are on separate machines, joined by a router: cables that are pulled, links that are narrow.
 //! Machines are network namespaces; without the right to make them the tests are skipped by name.
 
 use std::{
@@ -17,7 +17,7 @@ use crate::system;
 const WARMUP: u64 = 200;
 const ROWS: u64 = 16;
 
-/// A run of parts that were started by hand, each on a machine of its own. Its replay is kept on disk.
+/// A run of processes that were started by hand, each on its own machine. Its replay is kept on disk.
 struct Run {
     system: TestSystem,
     network: Network,
@@ -79,7 +79,7 @@ impl Run {
         *self.on(machine) = Some(part);
     }
 
-    /// What the run says of itself, asked from the router; none while nobody answers.
+    /// The status of the run, fetched from the router; none while no process answers.
     fn status(&self) -> Option<Value> {
         let args = format!("status --json --connect {}", self.endpoint());
         let ended = self.system.run_after(&self.network.on_router(), &args);
@@ -138,7 +138,7 @@ impl Run {
     }
 }
 
-/// An actor's cable is out for longer than a session's lease, the learner's and the server's meanwhile too. The others go on while
+/// An actor's cable is out for longer than a session's lease, the learner's and the server's meanwhile too. The others continue while
 /// they can.
 #[test]
 fn cut_cables_heal_by_themselves() {
@@ -164,8 +164,8 @@ fn cut_cables_heal_by_themselves() {
 
 /// One actor behind 256 kbit/s: the others are as fast as they were, and it takes part.
 #[test]
-fn a_narrow_link_slows_nobody_else() {
-    let name = "a_narrow_link_slows_nobody_else";
+fn a_narrow_link_slows_no_other_process() {
+    let name = "a_narrow_link_slows_no_other_process";
     let Some(run) = Run::start(name, 2, 30_000, 8) else {
         return;
     };

@@ -73,8 +73,8 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
 }
 
 #[test]
-fn a_run_goes_on_when_others_fill_it_up() {
-    let Some(words) = with_shared_memory("a_run_goes_on_when_others_fill_it_up", "64m") else {
+fn a_run_continues_when_others_fill_it_up() {
+    let Some(words) = with_shared_memory("a_run_continues_when_others_fill_it_up", "64m") else {
         return;
     };
     let system = system();

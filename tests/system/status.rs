@@ -1,5 +1,5 @@
 //! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
-//! The parts' own words while they wait are here too.
+//! What processes log while they wait is here too.
 
 use driml_protocol::session::{self, Endpoints};
 use driml_tests::{Ended, TestSystem, wait_for};
@@ -21,7 +21,7 @@ fn wait_for_status(system: &TestSystem, words: &[&str]) -> String {
 }
 
 #[test]
-fn whoever_is_missing_is_named_with_what_to_do() {
+fn missing_processes_are_named_with_what_to_do() {
     let system = system();
     let endpoint = system.endpoint();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
@@ -73,7 +73,7 @@ fn whoever_is_missing_is_named_with_what_to_do() {
     assert_eq!(parts[2]["who"]["Actor"], 5);
     assert_eq!(answer["to_go_on"].as_array().unwrap().len(), 2);
 
-    // A server that stands still is no riddle either: it is said within seconds.
+    // A suspended server is reported within seconds, too.
     server.signal(Signal::SIGSTOP);
     let ended = system.run(&format!("status --connect {endpoint}"));
     server.signal(Signal::SIGCONT);
@@ -109,7 +109,7 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         .expect_said("nowhere is not a run folder");
 }
 
-/// Its launcher still plays the last checkpoint, and nobody else is there.
+/// Its launcher still plays the last checkpoint; no other process is left.
 #[test]
 fn a_run_that_is_ending_is_no_riddle() {
     let system = system();

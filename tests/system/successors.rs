@@ -32,7 +32,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
         // A learner names a version when it hands it over: the last ones may not have left the one that was killed, and what
-        // nobody has seen may come again. Its checkpoint's version is far below.
+        // no actor has seen may come again. Its checkpoint's version is far below.
         assert!(
             next.weights_version + UNSENT_MAX > killed.weights_version,
             "actors take the successor's weights: {killed:#?} {next:#?}"
@@ -134,7 +134,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
 }
 
 /// A learner without a checkpoint of the run: where updates were learned it is rejected with a sentence, unless it is told to restart;
-/// a finished run admits nobody.
+/// a finished run admits no learner.
 #[test]
 fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();

@@ -52,7 +52,7 @@ fn read(python: &str, system: &TestSystem) -> Value {
     serde_json::from_str(&run(python, &["-c", READ], &[&folder])).unwrap()
 }
 
-/// Every number of the rows is a point of the curve of its name, and there is no other.
+/// Every number of the rows is a point of the curve of its name, and there are no others.
 fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
     let curves = read["scalars"].as_object().unwrap();
     let names: Vec<_> = curves
@@ -73,8 +73,8 @@ fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
 }
 
 #[test]
-fn tensorboard_reads_what_a_run_recorded_and_goes_on_recording() {
-    let test = "tensorboard::tensorboard_reads_what_a_run_recorded_and_goes_on_recording";
+fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
+    let test = "tensorboard::tensorboard_reads_what_a_run_recorded_and_continues_recording";
     let Some(python) = python_with(test, &["tensorboard"]) else {
         return;
     };

@@ -1,4 +1,4 @@
-//! Mutual TLS in QUIC: a run over it, files that cannot be used, and everybody who is not let in.
+//! Mutual TLS in QUIC: a run over it, files that cannot be used, and clients that are not admitted.
 //! What each role may do is in `refusals::roles`.
 
 use std::{
@@ -19,10 +19,10 @@ use zenoh::{Session, Wait};
 
 use crate::{LONG, SHORT, system};
 
-/// How soon a refusal is said, on a busy machine too.
+/// How soon a rejection is reported, on a busy machine too.
 const SECONDS: Duration = Duration::from_secs(30);
 
-/// A system whose parts talk over TLS.
+/// A system whose processes talk over TLS.
 pub(crate) struct TlsSystem {
     pub(crate) system: TestSystem,
     pub(crate) good: Certificates,
@@ -78,7 +78,7 @@ impl TlsSystem {
         Client::over(session)
     }
 
-    /// A part whose files cannot be used exits before it does anything.
+    /// A process whose files cannot be used exits before it does anything.
     fn rejects_own_files(&self, part: &str, folder: &str, words: &str) {
         let ended = self.start(part, folder).wait();
         ended.expect_code(64).expect_said(words);
@@ -96,7 +96,7 @@ fn listen_raw(endpoint: &str, certificates: &Certificates, role: &str) -> Sessio
     .unwrap()
 }
 
-/// A port of this machine that nobody has.
+/// An unused port of this machine.
 fn free_port() -> u16 {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket.local_addr().unwrap().port()
@@ -157,7 +157,7 @@ fn a_run_over_tls() {
         (replay.transitions_lost, replay.transitions_duplicated),
         (0, 0)
     );
-    // Nobody asked for more than its role has.
+    // No process asked for more than its role allows.
     assert_eq!(replay.messages_refused, 0);
     assert!(
         replay.affinity_version > 0,
@@ -171,7 +171,7 @@ fn a_run_over_tls() {
     server.stop().expect_code(0);
 }
 
-/// Its parts meet at a unix socket, and one more comes from outside.
+/// Its processes meet at a unix socket, and one more comes from outside.
 #[test]
 fn a_launched_run_with_an_actor_from_outside() {
     let Some(tls) = TlsSystem::new("a_launched_run_with_an_actor_from_outside") else {
@@ -226,7 +226,7 @@ fn own_files_that_cannot_be_used() {
         (
             "actor --id 9",
             "tls",
-            "tls/actor-9.pem is not there: a part with the role actor-9 needs ca.pem, actor-9.pem and actor-9.key; \
+            "tls/actor-9.pem is not there: the role actor-9 needs ca.pem, actor-9.pem and actor-9.key; \
              `deploy/certs.sh tls --actors 10` makes them",
         ),
         (
@@ -313,7 +313,7 @@ fn strangers_at_a_replay_server() {
         assert!(opened.is_err(), "a certificate that is {name}");
     }
     server.wait_for_stderr("QUIC acceptor failed: ");
-    // Without QUIC, at whose port nobody listens.
+    // Without QUIC, at whose port nothing listens.
     let plain = tls.endpoint.replace("quic/", "tcp/");
     let started = Instant::now();
     let actor = tls.system.run(&format!("actor --connect {plain}"));
@@ -379,7 +379,7 @@ fn strangers_in_the_place_of_a_replay_server() {
     }
 }
 
-/// Of every part that has a file in the folder it is said whether it can take part, and what to do if it cannot.
+/// For every role that has a file in the folder, the report says whether it can be used, and what to do if not.
 #[test]
 fn the_doctor_looks_at_certificates() {
     let Some(tls) = TlsSystem::new("the_doctor_looks_at_certificates") else {

@@ -1,4 +1,4 @@
-//! `driml watch`: what is shown and recorded of runs that others have started, and that looking on disturbs nobody.
+//! `driml watch`: what is shown and recorded of runs that others have started, without disturbing them.
 //! What `driml status` says of a run is in `status`.
 
 use std::{
@@ -89,7 +89,7 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
 }
 
 #[test]
-fn a_launched_run_is_watched_and_goes_on_without() {
+fn a_launched_run_is_watched_and_continues_without() {
     let system = system();
     let launcher = launched(&system, 1);
     let mut watched = system.start("watch --run run --run-dir seen");
@@ -102,7 +102,7 @@ fn a_launched_run_is_watched_and_goes_on_without() {
     let before = rows();
     assert!(!system.path("seen/summary.json").exists());
 
-    // Where its launcher writes, nobody else does.
+    // Where its launcher writes, no other process does.
     system
         .run("watch --run run --run-dir run")
         .expect_code(64)
@@ -191,7 +191,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
     let look = format!("watch --connect {endpoint} --once");
-    // Somebody is missing.
+    // A process is missing.
     let ended = system.run(&look).expect_code(1);
     ended
         .expect_said("error: the run needs attention: no learner has joined: start `driml learner");

@@ -28,7 +28,7 @@ pub struct FewerActions {
 }
 
 impl FewerActions {
-    /// `world` with `actions` of its own; as it is where these are all.
+    /// `world` with a subset `actions` of its actions; unchanged where these are all.
     ///
     /// # Errors
     /// No action, or one that the world does not have.
@@ -42,7 +42,7 @@ impl FewerActions {
         }
         if actions.is_empty() || actions.iter().any(|&it| usize::from(it) >= count) {
             return Err(EnvError::Config(format!(
-                "{actions:?} are no actions of a world that has {count}"
+                "{actions:?} are not actions of a world that has {count}"
             )));
         }
         Ok(Box::new(Self {

@@ -14,7 +14,7 @@ pub struct CutFrames {
 }
 
 impl CutFrames {
-    /// `world` with frames of (height, width); as it is where its frames are that.
+    /// `world` with frames of (height, width); unchanged where its frames have that size.
     ///
     /// # Errors
     /// Frames larger than the world's, or without a pixel.

@@ -30,7 +30,7 @@ pub enum StepEnd {
     /// Nothing: the next frame follows from this one.
     #[default]
     Running = 0,
-    /// The level was completed and the next one began; the return goes on.
+    /// The level was completed and the next one began; the return continues.
     LevelChange = 1,
     /// The episode was cut off by its step limit.
     TimedOut = 2,
@@ -66,7 +66,7 @@ pub trait Environment: Send {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError>;
 
-    /// All copies' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it goes on
+    /// All copies' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it continues
     /// exactly as this one does.
     ///
     /// # Errors

@@ -25,7 +25,7 @@ pub enum EnvError {
     /// This world cannot say how it stands.
     #[error("this world's state cannot be saved")]
     NotSaved,
-    /// Bytes that are no saved state of this world.
+    /// Bytes that are not a saved state of this world.
     #[error("no state of this world: {0}")]
     State(String),
     /// A step was asked for with a buffer of the wrong length.

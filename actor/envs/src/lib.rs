@@ -10,7 +10,7 @@
 //! | `mspacman` | 21 x 19 x 3 | 5 | continual learning and predictability: four ghosts, lethal by choice |
 //! | `ising` | 84 x 84 x 1 | 1 | an Ising patch in noise: what can be predicted and what cannot |
 //! | `chain` | settable x 1 | 3 | a corridor with a known best return, for fast learning tests |
-//! | `exec:COMMAND` | as it declares | as it declares | a world of your own, in a process of its own |
+//! | `exec:COMMAND` | as it declares | as it declares | your own world, in its own process |
 //! | `libenv:PATH:GAME` | 64 x 64 x 3 | 15 | one of Procgen's games by another build of its library |
 //!
 //! [`WorldConfig`] holds the settings of any of them (`kind` says which) and builds it, and [`WorldName`] reads the names

@@ -1,5 +1,5 @@
 //! Worlds that a program adds to those of this crate: registered before anything else is done, known by name from then on.
-//! They come from the same program that starts every part, so that all parts know them.
+//! They come from the same program that starts every process, so that all processes know them.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -61,7 +61,7 @@ pub struct OwnWorld {
 }
 
 impl OwnWorld {
-    /// Reads the settings of a registered world; `None` if nobody registered its `kind`.
+    /// Reads the settings of a registered world; `None` if its `kind` is not registered.
     pub(crate) fn read(table: &Table) -> Option<Result<Self, toml::de::Error>> {
         let name = table.get("kind").and_then(Value::as_str)?;
         let found = {

@@ -284,13 +284,13 @@ impl WorldName {
         })
     }
 
-    /// The command that makes the world, if it is a process of its own.
+    /// The command that makes the world, if it runs in its own process.
     pub fn command(self) -> Option<&'static str> {
         let (_, variants) = KINDS.iter().find(|(kind, _)| *kind == self.kind)?;
         self.variant.filter(|_| variants().is_open)
     }
 
-    /// The code that the world brings along, and that is no part of this program: a command, or a library by its path.
+    /// The world's code outside this program: a command, or a library by its path.
     pub fn foreign_code(self) -> Option<&'static str> {
         self.command().or(self.library)
     }

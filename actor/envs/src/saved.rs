@@ -88,9 +88,9 @@ pub(crate) mod tests {
         seen
     }
 
-    /// Checks that another world made as `make` says goes on as the first did, also when that one has gone on itself. Gives the
+    /// Checks that another world made by `make` continues as the first did, also when that one has been stepped meanwhile. Gives the
     /// number of ends since it was saved.
-    pub(crate) fn goes_on(
+    pub(crate) fn continues(
         name: &str,
         steps: usize,
         mut make: impl FnMut() -> Box<dyn Environment>,
@@ -110,7 +110,7 @@ pub(crate) mod tests {
         other.load(&state).unwrap();
         assert_eq!(other.save().unwrap(), state, "{name}");
         let again = trajectory(&mut *other, steps, &mut at.clone());
-        assert!(again == seen, "{name} goes on otherwise");
+        assert!(again == seen, "{name} continues differently");
         for wrong in [&state[..state.len() - 1], &[]] {
             assert!(make().load(wrong).is_err(), "{name}: {} bytes", wrong.len());
         }
@@ -142,13 +142,13 @@ pub(crate) mod tests {
     #[test]
     fn worlds_go_on_where_they_were_saved() {
         for (name, config) in [("chain", chain(8)), ("ising", ising(9))] {
-            assert!(goes_on(name, 60, || config.build(COPIES, 3, 0).unwrap()) > 3);
+            assert!(continues(name, 60, || config.build(COPIES, 3, 0).unwrap()) > 3);
         }
         let part = || {
             let cut = CutFrames::of(chain(8).build(COPIES, 3, 0).unwrap(), (6, 11)).unwrap();
             FewerActions::of(cut, vec![1, 2]).unwrap()
         };
-        assert!(goes_on("a part of the chain", 60, part) > 3);
+        assert!(continues("a part of the chain", 60, part) > 3);
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub trait WorldSettings {
         10.0
     }
 
-    /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads of its own
+    /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads
     /// the world may start, 0 for none.
     ///
     /// # Errors
@@ -72,7 +72,7 @@ pub trait WorldSettings {
             .collect()
     }
 
-    /// Whether a run in this world can be resumed, which begins its episodes anew: false where the world goes on from one
+    /// Whether a run in this world can be resumed, which begins its episodes anew: false where the world continues from one
     /// episode to the next.
     fn is_resumable(&self) -> bool {
         true

@@ -35,7 +35,7 @@ impl Engine {
     /// The engine in the cache folder; fetched with pip if it is not there.
     ///
     /// A wheel that already lies in the cache folder under its published name is used instead of fetching.
-    /// `progress` is told what is being done, a line at a time; nothing when all is there.
+    /// `progress` gets a line for each step; none if the engine is installed.
     ///
     /// # Errors
     /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
@@ -236,7 +236,7 @@ mod tests {
         wheel::tests::archive(&cache.folder.join(WHEEL_NAME), &entries);
     }
 
-    /// Installs from a wheel in the cache folder whose hash is taken for the pinned one.
+    /// Installs from a wheel in the cache folder, with its hash in place of the pinned one.
     fn install(cache: &Cache, library: &str) -> Result<Engine, InstallError> {
         let path = cache.folder.join(WHEEL_NAME);
         let wheel = wheel::check_hash(&path, "").unwrap_err().to_string();

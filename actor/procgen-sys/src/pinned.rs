@@ -5,7 +5,7 @@ use std::ptr::NonNull;
 
 /// A slice that never moves or grows while it is alive, even when the value holding it moves.
 ///
-/// A `Box` will not do: moving one asserts that nobody else points into it, and the engine does.
+/// A `Box` does not work: moving one asserts that no other pointer into it exists, and the engine has one.
 pub(crate) struct Pinned<T> {
     slice: NonNull<[T]>,
 }
@@ -35,7 +35,7 @@ impl<T: Copy> Pinned<T> {
     /// # Safety
     /// The library must not write to this memory while the reference is alive.
     pub(crate) unsafe fn as_slice(&self) -> &[T] {
-        // SAFETY: the allocation lives as long as `self`; the caller vouches that nobody writes to it.
+        // SAFETY: the allocation lives as long as `self`; the caller guarantees that nothing writes to it.
         unsafe { self.slice.as_ref() }
     }
 

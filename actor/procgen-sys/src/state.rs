@@ -47,7 +47,7 @@ impl State {
     /// forged, which may end the process: take states from your own files alone.
     ///
     /// # Errors
-    /// Bytes that are no sealed state.
+    /// Bytes that are not a sealed state.
     pub fn unsealed(sealed: &[u8]) -> Result<Self, ProcgenError> {
         let damaged = || ProcgenError::State("a saved state that is damaged".to_owned());
         let (found, content) = sealed.split_at_checked(SUM_BYTES).ok_or_else(damaged)?;

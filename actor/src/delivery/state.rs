@@ -74,7 +74,7 @@ pub enum DeliveryError {
         /// How long it was tried.
         within: Duration,
     },
-    /// The replay server says no, for ever.
+    /// The replay server rejects it permanently.
     #[error("the replay server refused a chunk: {why}")]
     Refused {
         /// The replay server's reason, a sentence.

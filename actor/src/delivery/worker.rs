@@ -1,5 +1,5 @@
 //! The delivering thread: sends chunks, understands the answers, sends again what did not arrive.
-//! It never waits without hearing: a server that makes a chunk wait says so every few seconds, and one that is silent is
+//! It never waits without an answer: a server that delays a chunk says so every few seconds, and an unresponsive one is
 //! given up.
 
 use std::{
@@ -165,7 +165,7 @@ impl DeliveryWorker {
             });
         }
         if self.shutdown.is_set() {
-            // Copying costs nobody anything now, and a message that is lost costs the time that is left.
+            // Copying is cheap now, and a lost message would cost the time that is left.
             self.copy_out_of_shared_memory();
         }
         self.outgoing.front().map(|first| first.header)
@@ -354,7 +354,7 @@ impl DeliveryWorker {
                 Ok(Done) => return,
                 Err(e) => e,
             };
-            // Whoever told the actor to stop does not wait for long.
+            // The process that told the actor to stop does not wait for long.
             let may_wait = !self.shutdown.is_set() || began.elapsed() <= DRAIN_MAX;
             if may_wait && matches!(e, SessionError::Recovering(_)) {
                 silent_since = Instant::now();

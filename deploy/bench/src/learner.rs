@@ -17,40 +17,14 @@ use crate::{
 };
 
 /// What is measured: its name, agent, preset and further settings.
-const CASES: [(&str, &str, &str, &[&str]); 7] = [
-    ("C51, 64x64x3", "c51", "paper", &[]),
-    (GLOBAL_DIM, AGENT, "paper", &[]),
-    (
-        "C51 + local-local + global-global DIM, 64x64x3",
-        AGENT,
-        "paper",
-        &["learner.update.lambda.3t3=1"],
-    ),
-    (
-        "C51 + global-global DIM, 104x80x3",
-        AGENT,
-        "paper-observation",
-        &[],
-    ),
-    (
-        "C51, impala, 64x64x3",
-        "c51",
-        "paper",
-        &["model.torso=impala"],
-    ),
-    (
-        "C51, impala, 64x64x3, 64 rows",
-        "c51",
-        "paper",
-        &["model.torso=impala", "learner.batch_size=64"],
-    ),
-    (
-        "C51 + global-global DIM, impala, 64x64x3",
-        AGENT,
-        "paper",
-        &["model.torso=impala"],
-    ),
-];
+const CASES: &str = "\
+C51, 64x64x3|c51|paper
+C51 + global-global DIM, 64x64x3|driml-ada|paper
+C51 + local-local + global-global DIM, 64x64x3|driml-ada|paper|learner.update.lambda.3t3=1
+C51 + global-global DIM, 104x80x3|driml-ada|paper-observation
+C51, impala, 64x64x3|c51|paper|model.torso=impala
+C51, impala, 64x64x3, 64 rows|c51|paper|model.torso=impala|learner.batch_size=64
+C51 + global-global DIM, impala, 64x64x3|driml-ada|paper|model.torso=impala";
 /// The update that is also computed with candle's own operations, as on a GPU, in place of our kernels.
 pub(super) const GLOBAL_DIM: &str = "C51 + global-global DIM, 64x64x3";
 /// What that figure's name ends with.
@@ -122,8 +96,10 @@ impl Bench<'_> {
 
     /// Updates at the paper's sizes; on a CPU with candle's own operations too, and where states of a batch repeat.
     fn paper(&mut self, on_cpu: bool) -> anyhow::Result<()> {
-        for (name, agent, preset, sets) in CASES {
-            let config = settings::of_run(WORLD, agent, preset, sets)?.with_whole_frames()?;
+        for case in CASES.lines() {
+            let words: Vec<&str> = case.split('|').collect();
+            let (name, sets) = (words[0], &words[3..]);
+            let config = settings::of_run(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
             let work = updates(&config, &self.compute, 0.0)?;
             self.found(name, self.effort.rate_by_median(work)?, "updates/s");
             if name == GLOBAL_DIM && on_cpu && self.precision == Precision::F32 {

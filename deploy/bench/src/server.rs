@@ -1,4 +1,4 @@
-//! A replay server in a process of its own, with real clients over the real wire.
+//! A replay server in its own process, with real clients over the real wire.
 //! The clients are the actor's delivery and the learner's batch source, so what is measured is what runs in production.
 
 use std::{
@@ -56,7 +56,7 @@ pub(super) struct Server {
     process: ManagedProcess,
     pub(super) wire: Wire,
     keys: Keys,
-    /// The first may do anything where nothing is guarded, else only look; then each role has one of its own.
+    /// The first may do anything where nothing is guarded, else only watch; then each role has its own.
     sessions: Vec<Session>,
     actor: ActorSettings,
     learner: LearnerConfig,

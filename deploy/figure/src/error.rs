@@ -8,8 +8,8 @@ pub enum FigureError {
     /// The name asks for no kind of picture that there is.
     #[error("{} has no extension of a picture: take a name that ends in .svg, .pdf or .png", .0.display())]
     Extension(PathBuf),
-    /// The name is no film's.
-    #[error("{} is no name of a film: take one that ends in .gif", .0.display())]
+    /// The name is not a film's.
+    #[error("{} is not the name of a film: use one that ends in .gif", .0.display())]
     NoFilm(PathBuf),
     /// A picture or film of no area, or too large.
     #[error("a picture of {width} x {height} pixels cannot be made")]

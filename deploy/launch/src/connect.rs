@@ -27,7 +27,7 @@ pub(crate) fn connect(
     };
     let deadline = Instant::now() + LISTEN_MAX;
     loop {
-        // Opening may take seconds of its own, in which the replay server may end: so it is not waited for here.
+        // Opening may take seconds, in which the replay server may end: so it runs on another thread.
         let endpoints = endpoints.clone();
         let (tell, told) = std::sync::mpsc::channel();
         let open = move || {

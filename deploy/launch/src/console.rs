@@ -1,5 +1,5 @@
 //! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
-//! A terminal or pipe that is gone takes nothing and is no error here; `driml_protocol::end_signs` notices it.
+//! A closed terminal or pipe is not an error here; `driml_protocol::end_signs` notices it.
 
 use std::{
     collections::BTreeMap,
@@ -26,13 +26,13 @@ use tracing_subscriber::{
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
 
-/// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run goes on.
+/// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run continues.
 pub fn line(text: &str) {
     // In one write, so that lines of several threads do not mix.
     let _ = stderr().write_all(format!("{text}\n").as_bytes());
 }
 
-/// Writes a command's result to stdout; a reader that has gone away is no error.
+/// Writes a command's result to stdout; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -41,7 +41,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
-/// [`print`] of lines that a narrow terminal would break inside words: a line goes on after `indent` blanks.
+/// [`print`] of lines that a narrow terminal would break inside words: a line continues after `indent` blanks.
 pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     match io::stdout().is_terminal() {
         true => print(&wrapped(text, " ", indent)),
@@ -49,7 +49,7 @@ pub fn print_wrapped(text: &str, indent: usize) -> anyhow::Result<()> {
     }
 }
 
-/// `text` with its lines broken where `separator` stands, so that none is wider than the terminal where that can be; a line goes on
+/// `text` with its lines broken where `separator` stands, so that none is wider than the terminal where that can be; a line continues
 /// after `indent` blanks.
 pub(crate) fn wrapped(text: &str, separator: &str, indent: usize) -> String {
     let width = Term::stderr()
@@ -121,7 +121,7 @@ pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String
 /// zenoh warns of each try to reach a process that is not there yet or any more, which is ours to judge: so only its errors are
 /// logged, and of those neither what its session says of messages that come while it closes, as at the end of every run, nor
 /// that no answer is wanted any more. Nor that it does not know a liveliness token any more (`Unknown token`, the only error of that
-/// module) which a part that leaves takes back while its link closes, over QUIC now and then: it is gone, as it should be. Nor what quinn
+/// module) which a process that leaves drops while its link closes, over QUIC now and then: it is gone, as it should be. Nor what quinn
 /// warns of. Connections over QUIC that were rejected are logged with zenoh's own warning: the other side learns only that it failed.
 const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
                          zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=warn,quinn=error";
@@ -132,7 +132,7 @@ fn usual_filter(level: &str) -> String {
 }
 
 /// The filter that `DRIML_LOG` asks for. A level alone is that of driml's own crates, whose lines zenoh's would bury. All else is
-/// taken as it is, `off` too: it is for everything.
+/// used unchanged, `off` too: it is for everything.
 fn wanted_filter(wanted: &str) -> String {
     let level = wanted.trim().to_ascii_lowercase();
     match level.as_str() {

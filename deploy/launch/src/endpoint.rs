@@ -20,7 +20,7 @@ pub(crate) const SOCKET_PATH_MAX: usize = 107;
 pub struct Guard {
     /// `--tls-dir`: there are certificates.
     pub tls: bool,
-    /// `--insecure-network`: everybody who can connect is trusted.
+    /// `--insecure-network`: every client that can connect is trusted.
     pub insecure_network: bool,
 }
 
@@ -86,7 +86,7 @@ fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
             .rsplit_once(':')
             .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
     };
-    // Behind # zenoh takes settings of its own, which could undo ours.
+    // Behind # zenoh takes further settings, which could undo ours.
     match endpoint.split_once('/') {
         Some(("tcp", address)) if tls && has_host(address) => Err(usage!(
             "{endpoint} is not encrypted: with --tls-dir it is quic/{address}"

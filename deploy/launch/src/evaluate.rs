@@ -131,7 +131,7 @@ impl Player {
         }
     }
 
-    /// Returns of whole episodes in `world`, which is the run's with some levels of its own.
+    /// Returns of whole episodes in `world`, which is the run's, with other levels.
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.

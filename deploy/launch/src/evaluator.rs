@@ -1,4 +1,4 @@
-//! Plays a run's checkpoints while it goes on, each in a process of its own, one at a time.
+//! Plays a run's checkpoints during the run, each in its own process, one at a time.
 //! What a checkpoint earned, the process itself writes into the run's folder.
 
 use std::{
@@ -30,7 +30,7 @@ pub(crate) struct Evaluator {
 }
 
 impl Evaluator {
-    /// Goes on after what the run's folder says was played already.
+    /// Continues after the checkpoints that the run's folder lists as played.
     pub(crate) fn new(config: EvaluationConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         Ok(Self {
             config,
@@ -48,7 +48,7 @@ impl Evaluator {
         }
     }
 
-    /// Plays the last checkpoint, and waits for it as long as nobody asks to stop.
+    /// Plays the last checkpoint, and waits for it unless the run is told to stop.
     pub(crate) fn finish(&mut self, screen: &Screen, abort: &impl Fn() -> bool) {
         let deadline = Instant::now() + LAST_MAX;
         let mut last = false;

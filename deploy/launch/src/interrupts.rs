@@ -32,7 +32,7 @@ impl Interrupts {
         Ok(this)
     }
 
-    /// Counts a sign that was heard at `now`. `last` is when the last wish began.
+    /// Counts a signal received at `now`. `last` is when the last request began.
     fn hear(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
         let is_new = match sign {
             // Counted from the first signal of a request, so that repeated Ctrl-C always counts.

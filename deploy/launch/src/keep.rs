@@ -12,7 +12,7 @@ use crate::{
     stats::mean_and_deviation,
 };
 
-/// The seed of the episodes on which checkpoints are compared: none that anybody reports on.
+/// The seed of the episodes on which checkpoints are compared; reports use other seeds.
 pub const SELECTION_SEED: u64 = 1 << 32;
 
 /// What a checkpoint earned, and whether it is the run's best.

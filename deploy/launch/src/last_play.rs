@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn what_cannot_be_played_fails_no_run() {
         let mut config = config("smoke", "chain", "c51", &[]);
-        assert!(!config.local.play, "a run that tests parts is not played");
+        assert!(!config.local.play, "a test run is not played");
         config.local.play = true;
         let view = RunView::new(Plan::of(&config));
         let (none, outcome) = (Episodes::default(), Outcome::Finished);

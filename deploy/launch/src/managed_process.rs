@@ -59,7 +59,7 @@ pub fn exit_with_this_process() -> [String; 2] {
 }
 
 impl ManagedProcess {
-    /// Starts this program with other arguments, in a process group of its own so that Ctrl-C does not reach it. It ends when
+    /// Starts this program with other arguments, in its own process group so that Ctrl-C does not reach it. It ends when
     /// this process does.
     pub fn start(
         name: &str,
@@ -127,7 +127,7 @@ impl ManagedProcess {
         self.child.id()
     }
 
-    /// Whether it has died in a way that another start may mend: somebody killed it, or it had run for a while. A broken
+    /// Whether it has died in a way that a restart may mend: it was killed, or it had run for a while. A broken
     /// invariant of our own aborts it.
     pub(crate) fn may_be_started_again(&mut self) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;

@@ -127,12 +127,12 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_uses_is_swept_and_nothing_else() {
+    fn unused_folders_are_swept_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
         let meeting = Meeting::create_in(place.path()).unwrap();
         let mode = fs::metadata(meeting.folder.path()).unwrap().mode();
         assert_eq!(mode & 0o777, 0o700);
-        // Somebody else's, by its name or by what is in it.
+        // Of another program, by its name or content.
         fs::create_dir(place.path().join("driml-run-other")).unwrap();
         fs::create_dir(place.path().join("else")).unwrap();
         fs::write(place.path().join("else").join(IN_USE), "").unwrap();

@@ -329,7 +329,7 @@ mod tests {
             r#""c51_kl":0.5,"#,
             r#""losses":{"dim_4t4":2},"#,
             r#""rss_mib":{"actor-0":12.34},"#,
-            r#""waiting":"nobody waits","#,
+            r#""waiting":"neither side waits","#,
         ] {
             assert!(text.contains(part), "{part} in {text}");
         }

@@ -1,4 +1,4 @@
-//! A panic in any thread ends the process: one that goes on without one of its threads looks alive and no longer does its work.
+//! A panic in any thread ends the process: one that continues without one of its threads looks alive and no longer works.
 //! Nothing in this program catches a panic.
 
 use std::{
@@ -50,7 +50,7 @@ pub fn process_ends() {
     ENDING.get_or_init(|| std::thread::current().id());
 }
 
-/// Writes without the lock of `std::io::stderr`, which another thread may hold for ever, and without a buffer.
+/// Writes without the lock of `std::io::stderr`, which another thread may hold forever, and without a buffer.
 fn say(text: &str) {
     // Nothing is left to be done if stderr is gone.
     let _ = nix::unistd::write(std::io::stderr(), format!("{text}\n").as_bytes());
@@ -141,7 +141,7 @@ mod tests {
         };
         let (status, said) = child("ends");
         assert_eq!((status.code(), said), (Some(3), false));
-        let (status, said) = child("goes on");
+        let (status, said) = child("continues");
         assert_eq!((status.signal(), said), (Some(6), true));
     }
 

@@ -25,7 +25,7 @@ macro_rules! built_in_games {
 
 /// What stands before the name of a built-in network.
 const PREFIX: &str = "pretrained:";
-/// What the name of a file that is no run's folder ends with.
+/// The ending of a weights file, which is not a run's folder.
 const EXTENSION: &str = "safetensors";
 /// The built-in networks, by the game's name. To add one: `driml evaluate RUN --export deploy/pretrained/GAME.safetensors`, and its name
 /// here.

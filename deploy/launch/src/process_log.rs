@@ -41,7 +41,7 @@ struct Kept {
 }
 
 impl ProcessLog {
-    /// Opens the log of the process `name` in the folder `logs`, to go on at its end.
+    /// Opens the log of the process `name` in the folder `logs`, to append to it.
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
         let file = File::options().create(true).append(true).open(&path);
@@ -61,7 +61,7 @@ impl ProcessLog {
         })
     }
 
-    /// Carries what comes through `pipe`, on a thread of its own, until its other end is closed.
+    /// Carries what comes through `pipe`, on its own thread, until its other end is closed.
     pub(crate) fn follow(
         &mut self,
         pipe: impl Read + Send + 'static,
@@ -205,7 +205,7 @@ mod tests {
         lock(&log.kept).file = File::options().append(true).open("/dev/full").unwrap();
         let add = |line: &str| lock(&log.kept).add(line.into());
         assert!(add("one").unwrap().starts_with("No space left"));
-        assert_eq!(add("two"), None, "it is said once");
+        assert_eq!(add("two"), None, "it is logged once");
         let missing = log.missing().unwrap();
         let said = "2 lines of the log of actor-0 are lost: No space left";
         assert!(missing.starts_with(said), "{missing}");

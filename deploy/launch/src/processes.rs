@@ -65,7 +65,7 @@ impl Processes {
     }
 }
 
-/// Which parts of a run are started again when they have died: their end is none of the run's, however soon it comes.
+/// Which processes of a run are restarted when they have died: their end does not end the run, however soon it comes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Revived {
     /// All replay servers.

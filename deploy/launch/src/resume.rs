@@ -1,4 +1,4 @@
-//! `driml train --resume`: the settings of an interrupted run, and the point from which it goes on.
+//! `driml train --resume`: the settings of an interrupted run, and the point from which it continues.
 //! It changes nothing in the run's folder, and waits until an earlier learner has saved there.
 
 use std::{
@@ -30,8 +30,7 @@ const ENDING_MAX: Duration = Duration::from_secs(20);
 /// How often it is looked whether they have.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, which holds nothing of a world's own
-/// progress.
+/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, and the world keeps no progress over episodes.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
@@ -40,12 +39,12 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
         })
 }
 
-/// Whether a checkpoint is of a run in lockstep, and holds all its parts.
+/// Whether a checkpoint is of a run in lockstep, and holds all its components.
 fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
     checkpoint::companion(checkpoint).map(|it| it.is_some())
 }
 
-/// Says how a run that was interrupted or failed goes on, if it can.
+/// Prints how to resume a run that was interrupted or failed, if it can be.
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {
         console::line(&format!(
@@ -58,7 +57,7 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
 /// Waits until the learner of the run in `folder` has saved and its other processes have ended, if the run was ended.
 ///
 /// # Errors
-/// The run is still going on, or its learner takes too long.
+/// The run is still running, or its learner takes too long.
 pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     folder.lock()?;
     let checkpoints = folder.checkpoints();
@@ -109,7 +108,7 @@ pub enum Found {
     Resumed(Box<Resumed>),
 }
 
-/// How a run goes on.
+/// How a run continues.
 #[derive(Debug)]
 pub struct Resumed {
     /// Its settings.
@@ -120,10 +119,10 @@ pub struct Resumed {
     pub lockstep: bool,
 }
 
-/// The settings with which the run in `folder` goes on, and from which point.
+/// The settings with which the run in `folder` continues, and from which point.
 ///
 /// # Errors
-/// A folder that is no run's, settings that cannot work, no checkpoint, a run that is still going on.
+/// A folder that is not a run's, settings that cannot work, no checkpoint, a run that is still running.
 pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Result<Found> {
     let path = folder.config();
     let name = path.display().to_string();

@@ -104,7 +104,7 @@ pub struct RunView {
 }
 
 impl RunView {
-    /// Of a run of which nothing has been heard yet.
+    /// The view of a run without any report yet.
     pub fn new(plan: Plan) -> Self {
         let now = Instant::now();
         Self {
@@ -186,7 +186,7 @@ impl RunView {
         self.is_finished() || self.is_gone() && self.replay.waiting == Waiting::Finished
     }
 
-    /// For how many seconds the run has been going on, as far as its replay servers know.
+    /// Seconds since the run began, by its replay servers.
     pub(crate) fn up_s(&self) -> Option<f64> {
         let parts = self.servers.iter().filter_map(|it| it.parts.as_ref());
         parts.map(|it| it.up_s).reduce(f64::max)

@@ -102,7 +102,7 @@ mod tests {
         assert!(held(0x1a, 42, 7));
         assert!(!held(0x1a, 42, 8), "another's");
         assert!(!held(0x1a, 43, 7), "shared");
-        assert!(!held(0x1a, 44, 7), "nobody's");
+        assert!(!held(0x1a, 44, 7), "not in use");
         assert!(!held(0x1b, 42, 7), "on another device");
     }
 

@@ -10,7 +10,7 @@ const EVERYONE: [(&str, &str); 3] = [
     ("MALLOC_MMAP_THRESHOLD_", "1000000000"),
     ("MALLOC_TRIM_THRESHOLD_", "10000000000"),
 ];
-/// What a replay server needs beside it: glibc gives each thread a heap of its own, up to eight a core, and each keeps the
+/// What a replay server needs beside it: glibc gives each thread its own heap, up to eight a core, and each keeps the
 /// chunks that were freed in it, which is memory that only grows in a run whose actors come and go.
 const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 
@@ -24,10 +24,10 @@ pub enum Purpose {
 }
 
 /// Starts this program again, in the same process and with the same arguments, if the environment lacks something. What the user
-/// has set stays as it is.
+/// has set stays unchanged.
 ///
 /// # Errors
-/// The program cannot be started again, for example because its file was replaced. It may go on as it is, only slower.
+/// The program cannot be started again, for example because its file was replaced. It may continue, only slower.
 pub fn settle(purpose: Purpose) -> io::Result<()> {
     let missing = missing(purpose, |name| env::var_os(name).is_some());
     if missing.is_empty() {

@@ -67,7 +67,7 @@ impl Machine {
         ENVS
     }
 
-    /// Threads of the learner: all cores, as it is what a run waits for.
+    /// Threads of the learner: all cores, because a run waits for the learner.
     pub const fn learner_threads(&self) -> u32 {
         self.cores
     }

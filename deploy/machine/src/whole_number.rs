@@ -1,5 +1,5 @@
 //! Whole numbers as people write them: `1000000`, `1_000_000`, `1e6`, `2.5e5`.
-//! It rounds nothing: what is not whole is no number here.
+//! It does not round: non-integers are rejected.
 
 use std::ops::RangeInclusive;
 

@@ -27,7 +27,7 @@ pub struct LocalConfig {
     /// What the learner computes on.
     pub learner_device: DeviceName,
     /// Whether the replay is kept on disk, in the run folder: a replay server that died is started again with it, and a resumed
-    /// run goes on with it.
+    /// run continues with it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub durable: bool,
     /// Whether events for TensorBoard are written beside the metrics, about a kilobyte a second.
@@ -36,12 +36,12 @@ pub struct LocalConfig {
     /// Whether the weights of a finished run are played, beside a random policy; in lockstep never.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub play: bool,
-    /// When checkpoints are played while the run goes on; none if they are not.
+    /// When checkpoints are played during the run; none if they are not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evaluation: Option<EvaluationConfig>,
 }
 
-/// Whole episodes with checkpoints of a run that goes on.
+/// Whole episodes with checkpoints during a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvaluationConfig {
@@ -217,7 +217,7 @@ impl RunConfig {
         before + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
-    /// Checks what each part checks of its own table, then what spans two tables.
+    /// Runs each component's checks of its own table, then those that span two tables.
     fn validate(&self) -> Result<(), Usage> {
         let said = |e: &dyn std::fmt::Display| Usage(e.to_string());
         self.run.validate().map_err(|e| said(&e))?;

@@ -1,5 +1,5 @@
 //! The settings that follow from others: filled in, checked when read back, refused when set by hand.
-//! It decides nothing of its own.
+//! It makes no choice itself.
 
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
@@ -52,10 +52,10 @@ pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
     put(table, "run.agent", Value::String(agent.into()));
 }
 
-/// The limits of a world that is a process of its own, in `[world]`.
+/// The limits of a world that runs in its own process, in `[world]`.
 const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
 
-/// Asks a world that is a process of its own what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
+/// Asks a world that runs in its own process what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
     let [start, step] = LIMITS.map(|limit| whole_size(table, &format!("world.{limit}")));
     let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
@@ -287,7 +287,7 @@ pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     }
 }
 
-/// Writes a value, making the tables on the way; what is no table on the way stays, for its reader to refuse.
+/// Writes a value, making the tables on the way; what is not a table on the way stays, for its reader to reject.
 pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     match path.split_once('.') {
         None => {

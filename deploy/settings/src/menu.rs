@@ -27,7 +27,7 @@ const BY_MACHINE: [&str; 5] = [
     "actor.world_threads",
 ];
 
-/// What a world that is a process of its own says of itself.
+/// What a world in its own process declares.
 const DECLARED: [&str; 6] = [
     "world.height",
     "world.width",
@@ -88,7 +88,7 @@ fn lambdas(table: &Table) -> String {
 /// The resolved settings, each with its source.
 pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Result<String, Usage> {
     let source = Source::Layers(preset, world, agent.name);
-    // What the preset asks for, on any machine; memory that is free at this moment is no setting.
+    // What the preset asks for, on any machine; memory that is free at this moment is not a setting.
     let machine = Machine {
         memory_bytes: u64::MAX,
         ..Machine::this()
@@ -189,9 +189,9 @@ pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
     for line in text.lines() {
         let bare = line.trim();
         if let Some(remark) = bare.strip_prefix('#') {
-            let goes_on = line.starts_with(' ');
+            let continues = line.starts_with(' ');
             match found.last_mut() {
-                Some((_, comment)) if goes_on => *comment += &format!(" {}", remark.trim()),
+                Some((_, comment)) if continues => *comment += &format!(" {}", remark.trim()),
                 _ => above = remark.trim().to_owned(),
             }
         } else if let Some(name) = bare.strip_prefix('[').and_then(|it| it.strip_suffix(']')) {

@@ -1,5 +1,5 @@
 //! `--set key=value`: one value of the settings, by its dotted path.
-//! It knows keys and types by what is already in the settings, and no range: the parts' own checks follow.
+//! It knows keys and types by what is already in the settings, and no range: each component checks its own.
 
 use driml_machine::error::{Usage, nearest, usage};
 use toml::{Table, Value};

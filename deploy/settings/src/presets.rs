@@ -190,7 +190,7 @@ fn world_layer(world: WorldName) -> Layer {
         text,
     });
     let layer = found.or(own);
-    layer.expect("a test looks for a layer of each kind, and whoever adds one brings it along")
+    layer.expect("a test checks that each kind has its layers")
 }
 
 /// A world by its name, or by its game's.

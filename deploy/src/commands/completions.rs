@@ -7,7 +7,7 @@ use clap::Args;
 use clap_complete::{Shell, generate};
 use driml_launch::console::print;
 
-/// The program's name, as it is called.
+/// The program's name on the command line.
 const NAME: &str = "driml";
 
 #[derive(Debug, Args)]

@@ -43,7 +43,7 @@ pub(crate) struct TlsFlags {
     pub(crate) tls_dir: Option<PathBuf>,
 }
 
-/// Whether everybody is trusted who can connect.
+/// Whether every client that can connect is trusted.
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run

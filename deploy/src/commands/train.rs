@@ -129,7 +129,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         )
         .into());
     }
-    // What is wrong with them is said before anything is made.
+    // Errors in them are reported before anything is made.
     args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);

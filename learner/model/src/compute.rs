@@ -167,11 +167,11 @@ pub enum DeviceName {
     Cuda(usize),
 }
 
-/// Why there is no such device.
+/// Why a device cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
     /// Not the name of a device.
-    #[error("{0:?} is no device: take cpu, cuda or cuda:N")]
+    #[error("{0:?} is not a device: use cpu, cuda or cuda:N")]
     Name(String),
     /// Only this project's kernels, which are the CPU's, have another precision than f32.
     #[error(

@@ -15,7 +15,7 @@ thread_local! {
     /// The sums of the backward pass that runs on this thread, if it is one of [`Backward::of`].
     ///
     /// A thread of the pool that waits for its products may take up another learner's whole update: a pass that begins here
-    /// therefore puts the sums of the one below it aside and gives them back, and nobody holds the cell while others may run.
+    /// therefore puts the sums of the one below it aside and restores them, and the cell is never borrowed while other work may run.
     static SUMS: RefCell<Option<Sums>> = const { RefCell::new(None) };
 }
 

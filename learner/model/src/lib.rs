@@ -1,5 +1,5 @@
 //! The network that actor and learner share: a convolutional torso, one of several, the C51 head and the DIM heads, with their own CPU kernels.
-//! It has never heard of processes, replay or worlds, and it computes no loss.
+//! It knows no processes, replay or worlds, and computes no loss.
 //!
 //! The learner differentiates through [`Network`]; an actor uses [`PolicyNetwork`], which runs the same kernels without
 //! a graph. The C51 head may be a dueling one, and noisy ([`HeadConfig`]): whatever it is made of, it amounts to one linear

@@ -30,7 +30,7 @@ pub(super) fn check_probabilities<T: Copy + Into<f64>>(
     let probability = |&value: &T| (0.0..=1.0 + 1e-6).contains(&value.into());
     match array.iter().position(|value| !probability(value)) {
         Some(at) => Err(AffinityError(format!(
-            "{name} is no probability at index {at}"
+            "{name} is not a probability at index {at}"
         ))),
         None => Ok(()),
     }

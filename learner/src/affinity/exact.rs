@@ -123,7 +123,7 @@ impl ExactAffinity {
     /// A_ij = q_ij / sum_j q_ij with q_ij = (c_ij + s) / (e_ij + s), the softmax of ln q.
     ///
     /// q is p(j | i) / p(j) where a pair was seen often, and 1 where nothing is known: in the row or column of an action that was
-    /// never taken, and for the only action that ever was. Adding s to c alone would make a ratio of its own there.
+    /// never taken, and for the only action that ever was. Adding s to c alone would bias the ratio there.
     /// Source of the form: DuMouchel 1999, the shrinking of a ratio of counts towards 1.
     fn ratios(&self) -> Vec<f64> {
         let m = self.alphabet.len();

@@ -48,7 +48,7 @@ impl AffinityEstimator {
     ///
     /// # Errors
     /// Settings out of their ranges, an array of another length than they ask for, numbers that are not finite, entries of A that
-    /// are no probabilities.
+    /// are not probabilities.
     pub fn check_valid(&self) -> Result<(), AffinityError> {
         match self {
             Self::Learned(learned) => learned.check_valid(),

@@ -105,10 +105,10 @@ pub struct WeightedLoss {
 
 /// The online network's features of all states that an update needs with a graph, of one pass through it.
 ///
-/// One pass, as every pass packs the weights again and has a gradient of its own for each of them.
+/// One pass, as every pass packs the weights again and makes another gradient of each.
 #[derive(Debug)]
 pub struct OnlineFeatures {
-    /// Of s_t as it is.
+    /// Of s_t without augmentation.
     pub now: Features,
     /// Of s_t as the loss sees it: augmented, if the batch is.
     pub anchors: Features,
@@ -117,7 +117,7 @@ pub struct OnlineFeatures {
 }
 
 impl OnlineFeatures {
-    /// Passes what `loss` needs of `batch` through `network`; augmented states are taken for distinct, as each is drawn by itself.
+    /// Passes what `loss` needs of `batch` through `network`; augmented states count as distinct, as each is drawn separately.
     ///
     /// # Errors
     /// States that do not fit the network.

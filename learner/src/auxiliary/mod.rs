@@ -2,7 +2,7 @@
 //!
 //! Each loss is a file of this folder that implements [`AuxiliaryLoss`], and a line of [`MENU`]. Nothing
 //! outside this folder asks which loss it is: what the rest must know (heads, positives, names of what is reported) the
-//! loss says itself. A program of its own [`register`]s one without a change here.
+//! loss defines itself. Your own program [`register`]s one without a change here.
 
 pub mod cpc;
 pub mod curl;

@@ -21,7 +21,7 @@ pub(super) const KEY: &str = "key.safetensors";
 /// The averaged network; there if the settings ask for one.
 pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
-/// What whoever drives the learner keeps with it; there if it keeps something.
+/// The companion that the caller keeps with the checkpoint, if any.
 pub(super) const COMPANION: &str = "companion.bin";
 /// A [`StateFile`].
 pub(super) const STATE: &str = "state.json";
@@ -44,7 +44,7 @@ pub(super) struct StateFile {
     pub(super) sha256: BTreeMap<String, String>,
 }
 
-/// Reads a `state.json` and throws it away: for whoever tries what such a file may hold.
+/// Reads a `state.json` and drops it, for fuzzing.
 ///
 /// # Errors
 /// What is wrong with it.

@@ -59,7 +59,7 @@ pub enum CheckpointError {
         /// Its value in this run.
         expected: String,
     },
-    /// The learner's state is not one to go on from.
+    /// A learner cannot be restored from this state.
     #[error("nothing is saved, and the newest checkpoint stays the newest: {0}")]
     Unsound(UpdateError),
     /// The state does not fit the network or the settings.

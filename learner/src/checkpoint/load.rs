@@ -141,7 +141,7 @@ pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
     Ok((state.updates, state.progress))
 }
 
-/// What whoever drove the learner kept with the checkpoint at `path`; none if it kept nothing.
+/// The caller's companion of the checkpoint at `path`, if any.
 ///
 /// # Errors
 /// A file that is missing or is not what was written.

@@ -37,7 +37,7 @@ pub struct RunState<'a> {
     pub run_spec_hash: u64,
     /// What [`describe`](super::describe) says, for the networks' metadata.
     pub description: &'a str,
-    /// What whoever drives the learner keeps with it.
+    /// The caller's companion of the checkpoint.
     pub companion: Option<&'a [u8]>,
 }
 

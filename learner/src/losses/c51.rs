@@ -21,7 +21,7 @@ pub const KL_ERROR: f64 = 1e-14;
 /// `gradient` [B, N] is overwritten with the derivative by the logits: `(softmax - target) / B`. The arithmetic is f64 and shifts by
 /// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
 /// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is
-/// not finite, or a target that is no number, gives a loss that is not finite, which the update refuses; a logit of -inf under a target
+/// not finite, or a target that is NaN, gives a loss that is not finite, which the update refuses; a logit of -inf under a target
 /// of 0 adds nothing to the loss, as `0 ln 0` does, and has a slope of 0.
 /// Source: Bellemare et al. 2017, equation 7.
 ///

@@ -38,7 +38,7 @@ const EPS: RangeInclusive<f64> = 1e-15..=1e30;
 /// Largest error of a parameter against the same steps in f64, as a share of the way it went, beside [`step_floor`].
 pub const STEP_ERROR: f64 = 0.004;
 
-/// Largest error of a moment against f64 while gradients go on, as a share of the decayed mean of their sizes, or of their squares:
+/// Largest error of a moment against f64 while gradients continue, as a share of the decayed mean of their sizes, or of their squares:
 /// `beta` and each product and sum are rounded to f32, and 1 / (1 - beta) steps add up.
 pub const fn moment_error(beta: f64) -> f64 {
     2e-7 / (1.0 - beta)
@@ -162,7 +162,7 @@ impl Adam {
     ///
     /// `m = beta1 m + (1 - beta1) g`, `v = beta2 v + (1 - beta2) g^2`,
     /// `p -= lr / (1 - beta1^t) * m / (sqrt(v) / sqrt(1 - beta2^t) + eps)`.
-    /// A parameter without a gradient is left as it is, moments included.
+    /// A parameter without a gradient is unchanged, moments included.
     /// Source: PyTorch's `Adam` without weight decay.
     ///
     /// # Errors

@@ -279,7 +279,7 @@ impl Config {
             Objective::NONE
         };
         let objective = self.objective.unwrap_or(by_lambda);
-        // The one number of its own that an objective in the cases has.
+        // The one setting that only this loss has.
         let own = self.key_tau.map(|key_tau| {
             let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
             (objective.name().to_owned(), table.into())

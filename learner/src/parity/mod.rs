@@ -1,5 +1,5 @@
 //! The parity check: the learner's own update on a case computed elsewhere in float64, compared tensor by tensor.
-//! It has no arithmetic of its own beyond the comparison, and does not print.
+//! It computes nothing beyond the comparison, and does not print.
 
 mod case;
 pub mod deviation;
@@ -295,7 +295,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         lambda: Lambda::EVERY,
         ..settings.auxiliary_settings()
     };
-    // An objective that does not take every pair is taken as it is.
+    // A loss that does not take every pair is used unchanged.
     let loss = objective.loss(&every).or_else(|_| settings.auxiliary())?;
     let model = case.model(loss.heads(settings.condition_on_action));
     let (device, kernels) = (&compute.device, compute.kernels);

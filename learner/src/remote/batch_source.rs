@@ -1,4 +1,4 @@
-//! Fetches batches ahead of the update that needs them, several requests in flight, each on a thread of its own.
+//! Fetches batches ahead of the update that needs them, several requests in flight, one thread each.
 //! It does not reorder or keep batches: what arrives first is learned from first.
 
 use std::{
@@ -180,7 +180,7 @@ impl BatchSource {
         join_within(self.threads, THREADS_END_MAX);
     }
 
-    /// The next batch; batches that are on their way when the first thread hears of the end still come.
+    /// The next batch; batches in flight when the first thread learns of the end still arrive.
     ///
     /// # Errors
     /// The replay server was out of reach for too long, or refuses.
@@ -208,7 +208,7 @@ impl BatchSource {
     }
 }
 
-/// The one batch that is put together from the parts of several shards. It outlives a failed try, because a part that was
+/// The one batch that is assembled from the parts of several shards. It outlives a failed try, because a part that was
 /// given is counted as sampled.
 struct PartialBatch {
     counts: Vec<Count>,
@@ -373,7 +373,7 @@ impl Fetcher {
         }
         let (mut finished, mut failed) = (false, None);
         for (shard, asked) in asked {
-            // A part that did not arrive is asked for again, by itself.
+            // A part that did not arrive is requested again, alone.
             let answer = match self.answer(asked) {
                 Ok(answer) => answer,
                 Err(e) => {
@@ -488,7 +488,7 @@ impl Fetcher {
         let (reply, payload) = asked.receive(&self.pool).inspect_err(|e| {
             let unheard = matches!(
                 e,
-                SessionError::NoReply { .. } | SessionError::Nobody { .. }
+                SessionError::NoReply { .. } | SessionError::NoAnswerer { .. }
             );
             if shared_memory && unheard {
                 self.trust.lost();

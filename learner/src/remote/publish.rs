@@ -185,7 +185,7 @@ impl Outlets {
         self.priorities.put(update);
     }
 
-    /// Waits until somebody has asked for the status since the learner finished, or for `wait_max`.
+    /// Waits until the status was fetched once after the learner finished, or for `wait_max`.
     pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
         let started = Instant::now();
         while !self.heard.load(Ordering::Relaxed) && started.elapsed() < wait_max {

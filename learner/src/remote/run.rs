@@ -29,7 +29,7 @@ use crate::{
 const LAST_COUNT_MAX: Duration = Duration::from_secs(1);
 /// How long a learner that was told to stop stays to be asked for its last status.
 const LAST_WORD_MAX: Duration = Duration::from_secs(3);
-/// How long a batch may take before a person hears what it is waited for.
+/// How long a batch may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 /// How often a waiting learner looks whether it should stop.
 const TICK: Duration = Duration::from_millis(200);
@@ -182,7 +182,7 @@ fn learn(
     activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
-    // A wait is said after some seconds, then ever more seldom.
+    // A wait is logged after some seconds, then ever more seldom.
     let (mut waiting_since, mut said_next) = (Instant::now(), SILENT_MAX);
     while !shutdown.is_set() {
         let Served { batch, parts } = match batches.next(TICK)? {

@@ -81,7 +81,7 @@ fn neutral_values_change_no_byte_wherever_they_come_from() {
     }
 }
 
-/// A whole turn is no turn, to rounding.
+/// A whole turn changes nothing but rounding.
 #[test]
 fn a_third_of_a_turn_takes_red_to_green() {
     let augment = Augment::new(NOTHING, (1, 4, 3), 3);
@@ -323,8 +323,8 @@ fn the_generator_alone_decides_and_rows_differ() {
     let mut different: Vec<_> = first.chunks_exact(state.len()).collect();
     different.sort_unstable();
     different.dedup();
-    assert_eq!(different.len(), 33, "each row has a draw of its own");
-    // One call after the other goes on with the generator, and memory used before leaves no trace.
+    assert_eq!(different.len(), 33, "each row has its own draw");
+    // Each call continues the generator, and reused memory leaves no trace.
     let mut augment = Augment::new(PAPER, size, 3);
     let (mut rng, mut seen) = (rng(1), vec![1; 7]);
     for rows in [20, 13] {

@@ -158,7 +158,7 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
     .unwrap();
 }
 
-/// A network of other sizes is no damage: the setting that differs is named.
+/// A network of other sizes is not damage: the setting that differs is named.
 #[test]
 fn a_checkpoint_of_another_network_says_which_setting_differs() {
     let folder = Folder::new("model");
@@ -204,7 +204,7 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
 }
 
 #[test]
-fn a_checkpoint_goes_on_with_other_operations_than_it_was_saved_by() {
+fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
     const BF16: Compute = Compute::cpu(Precision::Bf16);
     // Of the total, relative; of parameters, absolute: a learning rate is 1e-3, and bf16 may turn the sign of a small gradient.
     let (same, rounded) = ((1e-4, 1e-4), (1e-2, 2e-3));
@@ -385,7 +385,7 @@ fn the_networks_say_what_they_are_and_need_not() {
     assert_eq!(Run::resume(&folder.0).bytes(), run.bytes());
 }
 
-/// Against float64; the average is no part of what is learned.
+/// Against float64; the average does not affect learning.
 #[test]
 fn averaged_weights_follow_and_are_saved_and_played() {
     const TAU: f64 = 0.25;

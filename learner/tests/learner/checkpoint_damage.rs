@@ -65,7 +65,7 @@ fn a_checkpoint_of_another_format_is_rejected() {
     }
 }
 
-/// With one checkpoint kept, a save of what cannot be gone on from would remove the last good one.
+/// With one checkpoint kept, saving a state that cannot be resumed would remove the last good one.
 #[test]
 fn a_state_that_is_not_finite_is_not_saved() {
     for compute in [&Compute::CPU, &CANDLE] {
@@ -96,7 +96,7 @@ fn a_state_that_is_not_finite_is_not_saved() {
     }
 }
 
-/// Files whose sum is right, as somebody may write them who wants the learner to fall over.
+/// Files with a valid checksum, as an attacker may write them.
 #[test]
 fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     let exact = ExactSettings {

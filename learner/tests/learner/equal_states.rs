@@ -119,7 +119,7 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                     (forward(&evaluation), gradients(&evaluation, &agent))
                 });
                 assert!(each.0 == once.0, "{case}: the same bits forward");
-                // Views of states are never taken for equal ones, and a target has no gradient.
+                // Views of states never count as equal, and a target has no gradient.
                 if repeat != Repeat::Everywhere || objective == CURL {
                     assert!(each.1 == once.1, "{case}: the same bits of gradients");
                     continue;

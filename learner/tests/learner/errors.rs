@@ -122,7 +122,7 @@ pub(crate) fn diverged(compute: &Compute, name: &str) -> (Agent, Result<f64, Upd
     let mut agent = fast(compute, 3e37);
     let evaluation = agent.evaluate(&Rows::random(6, 31).batch()).unwrap();
     let gradient = evaluation.gradients.get(name).unwrap();
-    // As large as numbers get, and where the next step goes on.
+    // As large as numbers get; the next step works again.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);
     let var = agent.online().get(name).unwrap();
     var.set(&direction.unwrap()).unwrap();

@@ -313,7 +313,7 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
         let dim: f32 = report.losses.iter().map(|it| it.1).sum();
         assert!(
             (report.total - report.c51_kl - dim).abs() < 1e-5,
-            "DIM is as it is"
+            "DIM is unchanged"
         );
     }
     let rows = report.row_kls.iter().map(|kl| f64::from(*kl)).sum::<f64>();

@@ -48,7 +48,7 @@ impl StackedFrames {
         self.frame_stack as usize * size_of::<Number>()
     }
 
-    /// The first number in `stacks` that is no frame's.
+    /// The first number in `stacks` that is not a frame's.
     pub(super) fn first_unknown(&self, stacks: &[u8]) -> Option<u32> {
         numbers(stacks).find(|number| *number >= self.frames)
     }

@@ -1,5 +1,5 @@
 //! How the columns of a batch lie in its payload: which there are, how wide they are, and where each begins.
-//! What the values mean is said at `Batch`.
+//! `Batch` documents what the values mean.
 
 use std::ops::Range;
 

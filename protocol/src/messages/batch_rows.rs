@@ -1,5 +1,5 @@
 //! How a batch is written: first all of its rows but their states, then each state, or its frames, in the place that follows from them.
-//! What the values mean is said at `Batch`.
+//! `Batch` documents what the values mean.
 
 use super::{
     batch_frames::StackedFrames,

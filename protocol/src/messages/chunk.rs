@@ -21,7 +21,7 @@ const _: () = assert!(TRANSITION_BYTES == 6);
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum End {
-    /// Nothing: the next step goes on from it.
+    /// The episode continues with the next step.
     Running = 0,
     /// A level: a boundary for DIM, not for the return.
     LevelChange = 1,
@@ -64,7 +64,7 @@ pub struct ChunkHeader {
     pub weights_version: u64,
     /// The actor was told to stop and sends what it has left: the rate limiter lets it pass.
     pub leaving: bool,
-    /// Copies of the world, each a stream of its own.
+    /// Copies of the world, one stream each.
     pub streams: u32,
     /// Consecutive steps of each stream in this chunk.
     pub steps: u32,

@@ -1,4 +1,4 @@
-//! The episodes that ended, one by one, for whoever keeps a record of the run.
+//! The episodes that ended, one by one, for the recorder of the run.
 //! Means over the newest of them are in `status`.
 
 use serde::{Deserialize, Serialize};

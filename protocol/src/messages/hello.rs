@@ -1,5 +1,5 @@
-//! What a part that joins a run is told first: the run's settings, and how far the run is.
-//! What it then does with them is its own.
+//! What a process that joins a run learns first: the run's settings, and how far the run is.
+//! It does not admit the process; `join` does.
 
 use serde::{Deserialize, Serialize};
 

@@ -54,7 +54,7 @@ pub enum InsertReply {
         /// Whether the replay server keeps the chunk and will store it: then a [`Claim`] is enough, else it must be sent again.
         kept: bool,
     },
-    /// Not stored: chunks before it are missing; go on from this sequence number.
+    /// Not stored: chunks before it are missing; send from this sequence number on.
     OutOfOrder {
         /// The sequence number that is expected.
         expected: u64,

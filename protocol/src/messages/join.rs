@@ -61,7 +61,7 @@ impl Request for LearnerJoin {
     type Reply = JoinReply;
 }
 
-/// The replay server's answer to a part that joins.
+/// The replay server's answer to a process that joins.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum JoinReply {
     /// It takes part.

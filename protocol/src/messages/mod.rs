@@ -1,5 +1,5 @@
 //! Everything that is sent, one file a message.
-//! How a message becomes bytes is `wire`'s business, who answers it the parts'.
+//! `wire` turns messages into bytes; each process decides what it answers.
 
 pub(crate) mod affinity;
 pub(crate) mod batch;

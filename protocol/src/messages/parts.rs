@@ -1,5 +1,5 @@
-//! Who takes part in a run and how each is, as a replay server knows it: for `driml status`.
-//! Counts and rates are in `status`; this is about who is there, who waits and who was last heard when.
+//! The processes of a run and their state, as a replay server knows them, for `driml status`.
+//! Counts and rates are in `status`; here are who is connected, who waits, and when each was last seen.
 
 use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
@@ -7,10 +7,10 @@ use zenoh::qos::Priority;
 use super::{report::Warning, status::Waiting};
 use crate::wire::message::{Keyed, Kind, Message};
 
-/// Parts of which the last warning is passed on: those whose is newest.
+/// Processes whose last warning is passed on: those with the newest ones.
 pub const WARNINGS_MAX: usize = 64;
 
-/// Which part of a run.
+/// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum PartName {
     /// The learner.
@@ -47,7 +47,7 @@ pub struct PartStatus {
     pub weights_version: Option<u64>,
     /// What it says that it does, for how many seconds, and how many seconds ago it said so; none if it has said nothing.
     pub doing: Option<(String, f64, f64)>,
-    /// The last warning in its log, where it is among the newest of all parts.
+    /// The last warning in its log, where it is among the newest of all processes.
     pub last_warning: Option<Warning>,
 }
 
@@ -68,7 +68,7 @@ pub struct LogStatus {
     pub unwritten_bytes: u64,
 }
 
-/// A replay server's account of itself and of all parts that have joined it.
+/// A replay server's report on itself and on all processes that have joined it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartsStatus {
     /// Seconds since it started.

@@ -1,5 +1,5 @@
 //! What a replay server answers to everything while it reads its replay back from disk: how far it is.
-//! It travels as an error reply, so whoever asked anything else asks again.
+//! It travels as an error reply to any query; the sender retries.
 
 use std::fmt;
 
@@ -40,7 +40,7 @@ impl fmt::Display for RecoveryProgress {
     }
 }
 
-/// The replay server cannot answer yet, as it is reading its replay back. Whatever was asked has had no effect.
+/// The replay server cannot answer yet, because it is reading its replay back. The query had no effect.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Recovering {
     /// How far it is.

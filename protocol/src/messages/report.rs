@@ -10,12 +10,12 @@ use crate::wire::{
     message::{Keyed, Kind, Message, Request, no_payload},
 };
 
-/// Bytes of what a part does, in words.
+/// Most bytes of the description of what a process does.
 const DOING_MAX: usize = 80;
 /// Bytes of a warning that is passed on.
 const WARNING_MAX: usize = 400;
 
-/// One life of a part, by the number that nobody knows but itself and the replay server.
+/// One incarnation of a process, by the number that only it and the replay server know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Life {
     /// Of an actor.
@@ -39,7 +39,7 @@ impl Life {
     }
 }
 
-/// A part's account of itself.
+/// What a process reports about itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// Whose it is.
@@ -54,7 +54,7 @@ pub struct Report {
     pub finished: Option<u64>,
 }
 
-/// A line of a part's log.
+/// A line of a process's log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Warning {
     /// The line, cut to 400 bytes.

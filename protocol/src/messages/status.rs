@@ -1,5 +1,5 @@
-//! What the parts say of themselves when asked: counters and means, never data.
-//! It computes nothing; each part fills in its own.
+//! What processes report when asked: counters and means, never data.
+//! It computes nothing; each process fills in its own.
 
 use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
@@ -11,7 +11,7 @@ use crate::wire::message::{Keyed, Kind, Message};
 pub enum Waiting {
     /// Neither side waits.
     #[default]
-    Nobody,
+    Neither,
     /// The learner, for the first transitions.
     WarmUp {
         /// Transitions stored so far.
@@ -23,14 +23,14 @@ pub enum Waiting {
     LearnerWaitsForActors,
     /// The actors: as many transitions are stored as the replay ratio allows.
     ActorsWaitForLearner,
-    /// Nobody any more: all transitions are in and their rows sampled.
+    /// Neither side: all transitions are stored and their rows sampled.
     Finished,
 }
 
 impl std::fmt::Display for Waiting {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::Nobody => f.write_str("nobody waits"),
+            Self::Neither => f.write_str("neither side waits"),
             Self::WarmUp { have, need } => write!(f, "warm-up {have}/{need}"),
             Self::LearnerWaitsForActors => f.write_str("learner waits for actors"),
             Self::ActorsWaitForLearner => f.write_str("actors wait for learner"),
@@ -232,7 +232,7 @@ impl ReplayStatus {
         // Each knows of the others what the learner told it; the one that knows of the end is right.
         self.finished |= it.finished;
         self.learner_finished |= it.learner_finished;
-        if it.waiting == Waiting::Finished || self.waiting == Waiting::Nobody {
+        if it.waiting == Waiting::Finished || self.waiting == Waiting::Neither {
             self.waiting = it.waiting;
         }
     }

@@ -1,5 +1,5 @@
-//! What a process is doing, and since when, in words: for whoever asks why nothing happens.
-//! It is told, it does not look.
+//! What a process is doing, and since when, as text for `driml status`.
+//! The process reports it; nothing is observed here.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -20,7 +20,7 @@ impl Activity {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// From now on it does this; what it does already goes on.
+    /// Sets what it does from now on; the same activity keeps its start time.
     pub fn begin(&self, doing: &str) {
         let mut now = self.now();
         if now.0 != doing {
@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_goes_on_is_not_begun_again() {
+    fn the_same_activity_keeps_its_start() {
         let activity = Activity::new("plays");
         std::thread::sleep(Duration::from_millis(20));
         activity.begin("plays");

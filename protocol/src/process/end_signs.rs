@@ -1,4 +1,4 @@
-//! The signs that a process should end: a signal, or that whoever watched it is gone. It listens for the process's whole life.
+//! Reasons for a process to exit: a signal, a closed terminal or stderr, a dead parent. It listens for the process's whole life.
 //! What a sign means, a wish to drain or to end at once, is for the caller.
 
 use std::{
@@ -22,9 +22,9 @@ const LOOK: Duration = Duration::from_millis(500);
 /// Why a process should end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EndSign {
-    /// Somebody asks for it: SIGINT (Ctrl-C) or SIGTERM.
+    /// It was requested: SIGINT (Ctrl-C) or SIGTERM.
     Asked,
-    /// Nobody watches any more: the terminal was closed (SIGHUP), stderr's reader has gone, or the parent has died.
+    /// The terminal was closed (SIGHUP), the reader of stderr exited, or the parent died.
     Abandoned,
 }
 
@@ -45,8 +45,8 @@ pub fn listen(
         .build()?;
     let (mut interrupt, mut terminate, mut hangup) = {
         let _inside = runtime.enter();
-        // A file that may not grow any more (`ulimit -f`) is an error of whoever writes it, as a full disk is; left alone, this signal
-        // would end the process. Its handler stays.
+        // A file at its size limit (`ulimit -f`) becomes a write error, like a full disk; without a handler this signal would kill
+        // the process. The handler stays.
         drop(signal(SignalKind::from_raw(Number::SIGXFSZ as i32))?);
         (
             signal(SignalKind::interrupt())?,
@@ -87,7 +87,7 @@ pub fn listen(
     Ok(())
 }
 
-/// Waits for the signal; for ever if there is none.
+/// Waits for the signal; without one it never returns.
 async fn received(signal: &mut Option<Signal>) {
     match signal {
         Some(signal) => {
@@ -110,8 +110,8 @@ fn ignored_signals(status: &str) -> u64 {
         .unwrap_or_default()
 }
 
-/// Whether nobody can read what is written to stderr any more: the pipe's reader has ended, or the terminal was closed. A file
-/// that cannot be written to is not gone.
+/// Whether stderr has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
+/// count.
 fn stderr_is_gone() -> bool {
     is_gone(std::io::stderr())
 }

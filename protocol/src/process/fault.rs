@@ -1,4 +1,4 @@
-//! Hidden faults for tests: with `DRIML_TEST_PANIC=NAME` in the environment, whoever comes to the point NAME panics; with
+//! Hidden faults for tests: with `DRIML_TEST_PANIC=NAME` in the environment, the thread that reaches the point NAME panics; with
 //! `DRIML_TEST_HOLD=UPDATES FILE` a learner that has made so many updates waits for the file.
 //! They exist in debug builds only; a release build reads no such variables.
 
@@ -7,8 +7,8 @@ pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 
 /// Panics if `DRIML_TEST_PANIC` names this point, in a debug build; else does nothing.
 ///
-/// Every thread that does a part's work passes one such point each time round its loop, named as the thread is. So a test can
-/// show for each of them that a panic ends the process and is not swallowed with the thread.
+/// Every working thread passes one such point in each iteration of its loop, named as the thread is. So a test can show for each
+/// thread that a panic ends the process.
 #[inline]
 #[track_caller]
 pub fn point(name: &str) {

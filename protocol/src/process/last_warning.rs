@@ -1,5 +1,5 @@
-//! The last warning or error of this process, for whoever asks how it is.
-//! The log hands it over; where a log line goes besides is not known here.
+//! The last warning or error of this process, for status reports.
+//! The logger stores it here; where else a log line goes is not known here.
 
 use std::{
     sync::{Mutex, PoisonError},

@@ -1,5 +1,5 @@
 //! Files whose lock says that something is in use. The lock ends with the last process that has the file open, however it ends.
-//! It does not wait: how long, and what is said meanwhile, is the caller's.
+//! It does not wait and logs nothing; the caller does.
 
 use std::{
     fs::{File, TryLockError},

@@ -56,7 +56,7 @@ impl Shutdown {
             .expect("no thread panics while holding the flag")
     }
 
-    /// What `work` gives, which runs on a thread of this `name`; `None` if the flag is raised before. Then nobody waits for the thread.
+    /// The result of `work`, run on a thread of this `name`; `None` if the flag is raised first. The thread is then left alone.
     ///
     /// # Errors
     /// The operating system gave no thread.
@@ -69,21 +69,20 @@ impl Shutdown {
         let thread = std::thread::Builder::new().name(name.into());
         thread.spawn(move || {
             fault::point(name);
-            // Nobody listens if the flag was raised meanwhile.
+            // The receiver is gone if the flag was raised meanwhile.
             let _ = tell.send(work());
         })?;
         loop {
             match told.recv_timeout(TICK) {
                 Ok(given) => return Ok(Some(given)),
-                // The thread ends without a word where it panics, and then the process ends.
+                // A thread that panics sends nothing; the panic ends the process.
                 Err(_) if self.is_set() => return Ok(None),
                 Err(_) => {}
             }
         }
     }
 
-    /// A flag that is raised at the first sign that this process should end: a signal, or that nobody watches it any more. The
-    /// death of the process `parent` is one.
+    /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
     ///
     /// # Errors
     /// As [`end_signs::listen`].
@@ -103,13 +102,13 @@ impl Shutdown {
 pub struct TwoSteps {
     /// Raised when it should end as soon as the others have left.
     pub ending: Shutdown,
-    /// Raised when it should end without waiting for anybody.
+    /// Raised when it should end without waiting for the others.
     pub now: Shutdown,
 }
 
 impl TwoSteps {
-    /// The first flag is raised at any sign that this process should end, the second at SIGINT and SIGTERM, and without a `parent` at
-    /// any sign. With one, its death, SIGHUP or a stderr that nobody reads raise the first alone: the others end then as well.
+    /// The first flag is raised at any reason to exit, the second at SIGINT and SIGTERM, and without a `parent` at any reason. With a
+    /// parent, its death, SIGHUP or a closed stderr raise only the first: the other processes exit then, too.
     ///
     /// # Errors
     /// As [`end_signs::listen`].

@@ -1,5 +1,5 @@
 //! What each role may do, as rules for zenoh's access control at the replay server: everything else is denied.
-//! A message is let in by its sender's common name and its key alone; what it says is checked by whoever answers it.
+//! A message is let in by its sender's common name and its key alone; its content is checked by the process that answers it.
 
 use super::role::{ACTORS_MAX, Role};
 use crate::{
@@ -28,13 +28,13 @@ struct Grant {
     asks: Vec<String>,
     /// Keys at which it answers.
     answers: Vec<String>,
-    /// Keys at which it hears announcements.
+    /// Keys to which it subscribes.
     hears: Vec<String>,
     /// Keys of its liveliness tokens.
     lives: Vec<String>,
 }
 
-/// What a role may do in the run whose keys these are; nothing for a replay server, which connects to nobody.
+/// What a role may do in the run whose keys these are; nothing for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
     let (mut asks, mut answers) = (vec![keys.of::<Hello>()], Vec::new());
     let (mut hears, mut lives) = (Vec::new(), Vec::new());

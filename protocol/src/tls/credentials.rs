@@ -32,7 +32,7 @@ pub fn authority_path(folder: &Path) -> PathBuf {
     folder.join("ca.pem")
 }
 
-/// What a part shows and whom it trusts. Nobody has them but by [`Credentials::read`], so they are good.
+/// A process's certificate and key, and the authority that it trusts. [`Credentials::read`] has checked them.
 #[derive(Debug)]
 pub struct Credentials {
     role: Role,
@@ -138,7 +138,7 @@ impl Credentials {
         &self.expires_on
     }
 
-    /// The names and addresses that the certificate is for: whoever connects to a replay server calls it by one of them.
+    /// The names and addresses that the certificate is for: clients connect to the replay server by one of them.
     pub fn hosts(&self) -> &[String] {
         &self.hosts
     }
@@ -148,7 +148,7 @@ impl Credentials {
         &self.key
     }
 
-    /// Whether other users of this machine can read the key, and so play this part.
+    /// Whether other users of this machine can read the key, and so act in this role.
     pub fn is_key_open(&self) -> bool {
         let mode = fs::metadata(&self.key).map(|it| it.permissions().mode());
         mode.is_ok_and(|mode| mode & 0o077 != 0)
@@ -160,7 +160,7 @@ impl Credentials {
         Duration::from_secs(u64::try_from(left).unwrap_or(0))
     }
 
-    /// Warns if the certificate expires soon: whoever has an expired one is cut off in the middle of a run.
+    /// Warns if the certificate expires soon: an expired one is rejected in the middle of a run.
     pub(crate) fn warn_if_it_expires_soon(&self) {
         let left = self.expires_in();
         if left < EXPIRES_SOON {

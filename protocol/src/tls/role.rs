@@ -1,11 +1,11 @@
-//! What a part is, as the common name of its certificate says it.
+//! The role of a process, which is the common name of its certificate.
 //! What each may do is in `access`.
 
 /// Actors that certificates can name: 0 to this many, less one. The access rules of all of them are made when a replay server
 /// starts, and take memory.
 pub const ACTORS_MAX: u32 = 1024;
 
-/// What a part is, and the common name of its certificate.
+/// The role of a process, and the common name of its certificate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// The actor of this number.
@@ -14,7 +14,7 @@ pub enum Role {
     Learner,
     /// A replay server: the side that listens.
     ReplayServer,
-    /// Whoever only looks.
+    /// A process that only watches.
     Observer,
 }
 
@@ -42,7 +42,7 @@ impl std::str::FromStr for Role {
             _ => number.map(Self::Actor),
         };
         role.filter(|role| role.to_string() == name).ok_or_else(|| {
-            format!("{name:?} is no role: take replay-server, learner, observer or actor-N")
+            format!("{name:?} is not a role: use replay-server, learner, observer or actor-N")
         })
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::role::{ACTORS_MAX, Role};
 
-/// Why a part cannot take part with its certificate.
+/// Why a process cannot use its certificate.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
     /// A number beyond what certificates can name.
@@ -19,7 +19,7 @@ pub enum TlsError {
     },
     /// A file that is not there.
     #[error(
-        "{} is not there: a part with the role {role} needs ca.pem, {role}.pem and {role}.key; `deploy/certs.sh {}` makes them, \
+        "{} is not there: the role {role} needs ca.pem, {role}.pem and {role}.key; `deploy/certs.sh {}` makes them, \
          beside the authority's key, and you copy them here",
         .path.display(), how(.path, *.role)
     )]

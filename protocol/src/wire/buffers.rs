@@ -133,7 +133,7 @@ impl Shared {
 /// A pool of `bytes` bytes of shared memory, or why there is none.
 ///
 /// zenoh makes its own part with the first piece, and panics where it cannot: so that piece is taken here, while there is room for
-/// it. All of it is locked in memory, so whoever fills the folder later takes nothing from this process.
+/// it. All of it is locked in memory, so that a folder that fills up later takes nothing from this process.
 fn provider(bytes: usize) -> Result<ShmProvider<PosixShmProviderBackend>, String> {
     let needed = shared_memory::process_bytes(bytes);
     shared_memory::check_lockable(needed)?;

@@ -12,7 +12,7 @@ use super::{
     prefix::Prefix,
 };
 
-/// The version of every message in this crate; parts of different versions refuse each other.
+/// The version of every message in this crate; processes of different versions reject each other.
 pub const PROTOCOL_VERSION: u16 = 7;
 
 /// Length of the fixed prefix, bytes.
@@ -124,7 +124,7 @@ pub fn encode<M: Message>(
 
 /// Checks a message in one piece and gives it and its payload.
 ///
-/// `spec_hash` is the hash that this part runs, or `None` where any run is welcome (a part that joins to learn it).
+/// `spec_hash` is the hash of this process's run, or `None` where any run is accepted (a process that joins to learn it).
 ///
 /// # Errors
 /// Anything that is not a whole, undamaged message of this kind, version and run.
@@ -178,7 +178,7 @@ struct Pieces<'a, I> {
 
 impl<'a, I: Iterator<Item = &'a [u8]>> Pieces<'a, I> {
     /// Copies the next bytes into `out`, a block at a time, so that the sum finds each block of the copy in the cache.
-    /// Where the pieces end early, the rest of `out` stays as it is: the checksum will not fit.
+    /// Where the pieces end early, the rest of `out` keeps its content: the checksum will not fit.
     fn copy_to(&mut self, out: &mut [u8], mut sum: Option<&mut crc32fast::Hasher>) {
         let mut filled = 0;
         while filled < out.len() {

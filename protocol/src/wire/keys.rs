@@ -52,7 +52,7 @@ impl Keys {
         }
     }
 
-    /// Where the learner asks messages of type `M`, of which each actor may have a key of its own.
+    /// Where the learner sends messages of type `M`, for which each actor may have its own key.
     pub fn of_learner<M: Keyed>(&self) -> String {
         if M::BY_ACTOR {
             self.key(&format!("{}/learner", M::KEY))
@@ -89,7 +89,7 @@ impl Keys {
         self.key("alive/**")
     }
 
-    /// Whose liveliness token has this key; none if it is no part's of this run.
+    /// Whose liveliness token has this key; none for a token of another run.
     pub fn alive(&self, key: &str) -> Option<Alive> {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
@@ -104,8 +104,8 @@ impl Keys {
     }
 }
 
-/// A part whose liveliness token was seen. Anybody may see tokens, so they do not show the numbers by which the replay server
-/// knows its actors and its learner: who knew such a number could speak for them.
+/// A process whose liveliness token was seen. Every client can see tokens, so they hide the numbers by which the replay server
+/// knows its actors and its learner: with such a number a client could send in their name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Alive {
     /// One life of an actor.
@@ -136,7 +136,7 @@ impl Alive {
     }
 }
 
-/// What shows that somebody knows `number`, and does not tell it: the first 8 bytes of its SHA-256.
+/// Proves knowledge of `number` without revealing it: the first 8 bytes of its SHA-256.
 fn mark(number: u64) -> u64 {
     let digest = Sha256::digest(number.to_le_bytes());
     u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
@@ -157,8 +157,8 @@ mod tests {
         assert_eq!(keys.of_learner::<Report>(), "a/7/report/learner");
         assert_eq!(Keys::actor("a/7/report/learner"), None);
         assert_eq!(Keys::actor("a/7/goodbye/7"), Some(7));
-        for nobody_s in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
-            assert_eq!(Keys::actor(nobody_s), None, "{nobody_s}");
+        for foreign in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
+            assert_eq!(Keys::actor(foreign), None, "{foreign}");
         }
     }
 

@@ -26,13 +26,12 @@ pub trait Message: Serialize + DeserializeOwned {
     }
 }
 
-/// A message with a key of its own: where it is asked, fetched or announced. Replies have none, they travel back.
+/// A message with a key at which it is queried, fetched or published. Replies have none, they travel back.
 pub trait Keyed: Message {
     /// Its key under the run's namespace.
     const KEY: &'static str;
-    /// Whether each actor has a key of its own for it, `KEY/<number>`. Then whoever guards the keys can tell who may speak for
-    /// which actor, without reading messages; the receiver checks that key and message agree. What the learner says stands at
-    /// `KEY/learner`.
+    /// Whether each actor has its own key for it, `KEY/<number>`. Then access control can check senders by their keys, without reading
+    /// messages; the receiver checks that key and message agree. The learner's key is `KEY/learner`.
     const BY_ACTOR: bool = false;
     /// How urgent it is beside other messages on the same link.
     const PRIORITY: Priority = Priority::Data;
@@ -86,7 +85,7 @@ pub enum Kind {
     ActorJoin = 13,
     /// A learner that starts.
     LearnerJoin = 14,
-    /// The answer to a part that starts.
+    /// The answer to a process that starts.
     JoinReply = 15,
     /// What became of a chunk, actor to replay server.
     Claim = 16,
@@ -94,7 +93,7 @@ pub enum Kind {
     WeightsUpload = 17,
     /// A request for a piece of the newest weights, actor to replay server.
     WeightsRequest = 18,
-    /// What a part says of itself, actor or learner to replay server.
+    /// The state of an actor or the learner, to the replay server.
     Report = 19,
     /// The replay server's account of who takes part.
     PartsStatus = 20,
@@ -104,6 +103,6 @@ pub enum Kind {
     EpisodesRequest = 22,
     /// Episodes that ended.
     EpisodesReply = 23,
-    /// "Not yet: the replay is being read back from disk", replay server to whoever asks anything.
+    /// "Not yet: the replay is being read back from disk", replay server in answer to any query.
     Recovering = 24,
 }

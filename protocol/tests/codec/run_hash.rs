@@ -87,7 +87,7 @@ fn the_hash_knows_every_field() {
     let mut hashes: Vec<u64> = others.iter().map(RunSpec::hash).collect();
     hashes.push(spec.hash());
     assert_eq!(spec.hash(), base().hash());
-    // Checkpoints bear it: with another one nobody could go on with them.
+    // Checkpoints hold it: with another hash they could not be resumed.
     assert_eq!(format!("{:016x}", spec.hash()), "0c6c6069564f3984");
     hashes.sort_unstable();
     hashes.dedup();

@@ -277,7 +277,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         },
     ];
     let waits = [
-        Waiting::Nobody,
+        Waiting::Neither,
         Waiting::WarmUp {
             have: 3,
             need: 1000,

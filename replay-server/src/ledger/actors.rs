@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
 
-/// Most actors a run may ever have; a further one is refused, the known ones go on.
+/// Most actors a run may ever have; a further one is rejected, the known ones continue.
 pub const ACTORS_MAX: usize = 4096;
 /// Most streams of one actor; a chunk with more is refused.
 pub const STREAMS_MAX: u32 = 4096;
@@ -28,7 +28,7 @@ pub(crate) struct Stream {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Count {
     incarnation: u64,
-    /// Transitions it has produced by its own account, as far as heard.
+    /// Transitions that it has produced, by its last report.
     produced: u64,
     said_goodbye: bool,
 }

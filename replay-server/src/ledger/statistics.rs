@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::actors::Difference;
 
-/// Ended episodes that are kept for those who ask for them; of more the oldest are let go.
+/// Ended episodes that are kept for clients; of more the oldest are dropped.
 const EPISODES_KEPT_MAX: usize = 4 * EPISODES_MAX;
-/// The same in what a log keeps of a moment, where somebody records them: those for which he has not asked yet.
+/// The same in a snapshot on disk, where a recorder fetches them: those that it has not fetched yet.
 const EPISODES_LOGGED_MAX: usize = 1_024;
 
 /// What is counted beside the ring's and the limiter's own counts.
@@ -125,7 +125,7 @@ impl Statistics {
         }
     }
 
-    /// Somebody has the first so many of them.
+    /// The recorder has the first so many of them.
     pub(crate) fn note_recorded(&mut self, episodes: u64) {
         self.recorded = Some(episodes.min(self.counted.episodes));
     }

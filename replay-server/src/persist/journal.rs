@@ -197,7 +197,7 @@ impl Journal {
             .and_then(|()| self.file.write_all_at(payload, at + record.len() as u64))
             .and_then(|()| self.syncer.written(number, &self.file));
         if let Err(e) = written {
-            // What stays behind the end is not whole, and is taken for nothing; this makes room.
+            // A partial record after the end is ignored on recovery; cutting it off makes room.
             if let Err(e) = self.file.set_len(at) {
                 tracing::debug!("cutting off what was not written whole: {e}");
             }

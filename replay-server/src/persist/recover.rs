@@ -163,7 +163,7 @@ struct Reader<'a> {
     oldest: u64,
     /// Whether which transitions are held follows from their number, as it did before.
     same_capacity: bool,
-    /// The last that the log says, if it is a mark: then all is brought back.
+    /// The last record of the log, if it is a mark: then everything is restored.
     mark: Option<Mark>,
 }
 

@@ -191,7 +191,7 @@ impl Replay {
         let (streams, difference) = self.state.actors.accept(&header);
         self.limiter.inserted(header.transitions() as u64);
         let steps = header.steps as usize;
-        // In all shards, as far as heard.
+        // In all shards, by their last reports.
         let frames = self.limiter.inserted_total();
         for ((number, stream), run) in streams.iter_mut().enumerate().zip(packed.runs()) {
             let rows = number * steps..(number + 1) * steps;

@@ -41,7 +41,7 @@ impl Replay {
         }
         let done = self.state.learned.updates;
         match self.state.learner {
-            // It has not heard the answer.
+            // It did not receive the answer.
             Some(known) if known.learner == join.learner => return Ok(0),
             Some(known) if known.run == join.run || join.restart => {}
             Some(_) if done == 0 && join.updates == 0 => {}

@@ -126,7 +126,7 @@ impl Replay {
         &mut self.state.statistics.counted
     }
 
-    /// Transitions of the run that were stored, in all shards as far as heard.
+    /// Transitions of the run that were stored, in all shards by their last reports.
     pub fn inserted_total(&self) -> u64 {
         self.limiter.inserted_total()
     }
@@ -148,7 +148,7 @@ impl Replay {
     /// Who waits for whom now, for batches of the size that the replay was made for.
     pub fn waiting(&self) -> Waiting {
         match self.limiter.waiting(self.batch_size) {
-            Waiting::ActorsWaitForLearner | Waiting::Nobody if self.state.starving => {
+            Waiting::ActorsWaitForLearner | Waiting::Neither if self.state.starving => {
                 Waiting::LearnerWaitsForActors
             }
             waiting => waiting,
@@ -178,7 +178,7 @@ impl Replay {
         self.state.statistics.episodes_since(since)
     }
 
-    /// Somebody has recorded the first so many episodes that ended.
+    /// The recorder has the first so many episodes that ended.
     pub fn note_recorded(&mut self, episodes: u64) {
         self.state.statistics.note_recorded(episodes);
     }

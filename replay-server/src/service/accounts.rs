@@ -1,5 +1,5 @@
-//! What is known of each part beyond its counts: whether it is there, since when, when it was last heard, what it says it does.
-//! It decides nothing. Who has joined, and all counts, are the core's.
+//! The state of each process beyond its counts: whether it is connected, since when, when it was last seen, what it reports.
+//! It decides nothing. The replay knows which processes have joined, and all counts.
 
 use std::{
     collections::{BTreeMap, HashSet},
@@ -11,10 +11,10 @@ use driml_protocol::{Alive, PartName, PartStatus, Report, WARNINGS_MAX, Waiting,
 
 use crate::ledger::actors::ACTORS_MAX;
 
-/// Parts that are known to be connected at a time, far more than take part: further ones count as absent.
+/// Most processes that count as connected at a time, far more than a run has; further ones count as absent.
 const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
 
-/// The accounts of all parts that have joined, and who is connected.
+/// The accounts of all processes that have joined, and the connections.
 pub(super) struct Accounts {
     started: Instant,
     waiting: (Waiting, Instant),
@@ -48,14 +48,14 @@ impl Accounts {
     pub(super) fn new(now: Instant) -> Self {
         Self {
             started: now,
-            waiting: (Waiting::Nobody, now),
+            waiting: (Waiting::Neither, now),
             weights_at: None,
             connected: HashSet::new(),
             parts: BTreeMap::new(),
         }
     }
 
-    /// A part takes part. One that asks again has joined once.
+    /// A process has joined. One that asks again has joined once.
     pub(super) fn joined(&mut self, who: Alive, now: Instant) {
         let earlier = self.parts.get(&name(who));
         if earlier.is_some_and(|account| account.alive == who) {
@@ -90,12 +90,12 @@ impl Accounts {
         self.all(false).map(|account| account.lives).sum()
     }
 
-    /// Whether this life of a part is connected, also if it has not joined.
+    /// Whether this incarnation of a process is connected, also if it has not joined.
     pub(super) fn is_connected(&self, who: Alive) -> bool {
         self.connected.contains(&who)
     }
 
-    /// A part is connected, or no longer.
+    /// A process is connected, or no longer.
     pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
         let has_changed = match is_connected {
             true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
@@ -112,7 +112,7 @@ impl Accounts {
         connected.count() as u32
     }
 
-    /// Parts that are connected and have joined.
+    /// Processes that are connected and have joined.
     pub(super) fn connected(&self) -> usize {
         let parts = self.parts.values();
         parts.filter(|it| self.is_connected(it.alive)).count()
@@ -126,7 +126,7 @@ impl Accounts {
         }
     }
 
-    /// A part says what it does; `false` if it does not take part.
+    /// A process reports what it does; `false` if it has not joined.
     pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
         let Some(account) = self.of(report.who.alive()) else {
             return false;
@@ -180,8 +180,8 @@ impl Accounts {
         learner.or(actors.filter(|_| !finished))
     }
 
-    /// All parts; `held_since` says since when a part's chunk or request has been waiting. Of very many parts the newest warnings are
-    /// passed on.
+    /// All processes; `held_since` says since when a process's chunk or request has been waiting. Of many processes only the newest
+    /// warnings are passed on.
     pub(super) fn parts(
         &self,
         now: Instant,

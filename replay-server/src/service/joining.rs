@@ -1,5 +1,5 @@
-//! Parts that join: what they are told of the run, and whether they are let in.
-//! Who is connected and who is served is kept in `accounts`.
+//! Processes that join: what they learn about the run, and whether they are admitted.
+//! `accounts` knows which are connected.
 
 use std::time::Instant;
 
@@ -18,7 +18,7 @@ impl Service {
         let (mut state, now) = (self.state(), Instant::now());
         let is_connected = kind == SampleKind::Put;
         state.accounts.note_connected(who, is_connected, now);
-        // A part that joined this server's predecessor, whose replay it has, does not join again.
+        // A process that joined this server's predecessor, whose replay it has, does not join again.
         if state.takes_part(who) {
             state.accounts.joined(who, now);
         }
@@ -48,7 +48,8 @@ impl Service {
         self.join(incoming, State::join_learner);
     }
 
-    /// Answers a part that joins: how many lives it had before, or why it is not taken. No answer while the disk refuses to note it.
+    /// Answers a process that joins: how many incarnations it had before, or why it is rejected. No answer while the disk cannot
+    /// record it.
     fn join<J: Request<Reply = JoinReply>>(
         &self,
         incoming: Incoming<J>,
@@ -70,7 +71,7 @@ impl Service {
             earlier_incarnations,
         });
         if let Err(JoinReply::Refused { why }) = &reply {
-            state.refuse("join", &format!("a part was not let in: {why}"));
+            state.refuse("join", &format!("a process was not admitted: {why}"));
         }
         drop(state);
         self.changed.notify_all();
@@ -88,7 +89,7 @@ impl State {
         self.replay.counted().actors = self.accounts.actors_connected();
     }
 
-    /// Whether this life of a part is the one that takes part.
+    /// Whether this incarnation of a process is the one that has joined.
     fn takes_part(&self, who: Alive) -> bool {
         let known = match who {
             Alive::Actor { actor, .. } => {

@@ -1,4 +1,4 @@
-//! What a run takes by its own settings: how long a message of each kind can be, as longer ones are no part's, and shared memory.
+//! Limits that follow from a run's settings: the longest message of each kind, as longer ones are foreign, and shared memory.
 
 use anyhow::Context;
 use driml_protocol::{

@@ -12,12 +12,12 @@ use crate::storage::frame_store::PackedChunk;
 
 /// Bytes of the chunks kept; an actor that sends one more is told to send it again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
-/// Requests kept; the one that has waited longest gives way to one more, and its client asks again.
+/// Requests kept; the one that has waited longest gives way to one more, and its client retries.
 const REQUESTS_MAX: usize = 1024;
 
 /// How long a request waits before it is told to come back: far below every learner's time-out.
 const HOLD_MAX: Duration = Duration::from_secs(1);
-/// The same for a part of a batch: what another shard counts meanwhile is not heard of here.
+/// The same for a part of a batch: this shard does not learn meanwhile what another one counts.
 const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 
 /// A chunk that is stored as soon as the limiter lets it pass.
@@ -70,7 +70,7 @@ impl<Q> ParkedChunks<Q> {
     ) -> Result<(), Q> {
         let place = self.place(chunk.chunk.header.actor);
         let others = self.bytes() - place.map_or(0, |at| self.line[at].chunk.bytes());
-        // One chunk of any size is kept, or an actor with large ones would send for ever.
+        // One chunk of any size is kept, or an actor with large ones would retry forever.
         if others > 0 && others + chunk.bytes() > CHUNK_BYTES_MAX {
             return Err(question);
         }

@@ -68,8 +68,8 @@ pub struct RunArgs {
     pub dir: Option<PathBuf>,
     /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
     pub stay: bool,
-    /// Raised when this process is to end, but not before its parts have delivered what they have and left: its launcher has died,
-    /// which ends them too. It waits for them for at most 10 s. What is to end it at once raises this and `shutdown`.
+    /// Raised when this process is to exit once the other processes have delivered what they have and left: its launcher has died,
+    /// which ends them too. It waits for them no longer than 10 s. To end it at once, raise this and `shutdown`.
     pub ending: Shutdown,
     /// The run's resolved settings, which it sends to each process that joins.
     pub config_toml: String,
@@ -271,7 +271,7 @@ struct Answers<'a> {
 }
 
 impl<'a> Answers<'a> {
-    /// Declares all of it, where rows are drawn by `sampling`. Until the entrance is open everybody is told to ask again.
+    /// Declares all of it, where rows are drawn by `sampling`. Until the entrance is open every query is answered with "retry".
     fn declare(
         client: &'a RunClient,
         entrance: &'a Arc<Entrance>,

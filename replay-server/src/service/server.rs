@@ -33,7 +33,7 @@ pub(super) struct Service {
     /// Whether chunks may come through shared memory.
     pub(super) shared_memory: bool,
     /// How long a question about a chunk is held before it is answered `Wait`: far below the actors' time-out, so that an actor
-    /// can tell a server that makes it wait from one that is silent.
+    /// can tell a server that makes it wait from an unresponsive one.
     pub(super) hold_max: Duration,
     /// Memory for chunks that arrive and batches that leave.
     pub(super) pool: BufferPool,
@@ -127,7 +127,7 @@ impl State {
     }
 }
 
-/// What stands between the questions and the service: until the replay is read back from disk everybody is told how far it is.
+/// Admits queries to the service: until the replay is read back from disk each is answered with the progress.
 pub(super) struct Entrance {
     /// Set once the replay is there.
     pub(super) service: OnceLock<Arc<Service>>,

@@ -14,13 +14,13 @@ use driml_protocol::{
 use super::server::{Service, State};
 use crate::persist::journal::Journal;
 
-/// How often it is looked whether somebody is missing.
+/// How often it checks whether a process is missing.
 const LOOK: Duration = Duration::from_secs(1);
-/// How long a replay server stays for parts that do not leave when the run is over.
+/// How long a replay server waits for processes that do not leave when the run is over.
 const FAREWELL_MAX: Duration = Duration::from_secs(30);
-/// How long it stays when its launcher has died, for parts that hear of that as it does and deliver what they have.
+/// How long it waits when its launcher has died, for processes that notice this too and deliver what they have.
 const ABANDONED_MAX: Duration = Duration::from_secs(10);
-/// How long a part may be missing before it is logged.
+/// How long a process may be missing before it is logged.
 const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
@@ -85,11 +85,11 @@ impl Service {
         };
         let mut state = self.state();
         let finished = report.finished;
-        // That of a part which has been replaced, or is about to join.
+        // Otherwise its process has been replaced, or is about to join.
         if state.accounts.reported(report, Instant::now()) {
             state.replay.note_updates(finished.unwrap_or(0));
         } else {
-            tracing::debug!("a report of a part that does not take part");
+            tracing::debug!("a report of a process that has not joined");
         }
         drop(state);
         incoming.into_responder().reply(&Done);
@@ -122,10 +122,10 @@ impl Service {
         responder.reply(&status);
     }
 
-    /// Says whom the run waits for, where it could not go on without: after some seconds, then now and then. The thread's whole
-    /// work until the end of the process.
+    /// Logs which process the run waits for, if it cannot continue without: after some seconds, then ever more seldom. This is the
+    /// thread's whole work until the process ends.
     pub(super) fn say_who_is_missing(&self) {
-        // Who, since when, and after how long it is logged next: ever more seldom.
+        // Which, since when, and after how long it is logged next.
         let mut missing: Option<(&str, Instant, Duration)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
             fault::point("missing");
@@ -145,8 +145,8 @@ impl Service {
         }
     }
 
-    /// Waits until the run is over or this process `ending`, and no part is left that would ask; or for the end from outside. With `stay`
-    /// a run that is over does not end it.
+    /// Waits until the run is over or this process `ending`, and the other processes have left; or for a shutdown. With `stay` the end
+    /// of the run does not end it.
     pub(super) fn wait_until_over(&self, ending: &Shutdown, stay: bool) {
         let mut waits: Option<(bool, Instant)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
@@ -169,7 +169,7 @@ impl Service {
             };
             waits = Some((is_ending, since));
             if connected == 0 || since.elapsed() > farewell_max {
-                return tracing::info!("{why}, and {connected} parts are left");
+                return tracing::info!("{why}, and {connected} processes are left");
             }
         }
     }

@@ -123,7 +123,7 @@ impl WeightsStore {
         }
     }
 
-    /// The version that somebody who has `version` is to pull.
+    /// The version that a client with `version` is to pull.
     fn begin(&mut self, version: u64, now: Instant) -> Result<u64, WeightsReply> {
         let newest = self.newest.as_ref();
         let newest = newest.filter(|it| it.header.version > version);

@@ -138,7 +138,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
         (Sends(0, 1, 1, 10), (4, 0, 0), "nothing"),
         (Sends(0, 1, 2, 17), (5, 0, 0), "between chunks"),
         (Leaves(0, 1, 30), (12, 0, 0), "after the last chunk"),
-        (Leaves(0, 1, 30), (12, 0, 0), "heard twice"),
+        (Leaves(0, 1, 30), (12, 0, 0), "received twice"),
         (Leaves(1, 1, 3), (12, 0, 1), "one that has not joined"),
         (Joins(1, 1), (12, 0, 1), "nothing was said"),
         (Leaves(1, 1, 3), (15, 0, 1), "of which nothing came"),
@@ -158,7 +158,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
         (Joins(0, 2), (0, 0, 0), "its next life"),
         (Sends(0, 1, 1, 6), (0, 0, 1), "a chunk of the past life"),
         (Leaves(0, 1, 18), (12, 0, 1), "what that could not deliver"),
-        (Leaves(0, 1, 18), (12, 0, 1), "heard twice"),
+        (Leaves(0, 1, 18), (12, 0, 1), "received twice"),
         (Sends(0, 2, 0, 0), (12, 0, 1), "the next life"),
     ];
     for story in [lost, duplicated, replaced] {

@@ -1,4 +1,4 @@
-//! What a replay refuses or lets wait, settings that cannot work, and where a run ends: neither side waits for ever.
+//! What a replay rejects or delays, settings that cannot work, and the end of a run: neither side waits forever.
 //! It does not look at rows, and no message is lost or repeated.
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Waiting};
@@ -270,7 +270,7 @@ proptest! {
             let ahead = allowed - sampled as f64 - ratio * slack as f64;
             prop_assert!(ahead <= ratio * 300.0 + 1e-6, "a chunk at most beyond the slack");
             match limiter.waiting(rows) {
-                Waiting::Nobody => prop_assert!(may_sample && (may_insert || inserted >= max)),
+                Waiting::Neither => prop_assert!(may_sample && (may_insert || inserted >= max)),
                 Waiting::WarmUp { have, need } => prop_assert!(have < need && may_insert && !may_sample),
                 Waiting::LearnerWaitsForActors => prop_assert!(may_insert && !may_sample),
                 Waiting::ActorsWaitForLearner => prop_assert!(!may_insert && may_sample),

@@ -197,7 +197,7 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
 }
 
 /// The log of a replay that died is used: what the learner says it has counts, and rows are right.
-fn check_goes_on(life: &Life, mut replay: Replay) {
+fn check_continues(life: &Life, mut replay: Replay) {
     let rows = life.replay.tally().rows_sampled;
     replay.note_learned(learned(0, 0, rows)).unwrap();
     assert_eq!(replay.tally(), life.replay.tally());
@@ -245,7 +245,7 @@ proptest! {
         let after = stored(&life.replay);
         life.replay.check_valid();
 
-        // The process dies now: all is there.
+        // The process dies now; everything is on disk.
         let dead = root.path().join("dead");
         copy(&life.args.dir, &dead);
         let (replay, recovery) = open(&args(&dead, segment_bytes), &life.config).unwrap();
@@ -282,7 +282,7 @@ proptest! {
         // It comes back from the start after a start, too.
         let (replay, _) = open(&args(&dead, segment_bytes), &life.config).unwrap();
         prop_assert_eq!(stored(&replay), after);
-        check_goes_on(&life, replay);
+        check_continues(&life, replay);
     }
 }
 
@@ -350,7 +350,7 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
 }
 
 #[test]
-fn a_resumed_run_goes_on_with_what_was_kept() {
+fn a_resumed_run_continues_with_what_was_kept() {
     let root = tempfile::tempdir().unwrap();
     let config = Config {
         replay_ratio: 4.0,

@@ -243,7 +243,7 @@ fn damage_costs_what_it_hits_and_is_said() {
 
 /// What was acknowledged and is lost never comes again: the actor, which continues, is taken at its word, and the loss is counted.
 #[test]
-fn after_a_loss_an_actor_goes_on_and_the_loss_is_counted() {
+fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
     let kept = Kept::new(10_000);
     let newest = kept.segments().pop().unwrap();
     flip(&newest, |length| length * 3 / 4);

@@ -1,4 +1,4 @@
-//! Going back to a mark in the log of a replay: all is as it was there, whatever came after it.
+//! Restoring a replay to a mark in its log: the state is that of the mark, whatever came after it.
 //! What comes back without a mark is tested in `persist`.
 
 use std::path::Path;

@@ -11,7 +11,7 @@ pub(crate) fn state(bytes: &[u8]) {
     let _ = checkpoint::check_state(bytes);
 }
 
-/// A run's settings, as the parts and the program read them. What is taken comes back as it is.
+/// A run's settings, as the components and the program read them. Accepted settings are written back unchanged.
 pub(crate) fn config(bytes: &[u8]) {
     let Ok(text) = str::from_utf8(bytes) else {
         return;

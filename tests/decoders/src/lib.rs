@@ -1,5 +1,5 @@
 //! Everything that reads bytes of others, as functions of bytes alone: what fuzzers and the bounded runs in CI call.
-//! None may panic, whatever the bytes; what is read must come back as it is when it is written again.
+//! None may panic, whatever the bytes; what is read must be written back unchanged.
 //!
 //! A new decoder is a function here, a line in [`ALL`], a target in `fuzz/` and seeds in `fuzz/corpus/NAME/`; a test holds that none
 //! of these is forgotten.

@@ -20,7 +20,7 @@ const FORGED_BYTES: usize = 3;
 /// Reads bytes as one type of message.
 type Read = fn(&[u8]);
 
-/// Reads a message in one piece and in several; both ways agree, and what is read comes back as it is.
+/// Reads a message in one piece and in several; both ways agree, and what is read is written back unchanged.
 fn read<M: Message + Debug>(bytes: &[u8]) {
     let whole = codec::decode::<M>(bytes, Some(SPEC));
     let (first, second) = bytes.split_at(bytes.len() / 3);

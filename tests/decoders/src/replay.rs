@@ -145,7 +145,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                 number: numbers.count()?,
                 attempt: numbers.count()?,
             };
-            // The service lets nobody have more rows than the run's batches have.
+            // The service serves no more rows than the run's batches have.
             let rows = numbers.count()?.min(64) as u32;
             let drawn = replay.draw_for(id, rows, driml_protocol::Buffer::zeroed);
             if let Ok(batch) = drawn {

@@ -133,7 +133,7 @@ pub(crate) fn segments(bytes: &[u8]) {
     drop(replay);
     let mut replay = open(dir.path()).unwrap();
     assert_eq!(replay.stored_bytes().unwrap(), before);
-    // It goes on.
+    // It works again.
     let actor = 1000;
     let join = ActorJoin {
         actor,
@@ -290,7 +290,7 @@ fn set(chunk: &mut Chunk, frame: &mut u32) {
     }
 }
 
-/// What the decoder `segments` takes, of a log of several segments and of one of a single segment; as it is, and to be mended.
+/// What the decoder `segments` takes, of a log of several segments and of one of a single segment; intact, and to be mended.
 pub fn logs() -> Vec<(String, Vec<u8>)> {
     let mut all = Vec::new();
     for (name, chunks) in [("short", 2), ("long", 12)] {

@@ -1,5 +1,5 @@
-//! Well-formed lies: a second client that knows the run's hash and says of each kind of message what nobody would.
-//! Each is refused, counted, and logged at a bounded rate; the run goes on. Malformed messages are in `messages`.
+//! Well-formed lies: a second client that knows the run's hash and sends impossible content in each kind of message.
+//! Each is rejected, counted, and logged at a bounded rate; the run continues. Malformed messages are in `messages`.
 
 use std::{
     fs,
@@ -22,7 +22,7 @@ use crate::{LONG, PRIORITISED, launched, system};
 
 const LIFE: u64 = 77;
 const LEARNER: u64 = 78;
-/// An actor's number that nobody has.
+/// An unused actor number.
 const STRANGER: u32 = 500;
 
 /// A launched run, and a second client of it.
@@ -64,8 +64,8 @@ impl Lied {
         assert_eq!(status.messages_refused - before.messages_refused, lies);
     }
 
-    /// The run goes on with its own numbers, and its log is short.
-    fn goes_on(self) {
+    /// The run continues with its own numbers, and its log is short.
+    fn continues(self) {
         let updates = self.client.learner().unwrap().updates;
         let before = self.status();
         self.client
@@ -234,7 +234,7 @@ fn of_each_kind_of_message() {
     let key = keys.of::<WeightsRequest>();
     let requests = requests.map(|(it, expected)| Row::of(client, key.clone(), &it, expected));
     lied.sends(requests, 0);
-    lied.goes_on();
+    lied.continues();
 }
 
 fn upload(client: &Client, learner: u64, version: u64) -> Vec<u8> {
@@ -255,7 +255,7 @@ fn priority(learner: u64, transition: u64, priority: f32) -> PriorityUpdate {
     }
 }
 
-/// Without certificates everybody may offer to answer what is the replay server's to answer.
+/// Without certificates every client may offer to answer in the replay server's place.
 #[test]
 fn of_who_answers() {
     let lied = lied();
@@ -279,7 +279,7 @@ fn of_who_answers() {
     lied.run.stop().expect_code(130);
 }
 
-/// More than a run may have, twice over; then one that is no stranger.
+/// More than a run may have, twice over; then one that belongs to the run.
 #[test]
 fn of_4096_strangers() {
     let lied = lied();
@@ -311,7 +311,7 @@ fn of_4096_strangers() {
     };
     let key = client.keys.of_actor::<Goodbye>(STRANGER);
     lied.sends([Row::of(client, key, &goodbye, "Done")], 1);
-    lied.goes_on();
+    lied.continues();
 }
 
 /// Of a run that draws by them.
@@ -336,7 +336,7 @@ fn of_priorities() {
     lied.sends(no_numbers.map(|it| row(&priority(LEARNER, 1, it))), 4);
     wait_for("what the server says of them", || {
         let log = fs::read_to_string(lied.system.path("run/logs/replay-server.log")).unwrap();
-        log.contains("which is no number from 0 on").then_some(())
+        log.contains("is not a number from 0 on").then_some(())
     });
     let mut long = priority(LEARNER, 1, 1.0);
     long.parts[0].transitions.resize(100_000, 1);
@@ -347,7 +347,7 @@ fn of_priorities() {
         long,
     ];
     lied.sends(others.map(|it| row(&it)), 3);
-    lied.goes_on();
+    lied.continues();
 }
 
 /// 512 MB of zeros are never held; what is too long by less is refused and counted before it is copied.
@@ -384,12 +384,12 @@ fn of_half_a_gigabyte() {
         peak < peak_before + 100,
         "{peak_before} MiB before, then {peak}"
     );
-    lied.goes_on();
+    lied.continues();
 }
 
 /// What a liar would need is not to be seen: the numbers by which the replay server knows its learner and its actors.
 #[test]
-fn of_nobody_whose_number_can_be_read() {
+fn of_processes_whose_number_can_be_read() {
     let lied = lied();
     let client = &lied.client;
     let tokens = client
@@ -425,5 +425,5 @@ fn of_nobody_whose_number_can_be_read() {
     }
     assert_eq!(rows.len(), 2, "the actor and the learner");
     lied.sends(rows, 2);
-    lied.goes_on();
+    lied.continues();
 }

@@ -1,5 +1,5 @@
 //! What a certificate is good for: its own role and number, and nothing else, whatever its holder sends.
-//! Who is let in at all is in `tls`.
+//! Which clients are admitted at all is in `tls`.
 
 use std::sync::{
     Arc,
@@ -47,8 +47,8 @@ impl Guarded {
         self.observer.replay().unwrap().messages_refused
     }
 
-    /// The run goes on as if nothing had been.
-    fn goes_on(&self) {
+    /// The run continues unaffected.
+    fn continues(&self) {
         let updates = self.observer.learner().unwrap().updates;
         let later = |learner: &LearnerStatus| learner.updates > updates + 10;
         self.observer.wait_for_learner("more updates", later);
@@ -149,10 +149,10 @@ fn an_actor_asks_for_nothing_but_its_own() {
         ],
     );
     assert_eq!(run.refused(), before + 4);
-    run.goes_on();
+    run.continues();
 }
 
-/// Neither answers in the place of others, nor announces, nor hears what is not for it, nor counts as somebody else.
+/// It can neither answer in the place of others, nor publish or receive what is not for it, nor count as another process.
 #[test]
 fn an_actor_declares_nothing_but_its_own() {
     let Some(run) = Guarded::new("an_actor_declares_nothing_but_its_own") else {
@@ -205,7 +205,7 @@ fn an_actor_declares_nothing_but_its_own() {
         .wait()
         .unwrap();
 
-    // Somebody who joins now is told the truth.
+    // A process that joins now gets the right answer.
     let mut two = run.tls.start("actor --id 2", "tls");
     two.wait_for_stderr("actor 2 steps");
     run.observer
@@ -213,12 +213,12 @@ fn an_actor_declares_nothing_but_its_own() {
     two.stop().expect_code(0).expect_said("leaves: ");
     run.observer
         .wait_for_replay("one", |replay| replay.actors == 1);
-    run.goes_on();
-    assert_eq!(asked.load(Ordering::Relaxed), 0, "nobody asks an actor");
+    run.continues();
+    assert_eq!(asked.load(Ordering::Relaxed), 0, "queries to an actor");
     assert_eq!(
         heard.load(Ordering::Relaxed),
         0,
-        "nobody tells it what is not for it"
+        "it receives nothing that is not for it"
     );
     drop((declared, everything, other, learner));
 }
@@ -245,5 +245,5 @@ fn an_observer_only_looks() {
             Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], SILENCE),
         ],
     );
-    run.goes_on();
+    run.continues();
 }

@@ -15,7 +15,7 @@ use crate::system;
 /// The learner that this test plays.
 const LEARNER: u64 = 5;
 
-/// A learner of the run, and whoever else sends weights.
+/// A learner of the run, and another sender of weights.
 struct FakeLearner<'a> {
     client: &'a Client,
 }

@@ -1,4 +1,4 @@
-//! Parts that are told to connect to the wrong place: each cause has its own sentence, soon, and with what to do.
+//! Processes that are told to connect to the wrong place: each cause has its own error, soon, and with what to do.
 //! Wrong certificates are in `tls`, wrong settings in the learner's and the watch's own tests.
 
 use std::{
@@ -22,8 +22,8 @@ const COMMANDS: [&str; 4] = [
     "watch --connect",
 ];
 
-/// Runs a command to its end, which must come within so many seconds of its own waiting, and checks that it names no file of
-/// whoever built it.
+/// Runs a command to its end, which must come within so many seconds, and checks that its output names no file of the build
+/// machine.
 fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
     let started = Instant::now();
     let ended = system.run(command).expect_code(1);
@@ -46,12 +46,12 @@ fn listener() -> (String, TcpListener) {
 }
 
 #[test]
-fn nobody_is_told_from_a_host_that_is_not_known() {
+fn a_closed_port_differs_from_an_unknown_host() {
     let system = system();
     let (endpoint, listener) = listener();
     drop(listener);
     for command in COMMANDS {
-        // Parts give the replay server some seconds to start, who only looks does not.
+        // Processes give the replay server some seconds to start, `driml status` does not.
         refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&format!(
             "nothing listens on {endpoint}: start the replay server first"
         ));
@@ -87,7 +87,7 @@ fn a_web_server_is_no_replay_server() {
     for command in COMMANDS {
         refused(&system, &format!("{command} {endpoint}"), 5)
             .expect_said(&format!(
-                "something listens on {endpoint} that is no part of driml"
+                "something listens on {endpoint} that is not driml"
             ))
             .expect_said("it says \"HTTP/1.0 404 Not Found\"");
     }
@@ -124,12 +124,12 @@ fn a_part_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
     for command in [COMMANDS[0], COMMANDS[1]] {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
-            // Nobody listens there.
+            // Nothing listens there.
             let mut part = system.start(&format!("{command} {}", system.endpoint()));
             part.wait_for_stderr("waiting for 10 s: nothing listens on ");
             part.signal(signal);
             part.wait().expect_code(0);
-            // Somebody does, and says nothing.
+            // Something listens, and sends nothing.
             let (endpoint, listener) = listener();
             let part = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();

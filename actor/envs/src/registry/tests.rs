@@ -285,7 +285,7 @@ fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
     })
 }
 
-/// The levels of a world, and whether an episode goes on from one to the next.
+/// The levels of a world, and whether an episode continues from one to the next.
 fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool) {
     match world.with_levels(which).unwrap() {
         WorldConfig::Procgen(it) => {
@@ -300,16 +300,16 @@ fn levels_of(world: &WorldConfig, which: Levels) -> (std::ops::Range<u32>, bool)
 fn unseen_levels_are_none_of_those_trained_on() {
     for (start, count) in [(0, 500), (70, 1), (1000, 200)] {
         let world = procgen(start, count);
-        let (train, goes_on) = levels_of(&world, Levels::Train);
-        assert_eq!((train.clone(), goes_on), (start..start + count, true));
-        let (single, goes_on) = levels_of(&world, Levels::TrainSingle);
-        assert_eq!((single, goes_on), (train.clone(), false));
-        let (unseen, goes_on) = levels_of(&world, Levels::Unseen);
+        let (train, continues) = levels_of(&world, Levels::Train);
+        assert_eq!((train.clone(), continues), (start..start + count, true));
+        let (single, continues) = levels_of(&world, Levels::TrainSingle);
+        assert_eq!((single, continues), (train.clone(), false));
+        let (unseen, continues) = levels_of(&world, Levels::Unseen);
         assert!(
             unseen.start >= train.end && unseen.len() == 100_000,
             "{unseen:?}"
         );
-        assert!(!goes_on);
+        assert!(!continues);
     }
 }
 

@@ -63,7 +63,7 @@ struct Row {
     skipped: Option<String>,
 }
 
-/// The comparison, as it is written to JSON.
+/// The comparison as JSON.
 #[derive(Clone, Debug, Serialize)]
 struct Comparison {
     rounds: u32,
@@ -224,12 +224,12 @@ fn describe(comparison: &Comparison) -> String {
     ));
     if *load > LOAD_MAX {
         text.push_str(&format!(
-            "The machine was not idle before: {} tasks wanted a core. These are no figures to go by.\n",
+            "The machine was not idle before: {} tasks wanted a core. These figures are not reliable.\n",
             number(*load)
         ));
     }
     if comparison.quick {
-        text.push_str("Quick: a few iterations only, no figures to go by.\n");
+        text.push_str("Quick: a few iterations only; these figures are not reliable.\n");
     }
     text
 }

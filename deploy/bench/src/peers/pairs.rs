@@ -42,24 +42,18 @@ pub(super) fn pairs() -> Vec<Pair> {
         });
     };
     // In bf16 beside the faster of PyTorch's f32 and bf16 autocast; that goal is for AVX512_BF16, with AMX it is 3.
-    for (name, f32, bf16) in [
-        ("C51, 64x64x3", None, None),
-        (GLOBAL_DIM, Some(1.3), Some(1.6)),
-        (
-            "C51 + local-local + global-global DIM, 64x64x3",
-            Some(1.2),
-            None,
-        ),
+    for (case, f32, bf16) in [
+        ("C51", None, None),
+        ("C51 + global-global DIM", Some(1.3), Some(1.6)),
+        ("C51 + local-local + global-global DIM", Some(1.2), None),
         ("C51 + global-global DIM, 104x80x3", Some(1.2), None),
-        ("C51, impala, 64x64x3", Some(1.5), Some(1.8)),
+        ("C51, impala", Some(1.5), Some(1.8)),
         ("C51, impala, 64x64x3, 64 rows", Some(1.5), Some(1.8)),
-        (
-            "C51 + global-global DIM, impala, 64x64x3",
-            Some(1.5),
-            Some(1.8),
-        ),
+        ("C51 + global-global DIM, impala", Some(1.5), Some(1.8)),
     ] {
-        add(Learner, name, name, f32);
+        let size = if case.contains("x3") { "" } else { ", 64x64x3" };
+        let name = format!("{case}{size}");
+        add(Learner, &name, &name, f32);
         let name = format!("{name}, bf16");
         add(Learner, &name, &name, bf16);
     }

@@ -91,7 +91,7 @@ impl Script {
         }
     }
 
-    /// Whether the interpreter is there and finds the peer's module; else why there are no figures, as the table says it.
+    /// Whether the interpreter is there and finds the peer's module; else why there are no figures, for the table.
     pub(super) fn check(&self) -> Result<(), String> {
         let find =
             "import importlib.util, sys; sys.exit(importlib.util.find_spec(sys.argv[1]) is None)";

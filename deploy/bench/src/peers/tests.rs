@@ -66,8 +66,8 @@ fn a_peer_that_is_missing_is_shown_as_skipped() {
         C51   6.00       -  updates/s  PyTorch      -  1.50  skipped
         skipped: python3 has no PyTorch
         Medians of 1 rounds of ours, theirs; the ratio is the median of the rounds' ratios. 2 threads; a processor, 2 cores.
-        The machine was not idle before: 6.60 tasks wanted a core. These are no figures to go by.
-        Quick: a few iterations only, no figures to go by.
+        The machine was not idle before: 6.60 tasks wanted a core. These figures are not reliable.
+        Quick: a few iterations only; these figures are not reliable.
     "#]]
     .assert_eq(&describe(&comparison));
     let json = serde_json::to_value(&comparison).unwrap();

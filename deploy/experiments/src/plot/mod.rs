@@ -56,7 +56,7 @@ const OVERVIEW: [&str; 7] = [
 /// Draws columns of the runs' metrics, or their action affinities.
 ///
 /// # Errors
-/// A folder that is no run's, a column that is not there, a file that cannot be written.
+/// A folder that is not a run's, a column that is not there, a file that cannot be written.
 pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
     Format::of(&args.out).map_err(|e| usage!("{e}"))?;
     let figure = if args.affinity {

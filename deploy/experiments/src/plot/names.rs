@@ -36,7 +36,7 @@ pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
     told_apart.collect()
 }
 
-/// How many seeds there are, and that some were run again where that is so: runs of one seed are no independent samples.
+/// How many seeds there are, and that some were run again where that is so: runs of one seed are not independent samples.
 fn seeds(runs: &[&Run]) -> String {
     let mut seeds: Vec<_> = runs.iter().map(|run| run.seed).collect();
     seeds.sort_unstable();

@@ -66,7 +66,7 @@ impl Run {
         let columns = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
         if columns.place("frames").is_none() {
             return Err(usage!(
-                "{} has no column \"frames\": it is no run's",
+                "{} has no column \"frames\": it is not a run's",
                 path.display()
             )
             .into());
@@ -108,7 +108,8 @@ impl Run {
         for (line, row) in (2..).zip(&table.rows) {
             let number = |text: &str| {
                 let number = text.parse::<f64>();
-                number.map_err(|_| usage!("{}, row {line}: {text:?} is no number", path.display()))
+                number
+                    .map_err(|_| usage!("{}, row {line}: {text:?} is not numeric", path.display()))
             };
             // What was not known yet at a time is empty.
             if !row[place].is_empty() && !row[x].is_empty() {

@@ -34,7 +34,7 @@ use super::{
 };
 use crate::{cache::Session, progress::Progress};
 
-/// Times that a run is tried in one call. A run may lose contact with its parts on a machine that is busy with much else.
+/// Times that a run is tried in one call. A run may lose contact with its processes on a machine that is busy with much else.
 const TRIES: u32 = 2;
 /// How often running children are looked at.
 const POLL: Duration = Duration::from_millis(250);

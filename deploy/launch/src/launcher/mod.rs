@@ -53,19 +53,19 @@ const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Where the replay server is reached from outside the run.
 #[derive(Clone, Debug, Default)]
 pub struct Outside {
-    /// Where the parts meet, if not at a unix socket of their own; with certificates, where it listens beside that.
+    /// Where the processes meet, if not at a private unix socket; with certificates, where it listens beside that.
     pub listen: Option<String>,
     /// The folder of certificates.
     pub tls_dir: Option<PathBuf>,
-    /// Whether everybody is trusted who can connect.
+    /// Whether every client that can connect is trusted.
     pub insecure_network: bool,
 }
 
 /// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
-/// that folder already and goes on from the point given.
+/// that folder already and continues from the point given.
 ///
 /// # Errors
-/// A process that failed or went silent, a file system that refuses; [`Interrupted`] if the run was asked to stop.
+/// A process that failed or is unresponsive, a file system error; [`Interrupted`] if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -143,7 +143,7 @@ pub fn run(
     {
         evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
     }
-    // Nobody is there any more who could be asked; where these files are left, locks tell.
+    // No process is left that could be reached by them; where these files stay behind, locks show it.
     for path in [run_dir.endpoints(), run_dir.meeting()] {
         if let Err(e) = std::fs::remove_file(&path) {
             tracing::debug!("removing {}: {e}", path.display());
@@ -152,7 +152,7 @@ pub fn run(
     // A run that was resumed and learned nothing most likely failed because of what it was resumed from.
     let has_learned = resumed.is_none() || summary.updates > resume_point.updates;
     if let Err(failed) = ended {
-        // It is what the run is remembered by; that the disk is full too is said before.
+        // This error is reported last; that the disk is full too is reported before.
         if let Err(e) = written {
             console::line(&console::describe(&e));
         }

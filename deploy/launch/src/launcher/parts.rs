@@ -27,7 +27,7 @@ fn call<'a>(command: &str, flags: impl IntoIterator<Item = (&'a str, &'a str)>) 
 }
 
 impl Outside {
-    /// What the first replay server is told of it, beside where the parts meet.
+    /// Flags of the first replay server, beside where the processes meet.
     fn flags(&self) -> Vec<String> {
         let mut flags = Vec::new();
         if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
@@ -80,7 +80,7 @@ impl Launch<'_> {
         ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
     }
 
-    /// Who is still started again.
+    /// What is still restarted.
     pub(super) fn revived(&self) -> Revived {
         Revived {
             servers: self.config.local.durable && self.restarts < RESTARTS_MAX,
@@ -88,7 +88,7 @@ impl Launch<'_> {
         }
     }
 
-    /// Starts actors that have died again. What one had not delivered is gone with it; the run goes on.
+    /// Restarts actors that have died. What one had not delivered is lost; the run continues.
     pub(super) fn revive_actors(&mut self) -> anyhow::Result<()> {
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
@@ -138,7 +138,7 @@ impl Launch<'_> {
         ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
     }
 
-    /// Starts replay servers that have died again, if they go on with what they have kept.
+    /// Restarts replay servers that have died, if they keep their replay on disk.
     pub(super) fn revive_servers(&mut self) -> anyhow::Result<()> {
         if !self.config.local.durable {
             return Ok(());

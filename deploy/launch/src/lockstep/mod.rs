@@ -1,7 +1,7 @@
 //! Actors, replay server and learner in one process, one after the other in a fixed order: the same code as the processes run,
 //! without sockets. The same seed gives the same weights, bit for bit, on the same machine; it is for tests and debugging, not for speed.
 //!
-//! A run that was interrupted goes on as if it had not been: with each checkpoint it keeps how worlds, actors and replay stand.
+//! A resumed run continues as if it had not been interrupted: each checkpoint holds the state of worlds, actors and replay.
 
 mod parts;
 mod saved;
@@ -34,7 +34,7 @@ const POLL: Duration = Duration::from_secs(1);
 /// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
 const ROWS_MIN: u64 = 200;
 
-/// Trains in this process, and leaves `run_dir`; with a resume point it goes on with the run that is there.
+/// Trains in this process, and leaves `run_dir`; with a resume point it continues the run that is there.
 ///
 /// # Errors
 /// A component that failed, a file system that refuses; [`Interrupted`] if the run was asked to stop.
@@ -109,7 +109,7 @@ pub fn run(
     if saved != Some((lockstep.updates(), lockstep.frames())) || outcome == Outcome::Interrupted {
         lockstep.save(&folder)?;
     }
-    // After the last save: a longer run would go on from there without it.
+    // After the last save: a longer run would continue from there without it.
     lockstep.end()?;
     screen.clear();
     if outcome == Outcome::Finished {

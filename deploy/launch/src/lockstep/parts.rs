@@ -1,4 +1,4 @@
-//! The parts of a run in lockstep, and whose turn it is.
+//! Actors, replay and learner stepped in a fixed order.
 //! When to save and what to show is for `mod`.
 
 use std::path::Path;
@@ -32,7 +32,7 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
     };
     let batch_size = config.learner.batch_size;
     let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
-    // A part of it would do for a server that goes on, but not for a run that is to be the same.
+    // A server could continue with a part of it, but a lockstep run must be the same.
     match recovery.warnings.first() {
         Some(why) if mark.is_some() => Err(usage!(
             "the run cannot resume to the same weights: {why}. Start it again, in another folder"
@@ -53,7 +53,7 @@ pub(super) struct Lockstep {
 }
 
 impl Lockstep {
-    /// The parts of a run that begins, whose replay is kept in the run's folder if a checkpoint of it could go on.
+    /// The components of a run that begins; its replay is kept in the run's folder if its checkpoints can be resumed.
     pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let mut this = Self::in_memory(config)?;
         if let Err(e) = this.actor_states() {
@@ -70,7 +70,7 @@ impl Lockstep {
         Ok(this)
     }
 
-    /// The parts of the run in `run_dir`, as they were at its newest checkpoint.
+    /// The components of the run in `run_dir`, as they were at its newest checkpoint.
     pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let saved = SavedParts::read(run_dir)?;
         let mut this = Self::in_memory(config)?;
@@ -83,7 +83,7 @@ impl Lockstep {
         Ok(this)
     }
 
-    /// The parts of a run that begins and is not kept.
+    /// The components of a run that begins and is not kept.
     pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
         let text = config.to_toml();
         let settings = ActorSettings::from_toml(&text)?;
@@ -189,7 +189,7 @@ impl Lockstep {
         self.replay.note_recorded(episodes);
     }
 
-    /// Writes a checkpoint into `folder`, from which the run goes on exactly as it does now.
+    /// Writes a checkpoint into `folder`, from which the run continues exactly as now.
     pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
         let inserted = self.replay.tally().inserted;
         self.learner.progress_mut().note_inserted(0, inserted);
@@ -296,7 +296,7 @@ impl Lockstep {
         Ok(())
     }
 
-    /// The last weights and everyone's last word.
+    /// Publishes the last weights; the actors leave.
     pub(super) fn end(&mut self) -> anyhow::Result<()> {
         if self.turn.published != self.learner.updates() {
             self.publish()?;

@@ -1,4 +1,4 @@
-//! What a checkpoint of a run in lockstep holds beside the learner: how the other parts stand.
+//! What a checkpoint of a run in lockstep holds beside the learner: the state of the other components.
 //! The replay's transitions are not in it; they lie in the run's folder, and this says up to where they count.
 
 use anyhow::Context;
@@ -14,7 +14,7 @@ use crate::run_folder::RunFolder;
 /// How it is written; another way is rejected.
 const FORMAT: u32 = 4;
 
-/// How the parts of a run in lockstep stand, without the learner.
+/// The state of a run in lockstep, without the learner.
 #[derive(Serialize, Deserialize)]
 pub(super) struct SavedParts {
     pub(super) actors: Vec<CollectorState>,
@@ -22,7 +22,7 @@ pub(super) struct SavedParts {
     pub(super) turn: Turn,
 }
 
-/// Whose turn it is, and with which weights.
+/// Which actor is next, and with which weights.
 #[derive(Clone, Serialize, Deserialize)]
 pub(super) struct Turn {
     pub(super) next_actor: usize,
@@ -38,7 +38,7 @@ impl SavedParts {
     /// The bytes of a checkpoint's companion.
     pub(super) fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
         let mut bytes = FORMAT.to_le_bytes().to_vec();
-        bytes.extend(codec::encode_value(self).context("writing how the processes stand")?);
+        bytes.extend(codec::encode_value(self).context("writing actors and replay")?);
         Ok(bytes)
     }
 
@@ -56,6 +56,6 @@ impl SavedParts {
             .into());
         };
         codec::decode_value(content)
-            .with_context(|| format!("reading the parts in {}", path.display()))
+            .with_context(|| format!("reading actors and replay in {}", path.display()))
     }
 }

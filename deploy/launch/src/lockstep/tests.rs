@@ -50,7 +50,7 @@ fn every_torso_learns_the_same_again() {
     }
 }
 
-/// Worlds that are made so large that a convolution leaves a border out: as it is drawn, and enlarged.
+/// Worlds that are made so large that a convolution leaves a border out: as drawn, and enlarged.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
     let pacman = ["input.height=88", "input.width=90"];
@@ -78,7 +78,7 @@ fn where_states_are_augmented_frames_stay_whole() {
     weights(&config);
 }
 
-/// Saves after so many rounds, goes on for `lost` more, which come to nothing, and ends what goes on from there.
+/// Saves after so many rounds, runs `lost` more, which are dropped, and finishes the run from the save.
 fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
@@ -164,9 +164,9 @@ fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
     assert_eq!(sha256(&lockstep), whole);
 }
 
-/// A run that ended goes on as a longer one would have.
+/// A run that ended continues as a longer one would have.
 #[test]
-fn a_finished_run_that_goes_on_computes_what_a_longer_one_would_have() {
+fn a_finished_run_that_continues_computes_what_a_longer_one_would_have() {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
     let short = config("mspacman", "driml-ada", 512, &[]);

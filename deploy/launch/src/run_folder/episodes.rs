@@ -1,7 +1,7 @@
 //! `episodes.csv`: a row for every training episode, kept over a run's resumptions, and the mean return of the last 100.
 //! Each shard's replay server is asked for the episodes that ended; what an episode is, is theirs to say.
 //!
-//! Columns: `seconds` of the run when the episode was heard of, up to a second after it ended (empty where it had ended before the
+//! Columns: `seconds` of the run when the episode was received, up to a second after it ended (empty where it had ended before the
 //! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `copy`, who
 //! played it, and in which copy of its world; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
 //! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
@@ -34,16 +34,16 @@ pub(super) struct TrainingEpisodes {
     episode: u64,
     /// Frames in the last row.
     frames: u64,
-    /// Frames of the run when it was heard last.
+    /// Frames of the run at the last status.
     frames_heard: Option<u64>,
-    /// How many had ended in each shard when it was heard last.
+    /// How many had ended in each shard at its last status.
     heard: Vec<u64>,
     /// How many are in no row.
     lost: u64,
     folder: RunFolder,
     /// The rows with which it began, until it is known how many of them stay.
     rows: Table,
-    /// The shards know of the episodes that were heard before this one was made.
+    /// The shards know of the episodes that were received before this one was made.
     is_known: bool,
 }
 
@@ -174,7 +174,7 @@ impl TrainingEpisodes {
         Ok(())
     }
 
-    /// What the shards knew of when the last episode was heard: all but the newest, which they share as they come.
+    /// What the shards knew of when the last episode was received: all but the newest, which are shared out in order.
     fn take_as_heard(&mut self, shards: &[ReplayStatus]) {
         let mut unheard: u64 = shards.iter().map(|it| it.episodes).sum();
         unheard = unheard.saturating_sub(self.episode);

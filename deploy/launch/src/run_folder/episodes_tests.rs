@@ -142,7 +142,7 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
 }
 
 #[test]
-fn a_run_that_goes_on_has_the_episodes_before() {
+fn a_run_that_continues_has_the_episodes_before() {
     let (_root, folder, mut episodes) = begun();
     hear(&mut episodes, &[Shard::of((1_000, 0, 60, 0))]);
     hear(&mut episodes, &[Shard::of((2_000, 60, 70, 0))]);

@@ -1,4 +1,4 @@
-//! What is written into the run folder while a run goes on: settings, metrics, episodes, events on request, and the summary at its end.
+//! What is written into the run folder during a run: settings, metrics, episodes, events on request, and the summary at its end.
 //! It asks no process: its caller hands a view over.
 
 use std::{
@@ -83,7 +83,7 @@ pub struct RunRecorder {
     metrics: AppendLog,
     events: Option<Events>,
     episodes: TrainingEpisodes,
-    /// The next episodes that are heard had ended before.
+    /// The next episodes that arrive had ended before.
     is_late: bool,
     run: Recorded,
     /// Resident memory of each process, now and at the most.
@@ -108,7 +108,7 @@ impl RunRecorder {
         Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
     }
 
-    /// Goes on from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
+    /// Continues from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
     /// to there stay.
     pub(crate) fn go_on(
         folder: &RunFolder,
@@ -168,7 +168,7 @@ impl RunRecorder {
         Ok(())
     }
 
-    /// The run has been going on for at least so many seconds, in which nobody recorded it.
+    /// The run has taken at least so many seconds before this recorder started.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
         self.is_late = true;
         self.count_seconds(seconds);

@@ -1,4 +1,4 @@
-//! The run folder's files: what a run leaves, and what a resumed one goes on with.
+//! The run folder's files: what a run leaves, and what a resumed one continues.
 
 use std::convert::Infallible;
 
@@ -131,7 +131,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 }
 
 #[test]
-fn a_resumed_run_goes_on_in_its_metrics() {
+fn a_resumed_run_continues_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server"];

@@ -229,7 +229,7 @@ mod tests {
         let said = table.add(row(1)).unwrap();
         let why = "metrics.csv cannot be written: No space left";
         assert!(said.starts_with(why), "{said}");
-        assert_eq!(table.add(row(2)), None, "it is said once");
+        assert_eq!(table.add(row(2)), None, "it is logged once");
         let missing = table.missing().unwrap();
         let why = "2 rows of metrics.csv are lost: ";
         assert!(missing.starts_with(why), "{missing}");

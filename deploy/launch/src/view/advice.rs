@@ -30,7 +30,7 @@ fn parts(view: &RunView) -> impl Iterator<Item = (&str, &PartStatus)> {
 /// Which side waits at the rate limiter and since when.
 pub(super) fn waits(view: &RunView) -> Vec<String> {
     let limiter = |(_, account): (_, &PartsStatus)| match account.waiting {
-        Waiting::Nobody => None,
+        Waiting::Neither => None,
         Waiting::Finished => Some(account.waiting.to_string()),
         waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
     };
@@ -247,8 +247,8 @@ mod tests {
     #[test]
     fn a_server_that_ended_is_told_from_one_that_stands_still() {
         let said = [
-            (false, Waiting::Nobody),
-            (true, Waiting::Nobody),
+            (false, Waiting::Neither),
+            (true, Waiting::Neither),
             (true, Waiting::Finished),
         ]
         .map(|(is_gone, waiting)| needed(&silent(is_gone, waiting)).join("; "));

@@ -14,7 +14,7 @@ use crate::{
 
 /// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
-/// How long updates go on before the rates are steady enough for a time left.
+/// How long updates run before the rates are steady enough to estimate the time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
 /// The progress display: how far, then two lines of numbers.
 pub const TEMPLATE: &str = "{bar:40} {percent:>3}%  {elapsed_precise}\n{msg}";
@@ -64,7 +64,7 @@ pub struct Display {
     /// Updates with which it began, and when the first beyond them was seen.
     updates_before: u64,
     learns_since: Option<Instant>,
-    /// When the run began: a terminal's bar has a clock of its own.
+    /// When the run began: a terminal's bar has its own clock.
     began: Instant,
     plain_next: Instant,
 }
@@ -257,7 +257,7 @@ mod tests {
         display.show(&nothing.moment(), &[]);
         expect![[r#"
             frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
-            return - (0 episodes)  nobody waits"#]]
+            return - (0 episodes)  neither side waits"#]]
         .assert_eq(&display.text(&nothing.moment()).join("\n"));
         let replay = ReplayStatus {
             transitions_inserted: 8_192,
@@ -271,7 +271,7 @@ mod tests {
         display.show(&all.moment(), &[]);
         expect![[r#"
             frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
-            return - (0 episodes)  C51 0.000  nobody waits"#]]
+            return - (0 episodes)  C51 0.000  neither side waits"#]]
         .assert_eq(&display.text(&all.moment()).join("\n"));
     }
 

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::run_view::{RunView, ServerAnswer};
 
-/// Actors that have a line of their own; of the others it is said how many there are.
+/// Actors that have their own line; the others are counted.
 const ACTORS_MAX: usize = 64;
 
 /// Age from which on the page tells how old a process's own report is, seconds.
@@ -34,7 +34,7 @@ pub(crate) fn page(view: &RunView) -> String {
     page += &counts.map(|(what, n)| format!("{what} {n}")).join("  ");
     let mut waits = waits(view);
     if waits.is_empty() {
-        waits.push(Waiting::Nobody.to_string());
+        waits.push(Waiting::Neither.to_string());
     }
     page += &format!("\n{}\n\n", waits.join("; "));
 

@@ -203,7 +203,7 @@ fn greeting(
             let what = format!("the greeting of the replay server on {endpoint}");
             return Err(why).context(what);
         }
-        Err(SessionError::Nobody { .. }) => {
+        Err(SessionError::NoAnswerer { .. }) => {
             return Err(usage!(
                 "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}"
             )

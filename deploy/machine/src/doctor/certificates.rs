@@ -84,7 +84,7 @@ fn complaint(credentials: &Credentials) -> Option<String> {
         ))
     } else if role == Role::ReplayServer && credentials.hosts().is_empty() {
         Some(format!(
-            "it is for no name or address, so nobody can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
+            "it is for no name or address, so no client can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
              NAME_OR_ADDRESS` makes one"
         ))
     } else {

@@ -1,4 +1,4 @@
-//! Presets, flags, `--set` and files: what they resolve to, and what is said of those that cannot work.
+//! Presets, flags, `--set` and files: what they resolve to, and the errors of those that cannot work.
 //! `tests/snapshots/refusals.txt` has the sentences.
 
 use driml_envs::WorldConfig;
@@ -163,7 +163,7 @@ fn an_agent_may_choose_among_the_actions_that_differ_alone() {
 }
 
 #[test]
-fn what_nobody_uses_is_not_there() {
+fn settings_that_are_not_used_are_left_out() {
     let config = with("mspacman", "c51", &[]).unwrap();
     assert_eq!(config.run.horizon, Horizon::None);
     assert_eq!(config.model.dim, driml_model::DimHeads::NONE);
@@ -379,7 +379,7 @@ fn rows_are_drawn_by_the_rule_that_is_set() {
     assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
     let learner = driml_learner::LearnerConfig::from_toml(&text).unwrap();
     assert_eq!(learner.sampling, expected);
-    // The hash of what all parts agree on is that of every other rule: checkpoints stay good.
+    // The hash of the run's settings is that of every other rule: checkpoints stay valid.
     assert_eq!(config.run, with("chain", "c51", &[]).unwrap().run);
 }
 

@@ -183,7 +183,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes the network that plays into a file of its own.
+/// Exports the network that plays into a file.
 fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_none_or(|it| it != "safetensors") {
         let name = path.display();
@@ -200,7 +200,7 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     ))
 }
 
-/// Ends this process when it is asked to or nobody waits for it any more, and leaves nothing half.
+/// Ends this process at a signal or when its reader is gone, and leaves no partial file.
 fn end_when_asked(folder: RunFolder, parent: Option<u32>) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(parent).context("listening for signals")?;
     std::thread::Builder::new()

@@ -131,7 +131,7 @@ impl Recording {
             || self.copies.iter().all(|copy| copy.over.is_some())
     }
 
-    /// Films a step. What fails is said by [`finish`](Self::finish).
+    /// Films a step. [`finish`](Self::finish) returns the errors.
     pub(crate) fn see(&mut self, step: &Step<'_>) {
         if !self.is_over()
             && let Err(e) = self.add(step)
@@ -200,13 +200,13 @@ impl Recording {
             let mut ends = between
                 .filter_map(|it| it.ends.get(i))
                 .chain(moment.ends.get(i));
-            let goes_on = ends.all(|end| *end == StepEnd::Running);
+            let continues = ends.all(|end| *end == StepEnd::Running);
             let look = moment.seen.as_ref().map(|seen| Look {
                 q_values: row(&seen.q_values, self.layout.actions(), i),
                 probabilities: row(&seen.probabilities, self.layout.logits(), i),
                 matches: matches
                     .as_deref()
-                    .filter(|_| goes_on)
+                    .filter(|_| continues)
                     .map(|all| row(all, self.layout.locations(), i)),
             });
             self.layout.draw(&mut picture, i, shot, look);

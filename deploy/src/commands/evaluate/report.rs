@@ -28,7 +28,7 @@ pub(super) fn write(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-/// The object, on a line of its own.
+/// The object, on one line.
 pub(super) fn json(
     player: &Player,
     levels: Levels,

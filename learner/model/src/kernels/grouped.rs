@@ -2,7 +2,7 @@
 //! It knows no network; it runs on the CPU only.
 //!
 //! All other outputs would be computed to be dropped, and their gradients are exactly 0. Rows of one group are put beside each
-//! other, so that each group is a product of its own; sums are taken in the order in which the whole layer takes them.
+//! other, so that each group is one product; sums are taken in the order in which the whole layer takes them.
 
 use std::sync::{Mutex, PoisonError};
 

@@ -49,7 +49,7 @@ impl<E: Element> Images<'_, E> {
 
     /// The image with this index as an operand, `len` scalars and `padding` zeros after them; `room` is for those that have to be made.
     ///
-    /// What lies behind an image in memory is the next one, which is no padding: 0 times a NaN in it is NaN.
+    /// What lies behind an image in memory is the next one, which is not padding: 0 times a NaN in it is NaN.
     pub(crate) fn image<'r, U: Unit<Element = E>>(
         &'r self,
         unit: U,

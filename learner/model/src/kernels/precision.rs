@@ -67,7 +67,7 @@ impl fmt::Display for Precision {
 
 /// Not the name of a precision.
 #[derive(Debug, thiserror::Error)]
-#[error("{0:?} is no precision: take f32 or bf16")]
+#[error("{0:?} is not a precision: use f32 or bf16")]
 pub struct UnknownPrecision(String);
 
 impl FromStr for Precision {

@@ -106,7 +106,7 @@ impl<'a> Product<'a> {
         self.run(&mut sums[first..last], stride, Mode::Add);
     }
 
-    /// As a vector of its own.
+    /// The product as a new vector.
     pub(crate) fn to_vec(self) -> Vec<f32> {
         struct Made<'a>(Product<'a>);
         impl ForUnit for Made<'_> {

@@ -294,7 +294,7 @@ impl Block {
     }
 }
 
-/// Adds to the gradient of a parameter; of one that is no variable there is none.
+/// Adds to the gradient of a parameter; a parameter that is not a variable has none.
 pub(crate) fn sum_in_place(
     parameter: &Tensor,
     add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,

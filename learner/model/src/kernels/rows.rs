@@ -1,4 +1,4 @@
-//! Rows of a tensor, each as often as it is asked for, as a candle operation whose gradient is summed in a fixed order.
+//! Rows of a tensor, each as often as it is listed, as a candle operation whose gradient is summed in a fixed order.
 //! It knows no network; it runs on the CPU only.
 //!
 //! candle's own selection adds its gradient on a single thread.
@@ -104,7 +104,7 @@ mod tests {
     fn rows_are_copied_and_their_gradients_summed() -> Result<()> {
         let values: Vec<f32> = (0..24u8).map(f32::from).collect();
         let x = Var::from_vec(values.clone(), (4, 2, 3), &Device::Cpu)?;
-        // Row 2 is asked for by nobody, row 1 three times.
+        // Row 2 is not listed, row 1 three times.
         let rows = [1, 0, 1, 3, 1];
         let selected = select_rows(&x, &rows)?;
         assert_eq!(selected.dims(), [5, 2, 3]);

@@ -65,7 +65,7 @@ fn a_step_beyond_the_finite_numbers_is_noticed_wherever_it_is() {
     }
 }
 
-/// Moments of a gradient that never ends, and of one whose sign and size go on changing.
+/// Moments of a gradient that never ends, and of one whose sign and size keep changing.
 #[test]
 fn ten_million_steps_leave_the_moments_right() {
     let AdamSettings { beta1, beta2, .. } = SETTINGS;

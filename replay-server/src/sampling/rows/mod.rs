@@ -60,7 +60,7 @@ pub(crate) trait RowSampler: Send {
     /// What decides the next draws, beside what is held.
     fn state(&self, ring: &Ring) -> RowsState;
 
-    /// Takes back a state; of transitions that are no longer held, or were not, nothing. `oldest` is the oldest that was held.
+    /// Restores a state, except for transitions that are no longer held, or were not. `oldest` is the oldest that was held.
     fn restore(&mut self, ring: &Ring, oldest: u64, state: &RowsState);
 
     /// Panics at the first thing that is wrong. Slow: for tests.

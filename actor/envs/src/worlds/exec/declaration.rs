@@ -9,7 +9,7 @@ use super::protocol::{Declaration, Request};
 use crate::copies::{RngUse, copy_rng};
 use crate::error::{EnvError, ExecError};
 
-/// Starts a world's process, asks it for a copy for each of `seeds`, and hears what it declares. Its stderr is logged at `level`.
+/// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
 pub(super) fn introduce(
     command: &str,
     patience: Patience,
@@ -24,7 +24,7 @@ pub(super) fn introduce(
     Ok((process, declaration))
 }
 
-/// Asks a command what world it is: starts it with one copy, hears its declaration, ends it.
+/// Asks a command what world it is: starts it with one copy, reads its declaration, ends it.
 ///
 /// # Errors
 /// A command that cannot be started, does not declare a world in time, or one that no run can be made of.

@@ -1,5 +1,5 @@
 //! A world's process: started, spoken to with a deadline on each answer, and ended with everything that it started.
-//! It does not know what is said.
+//! It does not know the protocol.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
@@ -157,7 +157,7 @@ impl WorldProcess {
         let deadline = Instant::now() + patience.limit;
         let mut line = Vec::new();
         loop {
-            // A byte at a time: what comes after the line is no part of it.
+            // A byte at a time: what follows the line does not belong to it.
             match self.byte_until(deadline, patience, doing)? {
                 b'\n' => return Ok(line),
                 _ if line.len() == LINE_MAX => return Ok(line),
@@ -227,7 +227,7 @@ impl WorldProcess {
     /// What to say of this fault, with the process's last words.
     pub(super) fn fail(&self, fault: Fault) -> ExecError {
         if matches!(fault, Fault::Dead(_)) {
-            // It is dead; its last words may be still on their way. Nobody sends anything here.
+            // It is dead; its last output may still arrive. Nothing is sent on this channel.
             let _ = self.spoken.recv_timeout(END_MAX);
         }
         let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);

@@ -1,7 +1,7 @@
 //! What an actor and a world's process say to each other, where it lies, and what can be wrong with it.
 //! Starting and ending the process is for `process`.
 //!
-//! The process is the command of `--env "exec:COMMAND"`, run by `sh`. What is said to it and what it answers:
+//! The process is the command of `--env "exec:COMMAND"`, run by `sh`. Requests and answers:
 //!
 //! | who | says | by |
 //! | --- | --- | --- |
@@ -20,7 +20,7 @@
 //! | world | the state of all copies is written into the empty file `PATH` | the byte `.` |
 //! | | or: this world cannot be saved after all | the byte `-` and a line that says why |
 //! | actor | `L` and `{"state": PATH, "bytes_max": M}`: the file holds a state that a world of this command and of as many copies wrote | a line to its stdin |
-//! | world | goes on from that state; the frames lie in the block already | the byte `.` |
+//! | world | continues from that state; the frames lie in the block already | the byte `.` |
 //!
 //! A state is everything that decides what follows, generators included, in at most M bytes of the world's own choice. A state that
 //! the world does not take back is a reason to end, with a word to stderr.
@@ -163,7 +163,7 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Makes the memory, whose size nobody can change afterwards.
+    /// Makes the memory, whose size is sealed.
     pub(super) fn new(copies: usize, shape: FrameShape) -> io::Result<Self> {
         let layout = Layout::new(copies, shape);
         let flags = MFdFlags::MFD_CLOEXEC | MFdFlags::MFD_ALLOW_SEALING;

@@ -1,4 +1,4 @@
-//! A world in a process of its own against one whose every frame says which one it is (`tests/worlds/numbered.py`), and each way in
+//! A world in its own process against one whose every frame says which one it is (`tests/worlds/numbered.py`), and each way in
 //! which a process can fail. Needs `python3`, without any package; what needs Gymnasium is in `tests/system/own_worlds.rs`.
 
 use std::fs;
@@ -9,7 +9,7 @@ use super::protocol::SavedExec;
 use super::*;
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
-use crate::saved::tests::goes_on;
+use crate::saved::tests::continues;
 use crate::settings::WorldSettings;
 
 /// The command of the world that numbers its frames.
@@ -116,7 +116,7 @@ fn a_copy_s_seed_does_not_depend_on_how_many_copies_there_are() {
     assert_eq!(different.len(), 64);
 }
 
-/// What is said of a world that goes wrong in its third step.
+/// The error of a world that fails in its third step.
 fn fault(arguments: &str, step_timeout_ms: u64) -> String {
     let config = ExecConfig {
         step_timeout_ms,
@@ -252,11 +252,11 @@ fn what_is_printed_into_the_protocol_is_named() {
 }
 
 #[test]
-fn a_world_that_offers_it_goes_on_where_it_was_saved() {
+fn a_world_that_offers_it_continues_where_it_was_saved() {
     let config = config(numbered("saves"));
     let mut worlds = Vec::new();
     // Another seed each: what a world is, is in its state alone.
-    let ended = goes_on("a process", 60, || {
+    let ended = continues("a process", 60, || {
         worlds.push(());
         Box::new(ExecWorld::new(&config, 3, worlds.len() as u64).unwrap())
     });
@@ -273,7 +273,7 @@ fn a_world_that_offers_it_goes_on_where_it_was_saved() {
     assert_eq!(numbers(&other_frames), numbers(&frames));
 }
 
-/// What is said of a world that offers to save its state, when it is asked to.
+/// The error of a world that offers to save its state, when it is asked to.
 fn save_fault(kind: &str) -> EnvError {
     let config = ExecConfig {
         step_timeout_ms: if kind == "hang" { 700 } else { 60_000 },
@@ -342,7 +342,7 @@ fn each_way_in_which_saving_can_fail_has_its_sentence() {
 fn a_world_that_does_not_offer_it_is_not_asked() {
     let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
     assert!(matches!(world.save(), Err(EnvError::NotSaved)));
-    // It hears nothing of it, and goes on.
+    // It is not told, and continues.
     let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
     world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
 }
@@ -395,7 +395,7 @@ fn alive(mark: &str) -> Vec<String> {
 #[test]
 fn nothing_is_left_of_a_world_and_of_what_it_started() {
     let mark = format!("mark-{}-left", std::process::id());
-    // A child that closes nothing and hears nothing, as a worker may be.
+    // A child that closes no pipe and handles no signal, as a worker may be.
     let command = format!(
         "sh -c 'sleep 600; : {mark}' & {}",
         numbered(&format!("none 0 {mark}"))

@@ -24,7 +24,7 @@ const SAVE: u8 = b'S';
 /// Gives a state back.
 const LOAD: u8 = b'L';
 
-/// Says that there is no state to be had, and why.
+/// The error where no state can be saved, and why.
 const NOT_SAVED: u8 = b'-';
 
 /// Copies of one game, stepped by a process of their own.

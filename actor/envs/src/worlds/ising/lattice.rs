@@ -26,7 +26,7 @@ pub enum Boundary {
 /// Spins s in {-1, +1} with energy E = -sum over bonds of s_i s_j (J = 1, each bond once).
 ///
 /// The stationary law of both dynamics is p(s) proportional to exp(-E / T). Sites may be absent (see `masked`); an
-/// absent site has spin 0 and binds nobody.
+/// absent site has spin 0 and no bonds.
 #[derive(Clone, Debug)]
 pub struct IsingLattice {
     height: usize,

@@ -158,7 +158,7 @@ fn ground_state_has_one_unit_of_energy_a_bond() {
 }
 
 #[test]
-fn absent_sites_stay_absent_and_bind_nobody() {
+fn absent_sites_stay_absent_and_have_no_bonds() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     // Two columns apart: 2 bonds in each, none between them.
     let present = [true, false, true].repeat(3);

@@ -9,7 +9,7 @@ use super::maze::{DIRECTIONS, Direction, Maze, Place};
 /// What a ghost is at. Which one the situation asks for: `wanted`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Mode {
-    /// Go on at random, turning back only where there is no other way.
+    /// Continue at random, turning back only where there is no other way.
     Wander,
     /// Take the shortest way to the agent.
     Follow,
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_follower_that_lost_sight_goes_on_until_it_changes_over() {
+    fn a_follower_that_lost_sight_continues_until_it_changes_over() {
         let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let mut ghost = Ghost {

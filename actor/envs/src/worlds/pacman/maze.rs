@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) const HEIGHT: usize = 21;
 /// Columns of the maze, one pixel each.
 pub(crate) const WIDTH: usize = 19;
-/// Ghosts, each with a start of its own.
+/// Number of ghosts, each with its own start.
 pub(crate) const GHOSTS: usize = 4;
 /// Ways out of a cell: up, down, left, right.
 pub(crate) const DIRECTIONS: usize = 4;

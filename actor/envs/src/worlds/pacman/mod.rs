@@ -32,7 +32,7 @@ use crate::worlds::ising::IsingLattice;
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
-/// A move into a wall is a no-op. The no-op is an action of its own so that an agent can wait for a ghost to pass.
+/// A move into a wall is a no-op. The no-op is a separate action so that an agent can wait for a ghost to pass.
 pub struct PacmanWorld {
     config: PacmanConfig,
     chance: Chance,

@@ -20,7 +20,7 @@ pub(crate) const AGENT: Colour = [255, 255, 0];
 pub(crate) const AGENT_BOOSTED: Colour = [255, 255, 150];
 /// Red, cyan, orange, green.
 pub(crate) const GHOST: [Colour; GHOSTS] = [[255, 0, 0], [0, 255, 255], [255, 128, 0], [0, 255, 0]];
-/// A wall whose Ising spin is +1; one with spin -1 stays as it is.
+/// A wall whose Ising spin is +1; one with spin -1 is unchanged.
 pub(crate) const FUCHSIA: Colour = [255, 0, 255];
 
 /// Paints walls, floor and all the food into `frame` [21, 19, 3].

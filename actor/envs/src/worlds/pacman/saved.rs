@@ -1,4 +1,4 @@
-//! A game of Ms. PacMan as it is kept, and taken back.
+//! Saving and restoring a game of Ms. PacMan.
 //! What never changes, the maze and the settings, is not in it.
 
 use rand_chacha::ChaCha8Rng;

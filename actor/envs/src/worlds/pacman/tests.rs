@@ -503,8 +503,8 @@ fn a_uniform_policy_earns_its_reference_return() {
 }
 
 #[test]
-fn a_game_goes_on_where_it_was_saved() {
-    use crate::saved::tests::goes_on;
+fn a_game_continues_where_it_was_saved() {
+    use crate::saved::tests::continues;
 
     let overlay = IsingOverlay {
         temperature: 2.0,
@@ -523,7 +523,7 @@ fn a_game_goes_on_where_it_was_saved() {
         };
         let make =
             || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
-        assert!(goes_on("Ms. PacMan", 100, make) > 3);
+        assert!(continues("Ms. PacMan", 100, make) > 3);
     }
 }
 

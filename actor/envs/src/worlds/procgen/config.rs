@@ -1,5 +1,5 @@
 //! The settings of the Procgen world, as a preset or a command line gives them.
-//! There are no defaults: every field affects what is learned, so a preset says each with its source.
+//! No field has a default: each affects what is learned, so a preset states it with its source.
 
 use std::path::Path;
 
@@ -24,7 +24,7 @@ pub struct ProcgenConfig {
     pub num_levels: u32,
     /// Number of the first level of the set; test sets start where training sets end.
     pub start_level: u32,
-    /// Whether a completed level is followed by another without ending the episode, so that the return goes on. The
+    /// Whether a completed level is followed by another without ending the episode, so that the return continues. The
     /// level that follows is kept within the set; see this module's documentation.
     pub use_sequential_levels: bool,
     /// Whether the agent's velocity is painted as two grey squares into the upper left corner, in the games in which one

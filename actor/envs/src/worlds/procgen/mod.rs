@@ -17,7 +17,7 @@
 //!
 //! # Sequential levels
 //! With `use_sequential_levels` the engine follows a completed level s by level s + 997, without `first`, the return
-//! going on. With 500 levels this leaves the training set at the first completed level, and the agent trains on ever
+//! continuing. With 500 levels this leaves the training set at the first completed level, and the agent trains on ever
 //! new levels until it dies; only a lost or timed-out episode draws from the set again.
 //!
 //! Here a completed level is followed by one **of the set**: when the engine has left it, the copy's complete state is

@@ -96,7 +96,7 @@ fn another_build_of_the_library_is_played_by_its_path() {
     );
     std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
 
-    crate::saved::tests::goes_on("another build", 50, || {
+    crate::saved::tests::continues("another build", 50, || {
         Box::new(ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap())
     });
     let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
@@ -307,7 +307,7 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
     }
 }
 
-/// There is no order of levels: what follows a level is drawn.
+/// Levels have no order: the next one is drawn.
 #[test]
 fn the_same_level_is_followed_by_different_ones() {
     let Some(engine) = engine("the_same_level_is_followed_by_different_ones") else {
@@ -346,7 +346,7 @@ fn the_same_level_is_followed_by_different_ones() {
     }
 }
 
-/// A redrawn copy is where a fresh one of that level is, and goes on as it does, in every game.
+/// A redrawn copy equals a fresh one of that level, also in the steps that follow, in every game.
 #[test]
 fn a_redrawn_level_is_the_level_itself() {
     let Some(engine) = engine("a_redrawn_level_is_the_level_itself") else {
@@ -478,7 +478,7 @@ fn ends_are_told_apart() {
         }
         assert!(reached > 0);
     }
-    // Being eaten by a larger fish is no time-out.
+    // Being eaten by a larger fish is not a time-out.
     let mut world = ProcgenWorld::with_engine(engine, &config(Game::Bigfish), 8, 1, 0).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let ends: Vec<StepEnd> = (0..500)
@@ -566,16 +566,16 @@ fn visible_actions_are_what_the_engine_does() {
 }
 
 #[test]
-fn every_game_goes_on_where_it_was_saved() {
-    use crate::saved::tests::goes_on;
+fn every_game_continues_where_it_was_saved() {
+    use crate::saved::tests::continues;
 
-    let Some(engine) = engine("every_game_goes_on_where_it_was_saved") else {
+    let Some(engine) = engine("every_game_continues_where_it_was_saved") else {
         return;
     };
     let mut ended = 0;
     for game in Game::ALL {
         let config = config(game);
-        ended += goes_on(game.name(), 200, || {
+        ended += continues(game.name(), 200, || {
             Box::new(ProcgenWorld::with_engine(engine, &config, 2, 5, 0).unwrap())
         });
     }

@@ -79,7 +79,7 @@ pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
     record(&event)
 }
 
-/// A `HistogramProto` in which each number has a bucket of its own, from half below it to half above. Its least and largest value are
+/// A `HistogramProto` in which each number has its own bucket, from half below it to half above. Its least and largest value are
 /// those buckets' ends, as TensorBoard draws nothing beyond them.
 fn histogram(counts: &[u64]) -> Vec<u8> {
     let total = counts.iter().map(|&n| n as f64).sum::<f64>();

@@ -74,7 +74,7 @@ pub(crate) trait ForUnit {
 
 /// Loops over slices, made by `vectorized!`.
 pub(crate) trait Loop {
-    /// Runs them. To be `#[inline(always)]`: a function of its own, or a closure, would be compiled for the least that any
+    /// Runs them. To be `#[inline(always)]`: a separate function, or a closure, would be compiled for the least that any
     /// processor has.
     fn run(self);
 }
