@@ -205,13 +205,13 @@ impl WeightsSource {
     pub fn watch(self, version: u64, shutdown: Shutdown) -> Result<NewestWeights, WeightsError> {
         let newest = NewestWeights::after(version);
         let slot = newest.clone();
-        let hear = move |announced: Result<WeightsVersion, CodecError>| match announced {
+        let on_announcement = move |announced: Result<WeightsVersion, CodecError>| match announced {
             Ok(announced) => slot.announce(announced.version),
             Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
         };
         let announcements = self
             .client
-            .subscribe(hear)
+            .subscribe(on_announcement)
             .map_err(WeightsError::Listening)?;
         let slot = newest.clone();
         let work = move || {

@@ -207,21 +207,21 @@ impl RunClient {
         })
     }
 
-    /// Calls `hear` at each announcement of `M`, until the result is dropped. It is called on the thread that reads the socket,
+    /// Calls `on_message` at each publication of `M`, until the result is dropped. It is called on the thread that reads the socket,
     /// so it must not wait.
     ///
     /// # Errors
     /// zenoh refused to declare it.
     pub fn subscribe<M: Keyed>(
         &self,
-        hear: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
+        on_message: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
     ) -> zenoh::Result<Subscriber<()>> {
         let spec_hash = self.spec_hash;
         self.session
             .declare_subscriber(self.keys.of::<M>())
             .callback(move |sample: Sample| {
                 let bytes = sample.payload().to_bytes();
-                hear(codec::decode(&bytes, Some(spec_hash)).map(|(message, _)| message));
+                on_message(codec::decode(&bytes, Some(spec_hash)).map(|(message, _)| message));
             })
             .wait()
     }

@@ -231,7 +231,7 @@ fn parts_end_with_their_launcher() {
     );
 }
 
-/// They all hear of it at once: the replay server stays until the others have delivered what they have and left.
+/// They all notice it at once: the replay server stays until the others have delivered what they have and left.
 #[test]
 fn parts_whose_launcher_died_deliver_what_they_have() {
     /// A launcher of three processes, each with a file for its output.
@@ -269,7 +269,7 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
     ] {
         assert!(said(part).contains(words), "{}", said(part));
     }
-    assert!(!said("actor").contains("did not hear the goodbye"));
+    assert!(!said("actor").contains("did not receive the goodbye"));
 }
 
 #[test]

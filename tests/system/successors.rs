@@ -98,7 +98,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
     let actor = system.start_actor(1);
-    // One without weights would wait for these, and hear nothing of a new server.
+    // One without weights would wait for these, and learn nothing of a new server.
     client.wait_for_replay("a second actor", |replay| {
         (replay.actors, replay.actors_acting) == (1, 2)
     });

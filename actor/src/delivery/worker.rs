@@ -198,7 +198,7 @@ impl DeliveryWorker {
                 actors,
                 waited,
             }) => {
-                self.hear(inserted_total);
+                self.note_inserted(inserted_total);
                 self.state.actors.store(actors, Ordering::Relaxed);
                 let was_held = self.held_since.take().is_some() || waited;
                 self.state.is_held.store(was_held, Ordering::Relaxed);
@@ -212,7 +212,7 @@ impl DeliveryWorker {
                 Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
-                self.hear(inserted_total);
+                self.note_inserted(inserted_total);
                 self.state.finished.store(true, Ordering::Relaxed);
                 Ok(Outcome::Unwanted)
             }
@@ -220,7 +220,7 @@ impl DeliveryWorker {
                 inserted_total,
                 kept,
             }) => {
-                self.hear(inserted_total);
+                self.note_inserted(inserted_total);
                 self.is_held(kept);
                 Ok(self.again())
             }
@@ -290,7 +290,7 @@ impl DeliveryWorker {
         }
     }
 
-    fn hear(&self, inserted_total: u64) {
+    fn note_inserted(&self, inserted_total: u64) {
         self.state
             .inserted_total
             .store(inserted_total, Ordering::Relaxed);
@@ -360,7 +360,7 @@ impl DeliveryWorker {
                 silent_since = Instant::now();
             }
             if silent_since.elapsed() > GOODBYE_MAX {
-                tracing::warn!("the replay server did not hear the goodbye: {e}");
+                tracing::warn!("the replay server did not receive the goodbye: {e}");
                 return;
             }
             std::thread::sleep(RETRY_PAUSE);

@@ -42,7 +42,7 @@ impl Evaluator {
 
     /// Says what an evaluation that has ended found, and begins the next if there is a checkpoint for it.
     pub(crate) fn look(&mut self, screen: &Screen) {
-        self.hear(screen);
+        self.take_result(screen);
         if self.playing.is_none() {
             self.begin(false, screen);
         }
@@ -53,7 +53,7 @@ impl Evaluator {
         let deadline = Instant::now() + LAST_MAX;
         let mut last = false;
         loop {
-            self.hear(screen);
+            self.take_result(screen);
             if self.playing.is_none() {
                 if last || !self.begin(true, screen) {
                     return;
@@ -109,7 +109,7 @@ impl Evaluator {
     }
 
     /// Takes note of an evaluation that has ended. One that failed costs the run nothing but a line.
-    fn hear(&mut self, screen: &Screen) {
+    fn take_result(&mut self, screen: &Screen) {
         let Some(process) = &mut self.playing else {
             return;
         };

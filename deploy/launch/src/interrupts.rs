@@ -26,14 +26,14 @@ impl Interrupts {
         let counted = this.clone();
         let mut last = None;
         end_signs::listen("interrupts", parent, move |sign| {
-            counted.hear(sign, &mut last, Instant::now());
+            counted.note(sign, &mut last, Instant::now());
             ControlFlow::Continue(())
         })?;
         Ok(this)
     }
 
     /// Counts a signal received at `now`. `last` is when the last request began.
-    fn hear(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
+    fn note(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
         let is_new = match sign {
             // Counted from the first signal of a request, so that repeated Ctrl-C always counts.
             EndSign::Asked => last.is_none_or(|last| now - last > ONE_WISH),
@@ -92,14 +92,14 @@ mod tests {
     fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
         let interrupts = Interrupts::default();
         let (start, mut last) = (Instant::now(), None);
-        let mut hear = |sign, seconds| {
-            interrupts.hear(sign, &mut last, start + Duration::from_secs(seconds));
+        let mut note = |sign, seconds| {
+            interrupts.note(sign, &mut last, start + Duration::from_secs(seconds));
             interrupts.count()
         };
-        assert_eq!(hear(EndSign::Abandoned, 0), 1);
-        assert_eq!(hear(EndSign::Abandoned, 5), 1);
-        assert_eq!(hear(EndSign::Asked, 10), 2, "a second wish by hand");
-        assert_eq!(hear(EndSign::Asked, 10), 2, "the same wish");
-        assert_eq!(hear(EndSign::Abandoned, 20), 2);
+        assert_eq!(note(EndSign::Abandoned, 0), 1);
+        assert_eq!(note(EndSign::Abandoned, 5), 1);
+        assert_eq!(note(EndSign::Asked, 10), 2, "a second request");
+        assert_eq!(note(EndSign::Asked, 10), 2, "the same request");
+        assert_eq!(note(EndSign::Abandoned, 20), 2);
     }
 }

@@ -387,7 +387,7 @@ impl Fetcher {
                     counts[shard] = Count {
                         tally: part.header.tally,
                         held: part.header.held,
-                        heard: Some(Instant::now()),
+                        last_seen: Some(Instant::now()),
                     };
                     from.push(self.received(shard, &part));
                     pending[shard] = 0;
@@ -452,7 +452,7 @@ impl Fetcher {
                     rows_sampled: status.rows_sampled,
                 },
                 held: status.transitions_held,
-                heard: Some(Instant::now()),
+                last_seen: Some(Instant::now()),
             };
             partial.all_in |= status.finished;
         }

@@ -38,7 +38,7 @@ const TICK: Duration = Duration::from_millis(200);
 pub(crate) struct Outlets {
     learner: u64,
     status: Arc<Mutex<LearnerStatus>>,
-    heard: Arc<AtomicBool>,
+    fetched: Arc<AtomicBool>,
     weights: Arc<Newest<Weights>>,
     affinity: Arc<Newest<AffinityUpdate>>,
     priorities: Arc<Newest<PriorityUpdate>>,
@@ -103,8 +103,8 @@ impl Outlets {
         shutdown: &Shutdown,
     ) -> anyhow::Result<Self> {
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
-        let heard: Arc<AtomicBool> = Arc::default();
-        let (held, told) = (status.clone(), heard.clone());
+        let fetched: Arc<AtomicBool> = Arc::default();
+        let (held, told) = (status.clone(), fetched.clone());
         let give = move |responder: Responder<LearnerStatus>| {
             let status = lock(&held).clone();
             responder.reply(&status);
@@ -121,7 +121,7 @@ impl Outlets {
         let this = Self {
             learner,
             status,
-            heard,
+            fetched,
             weights: Newest::of(1),
             affinity: Newest::of(1),
             priorities: Newest::of(PRIORITIES_MAX),
@@ -188,7 +188,7 @@ impl Outlets {
     /// Waits until the status was fetched once after the learner finished, or for `wait_max`.
     pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
         let started = Instant::now();
-        while !self.heard.load(Ordering::Relaxed) && started.elapsed() < wait_max {
+        while !self.fetched.load(Ordering::Relaxed) && started.elapsed() < wait_max {
             std::thread::sleep(Duration::from_millis(20));
         }
     }

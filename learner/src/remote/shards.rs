@@ -156,7 +156,7 @@ pub(crate) struct Count {
     /// Transitions that it holds.
     pub(crate) held: u64,
     /// When it said so; none before it is asked first.
-    pub(crate) heard: Option<Instant>,
+    pub(crate) last_seen: Option<Instant>,
 }
 
 impl Count {
@@ -167,7 +167,8 @@ impl Count {
         } else {
             AGE_MAX
         };
-        self.heard.is_none_or(|heard| now - heard > age_max)
+        self.last_seen
+            .is_none_or(|last_seen| now - last_seen > age_max)
     }
 }
 
@@ -228,7 +229,7 @@ mod tests {
                 rows_sampled,
             },
             held,
-            heard: None,
+            last_seen: None,
         }
     }
 
@@ -267,9 +268,9 @@ mod tests {
     fn a_shard_is_asked_again_and_sooner_if_it_held_nothing() {
         let now = Instant::now();
         let is_old = |held, age_ms| {
-            let heard = now.checked_sub(Duration::from_millis(age_ms));
+            let last_seen = now.checked_sub(Duration::from_millis(age_ms));
             Count {
-                heard,
+                last_seen,
                 ..count(held, 0, 0)
             }
             .is_old(now)

@@ -40,7 +40,7 @@ pub struct PartStatus {
     /// How often it has joined the run.
     pub lives: u32,
     /// Seconds since its last chunk, or request for a batch; none before the first.
-    pub heard_s: Option<f64>,
+    pub last_seen_s: Option<f64>,
     /// Seconds for which its chunk, or request, has been waiting at the rate limiter; none if none waits.
     pub held_s: Option<f64>,
     /// An actor's: the version of the weights that acted in its last chunk.

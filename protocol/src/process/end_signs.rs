@@ -28,7 +28,7 @@ pub enum EndSign {
     Abandoned,
 }
 
-/// Calls `hear` at each sign, on a thread of this `name`, until it breaks or the process ends. `parent` is the process whose
+/// Calls `on_sign` at each sign, on a thread of this `name`, until it breaks or the process ends. `parent` is the process whose
 /// death is a sign, given by its number: if it died before this process looked, that is seen too.
 ///
 /// SIGHUP is left ignored where it is ignored at the start, as `nohup` does it.
@@ -38,7 +38,7 @@ pub enum EndSign {
 pub fn listen(
     name: &'static str,
     parent: Option<u32>,
-    mut hear: impl FnMut(EndSign) -> ControlFlow<()> + Send + 'static,
+    mut on_sign: impl FnMut(EndSign) -> ControlFlow<()> + Send + 'static,
 ) -> std::io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -76,7 +76,7 @@ pub fn listen(
                     EndSign::Abandoned
                 }
             };
-            if hear(sign).is_break() {
+            if on_sign(sign).is_break() {
                 return;
             }
         }

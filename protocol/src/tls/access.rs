@@ -29,7 +29,7 @@ struct Grant {
     /// Keys at which it answers.
     answers: Vec<String>,
     /// Keys to which it subscribes.
-    hears: Vec<String>,
+    subscribes: Vec<String>,
     /// Keys of its liveliness tokens.
     lives: Vec<String>,
 }
@@ -37,7 +37,7 @@ struct Grant {
 /// What a role may do in the run whose keys these are; nothing for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
     let (mut asks, mut answers) = (vec![keys.of::<Hello>()], Vec::new());
-    let (mut hears, mut lives) = (Vec::new(), Vec::new());
+    let (mut subscribes, mut lives) = (Vec::new(), Vec::new());
     match role {
         Role::Actor(actor) => {
             asks.extend([
@@ -48,7 +48,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of_actor::<Report>(actor),
                 keys.of::<WeightsRequest>(),
             ]);
-            hears.push(keys.of::<WeightsVersion>());
+            subscribes.push(keys.of::<WeightsVersion>());
             lives.push(keys.lives_of_actor(actor));
         }
         Role::Learner => {
@@ -78,7 +78,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
         role,
         asks,
         answers,
-        hears,
+        subscribes,
         lives,
     }
 }
@@ -109,9 +109,9 @@ impl Lists {
                 "listens",
                 "ingress",
                 r#""declare_subscriber""#,
-                &grant.hears,
+                &grant.subscribes,
             ),
-            ("hears", "egress", r#""put""#, &grant.hears),
+            ("receives", "egress", r#""put""#, &grant.subscribes),
             ("lives", "ingress", r#""liveliness_token""#, &grant.lives),
         ] {
             if keys.is_empty() {
@@ -174,7 +174,7 @@ mod tests {
 
     /// Every key at which a role may do anything.
     fn all(grant: &Grant) -> Vec<&str> {
-        let lists = [&grant.asks, &grant.answers, &grant.hears, &grant.lives];
+        let lists = [&grant.asks, &grant.answers, &grant.subscribes, &grant.lives];
         lists.into_iter().flatten().map(String::as_str).collect()
     }
 

@@ -213,7 +213,7 @@ pub(crate) fn parts_status() -> PartsStatus {
             connected: true,
             since_s: 50.0,
             lives: 2,
-            heard_s: Some(0.5),
+            last_seen_s: Some(0.5),
             held_s: None,
             weights_version: Some(3),
             doing: Some(("plays".into(), 5.0, 1.0)),

@@ -16,7 +16,7 @@ use crate::{
     storage::ring::{Link, Step},
 };
 
-/// What is written, and what others hear of it.
+/// What is written, and what is reported of it.
 impl Replay {
     /// Whether all notes are on disk; until then joins and goodbyes get no answer.
     pub(crate) fn is_ready(&mut self) -> bool {

@@ -31,7 +31,7 @@ struct Account {
     lives: u32,
     /// When it was connected, or went.
     changed: Instant,
-    heard: Option<Instant>,
+    last_seen: Option<Instant>,
     weights_version: Option<u64>,
     report: Option<(Report, Instant)>,
 }
@@ -65,7 +65,7 @@ impl Accounts {
             alive: who,
             lives: earlier.map_or(0, |account| account.lives) + 1,
             changed: now,
-            heard: None,
+            last_seen: None,
             weights_version: None,
             report: None,
         };
@@ -119,9 +119,9 @@ impl Accounts {
     }
 
     /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
-    pub(super) fn heard(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
+    pub(super) fn seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
         if let Some(account) = self.of(who) {
-            account.heard = Some(now);
+            account.last_seen = Some(now);
             account.weights_version = weights_version.or(account.weights_version);
         }
     }
@@ -195,7 +195,7 @@ impl Accounts {
                 connected: self.is_connected(account.alive),
                 since_s: seconds(now, account.changed),
                 lives: account.lives,
-                heard_s: account.heard.map(|at| seconds(now, at)),
+                last_seen_s: account.last_seen.map(|at| seconds(now, at)),
                 held_s: held_since(who).map(|at| seconds(now, at)),
                 weights_version: account.weights_version,
                 doing: report.map(|(it, said)| (it.doing.clone(), it.since_s + said, said)),
@@ -244,8 +244,8 @@ mod tests {
         assert_eq!(parts, [], "who has not joined has no account");
         accounts.joined(actor(1), at(2));
         accounts.joined(actor(1), at(5));
-        accounts.heard(actor(1), Some(7), at(6));
-        accounts.heard(actor(9), Some(8), at(7));
+        accounts.seen(actor(1), Some(7), at(6));
+        accounts.seen(actor(9), Some(8), at(7));
         let report = |incarnation| {
             let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
             Report::new(Life::Actor { actor, incarnation }, "plays", 2.0, warning)
@@ -259,7 +259,7 @@ mod tests {
             connected: false,
             since_s: 2.0,
             lives: 1,
-            heard_s: Some(6.0),
+            last_seen_s: Some(6.0),
             held_s: Some(1.0),
             weights_version: Some(7),
             doing: Some(("plays".into(), 6.0, 4.0)),
@@ -274,7 +274,7 @@ mod tests {
         assert_eq!(accounts.actors_connected(), 1);
         assert_eq!(accounts.actor_lives(), 2);
         let again = &accounts.parts(at(21), |_| None)[1];
-        assert!(again.lives == 2 && again.connected && again.heard_s.is_none());
+        assert!(again.lives == 2 && again.connected && again.last_seen_s.is_none());
     }
 
     #[test]

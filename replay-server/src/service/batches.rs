@@ -23,15 +23,15 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         };
         let mut state = self.state();
-        let heard = self.hear_learner(&mut state, &request);
-        if let Err(why) = heard {
+        let learner_status = self.note_learner(&mut state, &request);
+        if let Err(why) = learner_status {
             let line = format!("a request for a batch was refused: {why}");
             state.refuse("batch", &line);
             drop(state);
             return responder.reply(&BatchReply::Refused { why });
         }
         let learner = Alive::learner(request.learner);
-        state.accounts.heard(learner, None, Instant::now());
+        state.accounts.seen(learner, None, Instant::now());
         let parked = ParkedRequest {
             request,
             question: responder,
@@ -43,7 +43,7 @@ impl Service {
     }
 
     /// Takes what the learner says of itself and of the other shards; an error says why it gets no batch.
-    fn hear_learner(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
+    fn note_learner(&self, state: &mut State, request: &BatchRequest) -> Result<(), String> {
         state.check_learner(request.learner)?;
         let (rows, most) = (request.rows, self.limits.batch_rows);
         if !(1..=most).contains(&rows) {

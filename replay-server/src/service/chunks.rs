@@ -102,7 +102,7 @@ impl State {
         let header = packed.chunk.header;
         let (version, arrived) = (header.weights_version, question.arrived);
         let actor = Alive::actor(header.actor, header.incarnation);
-        self.accounts.heard(actor, Some(version), arrived);
+        self.accounts.seen(actor, Some(version), arrived);
         let reply = match self.replay.settle(&packed) {
             Some(reply) => reply,
             // Those that came before go first.

@@ -177,8 +177,8 @@ fn an_actor_declares_nothing_but_its_own() {
         let queryable = one.session.declare_queryable(key).complete(true);
         declared.push(queryable.callback(answer).wait().unwrap());
     }
-    let heard = Arc::<AtomicUsize>::default();
-    let counter = heard.clone();
+    let received = Arc::<AtomicUsize>::default();
+    let counter = received.clone();
     let count = move |_| {
         counter.fetch_add(1, Ordering::Relaxed);
     };
@@ -216,7 +216,7 @@ fn an_actor_declares_nothing_but_its_own() {
     run.continues();
     assert_eq!(asked.load(Ordering::Relaxed), 0, "queries to an actor");
     assert_eq!(
-        heard.load(Ordering::Relaxed),
+        received.load(Ordering::Relaxed),
         0,
         "it receives nothing that is not for it"
     );

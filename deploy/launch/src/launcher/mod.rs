@@ -275,15 +275,15 @@ impl Launch<'_> {
             let poller = poller.expect("it was set before the run is watched");
             poller.ask();
             let view = &poller.view;
-            for (name, heard) in [
+            for (name, last_seen) in [
                 ("replay server", view.replay_last_seen),
                 ("learner", view.learner_last_seen),
             ] {
-                if heard.elapsed() > SILENCE_MAX {
+                if last_seen.elapsed() > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
                     bail!(
                         "the {name} has not answered for {}: {}",
-                        duration(heard.elapsed()),
+                        duration(last_seen.elapsed()),
                         why.unwrap_or("no answer")
                     );
                 }
@@ -345,7 +345,7 @@ impl Launch<'_> {
             Ok(_) => ACTORS_DRAIN_MAX,
             Err(_) => FAILED_DRAIN_MAX,
         };
-        // When the run is finished, actors hear it from the replay server and end by themselves.
+        // When the run is finished, actors learn it from the replay server and exit.
         let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
         self.wait_for_final_checkpoint(&abort);
         let learner = self.processes.learner.as_mut_slice();

@@ -35,9 +35,9 @@ pub(super) struct TrainingEpisodes {
     /// Frames in the last row.
     frames: u64,
     /// Frames of the run at the last status.
-    frames_heard: Option<u64>,
+    frames_at_status: Option<u64>,
     /// How many had ended in each shard at its last status.
-    heard: Vec<u64>,
+    received: Vec<u64>,
     /// How many are in no row.
     lost: u64,
     folder: RunFolder,
@@ -84,8 +84,8 @@ impl TrainingEpisodes {
             newest,
             episode,
             frames,
-            frames_heard: None,
-            heard: Vec::new(),
+            frames_at_status: None,
+            received: Vec::new(),
             lost: 0,
             is_known,
             rows: match is_known {
@@ -98,7 +98,7 @@ impl TrainingEpisodes {
 
     /// Takes what each shard counts and asks it for the episodes that ended since those that are known, after so many `seconds` of the
     /// run, if they are known. The file then holds as many as the shards count, and each once. Returns warnings about the file.
-    pub(super) fn hear<E: Display>(
+    pub(super) fn update<E: Display>(
         &mut self,
         shards: &[ReplayStatus],
         ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
@@ -106,36 +106,39 @@ impl TrainingEpisodes {
     ) -> Vec<String> {
         let frames = shards.iter().map(|it| it.transitions_inserted).sum();
         // They were not there the last time; what a shard knows of the others is older.
-        let heard = self.frames_heard.replace(frames);
-        let later = heard.map_or(0, |before| before.saturating_add(1).min(frames));
+        let received = self.frames_at_status.replace(frames);
+        let later = received.map_or(0, |before| before.saturating_add(1).min(frames));
         // While a resumed run's replay fills again it counts frames that it had before.
         self.frames = self.frames.max(later);
-        self.heard.resize(shards.len().max(self.heard.len()), 0);
+        self.received
+            .resize(shards.len().max(self.received.len()), 0);
         let mut warnings = Vec::new();
         if std::mem::take(&mut self.is_known) {
             warnings.extend(self.cut(frames).err().map(|e| format!("{e:#}")));
-            self.take_as_heard(shards);
+            self.take_as_received(shards);
         }
         let mut rows = Vec::new();
         for (shard, status) in shards.iter().enumerate() {
             // A server that knows of fewer than before is another one.
-            let mut heard = self.heard[shard];
-            if status.episodes < heard {
-                heard = 0;
+            let mut received = self.received[shard];
+            if status.episodes < received {
+                received = 0;
             }
             for _ in 0..ASKS_MAX {
-                if heard >= status.episodes {
+                if received >= status.episodes {
                     break;
                 }
-                let reply = match ask(shard, heard) {
-                    Ok(reply) if reply.ended >= status.episodes && reply.before >= heard => reply,
+                let reply = match ask(shard, received) {
+                    Ok(reply) if reply.ended >= status.episodes && reply.before >= received => {
+                        reply
+                    }
                     Ok(_) => break,
                     Err(e) => {
                         tracing::debug!("episodes of shard {shard}: {e}");
                         break;
                     }
                 };
-                let missing = reply.before - heard;
+                let missing = reply.before - received;
                 if missing > 0 {
                     warnings.extend((self.lost == 0).then(|| {
                         format!("{missing} episodes have no row in episodes.csv: the replay server keeps no more between two looks")
@@ -148,9 +151,9 @@ impl TrainingEpisodes {
                 let ended = reply.episodes.iter().take(wanted);
                 let all = reply.before + ended.len() as u64;
                 rows.extend(ended.map(|it| csv_row(self.take(it, seconds))));
-                heard = all.max(heard + 1);
+                received = all.max(received + 1);
             }
-            self.heard[shard] = heard;
+            self.received[shard] = received;
         }
         // Those that could not be written before are tried again, too.
         warnings.extend(self.table.add_all(rows));
@@ -164,10 +167,10 @@ impl TrainingEpisodes {
         let is_kept = |row: &_| read(row).is_some_and(|it| it.0 <= frames_max);
         rows.keep(&self.folder.episodes(), |_, row| Ok(is_kept(row)))?;
         if rows.rows.len() < all {
-            let heard = std::mem::take(&mut self.heard);
+            let received = std::mem::take(&mut self.received);
             *self = Self {
-                heard,
-                frames_heard: self.frames_heard,
+                received,
+                frames_at_status: self.frames_at_status,
                 ..Self::begin(&self.folder, rows, false)?
             };
         }
@@ -175,12 +178,12 @@ impl TrainingEpisodes {
     }
 
     /// What the shards knew of when the last episode was received: all but the newest, which are shared out in order.
-    fn take_as_heard(&mut self, shards: &[ReplayStatus]) {
+    fn take_as_received(&mut self, shards: &[ReplayStatus]) {
         let mut unheard: u64 = shards.iter().map(|it| it.episodes).sum();
         unheard = unheard.saturating_sub(self.episode);
-        for (heard, status) in self.heard.iter_mut().zip(shards) {
+        for (received, status) in self.received.iter_mut().zip(shards) {
             let here = unheard.min(status.episodes);
-            *heard = status.episodes - here;
+            *received = status.episodes - here;
             unheard -= here;
         }
     }

@@ -60,10 +60,10 @@ fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
     (root, folder, episodes)
 }
 
-fn hear(episodes: &mut TrainingEpisodes, shards: &[Shard]) -> Vec<String> {
+fn update(episodes: &mut TrainingEpisodes, shards: &[Shard]) -> Vec<String> {
     let statuses: Vec<_> = shards.iter().map(Shard::status).collect();
     let ask = |shard: usize, since| Ok::<_, Infallible>(shards[shard].reply(since));
-    episodes.hear(&statuses, ask, Some(1.5))
+    episodes.update(&statuses, ask, Some(1.5))
 }
 
 fn rows(folder: &RunFolder) -> Vec<String> {
@@ -81,7 +81,7 @@ fn every_episode_is_taken_once_from_every_shard() {
         [(20, 1, 3, 0), (5, 0, 1, 50)],
         [(20, 1, 3, 0), (5, 0, 1, 50)],
     ] {
-        hear(&mut episodes, &[one, other].map(Shard::of));
+        update(&mut episodes, &[one, other].map(Shard::of));
     }
     assert_eq!(
         rows(&folder),
@@ -103,8 +103,8 @@ fn every_episode_is_taken_once_from_every_shard() {
 #[test]
 fn what_the_server_has_let_go_is_counted_and_said() {
     let (_root, folder, mut episodes) = begun();
-    hear(&mut episodes, &[Shard::of((10, 0, 5, 0))]);
-    let said = hear(&mut episodes, &[Shard::of((90, 155, 255, 0))]);
+    update(&mut episodes, &[Shard::of((10, 0, 5, 0))]);
+    let said = update(&mut episodes, &[Shard::of((90, 155, 255, 0))]);
     assert!(
         said[0].starts_with("150 episodes have no row in episodes.csv"),
         "{said:?}"
@@ -133,7 +133,7 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
         reply.episodes[0].played = None;
         Ok::<_, Infallible>(reply)
     };
-    episodes.hear(&[shard.status()], ask, None);
+    episodes.update(&[shard.status()], ask, None);
     assert_eq!(rows(&folder), [",10,1,4,2,,"]);
     assert_eq!(episodes.mean(), None);
     drop(episodes);
@@ -144,10 +144,10 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
 #[test]
 fn a_run_that_continues_has_the_episodes_before() {
     let (_root, folder, mut episodes) = begun();
-    hear(&mut episodes, &[Shard::of((1_000, 0, 60, 0))]);
-    hear(&mut episodes, &[Shard::of((2_000, 60, 70, 0))]);
+    update(&mut episodes, &[Shard::of((1_000, 0, 60, 0))]);
+    update(&mut episodes, &[Shard::of((2_000, 60, 70, 0))]);
     // What came after the checkpoint does not count, nor what was cut off.
-    hear(&mut episodes, &[Shard::of((3_000, 70, 90, 0))]);
+    update(&mut episodes, &[Shard::of((3_000, 70, 90, 0))]);
     let path = folder.episodes();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text + "1.5,3000,91").unwrap();
@@ -155,7 +155,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, false).unwrap();
     assert_eq!(episodes.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
     // Another server, which counts from the start; the replay fills again.
-    hear(&mut episodes, &[Shard::of((1_500, 0, 40, 1_000))]);
+    update(&mut episodes, &[Shard::of((1_500, 0, 40, 1_000))]);
     let expected: f64 = (10..70).chain(1_000..1_040).map(f64::from).sum();
     let mean = expected / 100.0;
     assert_eq!(episodes.mean(), Some(MeanReturn { mean, of: 100 }));
@@ -163,8 +163,8 @@ fn a_run_that_continues_has_the_episodes_before() {
 
     // A server that knows of those before, and of four more; it hands out all that it keeps.
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, true).unwrap();
-    hear(&mut episodes, &[Shard::of((2_600, 0, 114, 0))]);
-    hear(&mut episodes, &[Shard::of((2_600, 114, 115, 0))]);
+    update(&mut episodes, &[Shard::of((2_600, 0, 114, 0))]);
+    update(&mut episodes, &[Shard::of((2_600, 114, 115, 0))]);
     let text = rows(&folder);
     assert_eq!(text[text.len() - 5], "1.500,2600,111,4,2,110,9");
     assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");

@@ -216,7 +216,7 @@ impl RunRecorder {
         ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
     ) -> Vec<String> {
         let seconds = (!std::mem::take(&mut self.is_late)).then(|| self.seconds());
-        self.episodes.hear(&view.shards, ask, seconds)
+        self.episodes.update(&view.shards, ask, seconds)
     }
 
     /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.

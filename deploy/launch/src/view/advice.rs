@@ -186,7 +186,7 @@ fn silence(process: &str, last_seen: Instant) -> Option<String> {
 
 /// For how many seconds a connected part has said nothing, where that is worth a sentence.
 fn silent_for(part: &PartStatus) -> Option<f64> {
-    let silent = part.heard_s.unwrap_or(part.since_s);
+    let silent = part.last_seen_s.unwrap_or(part.since_s);
     let doing = part.doing.as_ref();
     let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
     (part.connected && silent > UNRESPONSIVE_S && says > UNRESPONSIVE_S && part.held_s.is_none())

@@ -178,7 +178,7 @@ impl Page {
             Some(it.lives.into())
         });
         let silent = "Seconds since the last chunk or request for a batch of a process.";
-        each("gauge", "part_silent_seconds", silent, |it| it.heard_s);
+        each("gauge", "part_silent_seconds", silent, |it| it.last_seen_s);
     }
 }
 

@@ -160,7 +160,7 @@ fn part_row(part: &PartStatus) -> Vec<String> {
         part.who.to_string(),
         state,
         doing,
-        ago(part.heard_s),
+        ago(part.last_seen_s),
         part.held_s.map_or("-".into(), seconds),
         part.weights_version.map_or("-".into(), |it| it.to_string()),
         part.lives.to_string(),

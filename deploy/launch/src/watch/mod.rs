@@ -89,17 +89,17 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
 fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-    let (mut heard, mut said) = (Instant::now(), Seldom::default());
+    let (mut last_seen, mut said) = (Instant::now(), Seldom::default());
     loop {
         let view = poller.ask();
         if view.is_answered() && view.after_updates.is_some() {
             return Ok(());
         }
         if view.is_answered() || view.recovering().next().is_some() {
-            heard = Instant::now();
+            last_seen = Instant::now();
         }
         let is_another_run = view.servers.iter().any(|it| it.is_another_run);
-        if is_another_run || heard.elapsed() > silent_max {
+        if is_another_run || last_seen.elapsed() > silent_max {
             bail!("{}", needed(view).join("; "));
         }
         if said.due().is_some() {
