@@ -169,7 +169,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     let output = driml("bench policy --quick --json -");
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let figures = report["figures"].as_array().unwrap();
-    assert_eq!((figures.len(), &report["bench"]), (8, &"policy".into()));
+    assert_eq!((figures.len(), &report["bench"]), (12, &"policy".into()));
     assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
 
     let output = driml("bench learner --growth --quick --precision bf16 --json -");
@@ -182,7 +182,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
     assert_eq!(output.status.code(), Some(0), "{table}");
     const SKIPPED: &str = "skipped: no-such-python cannot be started (No such file or directory (os error 2)): name a Python that has PyTorch with --torch-python";
     let lines = |is: fn(&str) -> bool| table.lines().filter(|line| is(line)).count();
-    assert_eq!(lines(|line| line.ends_with("  skipped")), 8, "{table}");
+    assert_eq!(lines(|line| line.ends_with("  skipped")), 12, "{table}");
     assert_eq!(lines(|line| line == SKIPPED), 1, "{table}");
 }
 

@@ -481,7 +481,7 @@ fn a_film_changes_nothing_that_is_played() {
 fn films_that_cannot_be_are_refused_before_anything_is_played() {
     let system = with_run();
     for (flags, said) in [
-        ("--record play.mp4", "take one that ends in .gif"),
+        ("--record play.mp4", "use one that ends in .gif"),
         (
             "--record none/play.gif",
             "--record none/play.gif: No such file or directory",

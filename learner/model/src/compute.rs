@@ -274,7 +274,7 @@ mod tests {
         assert_eq!("cuda".parse::<DeviceName>().unwrap(), DeviceName::Cuda(0));
         for wrong in ["", "gpu", "cuda:", "cuda:-1", "cpu:0", "CUDA"] {
             let error = wrong.parse::<DeviceName>().unwrap_err().to_string();
-            assert!(error.contains("take cpu, cuda or cuda:N"), "{error}");
+            assert!(error.contains("use cpu, cuda or cuda:N"), "{error}");
         }
     }
 

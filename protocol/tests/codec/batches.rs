@@ -262,7 +262,7 @@ fn draws_and_priorities_that_cannot_be_are_refused() {
         let bytes = codec::encode(SPEC, &update, &[]).unwrap();
         let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
         let said = refused.to_string();
-        assert!(said.contains("no number from 0 on"), "{said}");
+        assert!(said.contains("not a number from 0 on"), "{said}");
     }
     let mut update = priority_update();
     update.parts[0].priorities.pop();

@@ -94,6 +94,6 @@ mod tests {
             );
         }
         let error = "f16".parse::<Precision>().unwrap_err().to_string();
-        assert!(error.contains("take f32 or bf16"), "{error}");
+        assert!(error.contains("use f32 or bf16"), "{error}");
     }
 }
