@@ -64,7 +64,6 @@ pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     Ok(RunConfig::parse(&path.display().to_string(), &text)?)
 }
 
-/// The folder of a checkpoint.
 pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
     let updates = match which {
         Which::Newest => None,

@@ -179,7 +179,6 @@ impl<S: Subscriber> Layer<S> for LastWarning {
     }
 }
 
-/// The text of a line of the log.
 fn text(event: &Event<'_>) -> String {
     struct Text(String);
     impl Visit for Text {
@@ -212,7 +211,6 @@ struct FullDisk {
 }
 
 impl FullDisk {
-    /// Whether a line is to be written.
     fn is_due(&mut self, text: &str, now: Instant) -> bool {
         let is_about_it = ["No space left on device", "Disk quota exceeded"]
             .iter()

@@ -19,7 +19,6 @@ use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
 
 /// A process that ends with an error within this time of its start would do so again.
 const AT_ONCE: Duration = Duration::from_secs(10);
-/// How often a process that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
 /// A process that was started.
@@ -67,23 +66,15 @@ impl ManagedProcess {
         threads: u32,
         surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
-        let Surroundings {
-            logs,
-            screen,
-            meeting,
-        } = surroundings;
-        let log = ProcessLog::open(name, logs)?;
+        let log = ProcessLog::open(name, surroundings.logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let held = meeting.map(Meeting::hold).transpose();
+        let held = surroundings.meeting.map(Meeting::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);
         set_thread_env(&mut command, threads);
-        command
-            .args(args)
-            .args(exit_with_this_process())
-            .stdin(stdin);
-        Self::spawn(name, command, log, screen)
+        command.args(args).args(exit_with_this_process()).stdin(stdin);
+        Self::spawn(name, command, log, surroundings.screen)
     }
 
     fn spawn(
@@ -98,12 +89,9 @@ impl ManagedProcess {
             .process_group(0)
             .spawn()
             .with_context(|| format!("starting {name}"))?;
-        if let Some(pipe) = child.stdout.take() {
-            log.follow(pipe, screen)?;
-        }
-        if let Some(pipe) = child.stderr.take() {
-            log.follow(pipe, screen)?;
-        }
+        let pipes = (child.stdout.take(), child.stderr.take());
+        log.follow(pipes.0.expect("it is piped"), screen)?;
+        log.follow(pipes.1.expect("it is piped"), screen)?;
         Ok(Self {
             name: name.into(),
             child,

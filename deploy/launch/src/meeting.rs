@@ -64,7 +64,6 @@ impl Meeting {
         self.folder.path()
     }
 
-    /// Where a process of this name listens.
     pub(crate) fn endpoint(&self, name: &str) -> String {
         let path = self.folder.path().join(format!("{name}.sock"));
         format!("unixsock-stream/{}", path.display())

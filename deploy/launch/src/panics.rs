@@ -101,7 +101,6 @@ mod tests {
 
     use super::*;
 
-    /// A thread that panicked was stopped.
     pub(super) static STOPPED: AtomicBool = AtomicBool::new(false);
 
     /// Set where this test is the process that panics, to what it says before.

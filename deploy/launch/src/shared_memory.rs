@@ -45,7 +45,6 @@ fn is_mapped_elsewhere(path: &Path) -> bool {
         .any(|maps| maps.lines().any(|line| line.ends_with(&*path)))
 }
 
-/// What tells a file from all others.
 struct FileId {
     major: u64,
     minor: u64,

@@ -13,9 +13,7 @@ use crate::{resources::Machine, units::kib};
 
 /// Open files that a library may want at once, to connect or to share memory: with fewer left, they are scarce.
 const FILES_SPARE: u64 = 8;
-/// Memory maps, likewise.
 const MAPS_SPARE: u64 = 64;
-/// Memory, likewise, bytes.
 const MEMORY_SPARE: u64 = 64 << 20;
 
 /// Open files that this process may have, once what may be raised is.

@@ -18,7 +18,6 @@ use crate::{
 
 /// Where a setting's source begins, if the setting leaves room.
 const SOURCE_COLUMN: usize = 44;
-/// What the machine decides.
 const BY_MACHINE: [&str; 5] = [
     "local.actors",
     "local.learner_threads",
@@ -74,7 +73,6 @@ fn k(table: &Table) -> String {
     find(table, "run.horizon.k").map_or("-".into(), Value::to_string)
 }
 
-/// Those above 0.
 fn lambdas(table: &Table) -> String {
     let all = find(table, "learner.update.lambda").and_then(Value::as_table);
     let weighs = |value: &Value| value.as_float().is_some_and(|value| value > 0.0);
@@ -139,7 +137,6 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
 }
 
-/// A key in TOML's form.
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if key.chars().all(bare) {

@@ -11,7 +11,6 @@ use driml_machine::error::{Usage, nearest, usage};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-/// One file of `presets/`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layer {
     pub(crate) name: &'static str,
@@ -152,7 +151,6 @@ agents! {
     "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
 }
 
-/// Those that the program added.
 static OWN_AGENTS: Mutex<Vec<&'static Agent>> = Mutex::new(Vec::new());
 
 /// Makes an agent known, before anything else is done: `--agent NAME` takes it from then on. `layer` is its settings, TOML as in
@@ -274,12 +272,9 @@ pub fn notes(name: &str, world: &str) -> Vec<String> {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Only {
-    /// The worlds in which it holds.
     worlds: Vec<String>,
-    /// What it sets.
     #[serde(default)]
     set: Table,
-    /// A note that is printed before the run starts.
     note: Option<String>,
 }
 

@@ -89,19 +89,16 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             ("actor.envs", machine.envs().into()),
             ("actor.world_threads", 0.into()),
         ] {
-            if derived::find(&table, path).is_none() {
-                derived::put(&mut table, path, value);
-            }
+            derived::put_missing(&mut table, path, value);
         }
     }
-    let by_flag = [
+    for (path, value) in [
         ("local.actors", flags.actors.map(u64::from)),
         ("actor.envs", flags.envs.map(u64::from)),
         ("replay.transitions_max", flags.frames),
         ("replay.shards", flags.replay_shards.map(u64::from)),
         ("run.seed", flags.seed),
-    ];
-    for (path, value) in by_flag {
+    ] {
         if let Some(value) = value {
             Override::number(path, value)?.apply(&mut table)?;
         }

@@ -22,7 +22,6 @@ pub(crate) struct DoctorArgs {
     pub(crate) json: bool,
 }
 
-/// Prints the facts.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
     if args.json {

@@ -40,7 +40,6 @@ pub(crate) struct ReplayServerArgs {
     pub(crate) join: JoinFlags,
 }
 
-/// Serves until the run ends.
 pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listening(&args.listen, args.network.guard(&args.tls))?;
     check_unused(&args.listen)?;

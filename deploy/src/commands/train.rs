@@ -26,7 +26,6 @@ use driml_settings::{
 
 use super::join::{NetworkFlag, TlsFlags};
 
-/// What a resumed run has settled.
 const RESUMED: [&str; 10] = [
     "env",
     "agent",
@@ -86,7 +85,6 @@ pub(crate) struct TrainArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Trains on this machine.
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     let sets = &mut args.run.over.sets;

@@ -14,22 +14,21 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::error::Interrupted;
 use driml_protocol::Shutdown;
-use driml_settings::config::{EvaluationConfig, RunConfig};
+use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::Which,
-    console::{self, Screen, print, print_wrapped},
+    console::{self, Screen, print_wrapped},
+    evaluator::Due,
     keep::keep,
     resume,
-    run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
     view::{Display, TEMPLATE},
 };
 use parts::Lockstep;
 
-/// How often progress is shown and recorded.
 const POLL: Duration = Duration::from_secs(1);
 /// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
 const ROWS_MIN: u64 = 200;
@@ -37,7 +36,7 @@ const ROWS_MIN: u64 = 200;
 /// Trains in this process, and leaves `run_dir`; with a resume point it continues the run that is there.
 ///
 /// # Errors
-/// A component that failed, a file system that refuses; [`Interrupted`] if the run was asked to stop.
+/// A component that failed, a file system that refuses; `Interrupted` if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -45,14 +44,7 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let recorded = Recorded::of(config, Vec::new());
-    let mut recorder = match resumed {
-        Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
-        None => RunRecorder::create(run_dir, recorded)?,
-    };
-    if config.local.tensorboard {
-        recorder.write_events(run_dir)?;
-    }
+    let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,
@@ -64,7 +56,14 @@ pub fn run(
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
     let plan = view.plan.clone();
     let mut display = Display::new(screen.clone(), plan, Instant::now(), updates);
-    let mut evaluations = Evaluations::new(config, run_dir)?;
+    let mut due = Due::new(config, run_dir)?;
+    let mut play = |updates, is_last| -> anyhow::Result<()> {
+        if let Some(episodes) = due.take(updates, is_last) {
+            let judged = keep(run_dir, Which::After(updates), episodes)?;
+            screen.line(&judged.earned.describe());
+        }
+        Ok(())
+    };
     let mut shown = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
     let mut row = lockstep.frames() / row_frames;
@@ -87,7 +86,7 @@ pub fn run(
                 ));
             } else {
                 saved = Some((updates, lockstep.frames()));
-                evaluations.play(updates, false, &screen)?;
+                play(updates, false)?;
             }
         }
         let show = shown.elapsed() >= POLL;
@@ -113,7 +112,7 @@ pub fn run(
     lockstep.end()?;
     screen.clear();
     if outcome == Outcome::Finished {
-        evaluations.play(lockstep.updates(), true, &screen)?;
+        play(lockstep.updates(), true)?;
     }
     record(&mut recorder, &mut view, &mut lockstep);
     let missing = console::join_losses(recorder.missing());
@@ -122,12 +121,7 @@ pub fn run(
     let summary = recorder.summarise(outcome, &config.run, &view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
-    if outcome == Outcome::Interrupted {
-        resume::say_how(&config.world, run_dir);
-        Err(Interrupted.into())
-    } else {
-        print(&summary.next_steps(run_dir))
-    }
+    resume::say_next(&summary, &config.world, run_dir)
 }
 
 /// Records how the run stands, and the episodes that ended. Returns warnings.
@@ -137,40 +131,7 @@ fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockste
     view.take_learner(Some(learner.clone()));
     view.take_replay(vec![replay]);
     let ask = |_, since| Ok::<_, Infallible>(lockstep.episodes_since(since));
-    let mut warnings = recorder.record_episodes(view, ask);
+    let warnings = recorder.record_all(view, &[], ask);
     lockstep.note_recorded(ended);
-    warnings.extend(recorder.record(view, &[]));
     warnings
-}
-
-/// Plays checkpoints between rounds, if they are to be played.
-struct Evaluations<'a> {
-    config: Option<EvaluationConfig>,
-    run_dir: &'a RunFolder,
-    /// Updates of the newest that was played.
-    newest: u64,
-}
-
-impl<'a> Evaluations<'a> {
-    fn new(config: &RunConfig, run_dir: &'a RunFolder) -> anyhow::Result<Self> {
-        Ok(Self {
-            config: config.local.evaluation,
-            run_dir,
-            newest: Evaluated::newest(run_dir)?,
-        })
-    }
-
-    /// Plays the checkpoint after so many updates if it is time, or if it is the last.
-    fn play(&mut self, updates: u64, is_last: bool, screen: &Screen) -> anyhow::Result<()> {
-        let Some(config) = self.config else {
-            return Ok(());
-        };
-        if config.is_due(updates, self.newest, is_last) {
-            self.newest = updates;
-            let which = Which::After(updates);
-            let judged = keep(self.run_dir, which, config.episodes)?;
-            screen.line(&judged.earned.describe());
-        }
-        Ok(())
-    }
 }

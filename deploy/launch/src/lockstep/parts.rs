@@ -144,12 +144,10 @@ impl Lockstep {
         Ok(())
     }
 
-    /// How the actors stand.
     fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
         self.actors.iter_mut().map(Collector::state).collect()
     }
 
-    /// Takes back what [`Lockstep::save`] kept.
     fn take(&mut self, SavedParts { actors, turn, .. }: SavedParts) -> anyhow::Result<()> {
         let (found, count) = (actors.len(), self.actors.len());
         if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
@@ -164,27 +162,22 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Updates so far.
     pub(super) const fn updates(&self) -> u64 {
         self.learner.updates()
     }
 
-    /// Transitions stored so far.
     pub(super) fn frames(&self) -> u64 {
         self.replay.inserted_total()
     }
 
-    /// What replay and learner say of themselves.
     pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
         (self.replay.status(), &self.turn.status)
     }
 
-    /// Episodes that ended after the first `since`.
     pub(super) fn episodes_since(&self, since: u64) -> EpisodesReply {
         self.replay.episodes_since(since)
     }
 
-    /// The first so many episodes are recorded.
     pub(super) fn note_recorded(&mut self, episodes: u64) {
         self.replay.note_recorded(episodes);
     }

@@ -35,7 +35,6 @@ pub(super) struct Turn {
 }
 
 impl SavedParts {
-    /// The bytes of a checkpoint's companion.
     pub(super) fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
         let mut bytes = FORMAT.to_le_bytes().to_vec();
         bytes.extend(codec::encode_value(self).context("writing actors and replay")?);

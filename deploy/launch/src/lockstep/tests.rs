@@ -17,7 +17,6 @@ fn sha256(lockstep: &Lockstep) -> String {
     lockstep.status().1.weights_sha256.clone()
 }
 
-/// The SHA-256 of the weights after a whole run.
 fn weights(config: &RunConfig) -> String {
     ended(Lockstep::in_memory(config).unwrap())
 }
@@ -90,7 +89,6 @@ fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
     ended(Lockstep::resume(config, &run_dir).unwrap())
 }
 
-/// The numbers of Rainbow.
 const PRIORITISED: &str =
     "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
@@ -141,7 +139,6 @@ fn begun(config: &RunConfig) -> (tempfile::TempDir, RunFolder) {
     (folder, run_dir)
 }
 
-/// Why a run cannot be resumed.
 fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
     let error = Lockstep::resume(config, run_dir).map(drop).unwrap_err();
     format!("{error:#}")

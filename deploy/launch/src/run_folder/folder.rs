@@ -192,7 +192,6 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes the settings.
     pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
         write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())

@@ -9,7 +9,7 @@ use expect_test::expect;
 use super::*;
 use crate::{
     run_folder::{Earned, LastPlay},
-    testing::config,
+    testing::{config, with},
 };
 
 fn spec() -> RunSpec {
@@ -26,7 +26,6 @@ fn point(updates: u64) -> ResumePoint {
     }
 }
 
-/// What DIM reports.
 const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 fn statuses() -> (ReplayStatus, LearnerStatus) {
@@ -63,15 +62,14 @@ fn recorded(processes: &[&str]) -> Recorded {
 }
 
 fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
-    let epsilon = Schedule::Falling {
-        start: 0.5,
-        end: 0.1,
-        decay_frames: 4_000,
-    };
-    let mut view = RunView::new(Plan {
-        epsilon: Some(epsilon),
-        ..Plan::default()
-    });
+    let (start, end, decay_frames) = (0.5, 0.1, 4_000);
+    let mut view = RunView::new(with(|it: &mut Plan| {
+        it.epsilon = Some(Schedule::Falling {
+            start,
+            end,
+            decay_frames,
+        });
+    }));
     view.take_learner(Some(learner.clone()));
     view.take_replay(vec![replay.clone()]);
     view
@@ -235,10 +233,7 @@ fn summary(replay: &ReplayStatus) -> Summary {
 
 #[test]
 fn next_steps_stand_in_columns() {
-    let replay = ReplayStatus {
-        transitions_inserted: 1_280,
-        ..ReplayStatus::default()
-    };
+    let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
     let earned = |mean, low, high| Earned { mean, low, high };
     let played = LastPlay {
         weights: "averaged".into(),

@@ -62,7 +62,6 @@ pub struct LastPlay {
 }
 
 impl LastPlay {
-    /// A line about it.
     fn describe(&self) -> String {
         let Self { agent, random, .. } = self;
         format!(
@@ -188,8 +187,8 @@ impl Summary {
             updates_relearned: replay.updates_relearned,
             replay_ratio: replay.replay_ratio(),
             episodes: episodes.count,
-            mean_return: episodes.mean_return.map(|it| it.mean),
-            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
+            mean_return: episodes.mean_return,
+            mean_return_of: episodes.mean_return_of as u64,
             wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,

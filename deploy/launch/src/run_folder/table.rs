@@ -63,7 +63,6 @@ impl Table {
         self.value(self.rows.last()?, name)
     }
 
-    /// The file's text: the header and the rows.
     pub(super) fn text(&self) -> Vec<u8> {
         let rows = self.rows.iter().flat_map(csv_row);
         csv_row(&self.header).into_iter().chain(rows).collect()
@@ -104,17 +103,14 @@ impl Table {
     }
 }
 
-/// The file and what is not in it yet.
 #[derive(Debug)]
 pub(super) struct AppendLog {
-    /// Its name, for messages.
     name: String,
     file: File,
     /// Bytes of it that are whole rows.
     length: u64,
     waiting: VecDeque<Vec<u8>>,
     lost: u64,
-    /// The first error.
     failed: Option<io::Error>,
 }
 
@@ -213,7 +209,6 @@ mod tests {
         assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
     }
 
-    /// A file on a full disk.
     fn full(path: &Path) -> AppendLog {
         let mut table = AppendLog::create(path, b"a\n").unwrap();
         table.file = File::options().append(true).open("/dev/full").unwrap();

@@ -139,7 +139,6 @@ fn of_actors(view: &RunView) -> Vec<String> {
     actors.iter().filter_map(of_actor).collect()
 }
 
-/// The flag that an endpoint with certificates wants.
 fn certificates(endpoint: &str) -> &'static str {
     match session::is_quic(endpoint) {
         true => " --tls-dir DIR",
@@ -211,7 +210,6 @@ fn unresponsive_actors(view: &RunView) -> Vec<String> {
     words
 }
 
-/// A time in seconds for a person.
 pub(super) fn seconds(seconds: f64) -> String {
     duration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
 }
@@ -222,25 +220,16 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
-    use crate::run_view::Plan;
+    use crate::{run_view::Plan, testing::with};
 
     /// A run whose only replay server does not answer any more; `waiting` is what it answered last.
     fn silent(is_gone: bool, waiting: Waiting) -> RunView {
         let mut view = RunView::new(Plan::default());
-        view.take_replay(vec![ReplayStatus {
-            waiting,
-            ..ReplayStatus::default()
-        }]);
-        view.servers = vec![ServerAnswer {
-            name: "replay-server".into(),
-            endpoint: "tcp/host:1".into(),
-            replay: None,
-            parts: None,
-            recovering: None,
-            error: Some("no answer".into()),
-            is_gone,
-            is_another_run: false,
-        }];
+        view.take_replay(vec![with(|it: &mut ReplayStatus| it.waiting = waiting)]);
+        view.servers = vec![with(|it: &mut ServerAnswer| {
+            it.endpoint = "tcp/host:1".into();
+            (it.error, it.is_gone) = (Some("no answer".into()), is_gone);
+        })];
         view
     }
 

@@ -15,14 +15,11 @@ use crate::{
     run_view::{Plan, RunView, ServerAnswer},
 };
 
-/// The object that `--json` prints.
 #[derive(Serialize)]
 struct Answer<'a> {
     #[serde(flatten)]
     plan: &'a Plan,
-    /// Nothing is missing.
     well: bool,
-    /// Everything is learned and saved.
     finished: bool,
     #[serde(flatten)]
     metrics: BTreeMap<&'static str, serde_json::Value>,
@@ -35,7 +32,6 @@ struct Answer<'a> {
     to_go_on: Vec<String>,
 }
 
-/// The run as one line of JSON.
 pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
     let to_go_on = needed(view);
     let answer = Answer {
@@ -182,7 +178,6 @@ impl Page {
     }
 }
 
-/// A label's value.
 fn escaped(text: &str) -> String {
     let text = text.replace('\\', "\\\\").replace('"', "\\\"");
     text.replace('\n', "\\n")

@@ -36,7 +36,6 @@ pub struct Poller {
     pub config: RunConfig,
     /// What they have answered.
     pub view: RunView,
-    /// One for each shard of the replay.
     servers: Vec<Reached>,
 }
 
@@ -177,7 +176,6 @@ impl Reached {
     }
 }
 
-/// What a replay server says of its run to those who come.
 struct Greeting {
     config: RunConfig,
     /// Updates after which the run was resumed; none before its learner has joined.

@@ -21,11 +21,9 @@ use crate::{
     view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
 
-/// How often the run is asked.
 const POLL: Duration = Duration::from_secs(1);
 /// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
 const LAST_POLL: Duration = Duration::from_millis(200);
-/// How often a page is shown anew.
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
 /// How a run is looked at, a page at a time.

@@ -35,7 +35,6 @@ pub struct Outputs {
     pub prometheus: Option<PathBuf>,
 }
 
-/// A run that is watched.
 pub(super) struct Watched {
     screen: Screen,
     display: Display,
@@ -83,8 +82,7 @@ impl Watched {
         }
         if let Some(recorder) = self.recorder.as_mut().filter(|_| poller.view.is_answered()) {
             let ask = |shard, since| poller.episodes(shard, since);
-            let mut warnings = recorder.record_episodes(&poller.view, ask);
-            warnings.extend(recorder.record(&poller.view, &[]));
+            let warnings = recorder.record_all(&poller.view, &[], ask);
             warnings.iter().for_each(|line| self.screen.line(line));
         }
         let view = &poller.view;
@@ -93,7 +91,6 @@ impl Watched {
         self.is_over(poller)
     }
 
-    /// Writes a line above the live lines.
     pub(super) fn say(&self, line: &str) {
         self.screen.line(line);
     }

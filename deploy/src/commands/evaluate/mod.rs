@@ -77,7 +77,6 @@ pub(crate) struct EvaluateArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Plays, and prints mean and standard deviation.
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.film.record {
         Film::check_name(path).map_err(|e| usage!("--record: {e}"))?;
@@ -183,7 +182,6 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Exports the network that plays into a file.
 fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_none_or(|it| it != "safetensors") {
         let name = path.display();

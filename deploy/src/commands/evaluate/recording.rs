@@ -37,13 +37,11 @@ pub(crate) struct RecordArgs {
     pub(crate) record_steps: u32,
 }
 
-/// A film in the making.
 pub(crate) struct Recording {
     path: PathBuf,
     film: Film,
     layout: Layout,
     overlay: Option<Overlay>,
-    /// What happened in each filmed copy up to now.
     copies: Vec<Copy>,
     episodes_max: u32,
     steps_max: u32,
@@ -124,7 +122,6 @@ impl Recording {
         }))
     }
 
-    /// Whether nothing more is filmed.
     fn is_over(&self) -> bool {
         self.failed.is_some()
             || self.steps >= self.steps_max
@@ -232,7 +229,6 @@ impl Recording {
         Ok(format!("filmed {steps} steps: {}\n", self.path.display()))
     }
 
-    /// Gives the film up.
     pub(crate) fn discard(self) {
         self.film.discard();
     }

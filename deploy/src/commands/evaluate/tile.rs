@@ -15,7 +15,6 @@ const PANEL_HEIGHT: usize = 230;
 /// Pixels from line to line.
 const LEADING: usize = 19;
 
-/// What a copy showed and did in one step.
 #[derive(Clone, Debug)]
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.
@@ -26,11 +25,9 @@ pub(super) struct Shot {
     pub(super) total: f64,
     pub(super) reward: f64,
     pub(super) action: u8,
-    /// The episode ended with it.
     pub(super) is_last: bool,
 }
 
-/// What the network makes of it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Look<'a> {
     /// [A].
@@ -53,7 +50,6 @@ pub(super) struct Layout {
     support: Vec<f32>,
 }
 
-/// What local DIM's map shows.
 #[derive(Debug)]
 struct Local {
     k: usize,
@@ -141,7 +137,6 @@ impl Layout {
         }
     }
 
-    /// Draws copy `i`.
     pub(super) fn draw(
         &self,
         picture: &mut Picture,

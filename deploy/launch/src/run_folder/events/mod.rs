@@ -29,7 +29,6 @@ const CELL: usize = 24;
 const CAPTION: usize = 22;
 const MARGIN: usize = 8;
 
-/// The event file of a run.
 #[derive(Debug)]
 pub(super) struct Events {
     file: AppendLog,
@@ -38,7 +37,6 @@ pub(super) struct Events {
     /// Counts when histograms were written last.
     k: Vec<u64>,
     actions: Vec<u64>,
-    /// Updates of the checkpoint whose A was drawn last.
     drawn: Option<u64>,
 }
 
@@ -134,7 +132,6 @@ impl Events {
         self.file.add(encode::summary(at, &image))
     }
 
-    /// What is missing in the file, as [`AppendLog::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
         self.file.missing()
     }
@@ -187,6 +184,7 @@ fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::with;
 
     #[test]
     fn counts_are_those_since_the_last_histogram() {
@@ -200,11 +198,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let mut events = Events::create(&folder, None).unwrap();
-        let replay = ReplayStatus {
-            transitions_inserted: 70,
-            k_histogram: vec![0, 4, 1],
-            ..ReplayStatus::default()
-        };
+        let replay = with(|it: &mut ReplayStatus| {
+            (it.transitions_inserted, it.k_histogram) = (70, vec![0, 4, 1]);
+        });
         let points = [("return/mean_return".to_owned(), 1.5)];
         assert_eq!(events.add(&points, &replay, false), None);
         let again = Events::create(&folder, Some(70)).unwrap();
