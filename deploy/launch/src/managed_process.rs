@@ -73,7 +73,10 @@ impl ManagedProcess {
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);
         set_thread_env(&mut command, threads);
-        command.args(args).args(exit_with_this_process()).stdin(stdin);
+        command
+            .args(args)
+            .args(exit_with_this_process())
+            .stdin(stdin);
         Self::spawn(name, command, log, surroundings.screen)
     }
 

@@ -62,7 +62,10 @@ pub fn describe(
     let mut text = String::new();
     let mut fact = |name, fact: &str| text += &format!("{name:<INDENT$}{fact}\n");
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
-    fact("trains", &format!("{agent} on {world}, seed {seed}, from {from}"));
+    fact(
+        "trains",
+        &format!("{agent} on {world}, seed {seed}, from {from}"),
+    );
     fact(
         "frames",
         &format!("{frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})"),

@@ -5,10 +5,7 @@ use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
-use driml_protocol::{
-    Horizon, RunSpec,
-    config::TransportConfig,
-};
+use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -179,7 +176,9 @@ impl RunConfig {
     pub fn action_names(&self) -> Vec<String> {
         let actions = self.world.actions(self.actor.actions).into_iter();
         let names = self.world.action_names();
-        actions.map(|it| names[usize::from(it)].to_owned()).collect()
+        actions
+            .map(|it| names[usize::from(it)].to_owned())
+            .collect()
     }
 
     /// Transitions of the whole run.
@@ -234,9 +233,7 @@ impl RunConfig {
         self.model.validate().map_err(said)?;
         if !(1..=256).contains(&local.actors) {
             let actors = local.actors;
-            return Err(usage!(
-                "local.actors = {actors}: a run has 1 to 256 actors"
-            ));
+            return Err(usage!("local.actors = {actors}: a run has 1 to 256 actors"));
         }
         if !(1..=1024).contains(&local.learner_threads) {
             let threads = local.learner_threads;

@@ -311,10 +311,7 @@ fn table_at<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> 
 }
 
 /// What is set at a dotted path, if anything is.
-pub(crate) fn optional<T: DeserializeOwned>(
-    table: &Table,
-    path: &str,
-) -> Result<Option<T>, Usage> {
+pub(crate) fn optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let read = find(table, path).cloned().map(Value::try_into).transpose();
     read.map_err(|e| usage!("in the settings' [{path}] table: {}", in_words(&e)))
 }

@@ -77,7 +77,7 @@ fn lambdas(table: &Table) -> String {
     let all = find(table, "learner.update.lambda").and_then(Value::as_table);
     let weighs = |value: &Value| value.as_float().is_some_and(|value| value > 0.0);
     let some = all.into_iter().flatten().filter(|(_, value)| weighs(value));
-    let texts: Vec<String> = some
+    let texts: Vec<_> = some
         .map(|(pair, value)| format!("{pair} {value}"))
         .collect();
     texts.join(", ")
@@ -139,24 +139,19 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
 
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if key.chars().all(bare) {
-        key.to_owned()
-    } else {
-        Value::String(key.to_owned()).to_string()
+    match key.chars().all(bare) {
+        true => key.to_owned(),
+        false => Value::String(key.to_owned()).to_string(),
     }
 }
 
-fn source_of(path: &str, sources: &BTreeMap<String, String>, is_process: bool) -> String {
-    if let Some(source) = sources.get(path) {
-        return source.clone();
+fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: bool) -> &'a str {
+    match sources.get(path) {
+        Some(source) => source,
+        None if BY_MACHINE.contains(&path) => "this machine",
+        None if is_process && DECLARED.contains(&path) => "the world declares it",
+        None => derived::follows(path).unwrap_or("not said"),
     }
-    if BY_MACHINE.contains(&path) {
-        return "this machine".into();
-    }
-    if is_process && DECLARED.contains(&path) {
-        return "the world declares it".into();
-    }
-    derived::follows(path).unwrap_or("not said").to_owned()
 }
 
 /// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.

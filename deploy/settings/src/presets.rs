@@ -47,11 +47,8 @@ const TUNED: &str = "tuned";
 
 /// The preset of this name for a run in `world`. Without a name it is `tuned` on Procgen and `paper` elsewhere.
 pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'static Preset, Usage> {
-    let name = name.unwrap_or(match world.kind() {
-        "procgen" => TUNED,
-        _ => PRESETS[0].name,
-    });
-    preset(name)
+    let is_game = world.kind() == "procgen";
+    preset(name.unwrap_or(if is_game { TUNED } else { PRESETS[0].name }))
 }
 
 /// Every preset, `paper` first.
@@ -205,12 +202,8 @@ pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
     let agents = agents();
     let found = agents.iter().copied().find(|agent| agent.name == name);
     found.ok_or_else(|| {
-        let names: Vec<_> = agents.iter().map(|agent| agent.name).collect();
-        usage!(
-            "there is no agent {name:?}{}; --agent takes {}",
-            nearest(name, names.iter().copied()),
-            names.join(", ")
-        )
+        let (near, names) = names(name, agents.iter().map(|it| it.name));
+        usage!("there is no agent {name:?}{near}; --agent takes {names}")
     })
 }
 
@@ -218,13 +211,17 @@ pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
 pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
     let found = PRESETS.iter().find(|preset| preset.name == name);
     found.ok_or_else(|| {
-        let names: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
+        let (near, names) = names(name, PRESETS.iter().map(|it| it.name));
         usage!(
-            "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
-            nearest(name, names.iter().copied()),
-            names.join(", ")
+            "there is no preset {name:?}{near}; --preset takes {names} (`driml presets` describes them)"
         )
     })
+}
+
+/// The name that is nearest to `name`, as a question, and all of them.
+fn names(name: &str, all: impl Iterator<Item = &'static str>) -> (String, String) {
+    let all: Vec<_> = all.collect();
+    (nearest(name, all.iter().copied()), all.join(", "))
 }
 
 /// Lays base, world, agent and preset over one another, in this order: a later one wins.
@@ -337,14 +334,9 @@ mod tests {
 
     #[test]
     fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
-        for (name, preset) in [
-            ("coinrun", "tuned"),
-            ("mspacman", "paper"),
-            ("chain", "paper"),
-        ] {
-            let found = preset_or_default(None, world(name).unwrap()).unwrap();
-            assert_eq!(found.name, preset, "{name}");
-        }
+        let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
+        let found = ["coinrun", "mspacman", "chain"].map(of);
+        assert_eq!(found, ["tuned", "paper", "paper"]);
     }
 
     #[test]
@@ -409,11 +401,9 @@ mod tests {
             .assert_eq(&worlds("driml-fix", augments));
         let all = WorldName::all().count();
         assert_eq!(worlds("curl", augments).split(' ').count(), all);
-        for agent in AGENTS
-            .iter()
-            .filter(|it| !["driml-fix", "curl"].contains(&it.name))
-        {
-            assert_eq!(worlds(agent.name, augments), "", "{}", agent.name);
+        let others = AGENTS.iter().map(|it| it.name);
+        for name in others.filter(|it| !["driml-fix", "curl"].contains(it)) {
+            assert_eq!(worlds(name, augments), "", "{name}");
         }
     }
 

@@ -10,10 +10,7 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_machine::{
-    error::Usage,
-    units::duration,
-};
+use driml_machine::{error::Usage, units::duration};
 use driml_protocol::{Keys, RunClient, Waiting, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;

@@ -4,7 +4,6 @@
 //! A resumed run continues as if it had not been interrupted: each checkpoint holds the state of worlds, actors and replay.
 
 mod parts;
-mod saved;
 #[cfg(test)]
 mod tests;
 

@@ -1,26 +1,75 @@
 //! Actors, replay and learner stepped in a fixed order.
+//! A checkpoint holds the learner, and beside it the state of the others but for the replay's transitions, which lie in the run folder.
 //! When to save and what to show is for `mod`.
 
 use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
-use driml_learner::{Learner, LearnerConfig, ServedPart};
+use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
     ActorJoin, Batch, BufferPool, EpisodesReply, Goodbye, InsertReply, LearnerStatus, ReplayStatus,
-    Weights,
+    Weights, WeightsHeader, codec,
 };
 use driml_replay_server::{Mark, PersistArgs, Replay, Unready};
 use driml_settings::config::RunConfig;
+use serde::{Deserialize, Serialize};
 
-use super::saved::{SavedParts, Turn};
 use crate::{console, run_folder::RunFolder};
 
 /// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
 const INCARNATION: u64 = 1;
 /// The learner's number, which influences nothing either.
 const LEARNER: u64 = 1;
+
+/// How it is written; another way is rejected.
+const FORMAT: u32 = 4;
+
+/// The state of a run in lockstep, without the learner.
+#[derive(Serialize, Deserialize)]
+struct SavedParts {
+    actors: Vec<CollectorState>,
+    replay: Mark,
+    turn: Turn,
+}
+
+/// Which actor is next, and with which weights.
+#[derive(Clone, Serialize, Deserialize)]
+struct Turn {
+    next_actor: usize,
+    /// Transitions of each actor that came after the run's last.
+    unwanted: Vec<u64>,
+    status: LearnerStatus,
+    /// The weights with which the actors act, a safetensors file, and the updates after which they were published.
+    acting: (WeightsHeader, Vec<u8>),
+    published: u64,
+}
+
+impl SavedParts {
+    fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
+        let mut bytes = FORMAT.to_le_bytes().to_vec();
+        bytes.extend(codec::encode_value(self).context("writing actors and replay")?);
+        Ok(bytes)
+    }
+
+    /// What the newest checkpoint in a run's folder holds.
+    fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let all = checkpoint::list(&run_dir.checkpoints())?;
+        let (_, path) = all.last().context("there is no checkpoint")?;
+        let bytes = checkpoint::companion(path)?
+            .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
+        let Some(content) = bytes.strip_prefix(&FORMAT.to_le_bytes()) else {
+            return Err(usage!(
+                "{} is a lockstep checkpoint of another version of driml: resume with that version",
+                path.display()
+            )
+            .into());
+        };
+        codec::decode_value(content)
+            .with_context(|| format!("reading actors and replay in {}", path.display()))
+    }
+}
 
 /// The replay of a run, kept in its folder; with a mark, as it was there.
 fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {

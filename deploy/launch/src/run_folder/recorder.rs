@@ -15,8 +15,7 @@ use super::{
     episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    metrics::{rows_up_to, seconds_of},
-    resume_point::ResumePoint,
+    metrics::{ResumePoint, rows_up_to, seconds_of},
     summary::{Outcome, Summary},
     table::{AppendLog, Table, csv_row},
 };

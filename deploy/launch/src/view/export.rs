@@ -93,14 +93,13 @@ fn prometheus(view: &RunView) -> String {
         let planned = [plan.frames_planned, plan.updates_planned].map(|it| it as f64);
         page.gauge("frames_planned", "Frames of the whole run.", planned[0]);
         page.gauge("updates_planned", "Updates of the whole run.", planned[1]);
-        let finished = view.is_finished().into();
-        page.gauge(
-            "finished",
+        let is_so = [view.is_finished(), needed(view).is_empty()].map(f64::from);
+        let [finished, well] = [
             "Whether everything is learned and saved.",
-            finished,
-        );
-        let well = needed(view).is_empty().into();
-        page.gauge("well", "Whether no process of the run is missing.", well);
+            "Whether no process of the run is missing.",
+        ];
+        page.gauge("finished", finished, is_so[0]);
+        page.gauge("well", well, is_so[1]);
     }
     page.text
 }

@@ -1,7 +1,6 @@
 //! `driml watch` and `driml status`: the live lines, metrics and summary of a run that other commands have started, on any machine.
 //! It asks and never tells: the run does not depend on whether it is watched.
 
-mod folder;
 mod run_of_folder;
 mod watched;
 

@@ -2,19 +2,22 @@
 //! It asks for no more than the episodes that it records.
 
 use std::{
+    fs,
     path::PathBuf,
     time::{Duration, Instant},
 };
 
-use anyhow::bail;
-use driml_machine::units::duration;
-use driml_protocol::Waiting;
+use anyhow::{Context, bail};
+use driml_machine::{error::usage, units::duration};
+use driml_protocol::{RunSpec, Waiting};
+use driml_settings::config::RunConfig;
 
-use super::folder;
 use crate::{
+    chosen::config_of,
     console::{self, Screen},
+    launcher::process_names,
     moment::Moment,
-    run_folder::{Outcome, RunFolder, RunRecorder, Summary},
+    run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::RunView,
     view::{Display, Poller, TEMPLATE, notes},
 };
@@ -49,7 +52,7 @@ impl Watched {
         let (config, view) = (&poller.config, &poller.view);
         let mut recorder = None;
         if let Some(folder) = &outputs.run_dir {
-            let recorder = recorder.insert(folder::record(folder, config, view)?);
+            let recorder = recorder.insert(record(folder, config, view)?);
             if outputs.tensorboard {
                 recorder.write_events(folder)?;
             }
@@ -166,4 +169,80 @@ fn moment<'a>(recorder: Option<&'a RunRecorder>, view: &'a RunView) -> Moment<'a
         },
         |it| it.moment(view),
     )
+}
+
+/// Begins to record the run in `folder`, or continues.
+fn record(folder: &RunFolder, config: &RunConfig, view: &RunView) -> anyhow::Result<RunRecorder> {
+    let recorded = Recorded::of(config, process_names(config));
+    // A learner may have just begun there.
+    let is_run_s = folder.config().exists() || folder.checkpoints().is_dir();
+    let mut recorder = match is_run_s {
+        false => RunRecorder::create(folder, recorded)?,
+        true => {
+            check_same(folder, config)?;
+            let point = resume_point(folder, view)?;
+            RunRecorder::go_on(folder, recorded, point, u64::MAX).map_err(|e| in_use(folder, e))?
+        }
+    };
+    recorder.count_seconds_from(view.up_s().unwrap_or(0.0));
+    Ok(recorder)
+}
+
+/// Says so if another command writes there.
+fn in_use(folder: &RunFolder, e: anyhow::Error) -> anyhow::Error {
+    match folder.lock() {
+        Ok(_) => e,
+        Err(_) => usage!(
+            "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
+            folder.display()
+        )
+        .into(),
+    }
+}
+
+/// Refuses the folder of a run with other settings.
+fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
+    let there = match folder.config().exists() {
+        true => config_of(folder)?.run,
+        false => return Ok(()),
+    };
+    if there.hash() == config.run.hash() {
+        return Ok(());
+    }
+    let name = |it: &RunSpec| format!("{} with {}, seed {}", it.world, it.agent, it.seed);
+    Err(usage!(
+        "{} holds another run ({}) than the one that is watched ({}): choose another --run-dir",
+        folder.display(),
+        name(&there),
+        name(&config.run)
+    )
+    .into())
+}
+
+/// Which of the rows that are there stay.
+fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoint> {
+    let path = folder.metrics();
+    let text = fs::read(&path).unwrap_or_default();
+    let rows = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+    let last = |name| rows.last::<u64>(name).unwrap_or(0);
+    let (frames, updates) = (last("frames"), last("updates"));
+    let now = view.replay.transitions_inserted;
+    let after_updates = view.after_updates.unwrap_or(0);
+    if after_updates == 0 && frames > now {
+        return Err(usage!(
+            "the run in {} had {frames} frames, and the watched run has {now}: it was restarted; choose another --run-dir",
+            folder.display()
+        )
+        .into());
+    }
+    Ok(ResumePoint {
+        // A run that was resumed makes the updates since its checkpoint again.
+        updates: match after_updates {
+            0 => updates,
+            _ => updates.min(view.learner.updates),
+        },
+        rows: view.replay.rows_sampled,
+        frames: now,
+        replay_is_kept: after_updates == 0,
+    })
 }
