@@ -291,13 +291,10 @@ impl Pages {
 
     /// Shows one.
     pub fn show(&self, text: &str) -> anyhow::Result<()> {
-        if let Some(term) = &self.0 {
-            term.clear_screen().or_else(|e| match is_gone(&e) {
-                true => Ok(()),
-                false => Err(e),
-            })?;
+        match self.0.as_ref().map(Term::clear_screen) {
+            Some(Err(e)) if !is_gone(&e) => Err(e.into()),
+            _ => print(text),
         }
-        print(text)
     }
 }
 

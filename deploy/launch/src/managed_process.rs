@@ -189,16 +189,14 @@ impl ManagedProcess {
     /// How it ended and its last lines, as one message.
     pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
-        let how = match self.end {
+        let how = match self.end.map(|it| (it.code(), it.signal())) {
             None => "is still running".into(),
-            Some(status) => match (status.code(), status.signal()) {
-                (Some(code), _) => format!("exited with code {code}"),
-                (None, Some(signal)) => {
-                    let name = Signal::try_from(signal).map_or("", Signal::as_str);
-                    format!("was killed by signal {signal} {name}")
-                }
-                (None, None) => "exited".into(),
-            },
+            Some((Some(code), _)) => format!("exited with code {code}"),
+            Some((None, Some(signal))) => {
+                let name = Signal::try_from(signal).map_or("", Signal::as_str);
+                format!("was killed by signal {signal} {name}")
+            }
+            Some((None, None)) => "exited".into(),
         };
         let last = match (self.log.error(), self.log.tail()) {
             // It says all.

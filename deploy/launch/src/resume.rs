@@ -155,13 +155,10 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     let mut config = resolve(&Source::File(name, text), flags, machine)?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
-    let Some((_, newest)) = all.last() else {
-        return Err(usage!(
-            "there is no checkpoint in {}: start the run again, in another folder",
-            checkpoints.display()
-        )
-        .into());
-    };
+    let (_, newest) = all.last().with_context(|| {
+        let checkpoints = checkpoints.display();
+        usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
+    })?;
     let (updates, progress) = checkpoint::progress(newest)?;
     let lockstep = is_in_lockstep(newest)?;
     if !lockstep && !config.world.is_resumable() {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::units::kib;
 
 /// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
-const ENVS: u32 = 16;
+pub const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
 /// Share of the free memory that a replay may take whose size was asked for.
@@ -59,16 +59,6 @@ impl Machine {
             4..16 => 2,
             _ => 4,
         }
-    }
-
-    /// Copies of the world in one actor.
-    pub const fn envs(&self) -> u32 {
-        ENVS
-    }
-
-    /// Threads of the learner: all cores, because a run waits for the learner.
-    pub const fn learner_threads(&self) -> u32 {
-        self.cores
     }
 
     /// Bytes that a replay sized by the machine may take, where the actors take `actors_bytes`.

@@ -18,23 +18,12 @@ use crate::{
 
 /// Where a setting's source begins, if the setting leaves room.
 const SOURCE_COLUMN: usize = 44;
-const BY_MACHINE: [&str; 5] = [
-    "local.actors",
-    "local.learner_threads",
-    "local.learner_device",
-    "actor.envs",
-    "actor.world_threads",
-];
+const BY_MACHINE: &str =
+    "local.actors local.learner_threads local.learner_device actor.envs actor.world_threads";
 
 /// What a world in its own process declares.
-const DECLARED: [&str; 6] = [
-    "world.height",
-    "world.width",
-    "world.channels",
-    "world.actions",
-    "input.height",
-    "input.width",
-];
+const DECLARED: &str =
+    "world.height world.width world.channels world.actions input.height input.width";
 
 /// Presets, agents, and what differs by game.
 pub fn menu() -> Result<String, Usage> {
@@ -146,10 +135,11 @@ fn quoted(key: &str) -> String {
 }
 
 fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: bool) -> &'a str {
+    let is_one = |paths: &str| paths.split(' ').any(|it| it == path);
     match sources.get(path) {
         Some(source) => source,
-        None if BY_MACHINE.contains(&path) => "this machine",
-        None if is_process && DECLARED.contains(&path) => "the world declares it",
+        None if is_one(BY_MACHINE) => "this machine",
+        None if is_process && is_one(DECLARED) => "the world declares it",
         None => derived::follows(path).unwrap_or("not said"),
     }
 }
@@ -239,9 +229,11 @@ mod tests {
     fn comments_are_found_beside_above_and_below() {
         let text = "# of the file\n\n[a]\nx = 1   # one\ny = 2   # two,\n        # and more\n# above\nz = 3\n";
         let found = comments(text);
-        let expected = [("a.x", "one"), ("a.y", "two, and more"), ("a.z", "above")];
-        let expected = expected.map(|(path, comment)| (path.into(), comment.into()));
-        assert_eq!(found, expected);
+        let found = found
+            .iter()
+            .map(|(path, comment)| format!("{path}: {comment}"));
+        let expected = ["a.x: one", "a.y: two, and more", "a.z: above"];
+        assert_eq!(found.collect::<Vec<_>>(), expected);
     }
 
     #[test]

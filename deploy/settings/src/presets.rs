@@ -314,7 +314,7 @@ fn merge(lower: &mut Table, upper: Table) {
 mod tests {
     use std::collections::BTreeSet;
 
-    use super::*;
+    use super::{pinned::all_layers, *};
 
     #[test]
     fn later_layers_win_key_by_key() {
@@ -322,14 +322,6 @@ mod tests {
         merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
         let merged: Table = "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse().unwrap();
         assert_eq!(lower, merged);
-    }
-
-    fn all_layers() -> Vec<Layer> {
-        let agents = AGENTS.iter().map(|agent| agent.layer);
-        let worlds = WorldName::all().map(world_layer);
-        let variants = PRESETS.iter().flat_map(|preset| preset.layers);
-        let variants = variants.copied();
-        agents.chain(worlds).chain(variants).chain([BASE]).collect()
     }
 
     #[test]
@@ -361,7 +353,7 @@ mod tests {
     #[test]
     fn every_only_block_names_worlds_that_exist() {
         let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
-        for layer in all_layers() {
+        for layer in all_layers().values() {
             for block in layer.read().1 {
                 for world in block.worlds {
                     assert!(worlds.contains(&world), "{world} in {}", layer.name);
@@ -372,7 +364,7 @@ mod tests {
 
     #[test]
     fn every_layer_says_what_it_is_for() {
-        for layer in all_layers() {
+        for layer in all_layers().values() {
             assert!(layer.text.starts_with("# "), "{}", layer.name);
         }
     }

@@ -5,7 +5,7 @@ use clap::Args;
 use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
-    resources::Machine,
+    resources::{self, Machine},
     whole_number,
 };
 use toml::{Table, Value};
@@ -84,9 +84,9 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     if sized_by_machine {
         for (path, value) in [
             ("local.actors", Value::from(machine.actors())),
-            ("local.learner_threads", machine.learner_threads().into()),
+            ("local.learner_threads", machine.cores.into()),
             ("local.learner_device", "cpu".into()),
-            ("actor.envs", machine.envs().into()),
+            ("actor.envs", resources::ENVS.into()),
             ("actor.world_threads", 0.into()),
         ] {
             derived::put_missing(&mut table, path, value);

@@ -145,31 +145,29 @@ impl<'a> Counted<'a> {
             let header = BatchHeader::of(run, self.config.learner.batch_size);
             header.sampled_by(&self.config.replay.sampling)
         };
-        let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
-        let numbers = |run: &RunSpec| {
+        let size = |header: BatchHeader| header.payload_bytes() as u64;
+        let states = |run: &RunSpec| {
             let without_states = BatchHeader {
                 state_bytes: 0,
                 stacked: None,
                 ..header(run)
             };
-            without_states.payload_bytes() as u64
+            size(header(run)) - size(without_states)
         };
-        let states = |run: &RunSpec| batch(run) - numbers(run);
         let run = &self.run;
+        let (batch, all_states) = (size(header(run)), states(run));
         let first_states = states(&RunSpec {
             horizon: Horizon::None,
             ..run.clone()
         });
+        let transition = (run.frame_bytes() + TRANSITION_BYTES) as u64;
         named([
-            (
-                "a transition in a chunk",
-                (run.frame_bytes() + TRANSITION_BYTES) as u64,
-            ),
+            ("a transition in a chunk", transition),
             ("a transition in the replay", replay_bytes_each(run)),
-            (BATCH, batch(run)),
+            (BATCH, batch),
             ("  s_t and s_{t+n}", first_states),
-            ("  s_{t+k}", states(run) - first_states),
-            ("  numbers", numbers(run)),
+            ("  s_{t+k}", all_states - first_states),
+            ("  numbers", batch - all_states),
             ("a broadcast", self.broadcast as u64),
         ])
     }

@@ -250,13 +250,11 @@ impl Launch<'_> {
                 ("replay server", view.replay_last_seen),
                 ("learner", view.learner_last_seen),
             ] {
-                if last_seen.elapsed() > SILENCE_MAX {
+                let silent = last_seen.elapsed();
+                if silent > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
-                    bail!(
-                        "the {name} has not answered for {}: {}",
-                        duration(last_seen.elapsed()),
-                        why.unwrap_or("no answer")
-                    );
+                    let (silent, why) = (duration(silent), why.unwrap_or("no answer"));
+                    bail!("the {name} has not answered for {silent}: {why}");
                 }
             }
             let rss = self.processes.rss_mib();

@@ -65,7 +65,7 @@ pub fn run(
     };
     let mut shown = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
-    let mut row = lockstep.frames() / row_frames;
+    let mut row = lockstep.replay.inserted_total() / row_frames;
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
@@ -75,7 +75,7 @@ pub fn run(
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
     while lockstep.round()? {
-        let updates = lockstep.updates();
+        let updates = lockstep.learner.updates();
         if updates / period > tried / period {
             tried = updates;
             // A disk that refuses once does not end the training; what cannot be saved in the end is an error.
@@ -84,13 +84,13 @@ pub fn run(
                     "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
                 ));
             } else {
-                saved = Some((updates, lockstep.frames()));
+                saved = Some((updates, lockstep.replay.inserted_total()));
                 play(updates, false)?;
             }
         }
         let show = shown.elapsed() >= POLL;
-        if show || lockstep.frames() / row_frames > row {
-            row = lockstep.frames() / row_frames;
+        if show || lockstep.replay.inserted_total() / row_frames > row {
+            row = lockstep.replay.inserted_total() / row_frames;
             let warnings = record(&mut recorder, &mut view, &mut lockstep);
             warnings.iter().for_each(|line| screen.line(line));
             if show {
@@ -104,14 +104,16 @@ pub fn run(
         }
     }
     // Frames may have come since the last update.
-    if saved != Some((lockstep.updates(), lockstep.frames())) || outcome == Outcome::Interrupted {
+    if saved != Some((lockstep.learner.updates(), lockstep.replay.inserted_total()))
+        || outcome == Outcome::Interrupted
+    {
         lockstep.save(&folder)?;
     }
     // After the last save: a longer run would continue from there without it.
     lockstep.end()?;
     screen.clear();
     if outcome == Outcome::Finished {
-        play(lockstep.updates(), true)?;
+        play(lockstep.learner.updates(), true)?;
     }
     record(&mut recorder, &mut view, &mut lockstep);
     let missing = console::join_losses(recorder.missing());
@@ -125,12 +127,12 @@ pub fn run(
 
 /// Records how the run stands, and the episodes that ended. Returns warnings.
 fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockstep) -> Vec<String> {
-    let (replay, learner) = lockstep.status();
-    let ended = replay.episodes;
-    view.take_learner(Some(learner.clone()));
-    view.take_replay(vec![replay]);
-    let ask = |_, since| Ok::<_, Infallible>(lockstep.episodes_since(since));
+    let status = lockstep.replay.status();
+    let ended = status.episodes;
+    view.take_learner(Some(lockstep.turn.status.clone()));
+    view.take_replay(vec![status]);
+    let ask = |_, since| Ok::<_, Infallible>(lockstep.replay.episodes_since(since));
     let warnings = recorder.record_all(view, &[], ask);
-    lockstep.note_recorded(ended);
+    lockstep.replay.note_recorded(ended);
     warnings
 }

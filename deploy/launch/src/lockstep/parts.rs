@@ -9,8 +9,8 @@ use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnatio
 use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
-    ActorJoin, Batch, BufferPool, EpisodesReply, Goodbye, InsertReply, LearnerStatus, ReplayStatus,
-    Weights, WeightsHeader, codec,
+    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Weights, WeightsHeader,
+    codec,
 };
 use driml_replay_server::{Mark, PersistArgs, Replay, Unready};
 use driml_settings::config::RunConfig;
@@ -36,11 +36,11 @@ struct SavedParts {
 
 /// Which actor is next, and with which weights.
 #[derive(Clone, Serialize, Deserialize)]
-struct Turn {
+pub(super) struct Turn {
     next_actor: usize,
     /// Transitions of each actor that came after the run's last.
     unwanted: Vec<u64>,
-    status: LearnerStatus,
+    pub(super) status: LearnerStatus,
     /// The weights with which the actors act, a safetensors file, and the updates after which they were published.
     acting: (WeightsHeader, Vec<u8>),
     published: u64,
@@ -59,13 +59,10 @@ impl SavedParts {
         let (_, path) = all.last().context("there is no checkpoint")?;
         let bytes = checkpoint::companion(path)?
             .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
-        let Some(content) = bytes.strip_prefix(&FORMAT.to_le_bytes()) else {
-            return Err(usage!(
-                "{} is a lockstep checkpoint of another version of driml: resume with that version",
-                path.display()
-            )
-            .into());
-        };
+        let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
+            let path = path.display();
+            usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
+        })?;
         codec::decode_value(content)
             .with_context(|| format!("reading actors and replay in {}", path.display()))
     }
@@ -94,11 +91,11 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
 /// The components of a run, which take turns.
 pub(super) struct Lockstep {
     actors: Vec<Collector>,
-    replay: Replay,
-    learner: Learner,
+    pub(super) replay: Replay,
+    pub(super) learner: Learner,
     batch_size: u32,
     steps_per_chunk: u32,
-    turn: Turn,
+    pub(super) turn: Turn,
 }
 
 impl Lockstep {
@@ -209,26 +206,6 @@ impl Lockstep {
         }
         self.turn = turn;
         Ok(())
-    }
-
-    pub(super) const fn updates(&self) -> u64 {
-        self.learner.updates()
-    }
-
-    pub(super) fn frames(&self) -> u64 {
-        self.replay.inserted_total()
-    }
-
-    pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
-        (self.replay.status(), &self.turn.status)
-    }
-
-    pub(super) fn episodes_since(&self, since: u64) -> EpisodesReply {
-        self.replay.episodes_since(since)
-    }
-
-    pub(super) fn note_recorded(&mut self, episodes: u64) {
-        self.replay.note_recorded(episodes);
     }
 
     /// Writes a checkpoint into `folder`, from which the run continues exactly as now.

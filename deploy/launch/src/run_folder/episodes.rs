@@ -27,7 +27,8 @@ pub(super) struct TrainingEpisodes {
     table: AppendLog,
     /// The newest returns, the oldest first.
     newest: VecDeque<f64>,
-    episode: u64,
+    /// The number of the newest.
+    pub(super) episode: u64,
     frames: u64,
     frames_at_status: Option<u64>,
     /// How many had ended in each shard at its last status.
@@ -199,10 +200,6 @@ impl TrainingEpisodes {
     /// The episodes of a run that counts so many.
     pub(super) fn so_far(&self, count: u64) -> Episodes {
         Episodes::of(count, self.newest.iter())
-    }
-
-    pub(super) const fn count(&self) -> u64 {
-        self.episode
     }
 
     pub(super) fn missing(&self) -> Vec<String> {

@@ -115,10 +115,8 @@ impl RunRecorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
         folder.write_config(&run.config_toml)?;
-        let rows = Table {
-            header: run.header(),
-            rows: Vec::new(),
-        };
+        let (header, rows) = (run.header(), Vec::new());
+        let rows = Table { header, rows };
         let episodes = TrainingEpisodes::create(folder)?;
         Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
     }
@@ -154,16 +152,13 @@ impl RunRecorder {
         // A replay that was kept knows of all the run's episodes and k.
         let is_kept = resume_point.replay_is_kept;
         let before = |column| rows.last(column).filter(|_| !is_kept);
-        let episodes_before = match is_kept {
-            true => 0,
-            false => rows.last("episodes").unwrap_or(0).max(episodes.count()),
-        };
+        let rows_of_episodes = rows.last("episodes").unwrap_or(0).max(episodes.episode);
         Ok(Self {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: resume_point.frames,
-            episodes_before,
+            episodes_before: if is_kept { 0 } else { rows_of_episodes },
             k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
             events: None,

@@ -84,18 +84,16 @@ fn of_disk((server, account): (&ServerAnswer, &PartsStatus)) -> Option<String> {
 }
 
 fn of_learner(view: &RunView) -> Option<String> {
-    let connects = view
-        .servers
-        .iter()
-        .map(|it| format!(" --connect {}", it.endpoint));
-    let flags = connects.collect::<String>() + certificates(&view.servers[0].endpoint);
+    let servers = view.servers.iter();
+    let connects: String = servers
+        .map(|it| format!(" --connect {}", it.endpoint))
+        .collect();
+    let tls = certificates(&view.servers[0].endpoint);
+    let command = format!("`driml learner{connects}{tls} --run-dir DIR`");
     match parts(view).find(|(_, part)| part.who == PartName::Learner) {
-        None => Some(format!(
-            "no learner has joined: start `driml learner{flags} --run-dir DIR`"
-        )),
+        None => Some(format!("no learner has joined: start {command}")),
         Some((_, learner)) if !learner.connected => Some(format!(
-            "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: \
-             `driml learner{flags} --run-dir DIR`",
+            "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: {command}",
             seconds(learner.since_s)
         )),
         Some(_) if view.learner_status().is_none() => Some(
@@ -106,9 +104,8 @@ fn of_learner(view: &RunView) -> Option<String> {
 }
 
 fn of_actors(view: &RunView) -> Vec<String> {
-    let actors: Vec<_> = parts(view)
-        .filter(|(_, part)| part.who != PartName::Learner)
-        .collect();
+    let is_actor = |(_, part): &(_, &PartStatus)| part.who != PartName::Learner;
+    let actors: Vec<_> = parts(view).filter(is_actor).collect();
     if !actors.iter().any(|(_, part)| part.connected) {
         let endpoint = &view.servers[0].endpoint;
         let what = match actors.is_empty() {
@@ -125,10 +122,9 @@ fn of_actors(view: &RunView) -> Vec<String> {
             return None;
         };
         if !part.connected {
+            let (since, tls) = (seconds(part.since_s), certificates(endpoint));
             return Some(format!(
-                "actor-{id} disconnected {} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{} --id {id}`",
-                seconds(part.since_s),
-                certificates(endpoint)
+                "actor-{id} disconnected {since} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{tls} --id {id}`"
             ));
         }
         let silent = seconds(silent_for(part)?);
@@ -148,10 +144,8 @@ fn certificates(endpoint: &str) -> &'static str {
 
 /// What to say below the live lines: the processes that do not respond, and for how long.
 pub(crate) fn notes(view: &RunView) -> Vec<String> {
-    let recovering = view.recovering();
-    let recovering: Vec<_> = recovering
-        .map(|(server, it)| recovery(&server.name, it))
-        .collect();
+    let recovering = view.recovering().map(|(it, how)| recovery(&it.name, how));
+    let recovering: Vec<_> = recovering.collect();
     if !recovering.is_empty() {
         return recovering;
     }

@@ -131,10 +131,12 @@ impl Watched {
             "the learner's last answer is missing: its updates are those whose batches were served, its losses and weights those before",
         );
         poller.view.learner.updates = updates;
-        if let Some(recorder) = &mut self.recorder {
-            let warnings = recorder.record(&poller.view, &[]);
-            warnings.iter().for_each(|line| self.screen.line(line));
-        }
+        let recorded = self.recorder.as_mut();
+        let warnings = recorded.map(|it| it.record(&poller.view, &[]));
+        warnings
+            .iter()
+            .flatten()
+            .for_each(|line| self.screen.line(line));
     }
 
     /// Takes the live lines away, says what could not be recorded, and gives the summary of a run that ended so.
@@ -161,14 +163,12 @@ impl Watched {
 
 /// What is shown of a run: of all of it where it is recorded.
 fn moment<'a>(recorder: Option<&'a RunRecorder>, view: &'a RunView) -> Moment<'a> {
-    recorder.map_or_else(
-        || Moment {
-            // Until it answers it has its last status.
-            learner: Some(&view.learner),
-            ..view.moment()
-        },
-        |it| it.moment(view),
-    )
+    let of_view = || Moment {
+        // Until it answers it has its last status.
+        learner: Some(&view.learner),
+        ..view.moment()
+    };
+    recorder.map_or_else(of_view, |it| it.moment(view))
 }
 
 /// Begins to record the run in `folder`, or continues.

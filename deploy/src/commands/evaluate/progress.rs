@@ -26,16 +26,12 @@ impl Progress {
 
     pub(super) fn see(&mut self, returns: &[f64]) {
         let now = Instant::now();
-        match self.screen.bar() {
-            Some(bar) => {
-                bar.set_position(returns.len() as u64);
-                bar.set_message(self.describe(returns));
-            }
-            None if now >= self.plain_next => {
-                self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&self.describe(returns));
-            }
-            None => {}
+        if let Some(bar) = self.screen.bar() {
+            bar.set_position(returns.len() as u64);
+            bar.set_message(self.describe(returns));
+        } else if now >= self.plain_next {
+            self.plain_next = now + PLAIN_PERIOD;
+            self.screen.line(&self.describe(returns));
         }
     }
 

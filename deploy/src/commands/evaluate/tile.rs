@@ -106,10 +106,8 @@ impl Layout {
         let (width, height) = self.tile();
         let columns = self.columns();
         let rows = self.copies.div_ceil(columns);
-        (
-            MARGIN + columns * (width + MARGIN),
-            MARGIN + rows * (height + MARGIN),
-        )
+        let along = |count: usize, side: usize| MARGIN + count * (side + MARGIN);
+        (along(columns, width), along(rows, height))
     }
 
     /// Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
@@ -127,11 +125,14 @@ impl Layout {
 
     fn tile(&self) -> (usize, usize) {
         let (width, height) = self.enlarged();
-        match (self.has_panel, &self.local) {
-            (false, _) => (width, height),
-            (true, None) => (width + MARGIN + PANEL_WIDTH, height.max(PANEL_HEIGHT)),
-            (true, Some(_)) => (
-                2 * width + 2 * MARGIN + PANEL_WIDTH,
+        if !self.has_panel {
+            return (width, height);
+        }
+        let with_panel = width + MARGIN + PANEL_WIDTH;
+        match self.local {
+            None => (with_panel, height.max(PANEL_HEIGHT)),
+            Some(_) => (
+                with_panel + MARGIN + width,
                 (height + LEADING).max(PANEL_HEIGHT),
             ),
         }
@@ -187,15 +188,11 @@ impl Layout {
         let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let q = look.q_values[action];
         let chance = if q < best { " (by chance)" } else { "" };
+        let Shot { episode, step, .. } = shot;
+        let Shot { total, reward, .. } = shot;
         let lines = [
-            (
-                Ink::Soft,
-                format!("episode {}, step {}", shot.episode, shot.step),
-            ),
-            (
-                Ink::Plain,
-                format!("return {:.2} ({:+.2})", shot.total, shot.reward),
-            ),
+            (Ink::Soft, format!("episode {episode}, step {step}")),
+            (Ink::Plain, format!("return {total:.2} ({reward:+.2})")),
             (Ink::Plain, format!("value {best:.3}")),
             (Ink::Bold, format!("{name}{chance}")),
         ];

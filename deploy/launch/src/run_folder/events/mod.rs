@@ -78,20 +78,28 @@ impl Events {
             seconds: now(),
             step: replay.transitions_inserted,
         };
-        let points = points.iter();
-        let points = points.map(|(name, value)| (name.clone(), Value::Scalar(*value as f32)));
-        let points = encode::summary(at, &points.collect::<Vec<_>>());
-        let said = self.file.add(points);
-        let was = self.slow_at;
-        if !is_last && was.is_some_and(|last| last.elapsed() < SLOW_PERIOD) {
-            return said;
+        let curve = |(name, value): &(String, f64)| (name.clone(), Value::Scalar(*value as f32));
+        let curves: Vec<_> = points.iter().map(curve).collect();
+        let mut records = vec![encode::summary(at, &curves)];
+        let is_slow_due = self.slow_at.is_none_or(|it| it.elapsed() >= SLOW_PERIOD);
+        if is_last || is_slow_due {
+            self.slow_at = Some(Instant::now());
+            records.extend(self.histograms(at, replay));
+            records.extend(self.affinity(at));
         }
-        self.slow_at = Some(Instant::now());
+        self.file.add_all(records)
+    }
+
+    /// What was counted since the last histograms.
+    fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
         let mut counted = Vec::new();
-        let (k, actions) = (&replay.k_histogram, &replay.action_histogram);
         for (name, now, before) in [
-            ("k/served", k, &mut self.k),
-            ("actions/stored", actions, &mut self.actions),
+            ("k/served", &replay.k_histogram, &mut self.k),
+            (
+                "actions/stored",
+                &replay.action_histogram,
+                &mut self.actions,
+            ),
         ] {
             let since = since(now, before);
             before.clone_from(now);
@@ -102,14 +110,11 @@ impl Events {
         let histograms = counted.iter();
         let histograms = histograms.map(|(name, counts)| (name.clone(), Value::Counts(counts)));
         let histograms: Vec<_> = histograms.collect();
-        let has_counted = !histograms.is_empty();
-        let more = has_counted.then(|| self.file.add(encode::summary(at, &histograms)));
-        let drawn = self.affinity(at);
-        said.or(more.flatten()).or(drawn)
+        (!histograms.is_empty()).then(|| encode::summary(at, &histograms))
     }
 
     /// Draws A of a checkpoint that was not there before. One that cannot be read just now is tried again.
-    fn affinity(&mut self, at: At) -> Option<String> {
+    fn affinity(&mut self, at: At) -> Option<Vec<u8>> {
         let (updates, path) = newest(&self.checkpoints)?;
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
             return None;
@@ -128,8 +133,7 @@ impl Events {
             height,
             png: &png,
         };
-        let image = [("affinity/A".to_owned(), image)];
-        self.file.add(encode::summary(at, &image))
+        Some(encode::summary(at, &[("affinity/A".to_owned(), image)]))
     }
 
     pub(super) fn missing(&self) -> Option<String> {
