@@ -23,7 +23,6 @@ use crate::commands::{
     watch::{self, StatusArgs, WatchArgs},
 };
 
-/// What `driml train --help` ends with.
 const EXAMPLES: &str = "\
 Examples:
   driml train --env chain --agent c51
@@ -98,7 +97,6 @@ impl Command {
         }
     }
 
-    /// Runs the command.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Train(args) => train::run(args),

@@ -27,10 +27,9 @@ pub fn main() -> ExitCode {
         Err(e) => {
             // Nothing is left to be done if the terminal is gone.
             let _ = e.print();
-            return if e.use_stderr() {
-                ExitCode::from(EXIT_USAGE)
-            } else {
-                ExitCode::SUCCESS
+            return match e.use_stderr() {
+                true => ExitCode::from(EXIT_USAGE),
+                false => ExitCode::SUCCESS,
             };
         }
     };
@@ -46,10 +45,9 @@ pub fn main() -> ExitCode {
         Err(e) if e.is::<Interrupted>() => ExitCode::from(EXIT_INTERRUPTED),
         Err(e) => {
             console::line(&format!("error: {}", console::describe(&e)));
-            if e.is::<Usage>() {
-                ExitCode::from(EXIT_USAGE)
-            } else {
-                ExitCode::FAILURE
+            match e.is::<Usage>() {
+                true => ExitCode::from(EXIT_USAGE),
+                false => ExitCode::FAILURE,
             }
         }
     }

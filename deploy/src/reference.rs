@@ -104,11 +104,7 @@ fn commands() -> String {
 }
 
 fn root() -> PathBuf {
-    let deploy = Path::new(env!("CARGO_MANIFEST_DIR"));
-    deploy
-        .parent()
-        .expect("the package lies in the repository")
-        .into()
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
 /// The presets of a folder: their names and files.
@@ -140,10 +136,8 @@ fn settings() -> String {
         writeln!(page, "* {}: {first}", link("variant", &name)).unwrap();
     }
     for (folder, title) in [("agent", "Agents"), ("world", "Worlds")] {
-        let links = presets(folder)
-            .into_iter()
-            .map(|(name, _)| link(folder, &name));
-        let links: Vec<_> = links.collect();
+        let presets = presets(folder);
+        let links: Vec<_> = presets.iter().map(|it| link(folder, &it.0)).collect();
         write!(page, "\n## {title}\n\n{}\n", links.join(", ")).unwrap();
     }
     page
@@ -184,10 +178,9 @@ fn words(line: &str) -> Vec<String> {
 
 /// The lines of a page's shell blocks that call the program.
 fn calls(page: &str) -> impl Iterator<Item = &str> {
-    page.split("```sh\n")
-        .skip(1)
-        .flat_map(|it| it.split("```").next().unwrap().lines())
-        .filter(|it| it.starts_with("driml "))
+    let blocks = page.split("```sh\n").skip(1);
+    let lines = blocks.flat_map(|it| it.split("```").next().unwrap().lines());
+    lines.filter(|it| it.starts_with("driml "))
 }
 
 #[test]

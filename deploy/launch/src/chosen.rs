@@ -3,6 +3,7 @@
 
 use std::{path::PathBuf, str::FromStr};
 
+use anyhow::Context;
 use clap::ValueEnum;
 use driml_learner::checkpoint;
 use driml_machine::{error::usage, whole_number};
@@ -64,41 +65,31 @@ pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
     Ok(RunConfig::parse(&path.display().to_string(), &text)?)
 }
 
-/// The folder of a checkpoint.
 pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
-    let updates = match which {
-        Which::Newest => None,
-        Which::After(updates) => Some(updates),
-        Which::Best => {
-            let mut best = checkpoint::list(&folder.best())?;
-            let (_, path) = best.pop().ok_or_else(|| {
-                usage!(
-                    "{} has no best checkpoint: none was evaluated. Train with --evaluate-every UPDATES, or evaluate one \
-                     with `driml evaluate {} --checkpoint UPDATES --keep`",
-                    folder.display(),
-                    folder.display()
-                )
-            })?;
-            return Ok(path);
-        }
+    let run = folder.display();
+    if which == Which::Best {
+        let best = checkpoint::list(&folder.best())?.pop();
+        return best.map(|(_, path)| path).with_context(|| {
+            usage!(
+                "{run} has no best checkpoint: none was evaluated. Train with --evaluate-every UPDATES, or evaluate one \
+                 with `driml evaluate {run} --checkpoint UPDATES --keep`"
+            )
+        });
+    }
+    let all = checkpoint::list(&folder.checkpoints())?;
+    let newest = all.last().map(|it| it.0);
+    let newest =
+        newest.with_context(|| usage!("{run} has no checkpoint yet: let the run continue"))?;
+    let wanted = match which {
+        Which::After(updates) => updates,
+        _ => newest,
     };
-    let mut all = checkpoint::list(&folder.checkpoints())?;
-    let Some((newest, _)) = all.last() else {
-        return Err(usage!(
-            "{} has no checkpoint yet: let the run continue",
-            folder.display()
-        )
-        .into());
-    };
-    let wanted = updates.unwrap_or(*newest);
-    let known: Vec<String> = all.iter().map(|(updates, _)| updates.to_string()).collect();
-    let found = all.iter().position(|(updates, _)| *updates == wanted);
-    let at = found.ok_or_else(|| {
+    let known: Vec<_> = all.iter().map(|(updates, _)| updates.to_string()).collect();
+    let found = all.into_iter().find(|(updates, _)| *updates == wanted);
+    found.map(|(_, path)| path).with_context(|| {
         usage!(
-            "{} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
-            folder.display(),
+            "{run} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
             known.join(", ")
         )
-    })?;
-    Ok(all.swap_remove(at).1)
+    })
 }

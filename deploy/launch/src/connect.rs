@@ -1,7 +1,10 @@
 //! The launcher's session to a replay server that is still starting.
 //! It starts no process; the actors and the learner connect by themselves.
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::mpsc::sync_channel,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
@@ -26,39 +29,35 @@ pub(crate) fn connect(
         connect: vec![endpoint.to_owned()],
     };
     let deadline = Instant::now() + LISTEN_MAX;
-    loop {
-        // Opening may take seconds, in which the replay server may end: so it runs on another thread.
-        let endpoints = endpoints.clone();
-        let (tell, told) = std::sync::mpsc::channel();
-        let open = move || {
+    let (tell, told) = sync_channel(0);
+    // Opening may take seconds, in which the replay server may end: so it runs on another thread.
+    let open = move || {
+        loop {
             fault::point("connect");
+            let opened = session::open(&endpoints);
+            let is_open = opened.is_ok();
             // The receiver is gone if the run has ended meanwhile.
-            let _ = tell.send(session::open(&endpoints));
-        };
-        let thread = std::thread::Builder::new().name("connect".into());
-        thread.spawn(open).context("starting a thread")?;
-        let opened = loop {
-            if interrupts.count() > 0 {
-                return Ok(None);
+            if tell.send(opened).is_err() || is_open {
+                return;
             }
-            check_alive()?;
-            match told.recv_timeout(Duration::from_millis(50)) {
-                Ok(opened) => break opened,
-                Err(_) if Instant::now() > deadline => {
-                    bail!(
-                        "the replay server does not listen on {endpoint} after {}",
-                        duration(LISTEN_MAX)
-                    )
-                }
-                Err(_) => {}
-            }
-        };
+        }
+    };
+    let thread = std::thread::Builder::new().name("connect".into());
+    thread.spawn(open).context("starting a thread")?;
+    while interrupts.count() == 0 {
+        check_alive()?;
+        let opened = told.recv_timeout(Duration::from_millis(50));
+        let is_late = Instant::now() > deadline;
         match opened {
-            Ok(session) => return Ok(Some(session)),
-            Err(e) if Instant::now() > deadline => {
-                return Err(e).context("reaching the replay server");
-            }
-            Err(e) => tracing::debug!("the replay server does not listen yet: {e}"),
+            Ok(Ok(session)) => return Ok(Some(session)),
+            Ok(Err(e)) if is_late => return Err(e).context("reaching the replay server"),
+            Ok(Err(e)) => tracing::debug!("the replay server does not listen yet: {e}"),
+            Err(_) if is_late => bail!(
+                "the replay server does not listen on {endpoint} after {}",
+                duration(LISTEN_MAX)
+            ),
+            Err(_) => {}
         }
     }
+    Ok(None)
 }

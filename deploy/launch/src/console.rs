@@ -101,19 +101,17 @@ pub fn describe(error: &anyhow::Error) -> String {
 /// Lines of the form `WHAT are lost: WHY`, those of the same cause in one.
 pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String> {
     const LOST: &str = " are lost: ";
-    let (mut by_cause, mut others) = (BTreeMap::<_, Vec<_>>::new(), Vec::new());
+    let mut by_cause = BTreeMap::<String, Vec<String>>::new();
+    let mut joined = Vec::new();
     for line in lines {
         match line.split_once(LOST) {
-            Some((what, why)) => by_cause
-                .entry(why.to_owned())
-                .or_default()
-                .push(what.to_owned()),
-            None => others.push(line),
+            Some((what, why)) => by_cause.entry(why.into()).or_default().push(what.into()),
+            None => joined.push(line),
         }
     }
-    let joined = by_cause.iter();
-    others.extend(joined.map(|(why, what)| format!("{}{LOST}{why}", what.join(", "))));
-    others
+    let lost = by_cause.iter();
+    joined.extend(lost.map(|(why, what)| format!("{}{LOST}{why}", what.join(", "))));
+    joined
 }
 
 /// What is logged of zenoh and quinn, whatever is logged of driml.
@@ -179,7 +177,6 @@ impl<S: Subscriber> Layer<S> for LastWarning {
     }
 }
 
-/// The text of a line of the log.
 fn text(event: &Event<'_>) -> String {
     struct Text(String);
     impl Visit for Text {
@@ -212,21 +209,18 @@ struct FullDisk {
 }
 
 impl FullDisk {
-    /// Whether a line is to be written.
     fn is_due(&mut self, text: &str, now: Instant) -> bool {
-        let is_about_it = ["No space left on device", "Disk quota exceeded"]
-            .iter()
-            .any(|it| text.contains(it));
-        let is_fresh = |said| now.saturating_duration_since(said) < FULL_DISK_PERIOD;
-        if !is_about_it {
+        let mut causes = ["No space left on device", "Disk quota exceeded"].iter();
+        if !causes.any(|it| text.contains(it)) {
             return true;
         }
-        if self.said.is_some_and(is_fresh) {
-            self.left_out += 1;
-            return false;
+        let is_fresh = |said| now.saturating_duration_since(said) < FULL_DISK_PERIOD;
+        let is_due = !self.said.is_some_and(is_fresh);
+        match is_due {
+            true => self.said = Some(now),
+            false => self.left_out += 1,
         }
-        self.said = Some(now);
-        true
+        is_due
     }
 }
 
@@ -238,10 +232,9 @@ impl Screen {
     pub fn new(length: u64, template: &str) -> Self {
         let target = ProgressDrawTarget::stderr_with_hz(DRAWS_PER_SECOND);
         let bar = (!target.is_hidden()).then(|| {
-            let bar = ProgressBar::with_draw_target(Some(length), target);
             let style = ProgressStyle::with_template(template);
-            bar.set_style(style.expect("the template is a constant, and a test makes one"));
-            bar
+            let style = style.expect("the template is a constant, and a test makes one");
+            ProgressBar::with_draw_target(Some(length), target).with_style(style)
         });
         Self {
             bar,
@@ -298,13 +291,10 @@ impl Pages {
 
     /// Shows one.
     pub fn show(&self, text: &str) -> anyhow::Result<()> {
-        if let Some(term) = &self.0 {
-            term.clear_screen().or_else(|e| match is_gone(&e) {
-                true => Ok(()),
-                false => Err(e),
-            })?;
+        match self.0.as_ref().map(Term::clear_screen) {
+            Some(Err(e)) if !is_gone(&e) => Err(e.into()),
+            _ => print(text),
         }
-        print(text)
     }
 }
 

@@ -82,9 +82,8 @@ fn is_taken<T>(bound: std::io::Result<T>) -> bool {
 
 fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
     let has_host = |address: &str| {
-        address
-            .rsplit_once(':')
-            .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
+        let parts = address.rsplit_once(':');
+        parts.is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
     };
     // Behind # zenoh takes further settings, which could undo ours.
     match endpoint.split_once('/') {
@@ -133,10 +132,13 @@ mod tests {
         check_listening(&[endpoint.into()], guard).map_err(|e| e.to_string())
     }
 
-    const TLS: Guard = Guard {
-        tls: true,
-        insecure_network: false,
-    };
+    const fn guard(tls: bool, insecure_network: bool) -> Guard {
+        Guard {
+            tls,
+            insecure_network,
+        }
+    }
+    const TLS: Guard = guard(true, false);
 
     /// Endpoints to connect to, with or without certificates, and a part of the answer; none to one that can work.
     #[test]
@@ -201,11 +203,12 @@ mod tests {
             format!("unixsock-stream/{}", path.display()),
         ];
         for endpoint in &endpoints {
-            let said = check_unused(std::slice::from_ref(endpoint)).unwrap_err();
-            let said = said.to_string();
+            let said = check_unused(std::slice::from_ref(endpoint)).unwrap_err().0;
             let begins = format!("cannot listen on {endpoint}: another process listens there");
-            let fits = said.starts_with(&begins) && said.contains("--listen");
-            assert!(fits, "{said}");
+            assert!(
+                said.starts_with(&begins) && said.contains("--listen"),
+                "{said}"
+            );
         }
         drop((tcp, udp, socket));
         assert!(check_unused(&endpoints).is_ok());
@@ -213,29 +216,23 @@ mod tests {
 
     #[test]
     fn what_other_machines_reach_is_guarded() {
-        let nothing = Guard::default();
-        for closed in [
-            "tcp/127.0.0.1:1",
-            "tcp/127.9.9.9:1",
-            "tcp/[::1]:1",
-            "tcp/localhost:1",
-            "unixsock-stream//tmp/s",
-        ] {
+        let (nothing, trusted) = (Guard::default(), guard(false, true));
+        let tcp = ["127.0.0.1", "127.9.9.9", "[::1]", "localhost"].map(|it| format!("tcp/{it}:1"));
+        for closed in tcp
+            .iter()
+            .map(String::as_str)
+            .chain(["unixsock-stream//tmp/s"])
+        {
             assert_eq!(listening(closed, nothing), Ok(()), "{closed}");
         }
         for open in ["tcp/0.0.0.0:7447", "tcp/[::]:1", "tcp/192.0.2.1:1"] {
             let said = listening(open, nothing).unwrap_err();
-            for way_out in [
+            let words = [
                 "--tls-dir DIR",
                 "--insecure-network",
                 "change and stop the run",
-            ] {
-                assert!(said.contains(way_out), "{said}");
-            }
-            let trusted = Guard {
-                insecure_network: true,
-                ..nothing
-            };
+            ];
+            assert!(words.iter().all(|it| said.contains(it)), "{said}");
             assert_eq!(listening(open, trusted), Ok(()), "{open}");
             assert_eq!(listening(&open.replace("tcp", "quic"), TLS), Ok(()));
         }

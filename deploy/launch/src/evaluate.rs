@@ -24,7 +24,6 @@ use crate::{
 
 /// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
 const EPSILON: f64 = 0.001;
-/// Copies of the world that are played at once.
 const COPIES_MAX: usize = 32;
 /// Steps of each copy after which an evaluation is given up; Procgen's longest episode has 6,000.
 const STEPS_A_ROUND_MAX: u64 = 20_000;
@@ -77,7 +76,6 @@ impl Player {
         Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
     }
 
-    /// Its weights as the learner publishes such.
     pub(crate) fn read(
         config: RunConfig,
         checkpoint: &Path,
@@ -99,10 +97,9 @@ impl Player {
 
     /// What its weights are: "averaged" or "online".
     pub const fn weights_name(&self) -> &'static str {
-        if self.is_averaged {
-            "averaged"
-        } else {
-            "online"
+        match self.is_averaged {
+            true => "averaged",
+            false => "online",
         }
     }
 
@@ -154,20 +151,16 @@ impl Player {
         seed: u64,
         watch: Watch<'_>,
     ) -> anyhow::Result<Vec<f64>> {
+        let config = &self.config;
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => {
-                let (model, precision) = (&self.config.model, self.config.actor.precision);
-                let enlarge = self.enlarge()?;
-                Box::new(NetworkPolicy::new(
-                    model,
-                    enlarge,
-                    &self.weights,
-                    precision,
-                )?)
+                let (enlarge, precision) = (self.enlarge()?, config.actor.precision);
+                let policy = NetworkPolicy::new(&config.model, enlarge, &self.weights, precision)?;
+                Box::new(policy)
             }
-            Who::Random => Box::new(random_policy(&self.config)?),
+            Who::Random => Box::new(random_policy(config)?),
         };
-        play_with(&self.config, policy.as_mut(), world, episodes, seed, watch)
+        play_with(config, policy.as_mut(), world, episodes, seed, watch)
     }
 
     /// Copies of the world that play so many episodes.

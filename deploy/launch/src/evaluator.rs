@@ -1,13 +1,10 @@
 //! Plays a run's checkpoints during the run, each in its own process, one at a time.
 //! What a checkpoint earned, the process itself writes into the run's folder.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use driml_learner::checkpoint;
-use driml_settings::config::EvaluationConfig;
+use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     console::Screen,
@@ -15,27 +12,46 @@ use crate::{
     run_folder::{Evaluated, RunFolder, sweep},
 };
 
-/// How long the last evaluation may take once the run is over.
 const LAST_MAX: Duration = Duration::from_secs(3600);
-/// How often it is looked at then.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Plays checkpoints as they appear.
-pub(crate) struct Evaluator {
-    config: EvaluationConfig,
-    run_dir: RunFolder,
+/// Which checkpoints of a run are to be played.
+pub(crate) struct Due {
+    /// None if none is.
+    config: Option<EvaluationConfig>,
     /// Updates of the newest checkpoint that was played or is.
     newest: u64,
+}
+
+impl Due {
+    /// Those after the checkpoints that the run's folder lists as played.
+    pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        Ok(Self {
+            config: config.local.evaluation,
+            newest: Evaluated::newest(run_dir)?,
+        })
+    }
+
+    /// How many episodes the checkpoint after so many updates is now played for, if it is due.
+    pub(crate) fn take(&mut self, updates: u64, is_last: bool) -> Option<u32> {
+        let is_due = |it: &EvaluationConfig| it.is_due(updates, self.newest, is_last);
+        let config = self.config.filter(is_due)?;
+        self.newest = updates;
+        Some(config.episodes)
+    }
+}
+
+pub(crate) struct Evaluator {
+    due: Due,
+    run_dir: RunFolder,
     playing: Option<ManagedProcess>,
 }
 
 impl Evaluator {
-    /// Continues after the checkpoints that the run's folder lists as played.
-    pub(crate) fn new(config: EvaluationConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+    pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         Ok(Self {
-            config,
+            due: Due::new(config, run_dir)?,
             run_dir: run_dir.clone(),
-            newest: Evaluated::newest(run_dir)?,
             playing: None,
         })
     }
@@ -71,17 +87,19 @@ impl Evaluator {
 
     /// Begins to play the newest checkpoint if it is due. Says whether it did.
     fn begin(&mut self, is_last: bool, screen: &Screen) -> bool {
+        if self.due.config.is_none() {
+            return false;
+        }
         let all = checkpoint::list(&self.run_dir.checkpoints()).unwrap_or_else(|e| {
             tracing::debug!("looking for a checkpoint to play: {e}");
             Vec::new()
         });
-        let is_due = |&updates: &u64| self.config.is_due(updates, self.newest, is_last);
-        let Some(updates) = all.last().map(|it| it.0).filter(is_due) else {
+        let newest = all.last().map(|it| it.0);
+        let due = newest.and_then(|it| Some((it, self.due.take(it, is_last)?)));
+        let Some((updates, episodes)) = due else {
             return false;
         };
-        self.newest = updates;
-        let logs = self.run_dir.logs();
-        match self.start(updates, &logs, screen) {
+        match self.start(updates, episodes, screen) {
             Ok(process) => self.playing = Some(process),
             Err(e) => screen.line(&format!(
                 "the checkpoint after {updates} updates is not played: {e:#}"
@@ -90,7 +108,12 @@ impl Evaluator {
         self.playing.is_some()
     }
 
-    fn start(&self, updates: u64, logs: &Path, screen: &Screen) -> anyhow::Result<ManagedProcess> {
+    fn start(
+        &self,
+        updates: u64,
+        episodes: u32,
+        screen: &Screen,
+    ) -> anyhow::Result<ManagedProcess> {
         let args = [
             "evaluate".into(),
             self.run_dir.display().to_string(),
@@ -98,10 +121,10 @@ impl Evaluator {
             "--checkpoint".into(),
             updates.to_string(),
             "--episodes".into(),
-            self.config.episodes.to_string(),
+            episodes.to_string(),
         ];
         let surroundings = Surroundings {
-            logs,
+            logs: &self.run_dir.logs(),
             screen,
             meeting: None,
         };

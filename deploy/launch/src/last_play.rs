@@ -18,7 +18,6 @@ use crate::{
 
 /// Episodes that are played at once, one in each copy of the world. They count together, so that long ones are not left out.
 const BATCH: usize = 20;
-/// Batches that are played if there is time.
 const BATCHES_MAX: u32 = 5;
 /// How long all of it may take; the first batch may take longer.
 const PLAY_MAX: Duration = Duration::from_secs(30);

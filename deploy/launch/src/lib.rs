@@ -42,7 +42,6 @@ pub mod plan;
 pub mod pretrained;
 pub mod process_log;
 mod processes;
-mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod run_view;

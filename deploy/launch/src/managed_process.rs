@@ -19,7 +19,6 @@ use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
 
 /// A process that ends with an error within this time of its start would do so again.
 const AT_ONCE: Duration = Duration::from_secs(10);
-/// How often a process that should end is looked at.
 const POLL: Duration = Duration::from_millis(20);
 
 /// A process that was started.
@@ -67,14 +66,9 @@ impl ManagedProcess {
         threads: u32,
         surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
-        let Surroundings {
-            logs,
-            screen,
-            meeting,
-        } = surroundings;
-        let log = ProcessLog::open(name, logs)?;
+        let log = ProcessLog::open(name, surroundings.logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let held = meeting.map(Meeting::hold).transpose();
+        let held = surroundings.meeting.map(Meeting::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);
@@ -83,7 +77,7 @@ impl ManagedProcess {
             .args(args)
             .args(exit_with_this_process())
             .stdin(stdin);
-        Self::spawn(name, command, log, screen)
+        Self::spawn(name, command, log, surroundings.screen)
     }
 
     fn spawn(
@@ -98,12 +92,9 @@ impl ManagedProcess {
             .process_group(0)
             .spawn()
             .with_context(|| format!("starting {name}"))?;
-        if let Some(pipe) = child.stdout.take() {
-            log.follow(pipe, screen)?;
-        }
-        if let Some(pipe) = child.stderr.take() {
-            log.follow(pipe, screen)?;
-        }
+        let pipes = (child.stdout.take(), child.stderr.take());
+        log.follow(pipes.0.expect("it is piped"), screen)?;
+        log.follow(pipes.1.expect("it is piped"), screen)?;
         Ok(Self {
             name: name.into(),
             child,
@@ -198,16 +189,14 @@ impl ManagedProcess {
     /// How it ended and its last lines, as one message.
     pub fn exit_report(&mut self) -> String {
         self.wait_until(Instant::now(), || false);
-        let how = match self.end {
+        let how = match self.end.map(|it| (it.code(), it.signal())) {
             None => "is still running".into(),
-            Some(status) => match (status.code(), status.signal()) {
-                (Some(code), _) => format!("exited with code {code}"),
-                (None, Some(signal)) => {
-                    let name = Signal::try_from(signal).map_or("", Signal::as_str);
-                    format!("was killed by signal {signal} {name}")
-                }
-                (None, None) => "exited".into(),
-            },
+            Some((Some(code), _)) => format!("exited with code {code}"),
+            Some((None, Some(signal))) => {
+                let name = Signal::try_from(signal).map_or("", Signal::as_str);
+                format!("was killed by signal {signal} {name}")
+            }
+            Some((None, None)) => "exited".into(),
         };
         let last = match (self.log.error(), self.log.tail()) {
             // It says all.

@@ -64,7 +64,6 @@ impl Meeting {
         self.folder.path()
     }
 
-    /// Where a process of this name listens.
     pub(crate) fn endpoint(&self, name: &str) -> String {
         let path = self.folder.path().join(format!("{name}.sock"));
         format!("unixsock-stream/{}", path.display())
@@ -130,6 +129,9 @@ mod tests {
     fn unused_folders_are_swept_and_nothing_else() {
         let place = tempfile::tempdir().unwrap();
         let meeting = Meeting::create_in(place.path()).unwrap();
+        let path = meeting.folder.path().display().to_string();
+        let endpoint = format!("unixsock-stream/{path}/learner.sock");
+        assert_eq!(meeting.endpoint("learner"), endpoint);
         let mode = fs::metadata(meeting.folder.path()).unwrap().mode();
         assert_eq!(mode & 0o777, 0o700);
         // Of another program, by its name or content.
@@ -163,14 +165,5 @@ mod tests {
         let meeting = Meeting::create_in(&place_under(name_of(95))).unwrap();
         let endpoint = meeting.endpoint("replay-server-255");
         assert!(check_endpoints(&[endpoint], false).is_ok());
-    }
-
-    #[test]
-    fn an_endpoint_is_in_the_folder() {
-        let place = tempfile::tempdir().unwrap();
-        let meeting = Meeting::create_in(place.path()).unwrap();
-        let path = meeting.folder.path().display().to_string();
-        let endpoint = format!("unixsock-stream/{path}/learner.sock");
-        assert_eq!(meeting.endpoint("learner"), endpoint);
     }
 }

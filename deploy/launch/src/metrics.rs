@@ -91,10 +91,10 @@ columns! {
         Value::Counter(|it| Some(it.episodes.count as f64));
     "mean_return", "mean of the last 100 episodes", "return", "Return":
         "Mean undiscounted return of the newest training episodes.",
-        Value::Gauge(|it| it.episodes.mean_return.map(|it| it.mean));
+        Value::Gauge(|it| it.episodes.mean_return);
     "mean_return_of", "episodes", "return", "Episodes in the mean return":
         "Episodes in the mean return: 100, or as many as there were.",
-        Value::Gauge(|it| Some(it.episodes.mean_return.map_or(0.0, |it| it.of as f64)));
+        Value::Gauge(|it| Some(it.episodes.mean_return_of as f64));
     "c51_kl", "KL divergence [nats]", "learning", "C51 loss":
         "C51's loss of the last update.",
         Value::Gauge(|it| it.learned(|it| it.c51_kl.into()));
@@ -279,7 +279,10 @@ mod tests {
     use driml_protocol::{LearnerStatus, ReplayStatus};
 
     use super::*;
-    use crate::moment::{Episodes, Speed};
+    use crate::{
+        moment::{Episodes, Speed},
+        testing::with,
+    };
 
     fn moment<'a>(replay: &'a ReplayStatus, learner: Option<&'a LearnerStatus>) -> Moment<'a> {
         Moment {
@@ -309,19 +312,14 @@ mod tests {
 
     #[test]
     fn what_is_not_known_is_left_out() {
-        let replay = ReplayStatus {
-            transitions_inserted: 7,
-            ..ReplayStatus::default()
-        };
-        let mut learner = LearnerStatus {
-            losses: vec![("dim_4t4".into(), 2.0)],
-            ..LearnerStatus::default()
-        };
+        let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 7);
+        let learner = with(|it: &mut LearnerStatus| {
+            it.losses = vec![("dim_4t4".into(), 2.0)];
+            (it.updates, it.c51_kl) = (3, 0.5);
+        });
         let unknown = json(&moment(&replay, None));
         assert_eq!(unknown["updates"], serde_json::Value::Null);
         assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
-        learner.updates = 3;
-        learner.c51_kl = 0.5;
         let known = moment(&replay, Some(&learner));
         let text = serde_json::to_string(&json(&known)).unwrap();
         for part in [

@@ -19,10 +19,8 @@ static ENDING: OnceLock<ThreadId> = OnceLock::new();
 /// The launcher shows that line and says which process it was; processes whose launcher aborts end in order.
 pub fn end_the_process() {
     std::panic::set_hook(Box::new(|panic| {
-        if ENDING
-            .get()
-            .is_some_and(|it| *it != std::thread::current().id())
-        {
+        let thread = std::thread::current();
+        if ENDING.get().is_some_and(|it| *it != thread.id()) {
             #[cfg(test)]
             tests::STOPPED.store(true, std::sync::atomic::Ordering::Release);
             loop {
@@ -33,7 +31,7 @@ pub fn end_the_process() {
             Some(place) if !is_ours(place.file()) => limits::scarce(),
             _ => Vec::new(),
         };
-        say(&line(panic, std::thread::current().name(), &scarce));
+        say(&line(panic, thread.name(), &scarce));
         let trace = Backtrace::capture();
         if trace.status() == BacktraceStatus::Captured {
             say(&trace.to_string());
@@ -63,28 +61,19 @@ fn is_ours(file: &str) -> bool {
 
 fn line(panic: &PanicHookInfo<'_>, thread: Option<&str>, scarce: &[String]) -> String {
     let message = panic.payload();
-    let message = message
-        .downcast_ref::<&str>()
-        .copied()
-        .or_else(|| message.downcast_ref::<String>().map(String::as_str))
-        .unwrap_or("without a message");
+    let text = message.downcast_ref::<String>().map(String::as_str);
+    let text = text.or_else(|| message.downcast_ref::<&str>().copied());
+    let message = text.unwrap_or("without a message");
     // What `assert_eq!` says takes several lines.
     let message: Vec<_> = message.lines().map(str::trim).collect();
-    let place = panic
-        .location()
-        .map_or(String::new(), |it| format!(" at {it}"));
-    let why = match scarce {
-        [] => "this is a fault of the program, which ends here".to_owned(),
-        scarce => format!(
-            "the program ends here, and the system is short of this: {}",
-            scarce.join("; ")
-        ),
+    let place = panic.location().map(|it| format!(" at {it}"));
+    let place = place.unwrap_or_default();
+    let why = match scarce.join("; ") {
+        scarce if scarce.is_empty() => "this is a fault of the program, which ends here".to_owned(),
+        scarce => format!("the program ends here, and the system is short of this: {scarce}"),
     };
-    format!(
-        "error: the thread {} panicked{place}: {}; {why}",
-        thread.unwrap_or("without a name"),
-        message.join("; ")
-    )
+    let (thread, message) = (thread.unwrap_or("without a name"), message.join("; "));
+    format!("error: the thread {thread} panicked{place}: {message}; {why}")
 }
 
 #[cfg(test)]
@@ -101,15 +90,17 @@ mod tests {
 
     use super::*;
 
-    /// A thread that panicked was stopped.
     pub(super) static STOPPED: AtomicBool = AtomicBool::new(false);
 
     /// Set where this test is the process that panics, to what it says before.
     const CHILD: &str = "DRIML_TEST_PANICS";
 
-    /// Runs one of these tests as the process that panics.
-    fn run_as_child(command: &mut Command, name: &str, says: &str) -> Output {
-        let command = command.args(["--exact", name, "--nocapture"]);
+    /// Runs one of these tests as the process that panics, started by a shell's script.
+    fn run_as_child(script: &str, name: &str, says: &str) -> Output {
+        let mut command = Command::new("sh");
+        command.args(["-c", script]);
+        command.arg(std::env::current_exe().unwrap());
+        command.args(["--exact", name, "--nocapture"]);
         command.env(CHILD, says).output().unwrap()
     }
 
@@ -134,8 +125,7 @@ mod tests {
         }
         let child = |says: &str| {
             let name = "panics::tests::a_panic_while_the_process_ends_does_not_change_how";
-            let mut command = Command::new(std::env::current_exe().unwrap());
-            let ended = run_as_child(&mut command, name, says);
+            let ended = run_as_child("exec \"$0\" \"$@\"", name, says);
             let stderr = String::from_utf8(ended.stderr).unwrap();
             (ended.status, stderr.contains("panicked at"))
         };
@@ -157,11 +147,7 @@ mod tests {
             std::process::exit(5);
         }
         let name = "panics::tests::a_library_s_panic_names_what_was_scarce";
-        let mut command = Command::new("sh");
-        command
-            .args(["-c", "ulimit -n 60 && exec \"$0\" \"$@\""])
-            .arg(std::env::current_exe().unwrap());
-        let ended = run_as_child(&mut command, name, "");
+        let ended = run_as_child("ulimit -n 60 && exec \"$0\" \"$@\"", name, "");
         assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
         let stderr = String::from_utf8(ended.stderr).unwrap();
         let mut lines = stderr.lines();

@@ -45,82 +45,62 @@ pub fn describe(
     resume_point: ResumePoint,
     machine: &Machine,
 ) -> String {
-    let RunConfig {
-        run,
-        actor,
-        replay,
-        learner,
-        local,
-        ..
-    } = config;
-    let held = config.frames().min(replay.capacity_transitions);
-    let compressed = replay.compressed_bytes_max.map_or(u64::MAX, |max| {
-        max.saturating_add(held * COMPRESSED_FIELDS_BYTES)
-    });
-    let bytes = compressed.min(held * replay_bytes_each(run));
-    let done = resume_point.updates as f64 / config.updates().max(1) as f64;
-    let left = (1.0 - done).max(0.0);
-    let threads = local.learner_threads;
-    let processes = if lockstep {
-        "one, with everything in lockstep".into()
-    } else {
-        let servers = match replay.shards {
-            1 => "replay server".into(),
-            shards => format!("{shards} replay servers"),
-        };
-        let learner = match (local.learner_device, learner.precision) {
-            (DeviceName::Cpu, Precision::F32) => format!("with {threads} threads"),
-            (DeviceName::Cpu, precision) => format!("with {threads} threads, in {precision}"),
-            (gpu, _) => format!("on {gpu}"),
-        };
-        let (count, envs) = (local.actors, actor.envs);
-        let actors = if count == 1 { "actor" } else { "actors" };
-        format!(
-            "{servers}; learner {learner}; {count} {actors} with {envs} copies of the world each"
-        )
-    };
-    let (frames, updates, ratio) = (config.frames(), config.updates(), replay.replay_ratio);
-    let disk = match local.durable || lockstep {
+    let (run, replay) = (&config.run, &config.replay);
+    let (frames, updates) = (config.frames(), config.updates());
+    let held = frames.min(replay.capacity_transitions);
+    let with_fields = |max: u64| max.saturating_add(held * COMPRESSED_FIELDS_BYTES);
+    let compressed = replay.compressed_bytes_max.map_or(u64::MAX, with_fields);
+    let bytes = size(compressed.min(held * replay_bytes_each(run)));
+    let disk = match config.local.durable || lockstep {
         true => " and about as much of disk, in the run folder",
         false => "",
     };
+    let done = resume_point.updates as f64 / updates.max(1) as f64;
+    let left = (1.0 - done).max(0.0);
     let time = about(estimate(config, machine.cores).mul_f64(left));
+    let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
     let mut text = String::new();
-    for (name, fact) in [
-        (
-            "trains",
-            format!(
-                "{} on {}, seed {}, from {from}",
-                run.agent, run.world, run.seed
-            ),
-        ),
-        (
-            "frames",
-            format!(
-                "{frames} in all, with {updates} updates of {} rows (replay ratio {ratio})",
-                learner.batch_size
-            ),
-        ),
-        ("processes", processes),
-        (
-            "replay",
-            format!(
-                "the newest {held} transitions, up to {} of memory{disk}",
-                size(bytes)
-            ),
-        ),
-        ("run folder", run_dir.display().to_string()),
-        (
-            "time",
-            format!("{time} (coarse: from the network's arithmetic)"),
-        ),
-    ] {
-        text += &format!("{name:<INDENT$}{fact}\n");
-    }
-    for note in &config.notes {
-        text += &format!("{:<INDENT$}{note}\n", "note");
-    }
+    let mut fact = |name, fact: &str| text += &format!("{name:<INDENT$}{fact}\n");
+    let (agent, world, seed) = (&run.agent, &run.world, run.seed);
+    fact(
+        "trains",
+        &format!("{agent} on {world}, seed {seed}, from {from}"),
+    );
+    fact(
+        "frames",
+        &format!("{frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})"),
+    );
+    fact("processes", &processes(config, lockstep));
+    fact(
+        "replay",
+        &format!("the newest {held} transitions, up to {bytes} of memory{disk}"),
+    );
+    fact("run folder", &run_dir.display().to_string());
+    fact(
+        "time",
+        &format!("{time} (coarse: from the network's arithmetic)"),
+    );
+    config.notes.iter().for_each(|note| fact("note", note));
     text
+}
+
+fn processes(config: &RunConfig, lockstep: bool) -> String {
+    if lockstep {
+        return "one, with everything in lockstep".into();
+    }
+    let servers = match config.replay.shards {
+        1 => "replay server".into(),
+        shards => format!("{shards} replay servers"),
+    };
+    let threads = config.local.learner_threads;
+    let learner = match (config.local.learner_device, config.learner.precision) {
+        (DeviceName::Cpu, Precision::F32) => format!("with {threads} threads"),
+        (DeviceName::Cpu, precision) => format!("with {threads} threads, in {precision}"),
+        (gpu, _) => format!("on {gpu}"),
+    };
+    let (count, envs) = (config.local.actors, config.actor.envs);
+    let actors = if count == 1 { "actor" } else { "actors" };
+    format!("{servers}; learner {learner}; {count} {actors} with {envs} copies of the world each")
 }
 
 /// Bytes in a unit that fits them.

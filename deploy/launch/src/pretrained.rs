@@ -23,7 +23,6 @@ macro_rules! built_in_games {
     };
 }
 
-/// What stands before the name of a built-in network.
 const PREFIX: &str = "pretrained:";
 /// The ending of a weights file, which is not a run's folder.
 const EXTENSION: &str = "safetensors";
@@ -31,7 +30,6 @@ const EXTENSION: &str = "safetensors";
 /// here.
 const BUILT_IN: &[(&str, &[u8])] = built_in_games!["bigfish", "coinrun", "fruitbot", "starpilot"];
 
-/// The key of [`Exported`] in the file's description.
 const EXPORTED: &str = "exported";
 
 /// What the description of an exported network has beside that of a checkpoint's.
@@ -78,7 +76,6 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     Ok(player)
 }
 
-/// The network in a file's bytes.
 fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
     let exported = described(&bytes).and_then(|it| it.get(EXPORTED).cloned());
     let exported: Exported = exported

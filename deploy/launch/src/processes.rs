@@ -12,39 +12,30 @@ use nix::sys::signal::Signal;
 
 use crate::managed_process::ManagedProcess;
 
-/// How long a process that was killed may take to end.
 const KILLED_MAX: Duration = Duration::from_secs(30);
 
-/// The processes by what they do.
 #[derive(Default)]
 pub(crate) struct Processes {
-    /// One for each shard.
     pub(crate) replay_servers: Vec<ManagedProcess>,
-    /// The one learner.
     pub(crate) learner: Option<ManagedProcess>,
-    /// By their numbers.
     pub(crate) actors: Vec<ManagedProcess>,
 }
 
 impl Processes {
     /// Replay servers, learner, actors, in this order.
-    fn all(&self) -> impl Iterator<Item = &ManagedProcess> {
-        let first = self.replay_servers.iter().chain(&self.learner);
-        first.chain(&self.actors)
+    fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
+        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
+        first.chain(&mut self.actors)
     }
 
     /// Memory of each in MiB, in the order of [`Processes::all`]; none of one that has ended.
     pub(crate) fn rss_mib(&mut self) -> Vec<Option<f64>> {
-        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
-        let all = first.chain(&mut self.actors);
-        all.map(ManagedProcess::rss_mib).collect()
+        self.all().map(ManagedProcess::rss_mib).collect()
     }
 
-    /// What to say of each whose log is not complete.
-    pub(crate) fn missing_log_lines(&self) -> Vec<String> {
-        self.all()
-            .filter_map(ManagedProcess::missing_log_lines)
-            .collect()
+    pub(crate) fn missing_log_lines(&mut self) -> Vec<String> {
+        let missing = |it: &mut ManagedProcess| it.missing_log_lines();
+        self.all().filter_map(missing).collect()
     }
 
     /// Checks that all are as they should be: running, about to be started again, or actors that are not needed any more.
@@ -68,7 +59,6 @@ impl Processes {
 /// Which processes of a run are restarted when they have died: their end does not end the run, however soon it comes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Revived {
-    /// All replay servers.
     pub(crate) servers: bool,
     /// Actors that had lived for a while.
     pub(crate) actors: bool,

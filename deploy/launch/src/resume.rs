@@ -11,7 +11,10 @@ use std::{
 use anyhow::Context;
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
-use driml_machine::{error::usage, resources::Machine};
+use driml_machine::{
+    error::{Interrupted, usage},
+    resources::Machine,
+};
 use driml_replay_server::Since;
 use driml_settings::{
     config::RunConfig,
@@ -20,14 +23,13 @@ use driml_settings::{
 
 use crate::{
     console, meeting,
-    run_folder::{ResumePoint, RunFolder, Summary},
+    run_folder::{Outcome, ResumePoint, RunFolder, Summary},
 };
 
 /// How long the learner of a launcher that was killed may take to save.
 const SAVING_MAX: Duration = Duration::from_secs(120);
 /// How long its other processes may then take to end; a replay server stays for 10 s where one of them is frozen.
 const ENDING_MAX: Duration = Duration::from_secs(20);
-/// How often it is looked whether they have.
 const LOOK: Duration = Duration::from_millis(250);
 
 /// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, and the world keeps no progress over episodes.
@@ -52,6 +54,22 @@ pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
             folder.display()
         ));
     }
+}
+
+/// Prints what can be done after a run that has ended: commands, or how it is resumed.
+///
+/// # Errors
+/// [`Interrupted`] if it was.
+pub(crate) fn say_next(
+    summary: &Summary,
+    world: &WorldConfig,
+    folder: &RunFolder,
+) -> anyhow::Result<()> {
+    if summary.outcome == Outcome::Interrupted {
+        say_how(world, folder);
+        return Err(Interrupted.into());
+    }
+    console::print(&summary.next_steps(folder))
 }
 
 /// Waits until the learner of the run in `folder` has saved and its other processes have ended, if the run was ended.
@@ -137,13 +155,10 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     let mut config = resolve(&Source::File(name, text), flags, machine)?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
-    let Some((_, newest)) = all.last() else {
-        return Err(usage!(
-            "there is no checkpoint in {}: start the run again, in another folder",
-            checkpoints.display()
-        )
-        .into());
-    };
+    let (_, newest) = all.last().with_context(|| {
+        let checkpoints = checkpoints.display();
+        usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
+    })?;
     let (updates, progress) = checkpoint::progress(newest)?;
     let lockstep = is_in_lockstep(newest)?;
     if !lockstep && !config.world.is_resumable() {

@@ -8,10 +8,7 @@ use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus,
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
-use crate::{
-    moment::{Episodes, MeanReturn, Moment, Spread},
-    rates::Rates,
-};
+use crate::moment::{Episodes, Moment, Rates, Spread};
 
 /// What the settings say of a run.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -57,7 +54,7 @@ impl Plan {
 }
 
 /// What one replay server answers.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct ServerAnswer {
     /// What it is called in messages.
     #[serde(skip)]
@@ -200,18 +197,12 @@ impl RunView {
 
     /// What it says of the run at this time.
     pub fn moment(&self) -> Moment<'_> {
-        let (replay, returns) = (&self.replay, &self.replay.returns);
+        let replay = &self.replay;
         let losses = self.learner.losses.iter();
         Moment {
             seconds: self.up_s(),
             speed: self.rates.speed(),
-            episodes: Episodes {
-                count: replay.episodes,
-                mean_return: returns.mean().map(|mean| MeanReturn {
-                    mean,
-                    of: returns.newest.len(),
-                }),
-            },
+            episodes: Episodes::of(replay.episodes, replay.returns.newest.iter()),
             k: (replay.mean_k().zip(replay.sd_k())).map(|(mean, sd)| Spread { mean, sd }),
             epsilon: (self.plan.epsilon).map(|it| it.epsilon(replay.transitions_inserted)),
             replay,
@@ -225,13 +216,11 @@ impl RunView {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::with;
 
     #[test]
     fn updates_before_the_learner_s_first_answer_are_not_its_speed() {
-        let learner = |updates| LearnerStatus {
-            updates,
-            ..LearnerStatus::default()
-        };
+        let learner = |updates| with(|it: &mut LearnerStatus| it.updates = updates);
         let mut view = RunView::new(Plan::default());
         for answer in [None, Some(learner(5_000)), Some(learner(5_000))] {
             view.take_learner(answer);

@@ -19,9 +19,8 @@ pub fn remove_own() {
         let path = entry.path();
         let is_segment = path.extension().is_some_and(|it| it == EXTENSION);
         let file = entry.metadata().ok().filter(|_| is_segment);
-        let is_held_by_alone =
-            |file| is_held_by_alone(&locks, &FileId::of(&file), std::process::id());
-        if file.is_some_and(is_held_by_alone) && !is_mapped_elsewhere(&path) {
+        let is_own = |it: fs::Metadata| is_held_by_alone(&locks, &id(&it), std::process::id());
+        if file.is_some_and(is_own) && !is_mapped_elsewhere(&path) {
             let removed = fs::remove_file(&path);
             tracing::debug!("removing {}: {removed:?}", path.display());
         }
@@ -45,32 +44,15 @@ fn is_mapped_elsewhere(path: &Path) -> bool {
         .any(|maps| maps.lines().any(|line| line.ends_with(&*path)))
 }
 
-/// What tells a file from all others.
-struct FileId {
-    major: u64,
-    minor: u64,
-    inode: u64,
+/// What tells a file from all others in the kernel's table of locks; device numbers are hexadecimal.
+fn id(file: &fs::Metadata) -> String {
+    let (major, minor) = (major(file.dev()), minor(file.dev()));
+    format!("{major:02x}:{minor:02x}:{}", file.ino())
 }
 
-impl FileId {
-    fn of(file: &fs::Metadata) -> Self {
-        Self {
-            major: major(file.dev()),
-            minor: minor(file.dev()),
-            inode: file.ino(),
-        }
-    }
-}
-
-/// Whether the process `pid` alone holds a lock on the file, by the kernel's table of locks.
-fn is_held_by_alone(locks: &str, file: &FileId, pid: u32) -> bool {
-    let FileId {
-        major,
-        minor,
-        inode,
-    } = file;
-    // `1: FLOCK  ADVISORY  READ  4711 00:1a:42 0 EOF`; device numbers are hexadecimal.
-    let id = format!("{major:02x}:{minor:02x}:{inode}");
+/// Whether the process `pid` alone holds a lock on the file with this [`id`], by the table.
+fn is_held_by_alone(locks: &str, id: &str, pid: u32) -> bool {
+    // `1: FLOCK  ADVISORY  READ  4711 00:1a:42 0 EOF`
     let mut holders = locks.lines().filter_map(|line| {
         let words: Vec<_> = line.split_whitespace().collect();
         let at = words.iter().position(|word| *word == id)?;
@@ -91,32 +73,21 @@ mod tests {
                      3: FLOCK  ADVISORY  READ 8 00:1a:43 0 EOF\n\
                      4: FLOCK  ADVISORY  READ 7 00:1a:42 0 EOF\n\
                      5: -> FLOCK ADVISORY WRITE 9 fe:00:42 0 EOF\n";
-        let held = |minor, inode, pid| {
-            let file = FileId {
-                major: 0,
-                minor,
-                inode,
-            };
-            is_held_by_alone(locks, &file, pid)
-        };
-        assert!(held(0x1a, 42, 7));
-        assert!(!held(0x1a, 42, 8), "another's");
-        assert!(!held(0x1a, 43, 7), "shared");
-        assert!(!held(0x1a, 44, 7), "not in use");
-        assert!(!held(0x1b, 42, 7), "on another device");
+        let held = |id, pid| is_held_by_alone(locks, id, pid);
+        assert!(held("00:1a:42", 7));
+        assert!(!held("00:1a:42", 8), "another's");
+        assert!(!held("00:1a:43", 7), "shared");
+        assert!(!held("00:1a:44", 7), "not in use");
+        assert!(!held("00:1b:42", 7), "on another device");
     }
 
     #[test]
     fn the_kernel_s_table_is_as_this_reads_it() {
         let file = tempfile::tempfile().unwrap();
         file.lock().unwrap();
-        let id = FileId::of(&file.metadata().unwrap());
+        let id = id(&file.metadata().unwrap());
         let locks = fs::read_to_string("/proc/locks").unwrap();
         let is_held = is_held_by_alone(&locks, &id, std::process::id());
-        assert!(
-            is_held,
-            "{}:{}:{} in\n{locks}",
-            id.major, id.minor, id.inode
-        );
+        assert!(is_held, "{id} in\n{locks}");
     }
 }

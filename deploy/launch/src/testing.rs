@@ -7,12 +7,18 @@ use driml_settings::{
     resolve::{Flags, Source, resolve},
 };
 
-/// A small machine with much memory.
 pub(crate) const MACHINE: Machine = Machine {
     cores: 2,
     memory_bytes: 64 << 30,
     fast_bf16: false,
 };
+
+/// A default of which some fields are `set`.
+pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
+    let mut it = T::default();
+    set(&mut it);
+    it
+}
 
 /// The settings of a preset, world and agent, with these `--set`s.
 pub(crate) fn config(

@@ -13,9 +13,7 @@ use crate::{resources::Machine, units::kib};
 
 /// Open files that a library may want at once, to connect or to share memory: with fewer left, they are scarce.
 const FILES_SPARE: u64 = 8;
-/// Memory maps, likewise.
 const MAPS_SPARE: u64 = 64;
-/// Memory, likewise, bytes.
 const MEMORY_SPARE: u64 = 64 << 20;
 
 /// Open files that this process may have, once what may be raised is.
@@ -46,15 +44,9 @@ pub fn check_open_files(needed: u64, whose: &str) -> Result<(), String> {
 
 /// What this process has nearly used up of what the system grants it, with how much there is and what to do.
 pub fn scarce() -> Vec<String> {
-    type Look = fn() -> Option<String>;
-    let all: [Look; 5] = [
-        open_files,
-        shared_memory,
-        locked_memory,
-        memory_maps,
-        memory,
-    ];
-    all.into_iter().filter_map(|look| look()).collect()
+    let all = [open_files(), shared_memory(), locked_memory()];
+    let all = all.into_iter().chain([memory_maps(), memory()]);
+    all.flatten().collect()
 }
 
 fn open_files() -> Option<String> {

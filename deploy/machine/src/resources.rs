@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::units::kib;
 
 /// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
-const ENVS: u32 = 16;
+pub const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
 /// Share of the free memory that a replay may take whose size was asked for.
@@ -31,7 +31,7 @@ pub fn actors_bytes(actors: u32, world: &str) -> u64 {
 }
 
 /// What this machine offers.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Machine {
     /// Cores that this process may use.
     pub cores: u32,
@@ -45,10 +45,9 @@ impl Machine {
     /// This one. Where the memory cannot be read, 4 GiB are assumed.
     pub fn this() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
-        let memory_bytes = free_memory_bytes().unwrap_or(4 << 30);
         Self {
             cores,
-            memory_bytes,
+            memory_bytes: free_memory_bytes().unwrap_or(4 << 30),
             fast_bf16: driml_model::is_bf16_fast(),
         }
     }
@@ -62,26 +61,19 @@ impl Machine {
         }
     }
 
-    /// Copies of the world in one actor.
-    pub const fn envs(&self) -> u32 {
-        ENVS
-    }
-
-    /// Threads of the learner: all cores, because a run waits for the learner.
-    pub const fn learner_threads(&self) -> u32 {
-        self.cores
-    }
-
     /// Bytes that a replay sized by the machine may take, where the actors take `actors_bytes`.
     pub fn replay_bytes(&self, actors_bytes: u64) -> u64 {
-        let share = (self.memory_bytes as f64 * REPLAY_SHARE) as u64;
-        share.min(self.beside_actors(actors_bytes))
+        self.share(REPLAY_SHARE, actors_bytes)
     }
 
     /// Bytes that a replay may take whose size was asked for, where the actors take `actors_bytes`.
     pub fn replay_bytes_max(&self, actors_bytes: u64) -> u64 {
-        let share = (self.memory_bytes as f64 * REPLAY_SHARE_MAX) as u64;
-        share.min(self.beside_actors(actors_bytes))
+        self.share(REPLAY_SHARE_MAX, actors_bytes)
+    }
+
+    fn share(&self, share: f64, actors_bytes: u64) -> u64 {
+        let bytes = (self.memory_bytes as f64 * share) as u64;
+        bytes.min(self.beside_actors(actors_bytes))
     }
 
     /// Bytes that actors and learner leave.
@@ -117,7 +109,6 @@ impl MachineNote {
     }
 }
 
-/// The mean over the last minute in the kernel's table.
 fn load(loadavg: &str) -> Option<f64> {
     loadavg.split_whitespace().next()?.parse().ok()
 }
@@ -128,7 +119,6 @@ pub fn processor() -> String {
     processor_in(&cpuinfo).unwrap_or("unknown").to_owned()
 }
 
-/// The processor's name in the kernel's table.
 fn processor_in(cpuinfo: &str) -> Option<&str> {
     let mut lines = cpuinfo.lines();
     let line = lines.find(|line| line.starts_with("model name"))?;
@@ -151,12 +141,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_load_is_read_from_the_kernels_table() {
+    fn load_and_processor_are_read_from_the_kernel_s_tables() {
         assert_eq!(load("6.60 5.35 4.10 3/200 1234"), Some(6.6));
-    }
-
-    #[test]
-    fn the_processor_is_named() {
         let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
         assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
         assert_eq!(processor_in(""), None);
@@ -167,10 +153,9 @@ mod tests {
         for cores in [0, 1, 2, 8, 300] {
             let machine = Machine {
                 cores,
-                memory_bytes: 1 << 30,
-                fast_bf16: false,
+                ..Machine::default()
             };
-            assert!(machine.actors() >= 1 && machine.actors() <= 4);
+            assert!((1..=4).contains(&machine.actors()));
         }
         assert!(Machine::this().cores >= 1);
     }

@@ -5,10 +5,7 @@ use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
-use driml_protocol::{
-    Horizon, RunSpec,
-    config::{TransportConfig, in_words},
-};
+use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -108,32 +105,16 @@ pub struct RunConfig {
 
 /// Reads one table of the settings.
 pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
-    let value = table
-        .get(name)
-        .ok_or_else(|| usage!("the settings have no [{name}] table"))?;
-    value
-        .clone()
-        .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{name}] table: {}", in_words(&e)))
+    derived::optional(table, name)?.ok_or_else(|| usage!("the settings have no [{name}] table"))
 }
 
 /// Reads every table as its part will.
 pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
-    let tables = [
-        "run",
-        "world",
-        "input",
-        "actor",
-        "replay",
-        "learner",
-        "model",
-        "transport",
-        "local",
-    ];
-    if let Some(other) = table.keys().find(|key| !tables.contains(&key.as_str())) {
+    let tables = "run, world, input, actor, replay, learner, model, transport, local";
+    let is_known = |key: &&String| tables.split(", ").any(|it| it == **key);
+    if let Some(other) = table.keys().find(|key| !is_known(key)) {
         return Err(usage!(
-            "the settings have an unknown field {other:?}; their tables are {}",
-            tables.join(", ")
+            "the settings have an unknown field {other:?}; their tables are {tables}"
         ));
     }
     Ok(RunConfig {
@@ -193,10 +174,9 @@ impl RunConfig {
 
     /// The names of the run's actions; an action is a place in this list.
     pub fn action_names(&self) -> Vec<String> {
-        let actions = self.world.actions(self.actor.actions);
+        let actions = self.world.actions(self.actor.actions).into_iter();
         let names = self.world.action_names();
         actions
-            .into_iter()
             .map(|it| names[usize::from(it)].to_owned())
             .collect()
     }
@@ -219,9 +199,11 @@ impl RunConfig {
 
     /// Runs each component's checks of its own table, then those that span two tables.
     fn validate(&self) -> Result<(), Usage> {
-        let said = |e: &dyn std::fmt::Display| Usage(e.to_string());
-        self.run.validate().map_err(|e| said(&e))?;
-        self.world.validate().map_err(|e| said(&e))?;
+        fn said(e: impl std::fmt::Display) -> Usage {
+            Usage(e.to_string())
+        }
+        self.run.validate().map_err(said)?;
+        self.world.validate().map_err(said)?;
         let name = self.world.name().to_string();
         if name != self.run.world {
             return Err(usage!(
@@ -229,59 +211,48 @@ impl RunConfig {
                 self.run.world
             ));
         }
-        self.actor.validate().map_err(|e| said(&e))?;
+        self.actor.validate().map_err(said)?;
         if self.replay.transitions_max.is_none() {
             return Err(usage!(
                 "replay.transitions_max is missing: say with --frames how long the run is"
             ));
         }
-        if self.frames() <= self.replay.warmup_transitions {
+        let (replay, learner, local) = (&self.replay, &self.learner, &self.local);
+        let (frames, warmup) = (self.frames(), replay.warmup_transitions);
+        if frames <= warmup {
             return Err(usage!(
-                "{} frames are no more than the warm-up of {}: ask for more --frames, or --set replay.warmup_transitions={}",
-                self.frames(),
-                self.replay.warmup_transitions,
-                self.frames() / 10
+                "{frames} frames are no more than the warm-up of {warmup}: ask for more --frames, or --set replay.warmup_transitions={}",
+                frames / 10
             ));
         }
-        self.replay
-            .validate(&self.run, self.learner.batch_size)
-            .map_err(|e| said(&e))?;
-        self.learner.validate().map_err(|e| said(&e))?;
-        self.learner
-            .update
-            .validate()
-            .map_err(|e| usage!("learner.update cannot work: {e}"))?;
-        self.model.validate().map_err(|e| said(&e))?;
-        if !(1..=256).contains(&self.local.actors) {
+        let checked = replay.validate(&self.run, learner.batch_size);
+        checked.map_err(said)?;
+        learner.validate().map_err(said)?;
+        let update = learner.update.validate();
+        update.map_err(|e| usage!("learner.update cannot work: {e}"))?;
+        self.model.validate().map_err(said)?;
+        if !(1..=256).contains(&local.actors) {
+            let actors = local.actors;
+            return Err(usage!("local.actors = {actors}: a run has 1 to 256 actors"));
+        }
+        if !(1..=1024).contains(&local.learner_threads) {
+            let threads = local.learner_threads;
             return Err(usage!(
-                "local.actors = {}: a run has 1 to 256 actors",
-                self.local.actors
+                "local.learner_threads = {threads}: a learner has 1 to 1024 threads"
             ));
         }
-        if !(1..=1024).contains(&self.local.learner_threads) {
-            return Err(usage!(
-                "local.learner_threads = {}: a learner has 1 to 1024 threads",
-                self.local.learner_threads
-            ));
+        if let Some(evaluation) = &local.evaluation {
+            evaluation.validate(learner.checkpoint_period_updates)?;
         }
-        if let Some(evaluation) = &self.local.evaluation {
-            evaluation.validate(self.learner.checkpoint_period_updates)?;
-        }
-        self.local
-            .learner_device
-            .check(self.learner.precision)
-            .map_err(|e| said(&e))?;
+        let device = local.learner_device.check(learner.precision);
+        device.map_err(said)?;
         self.check_objective()?;
-        let learns_affinity = self.learner.affinity.estimator != EstimatorKind::None;
-        let affinity = self
-            .learner
-            .affinity
-            .estimator(self.model.num_actions, &mut ChaCha8Rng::seed_from_u64(0));
-        affinity.map_err(|e| said(&e))?;
-        match (
-            matches!(self.run.horizon, Horizon::Nhg { .. }),
-            learns_affinity,
-        ) {
+        let rng = &mut ChaCha8Rng::seed_from_u64(0);
+        let affinity = learner.affinity.estimator(self.model.num_actions, rng);
+        affinity.map_err(said)?;
+        let needs_affinity = matches!(self.run.horizon, Horizon::Nhg { .. });
+        let learns_affinity = learner.affinity.estimator != EstimatorKind::None;
+        match (needs_affinity, learns_affinity) {
             (true, false) => Err(usage!(
                 "run.horizon needs the action affinity, but learner.affinity.estimator is none: --set learner.affinity.estimator=learned"
             )),
@@ -289,8 +260,7 @@ impl RunConfig {
                 "learner.affinity.estimator keeps an affinity that run.horizon does not use: --set learner.affinity.estimator=none"
             )),
             _ => Ok(()),
-        }?;
-        Ok(())
+        }
     }
 
     /// The replay serves what the auxiliary objective needs and no more.

@@ -6,6 +6,7 @@ use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, TorsoName};
 use driml_protocol::config::in_words;
+use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 use crate::overrides::inline;
@@ -14,7 +15,6 @@ const BY_ENV: &str = "is chosen by --env";
 const FROM_FRAME: &str = "follows from the world and what the torso reads";
 const FROM_ACTIONS: &str = "follows from the world and actor.actions";
 
-/// What follows, and from what.
 const FOLLOWS: [(&str, &str); 16] = [
     ("run.world", BY_ENV),
     ("run.agent", "is chosen by --agent"),
@@ -64,12 +64,9 @@ pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
         ("input.height", declared.height),
         ("input.width", declared.width),
     ] {
-        if find(table, path).is_none() {
-            put(table, path, Value::Integer(side as i64));
-        }
+        put_missing(table, path, Value::Integer(side as i64));
     }
-    let declared = Value::try_from(declared).map_err(|e| usage!("a world as TOML: {e}"))?;
-    put(table, "world", declared);
+    put(table, "world", as_toml(declared)?);
     Ok(())
 }
 
@@ -93,7 +90,6 @@ pub(crate) fn cut_frames(table: &mut Table) {
     put(table, FRAME, Value::Table(Table::new()));
 }
 
-/// Lets frames be recorded and sent whole.
 pub(crate) fn keep_whole_frames(table: &mut Table) {
     if let Some(input) = table.get_mut("input").and_then(Value::as_table_mut) {
         input.remove("frame");
@@ -113,12 +109,8 @@ pub(crate) fn drop_other_torsos(table: &mut Table, by_hand: &[String]) -> Result
     Ok(())
 }
 
-/// The torso that is chosen.
 fn torso(table: &Table) -> Result<TorsoName, Usage> {
-    match find(table, "model.torso") {
-        Some(_) => table_at(table, "model.torso"),
-        None => Ok(TorsoName::Nature),
-    }
+    Ok(optional(table, "model.torso")?.unwrap_or(TorsoName::Nature))
 }
 
 /// Refuses a `--set` of something that follows from something else.
@@ -143,11 +135,10 @@ fn followed(path: &str) -> Option<(&'static str, &'static str)> {
     FOLLOWS.into_iter().find(|(known, _)| inside(known))
 }
 
-/// Fills in what follows.
 pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
-    let world: WorldName = text(table, "run.world")?
-        .parse()
-        .map_err(|e| usage!("run.world: {e}"))?;
+    let world = find(table, "run.world").and_then(Value::as_str);
+    let world = world.ok_or_else(|| lack("run.world", "a word"))?.parse();
+    let world: WorldName = world.map_err(|e| usage!("run.world: {e}"))?;
     put(table, "world.kind", Value::String(world.kind().into()));
     for (key, value) in world.settings() {
         put(table, &format!("world.{key}"), Value::String(value.into()));
@@ -156,36 +147,26 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     let update: LearnerSettings = table_at(table, "learner.update")?;
     let shape = config.frame_shape();
     let frame = (shape.height, shape.width);
-    let side = |path| whole_size(table, path);
-    let input = (side("input.height")?, side("input.width")?);
+    let input = (
+        whole_size(table, "input.height")?,
+        whole_size(table, "input.width")?,
+    );
     let mut read = InputRead { input, frame };
     if find(table, FRAME).is_some() {
-        let size = FrameSize {
-            height: shape.height as u32,
-            width: shape.width as u32,
-        };
-        let size = Value::try_from(size).map_err(|e| usage!("a frame's size as TOML: {e}"))?;
-        put(table, FRAME, size);
+        let (height, width) = (shape.height as u32, shape.width as u32);
+        put(table, FRAME, as_toml(FrameSize { height, width })?);
         // A crop reads the borders too.
         if find(table, "learner.augment").is_none() {
             let input: InputSize = table_at(table, "input")?;
-            let torso = torso(table)?;
-            let conv: Vec<ConvLayer> = match find(table, "model.conv") {
-                Some(_) => table_at(table, "model.conv")?,
-                None => Vec::new(),
-            };
-            read = input.read(torso, &conv, frame);
+            let conv: Option<Vec<ConvLayer>> = optional(table, "model.conv")?;
+            read = input.read(torso(table)?, &conv.unwrap_or_default(), frame);
         }
     }
-    let set: ActionSet = match find(table, "actor.actions") {
-        Some(_) => table_at(table, "actor.actions")?,
-        None => ActionSet::All,
-    };
+    let set = optional(table, "actor.actions")?.unwrap_or(ActionSet::All);
     let num_actions = config.actions(set).len();
     let stack = whole(table, "run.frame_stack")?;
-    let dim = update.dim_heads(num_actions);
     let size = |value: usize| Value::Integer(value as i64);
-    let dim = Value::try_from(dim).map_err(|e| usage!("the DIM heads as TOML: {e}"))?;
+    let channels = stack.saturating_mul(shape.channels as i64);
     for (path, value) in [
         ("run.frame_height", size(read.frame.0)),
         ("run.frame_width", size(read.frame.1)),
@@ -193,12 +174,9 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
         ("run.num_actions", size(num_actions)),
         ("model.height", size(read.input.0)),
         ("model.width", size(read.input.1)),
-        (
-            "model.input_channels",
-            Value::Integer(stack.saturating_mul(shape.channels as i64)),
-        ),
+        ("model.input_channels", Value::Integer(channels)),
         ("model.num_actions", size(num_actions)),
-        ("model.dim", dim),
+        ("model.dim", as_toml(update.dim_heads(num_actions))?),
     ] {
         put(table, path, value);
     }
@@ -210,12 +188,10 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
 
 /// Fills in for how many actors the ladder of epsilons is, where there is one and it is not set.
 fn ladder(table: &mut Table) {
-    let asked = find(table, "actor.epsilon_ladder").is_some_and(Value::is_table);
-    if asked
-        && find(table, "actor.epsilon_ladder.actors").is_none()
+    if find(table, "actor.epsilon_ladder").is_some_and(Value::is_table)
         && let Some(actors) = find(table, "local.actors").cloned()
     {
-        put(table, "actor.epsilon_ladder.actors", actors);
+        put_missing(table, "actor.epsilon_ladder.actors", actors);
     }
 }
 
@@ -252,9 +228,8 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
             // They are told apart already.
             ActionSet::Visible => (0..world.actions(set).len()).map(|it| it as u8).collect(),
         };
-        let map = map.into_iter();
-        let map = map.map(|action| Value::Integer(action.into())).collect();
-        put(table, "learner.affinity.visible", Value::Array(map));
+        let map: Vec<_> = map.into_iter().map(i64::from).collect();
+        put(table, "learner.affinity.visible", map.into());
     }
 }
 
@@ -276,7 +251,6 @@ pub(crate) fn check(read: &Table) -> Result<(), Usage> {
     Ok(())
 }
 
-/// The value at a dotted path.
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').unwrap_or((path, ""));
     let value = table.get(first)?;
@@ -304,18 +278,24 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     }
 }
 
-fn text(table: &Table, path: &str) -> Result<String, Usage> {
-    let value = find(table, path).and_then(Value::as_str);
-    value.map(str::to_owned).ok_or_else(|| {
-        usage!("the settings lack {path}, a word: use a config.toml that driml wrote")
-    })
+/// Writes a value where there is none.
+pub(crate) fn put_missing(table: &mut Table, path: &str, value: Value) {
+    if find(table, path).is_none() {
+        put(table, path, value);
+    }
+}
+
+fn as_toml(value: impl serde::Serialize) -> Result<Value, Usage> {
+    Value::try_from(value).map_err(|e| usage!("a setting as TOML: {e}"))
+}
+
+fn lack(path: &str, what: &str) -> Usage {
+    usage!("the settings lack {path}, {what}: use a config.toml that driml wrote")
 }
 
 fn whole(table: &Table, path: &str) -> Result<i64, Usage> {
     let value = find(table, path).and_then(Value::as_integer);
-    value.ok_or_else(|| {
-        usage!("the settings lack {path}, a whole number: use a config.toml that driml wrote")
-    })
+    value.ok_or_else(|| lack(path, "a whole number"))
 }
 
 /// A whole number that is a size; one that cannot be is left to the model's check.
@@ -324,12 +304,14 @@ fn whole_size(table: &Table, path: &str) -> Result<usize, Usage> {
     usize::try_from(size).map_err(|_| usage!("{path} = {size}: a size is not below 0"))
 }
 
-fn table_at<T: serde::de::DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
-    let value = find(table, path).ok_or_else(|| {
+fn table_at<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> {
+    optional(table, path)?.ok_or_else(|| {
         usage!("the settings have no [{path}] table: use a config.toml that driml wrote")
-    })?;
-    value
-        .clone()
-        .try_into()
-        .map_err(|e: toml::de::Error| usage!("in the settings' [{path}] table: {}", in_words(&e)))
+    })
+}
+
+/// What is set at a dotted path, if anything is.
+pub(crate) fn optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
+    let read = find(table, path).cloned().map(Value::try_into).transpose();
+    read.map_err(|e| usage!("in the settings' [{path}] table: {}", in_words(&e)))
 }

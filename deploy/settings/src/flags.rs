@@ -45,23 +45,17 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
     let (source, from) = match &args.config {
         Some(path) => {
             let name = path.display().to_string();
-            let text = std::fs::read_to_string(path)
-                .map_err(|e| usage!("reading the settings {name}: {e}"))?;
+            let text = std::fs::read_to_string(path);
+            let text = text.map_err(|e| usage!("reading the settings {name}: {e}"))?;
             (Source::File(name.clone(), text), name)
         }
         None => {
-            let world: WorldName = args
-                .env
-                .as_deref()
-                .unwrap_or(ENV)
-                .parse()
-                .map_err(|e| usage!("--env: {e}"))?;
+            let world = args.env.as_deref().unwrap_or(ENV).parse();
+            let world: WorldName = world.map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
             let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-            (
-                Source::Layers(preset, world, agent.name),
-                format!("preset {}", preset.name),
-            )
+            let source = Source::Layers(preset, world, agent.name);
+            (source, format!("preset {}", preset.name))
         }
     };
     Ok((resolve::resolve(&source, &args.over, machine)?, from))

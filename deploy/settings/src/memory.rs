@@ -57,14 +57,12 @@ pub(crate) fn fit(
     }
     Override::parse(&format!("replay.capacity_transitions={capacity}"))?.apply(table)?;
     // A replay that holds the whole run anyway is as good as a larger one.
-    let is_smaller_than_the_run = replay
-        .transitions_max
-        .is_none_or(|frames| frames > capacity);
-    Ok(is_smaller_than_the_run.then(|| {
-        format!(
-            "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
-        )
-    }))
+    let frames = replay.transitions_max;
+    let is_smaller_than_the_run = frames.is_none_or(|frames| frames > capacity);
+    let note = format!(
+        "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
+    );
+    Ok(is_smaller_than_the_run.then_some(note))
 }
 
 /// Bounds the bytes of a compressed replay, as it is not known beforehand how well its frames compress.
@@ -95,20 +93,17 @@ fn fit_compressed(
             "replay.compressed_bytes_max = {max} is {}, and {free} are free: --set replay.compressed_bytes_max={bytes}",
             gib(max)
         )),
-        Some(_) => Ok(None),
-        None if frames <= bytes => Ok(None),
-        None => {
+        None if frames > bytes => {
             Override::parse(&format!("replay.compressed_bytes_max={bytes}"))?.apply(table)?;
-            let run_frames = replay.transitions_max.unwrap_or(u64::MAX);
-            let is_smaller_than_the_run =
-                run_frames.saturating_mul(run.frame_bytes() as u64) > bytes;
-            Ok(is_smaller_than_the_run.then(|| {
-                format!(
-                    "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
-                    gib(bytes)
-                )
-            }))
+            let frames = replay.transitions_max.unwrap_or(u64::MAX);
+            let is_smaller_than_the_run = frames.saturating_mul(run.frame_bytes() as u64) > bytes;
+            let note = format!(
+                "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
+                gib(bytes)
+            );
+            Ok(is_smaller_than_the_run.then_some(note))
         }
+        _ => Ok(None),
     }
 }
 
@@ -120,10 +115,9 @@ pub const fn replay_bytes_each(run: &RunSpec) -> u64 {
 /// Bytes that the rule by which rows are drawn takes a transition: of a tree of sums, which is as wide as the next power of two, 32 at
 /// most, and 16 at least.
 const fn sampling_bytes_each(replay: &driml_replay_server::Config) -> u64 {
-    if replay.sampling.is_prioritised() {
-        32
-    } else {
-        0
+    match replay.sampling.is_prioritised() {
+        true => 32,
+        false => 0,
     }
 }
 

@@ -18,24 +18,12 @@ use crate::{
 
 /// Where a setting's source begins, if the setting leaves room.
 const SOURCE_COLUMN: usize = 44;
-/// What the machine decides.
-const BY_MACHINE: [&str; 5] = [
-    "local.actors",
-    "local.learner_threads",
-    "local.learner_device",
-    "actor.envs",
-    "actor.world_threads",
-];
+const BY_MACHINE: &str =
+    "local.actors local.learner_threads local.learner_device actor.envs actor.world_threads";
 
 /// What a world in its own process declares.
-const DECLARED: [&str; 6] = [
-    "world.height",
-    "world.width",
-    "world.channels",
-    "world.actions",
-    "input.height",
-    "input.width",
-];
+const DECLARED: &str =
+    "world.height world.width world.channels world.actions input.height input.width";
 
 /// Presets, agents, and what differs by game.
 pub fn menu() -> Result<String, Usage> {
@@ -74,12 +62,11 @@ fn k(table: &Table) -> String {
     find(table, "run.horizon.k").map_or("-".into(), Value::to_string)
 }
 
-/// Those above 0.
 fn lambdas(table: &Table) -> String {
     let all = find(table, "learner.update.lambda").and_then(Value::as_table);
     let weighs = |value: &Value| value.as_float().is_some_and(|value| value > 0.0);
     let some = all.into_iter().flatten().filter(|(_, value)| weighs(value));
-    let texts: Vec<String> = some
+    let texts: Vec<_> = some
         .map(|(pair, value)| format!("{pair} {value}"))
         .collect();
     texts.join(", ")
@@ -139,27 +126,22 @@ fn write_table(table: &Table, path: &str, sources: &BTreeMap<String, String>, ou
     }
 }
 
-/// A key in TOML's form.
 fn quoted(key: &str) -> String {
     let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if key.chars().all(bare) {
-        key.to_owned()
-    } else {
-        Value::String(key.to_owned()).to_string()
+    match key.chars().all(bare) {
+        true => key.to_owned(),
+        false => Value::String(key.to_owned()).to_string(),
     }
 }
 
-fn source_of(path: &str, sources: &BTreeMap<String, String>, is_process: bool) -> String {
-    if let Some(source) = sources.get(path) {
-        return source.clone();
+fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: bool) -> &'a str {
+    let is_one = |paths: &str| paths.split(' ').any(|it| it == path);
+    match sources.get(path) {
+        Some(source) => source,
+        None if is_one(BY_MACHINE) => "this machine",
+        None if is_process && is_one(DECLARED) => "the world declares it",
+        None => derived::follows(path).unwrap_or("not said"),
     }
-    if BY_MACHINE.contains(&path) {
-        return "this machine".into();
-    }
-    if is_process && DECLARED.contains(&path) {
-        return "the world declares it".into();
-    }
-    derived::follows(path).unwrap_or("not said").to_owned()
 }
 
 /// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.
@@ -247,9 +229,11 @@ mod tests {
     fn comments_are_found_beside_above_and_below() {
         let text = "# of the file\n\n[a]\nx = 1   # one\ny = 2   # two,\n        # and more\n# above\nz = 3\n";
         let found = comments(text);
-        let expected = [("a.x", "one"), ("a.y", "two, and more"), ("a.z", "above")];
-        let expected = expected.map(|(path, comment)| (path.into(), comment.into()));
-        assert_eq!(found, expected);
+        let found = found
+            .iter()
+            .map(|(path, comment)| format!("{path}: {comment}"));
+        let expected = ["a.x: one", "a.y: two, and more", "a.z: above"];
+        assert_eq!(found.collect::<Vec<_>>(), expected);
     }
 
     #[test]

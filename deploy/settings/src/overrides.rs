@@ -7,12 +7,10 @@ use toml::{Table, Value};
 /// Up to here a float is exactly the whole number that was written.
 const WHOLE_MAX: f64 = (1u64 << 53) as f64;
 
-/// A parsed `--set`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Override {
     /// The dotted path.
     pub path: String,
-    /// What it is to be.
     value: Value,
 }
 
@@ -27,18 +25,13 @@ impl Override {
         if path.split('.').any(|key| key.trim().is_empty()) {
             return Err(usage!("--set {text:?} has no key before '='; {form}"));
         }
-        let read = format!("value = {value}").parse::<Table>().ok();
+        let read = format!("value = {value}").parse::<Table>();
         // A line break could bring in a second key.
-        let value = match read
-            .and_then(|mut table| (table.len() == 1).then(|| table.remove("value")))
-            .flatten()
-        {
-            Some(value) => value,
-            None => Value::String(value.to_owned()),
-        };
+        let read = read.ok().filter(|table| table.len() == 1);
+        let read = read.and_then(|mut table| table.remove("value"));
         Ok(Self {
             path: path.to_owned(),
-            value,
+            value: read.unwrap_or_else(|| Value::String(value.to_owned())),
         })
     }
 
@@ -57,17 +50,12 @@ impl Override {
     /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
     pub(crate) fn apply(&self, table: &mut Table) -> Result<bool, Usage> {
         let unknown = self.unknown(table);
-        let (tables, key) = self
-            .path
-            .rsplit_once('.')
-            .ok_or_else(|| self.unknown(table))?;
+        let split = self.path.rsplit_once('.');
+        let (tables, key) = split.ok_or_else(|| unknown.clone())?;
         let mut inner = table;
         for name in tables.split('.') {
-            inner = inner
-                .get_mut(name)
-                .and_then(Value::as_table_mut)
-                .ok_or(())
-                .map_err(|()| unknown.clone())?;
+            let found = inner.get_mut(name).and_then(Value::as_table_mut);
+            inner = found.ok_or_else(|| unknown.clone())?;
         }
         let value = match inner.get(key) {
             Some(old) => self.as_type_of(old)?,
@@ -103,13 +91,11 @@ impl Override {
         let mut known = table;
         let mut at = Vec::new();
         for name in self.path.split('.') {
-            match known.get(name).and_then(Value::as_table) {
-                Some(inner) => {
-                    known = inner;
-                    at.push(name);
-                }
-                None => break,
-            }
+            let Some(inner) = known.get(name).and_then(Value::as_table) else {
+                break;
+            };
+            known = inner;
+            at.push(name);
         }
         // The same key in another table is what is meant most often.
         let paths = leaves(table);
@@ -120,10 +106,9 @@ impl Override {
             None => nearest(&self.path, paths.iter().map(String::as_str)),
         };
         let keys: Vec<_> = known.keys().map(String::as_str).collect();
-        let place = if at.is_empty() {
-            "the settings have the tables".into()
-        } else {
-            format!("[{}] has", at.join("."))
+        let place = match &at[..] {
+            [] => "the settings have the tables".into(),
+            at => format!("[{}] has", at.join(".")),
         };
         usage!(
             "there is no setting {:?}{near}; {place} {}",
@@ -193,11 +178,8 @@ mod tests {
         for (text, is) in [
             ("learner.update.adam.lr=1e-4", Value::Float(1e-4)),
             ("run.gamma=1", Value::Float(1.0)),
-            ("run.timeout=bootstrap", Value::String("bootstrap".into())),
-            (
-                "run.timeout = \"bootstrap\"",
-                Value::String("bootstrap".into()),
-            ),
+            ("run.timeout=bootstrap", "bootstrap".into()),
+            ("run.timeout = \"bootstrap\"", "bootstrap".into()),
         ] {
             let (table, _) = set(text).unwrap();
             let path = text.split(['=', ' ']).next().unwrap();

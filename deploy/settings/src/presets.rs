@@ -11,7 +11,6 @@ use driml_machine::error::{Usage, nearest, usage};
 use serde::Deserialize;
 use toml::{Table, Value};
 
-/// One file of `presets/`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layer {
     pub(crate) name: &'static str,
@@ -48,11 +47,8 @@ const TUNED: &str = "tuned";
 
 /// The preset of this name for a run in `world`. Without a name it is `tuned` on Procgen and `paper` elsewhere.
 pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'static Preset, Usage> {
-    let name = name.unwrap_or(match world.kind() {
-        "procgen" => TUNED,
-        _ => PRESETS[0].name,
-    });
-    preset(name)
+    let is_game = world.kind() == "procgen";
+    preset(name.unwrap_or(if is_game { TUNED } else { PRESETS[0].name }))
 }
 
 /// Every preset, `paper` first.
@@ -152,7 +148,6 @@ agents! {
     "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
 }
 
-/// Those that the program added.
 static OWN_AGENTS: Mutex<Vec<&'static Agent>> = Mutex::new(Vec::new());
 
 /// Makes an agent known, before anything else is done: `--agent NAME` takes it from then on. `layer` is its settings, TOML as in
@@ -207,12 +202,8 @@ pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
     let agents = agents();
     let found = agents.iter().copied().find(|agent| agent.name == name);
     found.ok_or_else(|| {
-        let names: Vec<_> = agents.iter().map(|agent| agent.name).collect();
-        usage!(
-            "there is no agent {name:?}{}; --agent takes {}",
-            nearest(name, names.iter().copied()),
-            names.join(", ")
-        )
+        let (near, names) = names(name, agents.iter().map(|it| it.name));
+        usage!("there is no agent {name:?}{near}; --agent takes {names}")
     })
 }
 
@@ -220,13 +211,17 @@ pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
 pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
     let found = PRESETS.iter().find(|preset| preset.name == name);
     found.ok_or_else(|| {
-        let names: Vec<_> = PRESETS.iter().map(|preset| preset.name).collect();
+        let (near, names) = names(name, PRESETS.iter().map(|it| it.name));
         usage!(
-            "there is no preset {name:?}{}; --preset takes {} (`driml presets` describes them)",
-            nearest(name, names.iter().copied()),
-            names.join(", ")
+            "there is no preset {name:?}{near}; --preset takes {names} (`driml presets` describes them)"
         )
     })
+}
+
+/// The name that is nearest to `name`, as a question, and all of them.
+fn names(name: &str, all: impl Iterator<Item = &'static str>) -> (String, String) {
+    let all: Vec<_> = all.collect();
+    (nearest(name, all.iter().copied()), all.join(", "))
 }
 
 /// Lays base, world, agent and preset over one another, in this order: a later one wins.
@@ -274,12 +269,9 @@ pub fn notes(name: &str, world: &str) -> Vec<String> {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Only {
-    /// The worlds in which it holds.
     worlds: Vec<String>,
-    /// What it sets.
     #[serde(default)]
     set: Table,
-    /// A note that is printed before the run starts.
     note: Option<String>,
 }
 
@@ -322,7 +314,7 @@ fn merge(lower: &mut Table, upper: Table) {
 mod tests {
     use std::collections::BTreeSet;
 
-    use super::*;
+    use super::{pinned::all_layers, *};
 
     #[test]
     fn later_layers_win_key_by_key() {
@@ -332,24 +324,11 @@ mod tests {
         assert_eq!(lower, merged);
     }
 
-    fn all_layers() -> Vec<Layer> {
-        let agents = AGENTS.iter().map(|agent| agent.layer);
-        let worlds = WorldName::all().map(world_layer);
-        let variants = PRESETS.iter().flat_map(|preset| preset.layers);
-        let variants = variants.copied();
-        agents.chain(worlds).chain(variants).chain([BASE]).collect()
-    }
-
     #[test]
     fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
-        for (name, preset) in [
-            ("coinrun", "tuned"),
-            ("mspacman", "paper"),
-            ("chain", "paper"),
-        ] {
-            let found = preset_or_default(None, world(name).unwrap()).unwrap();
-            assert_eq!(found.name, preset, "{name}");
-        }
+        let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
+        let found = ["coinrun", "mspacman", "chain"].map(of);
+        assert_eq!(found, ["tuned", "paper", "paper"]);
     }
 
     #[test]
@@ -374,7 +353,7 @@ mod tests {
     #[test]
     fn every_only_block_names_worlds_that_exist() {
         let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
-        for layer in all_layers() {
+        for layer in all_layers().values() {
             for block in layer.read().1 {
                 for world in block.worlds {
                     assert!(worlds.contains(&world), "{world} in {}", layer.name);
@@ -385,7 +364,7 @@ mod tests {
 
     #[test]
     fn every_layer_says_what_it_is_for() {
-        for layer in all_layers() {
+        for layer in all_layers().values() {
             assert!(layer.text.starts_with("# "), "{}", layer.name);
         }
     }
@@ -414,11 +393,9 @@ mod tests {
             .assert_eq(&worlds("driml-fix", augments));
         let all = WorldName::all().count();
         assert_eq!(worlds("curl", augments).split(' ').count(), all);
-        for agent in AGENTS
-            .iter()
-            .filter(|it| !["driml-fix", "curl"].contains(&it.name))
-        {
-            assert_eq!(worlds(agent.name, augments), "", "{}", agent.name);
+        let others = AGENTS.iter().map(|it| it.name);
+        for name in others.filter(|it| !["driml-fix", "curl"].contains(it)) {
+            assert_eq!(worlds(name, augments), "", "{name}");
         }
     }
 

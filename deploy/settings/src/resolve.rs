@@ -5,7 +5,7 @@ use clap::Args;
 use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
-    resources::Machine,
+    resources::{self, Machine},
     whole_number,
 };
 use toml::{Table, Value};
@@ -84,24 +84,21 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     if sized_by_machine {
         for (path, value) in [
             ("local.actors", Value::from(machine.actors())),
-            ("local.learner_threads", machine.learner_threads().into()),
+            ("local.learner_threads", machine.cores.into()),
             ("local.learner_device", "cpu".into()),
-            ("actor.envs", machine.envs().into()),
+            ("actor.envs", resources::ENVS.into()),
             ("actor.world_threads", 0.into()),
         ] {
-            if derived::find(&table, path).is_none() {
-                derived::put(&mut table, path, value);
-            }
+            derived::put_missing(&mut table, path, value);
         }
     }
-    let by_flag = [
+    for (path, value) in [
         ("local.actors", flags.actors.map(u64::from)),
         ("actor.envs", flags.envs.map(u64::from)),
         ("replay.transitions_max", flags.frames),
         ("replay.shards", flags.replay_shards.map(u64::from)),
         ("run.seed", flags.seed),
-    ];
-    for (path, value) in by_flag {
+    ] {
         if let Some(value) = value {
             Override::number(path, value)?.apply(&mut table)?;
         }

@@ -47,7 +47,6 @@ fn actor_id(text: &str) -> Result<u32, String> {
     }
 }
 
-/// Plays until the run ends.
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Actor(args.id))?;

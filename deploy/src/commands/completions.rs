@@ -7,7 +7,6 @@ use clap::Args;
 use clap_complete::{Shell, generate};
 use driml_launch::console::print;
 
-/// The program's name on the command line.
 const NAME: &str = "driml";
 
 #[derive(Debug, Args)]
@@ -23,7 +22,6 @@ pub(crate) struct ManArgs {
     out: PathBuf,
 }
 
-/// Prints the script that a shell reads.
 pub(crate) fn completions(
     args: &CompletionsArgs,
     mut command: clap::Command,
@@ -33,7 +31,6 @@ pub(crate) fn completions(
     print(&String::from_utf8(script).context("the script is not UTF-8")?)
 }
 
-/// Writes the pages.
 pub(crate) fn man(args: &ManArgs, command: clap::Command) -> anyhow::Result<()> {
     let doing = || format!("writing pages into {}", args.out.display());
     std::fs::create_dir_all(&args.out).with_context(doing)?;

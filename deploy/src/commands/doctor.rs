@@ -22,13 +22,11 @@ pub(crate) struct DoctorArgs {
     pub(crate) json: bool,
 }
 
-/// Prints the facts.
 pub(crate) fn run(args: &DoctorArgs) -> anyhow::Result<()> {
     let report = doctor::examine(&args.run_dir, args.tls_dir.as_deref());
-    if args.json {
-        print(&report.json()?)?;
-    } else {
-        print(&report.describe())?;
-    }
+    print(&match args.json {
+        true => report.json()?,
+        false => report.describe(),
+    })?;
     report.check(args.cuda)
 }

@@ -28,7 +28,6 @@ pub(crate) struct InspectArgs {
     pub(crate) json: bool,
 }
 
-/// Prints the table.
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
     if args.worlds {
         let inspections = in_every_world(&args.settings)?;

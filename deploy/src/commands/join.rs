@@ -62,7 +62,6 @@ impl NetworkFlag {
 }
 
 impl TlsFlags {
-    /// Whether there are certificates.
     pub(crate) const fn is_set(&self) -> bool {
         self.tls_dir.is_some()
     }

@@ -30,7 +30,6 @@ pub(crate) struct LearnerArgs {
     pub(crate) join: JoinFlags,
 }
 
-/// Learns until the run ends.
 pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;

@@ -9,7 +9,6 @@ pub(crate) enum ProcgenCommand {
     Install,
 }
 
-/// Fetches the engine and says where it is.
 pub(crate) fn run(command: &ProcgenCommand) -> anyhow::Result<()> {
     match command {
         ProcgenCommand::Install => {

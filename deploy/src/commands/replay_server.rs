@@ -40,7 +40,6 @@ pub(crate) struct ReplayServerArgs {
     pub(crate) join: JoinFlags,
 }
 
-/// Serves until the run ends.
 pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listening(&args.listen, args.network.guard(&args.tls))?;
     check_unused(&args.listen)?;
@@ -48,10 +47,8 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
     let credentials = args.tls.credentials(Role::ReplayServer)?;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;
     if args.replay_dir.is_none() {
-        config
-            .replay
-            .check_in_memory("--replay-dir DIR")
-            .map_err(|e| usage!("{e}"))?;
+        let checked = config.replay.check_in_memory("--replay-dir DIR");
+        checked.map_err(|e| usage!("{e}"))?;
     }
     let TwoSteps { ending, now } = join_in_two_steps(&args.join)?;
     for note in &config.notes {

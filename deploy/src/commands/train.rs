@@ -26,7 +26,6 @@ use driml_settings::{
 
 use super::join::{NetworkFlag, TlsFlags};
 
-/// What a resumed run has settled.
 const RESUMED: [&str; 10] = [
     "env",
     "agent",
@@ -86,7 +85,6 @@ pub(crate) struct TrainArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Trains on this machine.
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     let sets = &mut args.run.over.sets;
@@ -143,29 +141,19 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     if args.lockstep {
         check_lockstep(&config)?;
     } else if args.resume.is_none() && !config.local.durable {
-        config
-            .replay
-            .check_in_memory("--durable")
-            .map_err(|e| usage!("{e}"))?;
+        let checked = config.replay.check_in_memory("--durable");
+        checked.map_err(|e| usage!("{e}"))?;
     }
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),
         None => {
             let run_dir = args.run_dir.unwrap_or_else(|| default_run_dir(&config.run));
             let run_dir = RunFolder::new(run_dir);
-            run_dir.check_free()?;
-            run_dir
+            run_dir.check_free().map(|()| run_dir)?
         }
     };
-    let from_point = resume_point.unwrap_or_default();
-    let plan = plan::describe(
-        &config,
-        &from,
-        &run_dir,
-        args.lockstep,
-        from_point,
-        &machine,
-    );
+    let (lockstep, point) = (args.lockstep, resume_point.unwrap_or_default());
+    let plan = plan::describe(&config, &from, &run_dir, lockstep, point, &machine);
     print_wrapped(&plan, plan::INDENT)?;
     config.world.install(&mut console::line)?;
     if args.lockstep {
@@ -211,12 +199,9 @@ fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {
     let world = run.world.replace(':', "-");
-    PathBuf::from("runs").join(format!(
-        "{world}-{}-seed{}-{}",
-        run.agent,
-        run.seed,
-        timestamp(jiff::Timestamp::now())
-    ))
+    let (agent, seed) = (&run.agent, run.seed);
+    let time = timestamp(jiff::Timestamp::now());
+    PathBuf::from(format!("runs/{world}-{agent}-seed{seed}-{time}"))
 }
 
 /// `20260131-235959`, in UTC.

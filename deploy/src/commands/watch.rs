@@ -65,7 +65,6 @@ pub(crate) struct StatusArgs {
     pub(crate) json: bool,
 }
 
-/// Watches until the run is over.
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
     let Some(poller) = args.look.open()? else {
         return Ok(());
@@ -81,7 +80,6 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Asks, and prints the answers.
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
     let look = Look {
         again: args.watch,

@@ -11,14 +11,12 @@ use driml_protocol::{BatchHeader, Horizon, RunSpec, TRANSITION_BYTES};
 use driml_settings::{config::RunConfig, memory::replay_bytes_each};
 use serde::Serialize;
 
-/// What the second column stands for.
 pub(super) const EVERYTHING: &str = "all that the agents of the menu have, at once: five heads of DIM and a key encoder, \
      a dueling head of noisy layers, four pairs of levels at five positives a row, augmented, double DQN, all weights broadcast as f32; frames whole, stacked and enlarged where they are made";
 /// Positives of a row if everything is on: those of the agent that has most, cpc.
 const EVERY_POSITIVES: usize = 5;
 /// Rainbow's; no size depends on it.
 const NOISY_SIGMA: f64 = 0.5;
-/// The row of a whole batch.
 pub(super) const BATCH: &str = "a batch";
 
 /// One row of the table.
@@ -32,21 +30,17 @@ pub struct Line {
     pub everything: u64,
 }
 
-/// What is counted, and how much of it.
 type Counts = Vec<(String, u64)>;
 
-/// What a column counts.
 pub(super) struct Counted<'a> {
     config: &'a RunConfig,
     model: ModelConfig,
     shape: UpdateShape,
     run: RunSpec,
-    /// Bytes of the weights as they are broadcast.
     broadcast: usize,
 }
 
 impl<'a> Counted<'a> {
-    /// The configuration itself.
     pub(super) fn of(config: &'a RunConfig) -> driml_model::Result<Self> {
         Ok(Self {
             config,
@@ -106,7 +100,6 @@ impl<'a> Counted<'a> {
         })
     }
 
-    /// The units in which the layers of all its networks are shown.
     pub(super) fn units(&self) -> Vec<String> {
         units(&self.model)
     }
@@ -132,7 +125,6 @@ impl<'a> Counted<'a> {
         by_unit(&units(&self.model.without_dim()), forward)
     }
 
-    /// Arithmetic of one update.
     pub(super) fn update_flops(&self) -> Counts {
         let cost = UpdateCost::of(&self.model, &self.shape);
         named([
@@ -153,31 +145,29 @@ impl<'a> Counted<'a> {
             let header = BatchHeader::of(run, self.config.learner.batch_size);
             header.sampled_by(&self.config.replay.sampling)
         };
-        let batch = |run: &RunSpec| header(run).payload_bytes() as u64;
-        let numbers = |run: &RunSpec| {
+        let size = |header: BatchHeader| header.payload_bytes() as u64;
+        let states = |run: &RunSpec| {
             let without_states = BatchHeader {
                 state_bytes: 0,
                 stacked: None,
                 ..header(run)
             };
-            without_states.payload_bytes() as u64
+            size(header(run)) - size(without_states)
         };
-        let states = |run: &RunSpec| batch(run) - numbers(run);
         let run = &self.run;
+        let (batch, all_states) = (size(header(run)), states(run));
         let first_states = states(&RunSpec {
             horizon: Horizon::None,
             ..run.clone()
         });
+        let transition = (run.frame_bytes() + TRANSITION_BYTES) as u64;
         named([
-            (
-                "a transition in a chunk",
-                (run.frame_bytes() + TRANSITION_BYTES) as u64,
-            ),
+            ("a transition in a chunk", transition),
             ("a transition in the replay", replay_bytes_each(run)),
-            (BATCH, batch(run)),
+            (BATCH, batch),
             ("  s_t and s_{t+n}", first_states),
-            ("  s_{t+k}", states(run) - first_states),
-            ("  numbers", numbers(run)),
+            ("  s_{t+k}", all_states - first_states),
+            ("  numbers", batch - all_states),
             ("a broadcast", self.broadcast as u64),
         ])
     }

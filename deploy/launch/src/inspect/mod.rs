@@ -121,7 +121,6 @@ fn row(what: &str, [is, everything]: [String; 2]) -> String {
     format!("{what:WHAT_COLUMNS$}{is:>NUMBER_COLUMNS$}{everything:>NUMBER_COLUMNS$}\n")
 }
 
-/// With a comma at every third digit.
 fn thousands(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::new();

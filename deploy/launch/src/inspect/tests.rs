@@ -93,8 +93,8 @@ fn what_is_counted_is_what_is_built() {
             let settings = LearnerConfig::from_toml(&config.to_toml()).unwrap();
             let mut learner = Learner::new(settings, &Compute::CPU).unwrap();
             let networks = learner.agent();
-            let scalars = |parameters: &driml_model::Parameters| -> usize {
-                parameters.iter().map(|(_, var)| var.elem_count()).sum()
+            let scalars = |it: &driml_model::Parameters| -> usize {
+                it.iter().map(|(_, var)| var.elem_count()).sum()
             };
             let key = networks.key().map_or(0, scalars);
             let built = scalars(networks.online()) + scalars(networks.target()) + key;

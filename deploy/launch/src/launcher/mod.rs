@@ -10,17 +10,14 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_machine::{
-    error::{Interrupted, Usage},
-    units::duration,
-};
+use driml_machine::{error::Usage, units::duration};
 use driml_protocol::{Keys, RunClient, Waiting, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
     connect::connect,
-    console::{self, Screen, print, print_wrapped},
+    console::{self, Screen, print_wrapped},
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
@@ -29,12 +26,11 @@ use crate::{
     open_files,
     processes::{Processes, Revived, stop},
     resume,
-    run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView},
     view::{Display, Poller, Reached, TEMPLATE, notes},
 };
 
-/// How often the processes are asked how they are.
 const POLL: Duration = Duration::from_secs(1);
 /// How long a process may leave questions unanswered, from its start too, before the run is given up.
 const SILENCE_MAX: Duration = Duration::from_secs(120);
@@ -48,7 +44,6 @@ const FAILED_DRAIN_MAX: Duration = Duration::from_secs(5);
 const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
-/// How often a learner that saves is asked whether it is done.
 const DRAIN_POLL: Duration = Duration::from_millis(100);
 /// Where the replay server is reached from outside the run.
 #[derive(Clone, Debug, Default)]
@@ -65,7 +60,7 @@ pub struct Outside {
 /// that folder already and continues from the point given.
 ///
 /// # Errors
-/// A process that failed or is unresponsive, a file system error; [`Interrupted`] if the run was asked to stop.
+/// A process that failed or is unresponsive, a file system error; `Interrupted` if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -76,24 +71,14 @@ pub fn run(
     let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
     open_files::check_run(config)?;
     let servers = server_names(config.replay.shards);
-    let names = process_names(config);
-    let recorded = Recorded::of(config, names.clone());
     // Opening the recorder removes it.
     let before = resumed.and_then(|_| Summary::read(run_dir).ok());
     let restarts_before = before.map_or([0; 2], |it| {
         [it.replay_servers_restarted, it.actors_restarted]
     });
-    let mut recorder = match resumed {
-        Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
-        None => RunRecorder::create(run_dir, recorded)?,
-    };
-    if config.local.tensorboard {
-        recorder.write_events(run_dir)?;
-    }
+    let mut recorder = RunRecorder::open(run_dir, config, process_names(config), resumed)?;
     let resume_point = resumed.unwrap_or_default();
-    let evaluation = config.local.evaluation;
-    let evaluator = evaluation.map(|it| Evaluator::new(it, run_dir));
-    let evaluator = evaluator.transpose()?;
+    let evaluator = Evaluator::new(config, run_dir)?;
     let meeting = Meeting::create()?;
     let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
@@ -138,9 +123,8 @@ pub fn run(
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
     let (mut summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
     // An interrupted or failed run does not wait for it.
-    if let Some(mut evaluator) = launch.evaluator.take()
-        && outcome == Outcome::Finished
-    {
+    if outcome == Outcome::Finished {
+        let evaluator = &mut launch.evaluator;
         evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
     }
     // No process is left that could be reached by them; where these files stay behind, locks show it.
@@ -169,18 +153,13 @@ pub fn run(
             run_dir.display()
         )
     })?;
-    if outcome == Outcome::Interrupted {
-        resume::say_how(&config.world, run_dir);
-        Err(Interrupted.into())
-    } else {
-        last_play::play(&mut summary, config, run_dir, &|| {
-            launch.interrupts.count() > 0
-        });
-        print(&summary.next_steps(run_dir))
+    if outcome == Outcome::Finished {
+        let is_stopped = || launch.interrupts.count() > 0;
+        last_play::play(&mut summary, config, run_dir, &is_stopped);
     }
+    resume::say_next(&summary, &config.world, run_dir)
 }
 
-/// A run's processes and what is known of them.
 struct Launch<'a> {
     config: &'a RunConfig,
     /// Whether chunks and batches go through shared memory: it is asked for, and there is enough for all processes.
@@ -196,21 +175,17 @@ struct Launch<'a> {
     display: Display,
     interrupts: Interrupts,
     processes: Processes,
-    /// Plays the checkpoints, if they are to be.
-    evaluator: Option<Evaluator>,
-    /// How often a replay server that had died was started again.
+    evaluator: Evaluator,
     restarts: u32,
-    /// How often an actor was.
     actor_restarts: u32,
     poller: Option<Poller>,
 }
 
 /// The processes of a run that is started on one machine: replay servers, learner, actors.
 pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
-    let actors = (0..config.local.actors).map(|id| format!("actor-{id}"));
-    let others = ["learner".into()].into_iter().chain(actors);
     let mut names = server_names(config.replay.shards);
-    names.extend(others);
+    names.push("learner".into());
+    names.extend((0..config.local.actors).map(|id| format!("actor-{id}")));
     names
 }
 
@@ -234,22 +209,19 @@ impl Launch<'_> {
         let hash = self.config.run.hash();
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
-            match connect(endpoint, &self.interrupts, || {
-                self.processes.check_alive(Revived::default())
-            })? {
-                Some(session) => reached.push(Reached {
-                    name: name.clone(),
-                    endpoint: endpoint.clone(),
-                    client: RunClient::new(session, keys.clone(), hash),
-                }),
-                None => return Ok(Outcome::Interrupted),
-            }
+            let check_alive = || self.processes.check_alive(Revived::default());
+            let Some(session) = connect(endpoint, &self.interrupts, check_alive)? else {
+                return Ok(Outcome::Interrupted);
+            };
+            reached.push(Reached {
+                name: name.clone(),
+                endpoint: endpoint.clone(),
+                client: RunClient::new(session, keys.clone(), hash),
+            });
         }
         let mut poller = Poller::new(self.config, reached);
-        let ResumePoint {
-            frames, updates, ..
-        } = self.resume_point;
-        poller.view = RunView::beginning(poller.view.plan, frames, updates);
+        let point = &self.resume_point;
+        poller.view = RunView::beginning(poller.view.plan, point.frames, point.updates);
         self.poller = Some(poller);
 
         self.processes.learner = Some(self.start_learner()?);
@@ -268,8 +240,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
-            self.revive_servers()?;
-            self.revive_actors()?;
+            self.revive()?;
             self.processes.check_alive(self.revived())?;
             let poller = self.poller.as_mut();
             let poller = poller.expect("it was set before the run is watched");
@@ -279,26 +250,21 @@ impl Launch<'_> {
                 ("replay server", view.replay_last_seen),
                 ("learner", view.learner_last_seen),
             ] {
-                if last_seen.elapsed() > SILENCE_MAX {
+                let silent = last_seen.elapsed();
+                if silent > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
-                    bail!(
-                        "the {name} has not answered for {}: {}",
-                        duration(last_seen.elapsed()),
-                        why.unwrap_or("no answer")
-                    );
+                    let (silent, why) = (duration(silent), why.unwrap_or("no answer"));
+                    bail!("the {name} has not answered for {silent}: {why}");
                 }
             }
             let rss = self.processes.rss_mib();
             if view.is_answered() {
                 let ask = |shard, since| poller.episodes(shard, since);
-                let mut warnings = recorder.record_episodes(view, ask);
-                warnings.extend(recorder.record(view, &rss));
+                let warnings = recorder.record_all(view, &rss, ask);
                 warnings.iter().for_each(|line| self.screen.line(line));
             }
             self.display.show(&recorder.moment(view), &notes(view));
-            if let Some(evaluator) = &mut self.evaluator {
-                evaluator.look(&self.screen);
-            }
+            self.evaluator.look(&self.screen);
             if view.replay.finished && view.learner.finished {
                 self.display
                     .show_alone("all frames and updates are done: the processes exit");
@@ -409,12 +375,12 @@ impl Launch<'_> {
         }
         learner.ask_to_stop();
         let deadline = Instant::now() + LEARNER_DRAIN_MAX;
-        loop {
+        while Instant::now() <= deadline && !abort() {
             if let Err(e) = poller.ask_learner() {
                 tracing::debug!("a last question: {e:#}");
                 return;
             }
-            if poller.view.learner.finished || Instant::now() > deadline || abort() {
+            if poller.view.learner.finished {
                 return;
             }
             std::thread::sleep(DRAIN_POLL);

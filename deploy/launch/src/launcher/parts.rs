@@ -1,8 +1,6 @@
 //! The launcher's processes: the words that start each, and those that are started again when they have died.
 //! When the first are started, and how all end, is in `mod`.
 
-use std::path::Path;
-
 use anyhow::bail;
 use driml_protocol::session;
 
@@ -44,76 +42,35 @@ impl Outside {
 }
 
 impl Launch<'_> {
-    fn surroundings<'a>(&'a self, logs: &'a Path) -> Surroundings<'a> {
-        Surroundings {
-            logs,
+    fn start(&self, name: &str, args: &[String], threads: u32) -> anyhow::Result<ManagedProcess> {
+        let surroundings = Surroundings {
+            logs: &self.run_dir.logs(),
             screen: &self.screen,
             meeting: Some(&self.meeting),
-        }
+        };
+        ManagedProcess::start(name, args, threads, surroundings)
     }
 
-    /// Starts the learner.
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
         let folder = self.run_dir.display().to_string();
         let device = self.config.local.learner_device.to_string();
         let connect = self.endpoints.iter().map(|it| ("--connect", it.as_str()));
         let flags = [("--run-dir", folder.as_str()), ("--device", &device)];
         let args = call("learner --stay", flags.into_iter().chain(connect));
-        let logs = self.run_dir.logs();
-        let threads = self.config.local.learner_threads;
-        ManagedProcess::start("learner", &args, threads, self.surroundings(&logs))
+        self.start("learner", &args, self.config.local.learner_threads)
     }
 
-    /// Starts an actor.
     pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let (number, endpoint) = (
-            id.to_string(),
-            &self.endpoints[id as usize % self.endpoints.len()],
-        );
+        let number = id.to_string();
+        let endpoint = &self.endpoints[id as usize % self.endpoints.len()];
         let mut flags = vec![("--connect", endpoint.as_str()), ("--id", &number)];
         if self.config.world.name().foreign_code().is_some() {
             flags.push(("--env", &self.config.run.world));
         }
         let args = call("actor", flags);
-        let logs = self.run_dir.logs();
-        let name = format!("actor-{id}");
-        ManagedProcess::start(&name, &args, PROCESS_THREADS, self.surroundings(&logs))
+        self.start(&format!("actor-{id}"), &args, PROCESS_THREADS)
     }
 
-    /// What is still restarted.
-    pub(super) fn revived(&self) -> Revived {
-        Revived {
-            servers: self.config.local.durable && self.restarts < RESTARTS_MAX,
-            actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
-        }
-    }
-
-    /// Restarts actors that have died. What one had not delivered is lost; the run continues.
-    pub(super) fn revive_actors(&mut self) -> anyhow::Result<()> {
-        for id in 0..self.processes.actors.len() {
-            let actor = &mut self.processes.actors[id];
-            if self.actor_restarts == ACTOR_RESTARTS_MAX || !actor.may_be_started_again() {
-                continue;
-            }
-            let report = actor.exit_report();
-            if !self.config.world.is_resumable() {
-                bail!(
-                    "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
-                     count these from 0"
-                );
-            }
-            self.actor_restarts += 1;
-            self.screen.line(&format!(
-                "{report}\nactor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
-                self.actor_restarts
-            ));
-            session::sweep_shared_memory();
-            self.processes.actors[id] = self.start_actor(id as u32)?;
-        }
-        Ok(())
-    }
-
-    /// Starts the replay server of one shard.
     pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
         let config = self.run_dir.config().display().to_string();
         let number = shard.to_string();
@@ -133,31 +90,58 @@ impl Launch<'_> {
         if shard == 0 {
             args.extend(self.outside.flags());
         }
-        let logs = self.run_dir.logs();
-        let name = &self.servers[shard];
-        ManagedProcess::start(name, &args, PROCESS_THREADS, self.surroundings(&logs))
+        self.start(&self.servers[shard], &args, PROCESS_THREADS)
     }
 
-    /// Restarts replay servers that have died, if they keep their replay on disk.
-    pub(super) fn revive_servers(&mut self) -> anyhow::Result<()> {
-        if !self.config.local.durable {
-            return Ok(());
+    pub(super) fn revived(&self) -> Revived {
+        Revived {
+            servers: self.config.local.durable && self.restarts < RESTARTS_MAX,
+            actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
         }
+    }
+
+    /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. What an actor had not delivered is
+    /// lost; the run continues.
+    pub(super) fn revive(&mut self) -> anyhow::Result<()> {
         for shard in 0..self.processes.replay_servers.len() {
             let server = &mut self.processes.replay_servers[shard];
-            if server.end().is_none() || self.restarts == RESTARTS_MAX {
+            if server.end().is_none() || !self.revived().servers {
                 continue;
             }
+            let report = self.processes.replay_servers[shard].exit_report();
             self.restarts += 1;
-            let report = server.exit_report();
-            self.screen.line(&format!(
-                "{report}\n{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+            let how = format!(
+                "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
                 self.servers[shard], self.restarts
-            ));
-            session::sweep_shared_memory();
-            let server = self.start_server(shard)?;
-            self.processes.replay_servers[shard] = server;
+            );
+            self.note_restart(&report, &how);
+            self.processes.replay_servers[shard] = self.start_server(shard)?;
+        }
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if !actor.may_be_started_again() || !self.revived().actors {
+                continue;
+            }
+            let report = self.processes.actors[id].exit_report();
+            if !self.config.world.is_resumable() {
+                bail!(
+                    "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
+                     count these from 0"
+                );
+            }
+            self.actor_restarts += 1;
+            let how = format!(
+                "actor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            );
+            self.note_restart(&report, &how);
+            self.processes.actors[id] = self.start_actor(id as u32)?;
         }
         Ok(())
+    }
+
+    fn note_restart(&self, report: &str, how: &str) {
+        self.screen.line(&format!("{report}\n{how}"));
+        session::sweep_shared_memory();
     }
 }

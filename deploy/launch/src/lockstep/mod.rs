@@ -4,7 +4,6 @@
 //! A resumed run continues as if it had not been interrupted: each checkpoint holds the state of worlds, actors and replay.
 
 mod parts;
-mod saved;
 #[cfg(test)]
 mod tests;
 
@@ -14,22 +13,21 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::error::Interrupted;
 use driml_protocol::Shutdown;
-use driml_settings::config::{EvaluationConfig, RunConfig};
+use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::Which,
-    console::{self, Screen, print, print_wrapped},
+    console::{self, Screen, print_wrapped},
+    evaluator::Due,
     keep::keep,
     resume,
-    run_folder::{Evaluated, Outcome, Recorded, ResumePoint, RunFolder, RunRecorder},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
     view::{Display, TEMPLATE},
 };
 use parts::Lockstep;
 
-/// How often progress is shown and recorded.
 const POLL: Duration = Duration::from_secs(1);
 /// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.
 const ROWS_MIN: u64 = 200;
@@ -37,7 +35,7 @@ const ROWS_MIN: u64 = 200;
 /// Trains in this process, and leaves `run_dir`; with a resume point it continues the run that is there.
 ///
 /// # Errors
-/// A component that failed, a file system that refuses; [`Interrupted`] if the run was asked to stop.
+/// A component that failed, a file system that refuses; `Interrupted` if the run was asked to stop.
 pub fn run(
     config: &RunConfig,
     run_dir: &RunFolder,
@@ -45,14 +43,7 @@ pub fn run(
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
-    let recorded = Recorded::of(config, Vec::new());
-    let mut recorder = match resumed {
-        Some(point) => RunRecorder::go_on(run_dir, recorded, point, config.frames())?,
-        None => RunRecorder::create(run_dir, recorded)?,
-    };
-    if config.local.tensorboard {
-        recorder.write_events(run_dir)?;
-    }
+    let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,
@@ -64,10 +55,17 @@ pub fn run(
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
     let plan = view.plan.clone();
     let mut display = Display::new(screen.clone(), plan, Instant::now(), updates);
-    let mut evaluations = Evaluations::new(config, run_dir)?;
+    let mut due = Due::new(config, run_dir)?;
+    let mut play = |updates, is_last| -> anyhow::Result<()> {
+        if let Some(episodes) = due.take(updates, is_last) {
+            let judged = keep(run_dir, Which::After(updates), episodes)?;
+            screen.line(&judged.earned.describe());
+        }
+        Ok(())
+    };
     let mut shown = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
-    let mut row = lockstep.frames() / row_frames;
+    let mut row = lockstep.replay.inserted_total() / row_frames;
     let folder = run_dir.checkpoints();
 
     let mut outcome = Outcome::Finished;
@@ -77,7 +75,7 @@ pub fn run(
     // A round may take several updates.
     let period = config.learner.checkpoint_period_updates;
     while lockstep.round()? {
-        let updates = lockstep.updates();
+        let updates = lockstep.learner.updates();
         if updates / period > tried / period {
             tried = updates;
             // A disk that refuses once does not end the training; what cannot be saved in the end is an error.
@@ -86,13 +84,13 @@ pub fn run(
                     "no checkpoint after {updates} updates, trying again at the next period: {e:#}"
                 ));
             } else {
-                saved = Some((updates, lockstep.frames()));
-                evaluations.play(updates, false, &screen)?;
+                saved = Some((updates, lockstep.replay.inserted_total()));
+                play(updates, false)?;
             }
         }
         let show = shown.elapsed() >= POLL;
-        if show || lockstep.frames() / row_frames > row {
-            row = lockstep.frames() / row_frames;
+        if show || lockstep.replay.inserted_total() / row_frames > row {
+            row = lockstep.replay.inserted_total() / row_frames;
             let warnings = record(&mut recorder, &mut view, &mut lockstep);
             warnings.iter().for_each(|line| screen.line(line));
             if show {
@@ -106,14 +104,16 @@ pub fn run(
         }
     }
     // Frames may have come since the last update.
-    if saved != Some((lockstep.updates(), lockstep.frames())) || outcome == Outcome::Interrupted {
+    if saved != Some((lockstep.learner.updates(), lockstep.replay.inserted_total()))
+        || outcome == Outcome::Interrupted
+    {
         lockstep.save(&folder)?;
     }
     // After the last save: a longer run would continue from there without it.
     lockstep.end()?;
     screen.clear();
     if outcome == Outcome::Finished {
-        evaluations.play(lockstep.updates(), true, &screen)?;
+        play(lockstep.learner.updates(), true)?;
     }
     record(&mut recorder, &mut view, &mut lockstep);
     let missing = console::join_losses(recorder.missing());
@@ -122,55 +122,17 @@ pub fn run(
     let summary = recorder.summarise(outcome, &config.run, &view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
-    if outcome == Outcome::Interrupted {
-        resume::say_how(&config.world, run_dir);
-        Err(Interrupted.into())
-    } else {
-        print(&summary.next_steps(run_dir))
-    }
+    resume::say_next(&summary, &config.world, run_dir)
 }
 
 /// Records how the run stands, and the episodes that ended. Returns warnings.
 fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockstep) -> Vec<String> {
-    let (replay, learner) = lockstep.status();
-    let ended = replay.episodes;
-    view.take_learner(Some(learner.clone()));
-    view.take_replay(vec![replay]);
-    let ask = |_, since| Ok::<_, Infallible>(lockstep.episodes_since(since));
-    let mut warnings = recorder.record_episodes(view, ask);
-    lockstep.note_recorded(ended);
-    warnings.extend(recorder.record(view, &[]));
+    let status = lockstep.replay.status();
+    let ended = status.episodes;
+    view.take_learner(Some(lockstep.turn.status.clone()));
+    view.take_replay(vec![status]);
+    let ask = |_, since| Ok::<_, Infallible>(lockstep.replay.episodes_since(since));
+    let warnings = recorder.record_all(view, &[], ask);
+    lockstep.replay.note_recorded(ended);
     warnings
-}
-
-/// Plays checkpoints between rounds, if they are to be played.
-struct Evaluations<'a> {
-    config: Option<EvaluationConfig>,
-    run_dir: &'a RunFolder,
-    /// Updates of the newest that was played.
-    newest: u64,
-}
-
-impl<'a> Evaluations<'a> {
-    fn new(config: &RunConfig, run_dir: &'a RunFolder) -> anyhow::Result<Self> {
-        Ok(Self {
-            config: config.local.evaluation,
-            run_dir,
-            newest: Evaluated::newest(run_dir)?,
-        })
-    }
-
-    /// Plays the checkpoint after so many updates if it is time, or if it is the last.
-    fn play(&mut self, updates: u64, is_last: bool, screen: &Screen) -> anyhow::Result<()> {
-        let Some(config) = self.config else {
-            return Ok(());
-        };
-        if config.is_due(updates, self.newest, is_last) {
-            self.newest = updates;
-            let which = Which::After(updates);
-            let judged = keep(self.run_dir, which, config.episodes)?;
-            screen.line(&judged.earned.describe());
-        }
-        Ok(())
-    }
 }

@@ -1,26 +1,72 @@
 //! Actors, replay and learner stepped in a fixed order.
+//! A checkpoint holds the learner, and beside it the state of the others but for the replay's transitions, which lie in the run folder.
 //! When to save and what to show is for `mod`.
 
 use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
-use driml_learner::{Learner, LearnerConfig, ServedPart};
+use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
-    ActorJoin, Batch, BufferPool, EpisodesReply, Goodbye, InsertReply, LearnerStatus, ReplayStatus,
-    Weights,
+    ActorJoin, Batch, BufferPool, Goodbye, InsertReply, LearnerStatus, Weights, WeightsHeader,
+    codec,
 };
 use driml_replay_server::{Mark, PersistArgs, Replay, Unready};
 use driml_settings::config::RunConfig;
+use serde::{Deserialize, Serialize};
 
-use super::saved::{SavedParts, Turn};
 use crate::{console, run_folder::RunFolder};
 
 /// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
 const INCARNATION: u64 = 1;
 /// The learner's number, which influences nothing either.
 const LEARNER: u64 = 1;
+
+/// How it is written; another way is rejected.
+const FORMAT: u32 = 4;
+
+/// The state of a run in lockstep, without the learner.
+#[derive(Serialize, Deserialize)]
+struct SavedParts {
+    actors: Vec<CollectorState>,
+    replay: Mark,
+    turn: Turn,
+}
+
+/// Which actor is next, and with which weights.
+#[derive(Clone, Serialize, Deserialize)]
+pub(super) struct Turn {
+    next_actor: usize,
+    /// Transitions of each actor that came after the run's last.
+    unwanted: Vec<u64>,
+    pub(super) status: LearnerStatus,
+    /// The weights with which the actors act, a safetensors file, and the updates after which they were published.
+    acting: (WeightsHeader, Vec<u8>),
+    published: u64,
+}
+
+impl SavedParts {
+    fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
+        let mut bytes = FORMAT.to_le_bytes().to_vec();
+        bytes.extend(codec::encode_value(self).context("writing actors and replay")?);
+        Ok(bytes)
+    }
+
+    /// What the newest checkpoint in a run's folder holds.
+    fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let all = checkpoint::list(&run_dir.checkpoints())?;
+        let (_, path) = all.last().context("there is no checkpoint")?;
+        let bytes = checkpoint::companion(path)?
+            .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
+        let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
+            let path = path.display();
+            usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
+        })?;
+        codec::decode_value(content)
+            .with_context(|| format!("reading actors and replay in {}", path.display()))
+    }
+}
 
 /// The replay of a run, kept in its folder; with a mark, as it was there.
 fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
@@ -45,11 +91,11 @@ fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::
 /// The components of a run, which take turns.
 pub(super) struct Lockstep {
     actors: Vec<Collector>,
-    replay: Replay,
-    learner: Learner,
+    pub(super) replay: Replay,
+    pub(super) learner: Learner,
     batch_size: u32,
     steps_per_chunk: u32,
-    turn: Turn,
+    pub(super) turn: Turn,
 }
 
 impl Lockstep {
@@ -144,12 +190,10 @@ impl Lockstep {
         Ok(())
     }
 
-    /// How the actors stand.
     fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
         self.actors.iter_mut().map(Collector::state).collect()
     }
 
-    /// Takes back what [`Lockstep::save`] kept.
     fn take(&mut self, SavedParts { actors, turn, .. }: SavedParts) -> anyhow::Result<()> {
         let (found, count) = (actors.len(), self.actors.len());
         if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
@@ -162,31 +206,6 @@ impl Lockstep {
         }
         self.turn = turn;
         Ok(())
-    }
-
-    /// Updates so far.
-    pub(super) const fn updates(&self) -> u64 {
-        self.learner.updates()
-    }
-
-    /// Transitions stored so far.
-    pub(super) fn frames(&self) -> u64 {
-        self.replay.inserted_total()
-    }
-
-    /// What replay and learner say of themselves.
-    pub(super) fn status(&self) -> (ReplayStatus, &LearnerStatus) {
-        (self.replay.status(), &self.turn.status)
-    }
-
-    /// Episodes that ended after the first `since`.
-    pub(super) fn episodes_since(&self, since: u64) -> EpisodesReply {
-        self.replay.episodes_since(since)
-    }
-
-    /// The first so many episodes are recorded.
-    pub(super) fn note_recorded(&mut self, episodes: u64) {
-        self.replay.note_recorded(episodes);
     }
 
     /// Writes a checkpoint into `folder`, from which the run continues exactly as now.

@@ -14,10 +14,9 @@ fn frame(config: &RunConfig) -> (u32, u32) {
 }
 
 fn sha256(lockstep: &Lockstep) -> String {
-    lockstep.status().1.weights_sha256.clone()
+    lockstep.turn.status.weights_sha256.clone()
 }
 
-/// The SHA-256 of the weights after a whole run.
 fn weights(config: &RunConfig) -> String {
     ended(Lockstep::in_memory(config).unwrap())
 }
@@ -78,23 +77,20 @@ fn where_states_are_augmented_frames_stay_whole() {
     weights(&config);
 }
 
-/// Saves after so many rounds, runs `lost` more, which are dropped, and finishes the run from the save.
-fn resumed_weights(config: &RunConfig, rounds: usize, lost: usize) -> String {
+/// A run that was saved after so many rounds.
+fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
     let folder = tempfile::tempdir().unwrap();
     let run_dir = RunFolder::new(folder.path());
     let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
     (0..rounds).for_each(|_| assert!(lockstep.round().unwrap()));
     lockstep.save(&run_dir.checkpoints()).unwrap();
-    (0..lost).for_each(|_| assert!(lockstep.round().unwrap()));
-    drop(lockstep);
-    ended(Lockstep::resume(config, &run_dir).unwrap())
+    (folder, run_dir, lockstep)
 }
 
-/// The numbers of Rainbow.
 const PRIORITISED: &str =
     "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
-/// Before the first update, and late; a ring that is full by then, and one that is compressed.
+/// Before the first update, and late; a ring that is full by then, and one that is compressed. Rounds after the save are lost.
 #[test]
 fn a_run_that_was_interrupted_computes_what_it_would_have() {
     let small = ["replay.capacity_transitions=320"];
@@ -110,11 +106,19 @@ fn a_run_that_was_interrupted_computes_what_it_would_have() {
         let config = config(world, agent, 800, sets);
         let whole = weights(&config);
         for (rounds, lost) in [(1, 3), (14, 5)] {
-            let resumed = resumed_weights(&config, rounds, lost);
+            let (_folder, run_dir, mut lockstep) = begun(&config, rounds);
+            (0..lost).for_each(|_| assert!(lockstep.round().unwrap()));
+            drop(lockstep);
+            let resumed = ended(Lockstep::resume(&config, &run_dir).unwrap());
             let what = format!("{world} {agent} {sets:?} after {rounds} rounds");
             assert_eq!(resumed, whole, "{what}");
         }
     }
+}
+
+fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
+    let error = Lockstep::resume(config, run_dir).map(drop).unwrap_err();
+    format!("{error:#}")
 }
 
 /// By which rule rows are drawn decides the weights, and a checkpoint of the one rule is none of the other.
@@ -125,26 +129,10 @@ fn rows_that_are_drawn_by_priority_are_others() {
     assert_eq!(weights(&prioritised), weights(&prioritised));
     assert_ne!(weights(&prioritised), weights(&uniform));
 
-    let (_folder, run_dir) = begun(&uniform);
+    let (_folder, run_dir, _) = begun(&uniform, 9);
     let why = refused(&prioritised, &run_dir);
     let another = "replay.sampling is another rule than it was";
     assert!(why.contains(another), "{why}");
-}
-
-/// A run that was interrupted after its first checkpoint.
-fn begun(config: &RunConfig) -> (tempfile::TempDir, RunFolder) {
-    let folder = tempfile::tempdir().unwrap();
-    let run_dir = RunFolder::new(folder.path());
-    let mut lockstep = Lockstep::begin(config, &run_dir).unwrap();
-    (0..9).for_each(|_| assert!(lockstep.round().unwrap()));
-    lockstep.save(&run_dir.checkpoints()).unwrap();
-    (folder, run_dir)
-}
-
-/// Why a run cannot be resumed.
-fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
-    let error = Lockstep::resume(config, run_dir).map(drop).unwrap_err();
-    format!("{error:#}")
 }
 
 /// Each resumption begins where the one before it saved.
@@ -152,9 +140,7 @@ fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
 fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
     let config = config("mspacman", "driml-ada", 800, &[]);
     let whole = weights(&config);
-    let folder = tempfile::tempdir().unwrap();
-    let run_dir = RunFolder::new(folder.path());
-    let mut lockstep = Lockstep::begin(&config, &run_dir).unwrap();
+    let (_folder, run_dir, mut lockstep) = begun(&config, 0);
     while lockstep.round().unwrap() {
         lockstep.save(&run_dir.checkpoints()).unwrap();
         drop(lockstep);
@@ -167,10 +153,8 @@ fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
 /// A run that ended continues as a longer one would have.
 #[test]
 fn a_finished_run_that_continues_computes_what_a_longer_one_would_have() {
-    let folder = tempfile::tempdir().unwrap();
-    let run_dir = RunFolder::new(folder.path());
     let short = config("mspacman", "driml-ada", 512, &[]);
-    let mut lockstep = Lockstep::begin(&short, &run_dir).unwrap();
+    let (_folder, run_dir, mut lockstep) = begun(&short, 0);
     while lockstep.round().unwrap() {}
     lockstep.save(&run_dir.checkpoints()).unwrap();
     lockstep.end().unwrap();
@@ -191,17 +175,17 @@ fn what_cannot_go_on_says_why() {
         paths
     };
     // The newest segment begins with the mark, the one before it has the transitions.
-    let (_folder, run_dir) = begun(&config);
+    let (_folder, run_dir, _) = begun(&config, 9);
     std::fs::remove_file(segments(&run_dir).pop().unwrap()).unwrap();
     let why = refused(&config, &run_dir);
     let missing = "is missing or damaged: the replay cannot go back";
     assert!(why.contains(missing), "{why}");
-    let (_folder, run_dir) = begun(&config);
+    let (_folder, run_dir, _) = begun(&config, 9);
     std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
     let why = refused(&config, &run_dir);
     assert!(why.contains("cannot resume to the same weights"), "{why}");
     // A learner's own checkpoint.
-    let (_folder, run_dir) = begun(&config);
+    let (_folder, run_dir, _) = begun(&config, 9);
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();
     unkept.save(&run_dir.checkpoints()).unwrap();

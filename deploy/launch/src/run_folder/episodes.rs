@@ -15,40 +15,31 @@ use super::{
     folder::RunFolder,
     table::{AppendLog, Table, csv_row},
 };
-use crate::moment::{MeanReturn, rounded};
+use crate::moment::{Episodes, rounded};
 
 /// Answers that are asked of one shard at a time; what they do not hold comes the next time.
 const ASKS_MAX: usize = 16;
 
-const HEADER: [&str; 7] = [
-    "seconds", "frames", "episode", "actor", "copy", "return", "length",
-];
+const HEADER: &str = "seconds,frames,episode,actor,copy,return,length";
 
-/// The episodes of a run.
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
     table: AppendLog,
     /// The newest returns, the oldest first.
     newest: VecDeque<f64>,
-    /// The number of the newest episode.
-    episode: u64,
-    /// Frames in the last row.
+    /// The number of the newest.
+    pub(super) episode: u64,
     frames: u64,
-    /// Frames of the run at the last status.
     frames_at_status: Option<u64>,
     /// How many had ended in each shard at its last status.
     received: Vec<u64>,
-    /// How many are in no row.
     lost: u64,
     folder: RunFolder,
-    /// The rows with which it began, until it is known how many of them stay.
-    rows: Table,
-    /// The shards know of the episodes that were received before this one was made.
-    is_known: bool,
+    /// The rows with which it began, if the shards know of them, until their first status shows how many stay.
+    rows: Option<Table>,
 }
 
 impl TrainingEpisodes {
-    /// Of a run that begins.
     pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
         Self::begin(folder, Table::default(), false)
     }
@@ -72,7 +63,7 @@ impl TrainingEpisodes {
     }
 
     fn begin(folder: &RunFolder, mut rows: Table, is_known: bool) -> anyhow::Result<Self> {
-        rows.header = HEADER.map(String::from).to_vec();
+        rows.header = HEADER.split(',').map(String::from).collect();
         let table = AppendLog::create(&folder.episodes(), &rows.text())?;
         let known: Vec<_> = rows.rows.iter().filter_map(read).collect();
         let returns = known.iter().filter_map(|&(.., value)| value);
@@ -87,11 +78,7 @@ impl TrainingEpisodes {
             frames_at_status: None,
             received: Vec::new(),
             lost: 0,
-            is_known,
-            rows: match is_known {
-                true => rows,
-                false => Table::default(),
-            },
+            rows: is_known.then_some(rows),
             folder: folder.clone(),
         })
     }
@@ -113,8 +100,8 @@ impl TrainingEpisodes {
         self.received
             .resize(shards.len().max(self.received.len()), 0);
         let mut warnings = Vec::new();
-        if std::mem::take(&mut self.is_known) {
-            warnings.extend(self.cut(frames).err().map(|e| format!("{e:#}")));
+        if let Some(rows) = self.rows.take() {
+            warnings.extend(self.cut(rows, frames).err().map(|e| format!("{e:#}")));
             self.take_as_received(shards);
         }
         let mut rows = Vec::new();
@@ -128,15 +115,12 @@ impl TrainingEpisodes {
                 if received >= status.episodes {
                     break;
                 }
-                let reply = match ask(shard, received) {
-                    Ok(reply) if reply.ended >= status.episodes && reply.before >= received => {
-                        reply
-                    }
-                    Ok(_) => break,
-                    Err(e) => {
-                        tracing::debug!("episodes of shard {shard}: {e}");
-                        break;
-                    }
+                let reply = ask(shard, received);
+                let failed = |e: &E| tracing::debug!("episodes of shard {shard}: {e}");
+                let is_newer =
+                    |it: &EpisodesReply| it.ended >= status.episodes && it.before >= received;
+                let Some(reply) = reply.inspect_err(failed).ok().filter(is_newer) else {
+                    break;
                 };
                 let missing = reply.before - received;
                 if missing > 0 {
@@ -161,8 +145,7 @@ impl TrainingEpisodes {
     }
 
     /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
-    fn cut(&mut self, frames_max: u64) -> anyhow::Result<()> {
-        let mut rows = std::mem::take(&mut self.rows);
+    fn cut(&mut self, mut rows: Table, frames_max: u64) -> anyhow::Result<()> {
         let all = rows.rows.len();
         let is_kept = |row: &_| read(row).is_some_and(|it| it.0 <= frames_max);
         rows.keep(&self.folder.episodes(), |_, row| Ok(is_kept(row)))?;
@@ -189,7 +172,7 @@ impl TrainingEpisodes {
     }
 
     /// Counts an episode and gives its row.
-    fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; HEADER.len()] {
+    fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
         self.episode += 1;
         self.frames = self.frames.max(ended.frames);
         let played = ended.played.map(|it| Played {
@@ -214,22 +197,11 @@ impl TrainingEpisodes {
         ]
     }
 
-    /// The mean of the last 100, or of as many as there are; none before the first.
-    pub(super) fn mean(&self) -> Option<MeanReturn> {
-        let of = self.newest.len();
-        let sum: f64 = self.newest.iter().sum();
-        (of > 0).then(|| MeanReturn {
-            mean: sum / of as f64,
-            of,
-        })
+    /// The episodes of a run that counts so many.
+    pub(super) fn so_far(&self, count: u64) -> Episodes {
+        Episodes::of(count, self.newest.iter())
     }
 
-    /// Number of the newest episode.
-    pub(super) const fn count(&self) -> u64 {
-        self.episode
-    }
-
-    /// What is missing in the file.
     pub(super) fn missing(&self) -> Vec<String> {
         let lost = (self.lost > 0).then(|| {
             format!(

@@ -3,32 +3,32 @@
 use std::{convert::Infallible, fs};
 
 use super::*;
+use crate::testing::with;
 
-/// A shard in which so many episodes have ended, of which the server keeps those after the first `let_go`, thirty an answer; their returns
-/// are their numbers from `first`.
+/// A shard of `frames` in which so many episodes have `ended`, of which the server keeps those after the first `let_go`, thirty an
+/// answer; their returns are their numbers from `first`.
+#[derive(Clone, Copy)]
 struct Shard {
     frames: u64,
-    ended: u64,
     let_go: u64,
+    ended: u64,
     first: u64,
 }
 
-impl Shard {
-    const fn of((frames, let_go, ended, first): (u64, u64, u64, u64)) -> Self {
-        Self {
-            frames,
-            ended,
-            let_go,
-            first,
-        }
+const fn shard(frames: u64, let_go: u64, ended: u64, first: u64) -> Shard {
+    Shard {
+        frames,
+        let_go,
+        ended,
+        first,
     }
+}
 
+impl Shard {
     fn status(&self) -> ReplayStatus {
-        ReplayStatus {
-            transitions_inserted: self.frames,
-            episodes: self.ended,
-            ..ReplayStatus::default()
-        }
+        with(|it: &mut ReplayStatus| {
+            (it.transitions_inserted, it.episodes) = (self.frames, self.ended);
+        })
     }
 
     /// One more has ended since the status.
@@ -52,7 +52,6 @@ impl Shard {
     }
 }
 
-/// A run that begins.
 fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
     let root = tempfile::tempdir().unwrap();
     let folder = RunFolder::new(root.path());
@@ -71,63 +70,53 @@ fn rows(folder: &RunFolder) -> Vec<String> {
     text.lines().skip(1).map(str::to_owned).collect()
 }
 
+/// The mean return, and of how many.
+fn mean(episodes: &TrainingEpisodes) -> (Option<f64>, usize) {
+    let so_far = episodes.so_far(0);
+    (so_far.mean_return, so_far.mean_return_of)
+}
+
 #[test]
 fn every_episode_is_taken_once_from_every_shard() {
     let (_root, folder, mut episodes) = begun();
-    assert_eq!(episodes.mean(), None);
+    assert_eq!(mean(&episodes), (None, 0));
     // The last time nothing has ended since.
-    for [one, other] in [
-        [(10, 0, 1, 0), (5, 0, 0, 50)],
-        [(20, 1, 3, 0), (5, 0, 1, 50)],
-        [(20, 1, 3, 0), (5, 0, 1, 50)],
-    ] {
-        update(&mut episodes, &[one, other].map(Shard::of));
+    let later = [shard(20, 1, 3, 0), shard(5, 0, 1, 50)];
+    for shards in [[shard(10, 0, 1, 0), shard(5, 0, 0, 50)], later, later] {
+        update(&mut episodes, &shards);
     }
-    assert_eq!(
-        rows(&folder),
-        [
-            "1.500,10,1,4,2,0,9",
-            "1.500,20,2,4,2,1,9",
-            "1.500,20,3,4,2,2,9",
-            "1.500,20,4,4,2,50,9"
-        ]
-    );
-    let mean = MeanReturn {
-        mean: 53.0 / 4.0,
-        of: 4,
-    };
-    assert_eq!(episodes.mean(), Some(mean));
+    let expected = [
+        "1.500,10,1,4,2,0,9",
+        "1.500,20,2,4,2,1,9",
+        "1.500,20,3,4,2,2,9",
+        "1.500,20,4,4,2,50,9",
+    ];
+    assert_eq!(rows(&folder), expected);
+    assert_eq!(mean(&episodes), (Some(53.0 / 4.0), 4));
     assert!(episodes.missing().is_empty());
 }
 
 #[test]
 fn what_the_server_has_let_go_is_counted_and_said() {
     let (_root, folder, mut episodes) = begun();
-    update(&mut episodes, &[Shard::of((10, 0, 5, 0))]);
-    let said = update(&mut episodes, &[Shard::of((90, 155, 255, 0))]);
-    assert!(
-        said[0].starts_with("150 episodes have no row in episodes.csv"),
-        "{said:?}"
-    );
-    assert!(episodes.missing()[0].starts_with("150 episodes have no row"));
-    let mean = MeanReturn {
-        mean: (155.0 + 254.0) / 2.0,
-        of: 100,
-    };
-    assert_eq!(episodes.mean(), Some(mean));
+    update(&mut episodes, &[shard(10, 0, 5, 0)]);
+    let said = update(&mut episodes, &[shard(90, 155, 255, 0)]);
+    let why = "150 episodes have no row in episodes.csv";
+    for said in [&said[0], &episodes.missing()[0]] {
+        assert!(said.starts_with(why), "{said}");
+    }
+    assert_eq!(mean(&episodes), (Some((155.0 + 254.0) / 2.0), 100));
     let rows = rows(&folder);
     assert_eq!(rows.len(), 105);
     // 150 of them are in no row, but they have numbers.
-    assert_eq!(
-        [&rows[5], &rows[104]],
-        ["1.500,90,156,4,2,155,9", "1.500,90,255,4,2,254,9"]
-    );
+    let expected = ["1.500,90,156,4,2,155,9", "1.500,90,255,4,2,254,9"];
+    assert_eq!([&rows[5], &rows[104]], expected);
 }
 
 #[test]
 fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     let (_root, folder, mut episodes) = begun();
-    let shard = Shard::of((10, 0, 1, 0));
+    let shard = shard(10, 0, 1, 0);
     let ask = |_, since| {
         let mut reply = shard.reply(since);
         reply.episodes[0].played = None;
@@ -135,47 +124,44 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     };
     episodes.update(&[shard.status()], ask, None);
     assert_eq!(rows(&folder), [",10,1,4,2,,"]);
-    assert_eq!(episodes.mean(), None);
+    assert_eq!(mean(&episodes), (None, 0));
     drop(episodes);
     let episodes = TrainingEpisodes::go_on(&folder, 10, true).unwrap();
-    assert_eq!((episodes.mean(), episodes.episode), (None, 1));
+    assert_eq!((mean(&episodes), episodes.episode), ((None, 0), 1));
 }
 
 #[test]
 fn a_run_that_continues_has_the_episodes_before() {
     let (_root, folder, mut episodes) = begun();
-    update(&mut episodes, &[Shard::of((1_000, 0, 60, 0))]);
-    update(&mut episodes, &[Shard::of((2_000, 60, 70, 0))]);
+    update(&mut episodes, &[shard(1_000, 0, 60, 0)]);
+    update(&mut episodes, &[shard(2_000, 60, 70, 0)]);
     // What came after the checkpoint does not count, nor what was cut off.
-    update(&mut episodes, &[Shard::of((3_000, 70, 90, 0))]);
+    update(&mut episodes, &[shard(3_000, 70, 90, 0)]);
     let path = folder.episodes();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text + "1.5,3000,91").unwrap();
 
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, false).unwrap();
-    assert_eq!(episodes.mean().unwrap(), MeanReturn { mean: 34.5, of: 70 });
+    assert_eq!(mean(&episodes), (Some(34.5), 70));
     // Another server, which counts from the start; the replay fills again.
-    update(&mut episodes, &[Shard::of((1_500, 0, 40, 1_000))]);
+    update(&mut episodes, &[shard(1_500, 0, 40, 1_000)]);
     let expected: f64 = (10..70).chain(1_000..1_040).map(f64::from).sum();
-    let mean = expected / 100.0;
-    assert_eq!(episodes.mean(), Some(MeanReturn { mean, of: 100 }));
+    assert_eq!(mean(&episodes), (Some(expected / 100.0), 100));
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
     // A server that knows of those before, and of four more; it hands out all that it keeps.
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, true).unwrap();
-    update(&mut episodes, &[Shard::of((2_600, 0, 114, 0))]);
-    update(&mut episodes, &[Shard::of((2_600, 114, 115, 0))]);
+    update(&mut episodes, &[shard(2_600, 0, 114, 0)]);
+    update(&mut episodes, &[shard(2_600, 114, 115, 0)]);
     let text = rows(&folder);
     assert_eq!(text[text.len() - 5], "1.500,2600,111,4,2,110,9");
     assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");
 
     fs::remove_file(&path).unwrap();
     let nothing = TrainingEpisodes::go_on(&folder, 9, false).unwrap();
-    assert_eq!(nothing.mean(), None);
+    assert_eq!(mean(&nothing), (None, 0));
     fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
     let said = TrainingEpisodes::go_on(&folder, 9, false).unwrap_err();
-    assert!(
-        said.to_string().contains("is not a row of episodes"),
-        "{said}"
-    );
+    let said = said.to_string();
+    assert!(said.contains("is not a row of episodes"), "{said}");
 }

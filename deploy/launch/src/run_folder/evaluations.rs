@@ -18,14 +18,7 @@ use super::{
 };
 use crate::moment::rounded;
 
-const HEADER: [&str; 6] = [
-    "seconds",
-    "frames",
-    "updates",
-    "episodes",
-    "evaluated_return",
-    "evaluated_return_sd",
-];
+const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
 /// What the name of a checkpoint that is held begins with; the number of the process follows.
 const HELD: &str = ".playing-";
@@ -91,11 +84,8 @@ impl Evaluated {
         (mean_return, deviation): (f64, f64),
     ) -> Self {
         let metrics = Table::read(&folder.metrics()).unwrap_or_default();
-        let is_before = |row: &&_| {
-            metrics
-                .value(row, "updates")
-                .is_some_and(|at: u64| at <= updates)
-        };
+        let updates_at = |row: &_| metrics.value::<u64>(row, "updates");
+        let is_before = |row: &&_| updates_at(row).is_some_and(|at| at <= updates);
         let before = metrics.rows.iter().rev().find(is_before);
         let row = before.or(metrics.rows.first());
         Self {
@@ -120,24 +110,20 @@ impl Evaluated {
     pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
-        let mut file = File::options()
-            .create(true)
-            .append(true)
-            .open(&path)
-            .with_context(doing)?;
-        let mut rows = Vec::new();
-        if file.metadata().with_context(doing)?.len() == 0 {
-            rows.extend(csv_row(HEADER));
-        }
-        rows.extend(csv_row([
-            self.seconds.map(|it| it.to_string()).unwrap_or_default(),
-            self.frames.map(|it| it.to_string()).unwrap_or_default(),
+        let file = File::options().create(true).append(true).open(&path);
+        let mut file = file.with_context(doing)?;
+        let is_new = file.metadata().with_context(doing)?.len() == 0;
+        let row = csv_row([
+            self.seconds.map_or(String::new(), |it| it.to_string()),
+            self.frames.map_or(String::new(), |it| it.to_string()),
             self.updates.to_string(),
             self.episodes.to_string(),
             rounded(self.mean_return).to_string(),
             rounded(self.deviation).to_string(),
-        ]));
+        ]);
+        let head = is_new.then(|| csv_row(HEADER.split(',')));
         // A whole row at once: others may read meanwhile.
+        let rows = [head.unwrap_or_default(), row].concat();
         file.write_all(&rows).with_context(doing)
     }
 }
@@ -278,16 +264,10 @@ mod tests {
         assert!(!left.exists() && other.exists(), "process 1 lives");
         let all = Evaluated::all(&folder).unwrap();
         let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
-        let expected = [
-            (300, 10, -1.0),
-            (300, 20, 3.0),
-            (500, 30, 3.0),
-            (500, 40, 9.0),
-        ];
-        assert!(
-            at.eq(expected.map(|it| (Some(it.0), it.1, it.2))),
-            "{all:?}"
-        );
+        let (early, late) = (Some(300), Some(500));
+        let first = [(early, 10, -1.0), (early, 20, 3.0)];
+        let others = [(late, 30, 3.0), (late, 40, 9.0)];
+        assert!(at.eq(first.into_iter().chain(others)), "{all:?}");
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
         let said = Evaluated::all(&folder).unwrap_err().to_string();
         assert!(said.contains("is not a table of evaluations"), "{said}");

@@ -113,37 +113,33 @@ impl RunFolder {
 
     /// Whether nothing lies in the folder, or only what a run makes before its first frame.
     fn is_empty_run(&self, entries: fs::ReadDir) -> bool {
-        let made = [
-            self.config(),
-            self.metrics(),
-            self.episodes(),
+        let (config, checkpoints) = (self.config(), self.checkpoints());
+        let tables = [self.metrics(), self.episodes()];
+        let others = [
             self.summary(),
             self.endpoints(),
             self.meeting(),
-            self.checkpoints(),
             self.logs(),
             self.path.join(LOCK),
         ];
-        let has_frames = |path: PathBuf| {
+        let has_frames = |path: &PathBuf| {
             let text = fs::read(path).unwrap_or_default();
-            let rows = Table::parse(&text).ok();
-            rows.is_some_and(|it| it.last("frames").is_some_and(|frames: u64| frames > 0))
+            let frames = Table::parse(&text).ok().and_then(|it| it.last("frames"));
+            frames.is_some_and(|frames: u64| frames > 0)
         };
         let entries: Vec<_> = entries.flatten().collect();
-        if entries.is_empty() {
-            return true;
-        }
-        let saved = driml_learner::checkpoint::list(&self.checkpoints());
         let is_made = |it: &fs::DirEntry| {
-            let name = it.file_name();
-            made.contains(&it.path()) || name.to_string_lossy().starts_with(EVENTS)
+            let (path, name) = (it.path(), it.file_name());
+            let made = [&config, &checkpoints].into_iter().chain(&tables);
+            made.chain(&others).any(|made| *made == path)
+                || name.to_string_lossy().starts_with(EVENTS)
         };
-        entries.iter().all(is_made)
-            && self.config().exists()
-            && ![self.metrics(), self.episodes()]
-                .into_iter()
-                .any(has_frames)
-            && saved.is_ok_and(|all| all.is_empty())
+        let saved = driml_learner::checkpoint::list(&checkpoints);
+        entries.is_empty()
+            || entries.iter().all(is_made)
+                && config.exists()
+                && !tables.iter().any(has_frames)
+                && saved.is_ok_and(|all| all.is_empty())
     }
 
     /// Refuses a folder into which nothing could be written, before it is made.
@@ -192,7 +188,6 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes the settings.
     pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
         write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())
@@ -256,11 +251,11 @@ mod tests {
         let file = folder.path().join("file");
         fs::write(&file, "").unwrap();
         let said = refused(&file.join("runs/one"));
-        let why = format!(
-            "{} is not a folder; choose another --run-dir",
-            file.display()
+        let why = "is not a folder; choose another --run-dir";
+        assert!(
+            said.contains(&format!("{} {why}", file.display())),
+            "{said}"
         );
-        assert!(said.contains(&why), "{said}");
         let closed = folder.path().join("closed");
         fs::create_dir(&closed).unwrap();
         fs::set_permissions(&closed, fs::Permissions::from_mode(0o555)).unwrap();

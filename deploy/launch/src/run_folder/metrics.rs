@@ -1,4 +1,4 @@
-//! `metrics.csv` read again: the rows that a resumed run keeps, and how far a run is.
+//! `metrics.csv` read again: where a run is resumed, the rows that a resumed run keeps, and how far a run is.
 //! The recorder writes it, with the columns of `crate::metrics`.
 
 use std::{
@@ -9,7 +9,20 @@ use std::{
 
 use driml_machine::error::usage;
 
-use super::{folder::RunFolder, resume_point::ResumePoint, table::Table};
+use super::{folder::RunFolder, table::Table};
+
+/// What was done before a run starts: nothing, or what its newest checkpoint says.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ResumePoint {
+    /// Updates that the checkpoint has learned.
+    pub updates: u64,
+    /// Rows from which it has learned.
+    pub rows: u64,
+    /// Frames of the run by then.
+    pub frames: u64,
+    /// The replay was kept, and counts all of the run.
+    pub replay_is_kept: bool,
+}
 
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 4096;

@@ -6,7 +6,6 @@ mod events;
 mod folder;
 mod metrics;
 mod recorder;
-mod resume_point;
 mod summary;
 mod table;
 
@@ -17,9 +16,8 @@ pub(crate) use self::{
 pub use self::{
     evaluations::{Evaluated, sweep},
     folder::{RunFolder, write_whole},
-    metrics::{Progress, progress},
+    metrics::{Progress, ResumePoint, progress},
     recorder::{Recorded, RunRecorder},
-    resume_point::ResumePoint,
     summary::{Earned, LastPlay, Outcome, Summary},
     table::Table,
 };

@@ -15,8 +15,7 @@ use super::{
     episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    metrics::{rows_up_to, seconds_of},
-    resume_point::ResumePoint,
+    metrics::{ResumePoint, rows_up_to, seconds_of},
     summary::{Outcome, Summary},
     table::{AppendLog, Table, csv_row},
 };
@@ -38,7 +37,6 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Of a run with these settings and processes.
     pub(crate) fn of(config: &RunConfig, processes: Vec<String>) -> Self {
         Self {
             config_toml: config.to_toml(),
@@ -47,7 +45,6 @@ impl Recorded {
         }
     }
 
-    /// The columns of the run's metrics.
     pub(super) fn header(&self) -> Vec<String> {
         let nothing = RunView::new(Plan::default());
         let cells = cells(&self.moment(&nothing, &[]));
@@ -93,6 +90,24 @@ pub struct RunRecorder {
 }
 
 impl RunRecorder {
+    /// Records a run with these settings and processes in `folder`: one that begins, or that is `resumed` from there.
+    pub(crate) fn open(
+        folder: &RunFolder,
+        config: &RunConfig,
+        processes: Vec<String>,
+        resumed: Option<ResumePoint>,
+    ) -> anyhow::Result<Self> {
+        let recorded = Recorded::of(config, processes);
+        let mut this = match resumed {
+            Some(point) => Self::go_on(folder, recorded, point, config.frames())?,
+            None => Self::create(folder, recorded)?,
+        };
+        if config.local.tensorboard {
+            this.write_events(folder)?;
+        }
+        Ok(this)
+    }
+
     /// Makes the folder and writes the settings; the clock starts.
     pub fn create(folder: &RunFolder, run: Recorded) -> anyhow::Result<Self> {
         folder.check_free()?;
@@ -100,10 +115,8 @@ impl RunRecorder {
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
         folder.write_config(&run.config_toml)?;
-        let rows = Table {
-            header: run.header(),
-            rows: Vec::new(),
-        };
+        let (header, rows) = (run.header(), Vec::new());
+        let rows = Table { header, rows };
         let episodes = TrainingEpisodes::create(folder)?;
         Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
     }
@@ -139,16 +152,13 @@ impl RunRecorder {
         // A replay that was kept knows of all the run's episodes and k.
         let is_kept = resume_point.replay_is_kept;
         let before = |column| rows.last(column).filter(|_| !is_kept);
-        let episodes_before = match is_kept {
-            true => 0,
-            false => rows.last("episodes").unwrap_or(0).max(episodes.count()),
-        };
+        let rows_of_episodes = rows.last("episodes").unwrap_or(0).max(episodes.episode);
         Ok(Self {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
             frames_before: resume_point.frames,
-            episodes_before,
+            episodes_before: if is_kept { 0 } else { rows_of_episodes },
             k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
             events: None,
@@ -161,7 +171,6 @@ impl RunRecorder {
         })
     }
 
-    /// Writes TensorBoard's events from now on, too.
     pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
         let kept = (self.resume_point.updates > 0).then_some(self.frames_before);
         self.events = Some(Events::create(folder, kept)?);
@@ -219,6 +228,18 @@ impl RunRecorder {
         self.episodes.update(&view.shards, ask, seconds)
     }
 
+    /// [`Self::record_episodes`], then [`Self::record`].
+    pub(crate) fn record_all<E: Display>(
+        &mut self,
+        view: &RunView,
+        rss_mib: &[Option<f64>],
+        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
+    ) -> Vec<String> {
+        let mut warnings = self.record_episodes(view, ask);
+        warnings.extend(self.record(view, rss_mib));
+        warnings
+    }
+
     /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.
     /// `rss_mib` is in the order of the processes given at the start, none for one that ended.
     ///
@@ -253,10 +274,7 @@ impl RunRecorder {
 
     /// The whole run's episodes.
     pub fn episodes(&self, replay: &ReplayStatus) -> Episodes {
-        Episodes {
-            count: self.episodes_before + replay.episodes,
-            mean_return: self.episodes.mean(),
-        }
+        self.episodes.so_far(self.episodes_before + replay.episodes)
     }
 
     /// What there is to say of the run, which ended so.

@@ -3,13 +3,13 @@
 use std::convert::Infallible;
 
 use driml_actor::Schedule;
-use driml_protocol::{EndedEpisode, LearnerStatus, Played, Returns, RunSpec, Waiting};
+use driml_protocol::{EndedEpisode, LearnerStatus, Played, RunSpec, Waiting};
 use expect_test::expect;
 
 use super::*;
 use crate::{
     run_folder::{Earned, LastPlay},
-    testing::config,
+    testing::{config, with},
 };
 
 fn spec() -> RunSpec {
@@ -18,15 +18,9 @@ fn spec() -> RunSpec {
 
 /// Where a run is resumed, with 16 rows an update.
 fn point(updates: u64) -> ResumePoint {
-    ResumePoint {
-        updates,
-        rows: 31 * 16,
-        frames: 2_000,
-        replay_is_kept: false,
-    }
+    with(|it: &mut ResumePoint| (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000))
 }
 
-/// What DIM reports.
 const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 fn statuses() -> (ReplayStatus, LearnerStatus) {
@@ -35,10 +29,6 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
         warmup_transitions: 1_000,
         rows_sampled: 8_000,
         episodes: 7,
-        returns: Returns {
-            known: 7,
-            newest: vec![0.5; 7],
-        },
         k_histogram: vec![2, 1, 1],
         waiting: Waiting::Finished,
         ..ReplayStatus::default()
@@ -68,10 +58,7 @@ fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
         end: 0.1,
         decay_frames: 4_000,
     };
-    let mut view = RunView::new(Plan {
-        epsilon: Some(epsilon),
-        ..Plan::default()
-    });
+    let mut view = RunView::new(with(|it: &mut Plan| it.epsilon = Some(epsilon)));
     view.take_learner(Some(learner.clone()));
     view.take_replay(vec![replay.clone()]);
     view
@@ -235,19 +222,15 @@ fn summary(replay: &ReplayStatus) -> Summary {
 
 #[test]
 fn next_steps_stand_in_columns() {
-    let replay = ReplayStatus {
-        transitions_inserted: 1_280,
-        ..ReplayStatus::default()
-    };
+    let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
     let earned = |mean, low, high| Earned { mean, low, high };
-    let played = LastPlay {
+    let mut summary = summary(&replay);
+    summary.played = Some(LastPlay {
         weights: "averaged".into(),
         episodes: 100,
         agent: earned(45.123, 41.8, 48.4),
         random: earned(3.9, 3.1, 4.7),
-    };
-    let mut summary = summary(&replay);
-    summary.played = Some(played);
+    });
     expect![[r#"
         Greedy return (averaged weights): 45.12, 95% interval 41.80 to 48.40, 100 episodes; a random policy earns 3.90 (3.10 to 4.70).
           driml evaluate runs/x --record play.gif     films it, and plays a random policy beside it

@@ -62,19 +62,14 @@ pub struct LastPlay {
 }
 
 impl LastPlay {
-    /// A line about it.
     fn describe(&self) -> String {
-        let Self { agent, random, .. } = self;
+        let Earned { mean, low, high } = self.agent;
+        let agent = format!("{mean:.2}, 95% interval {low:.2} to {high:.2}");
+        let Earned { mean, low, high } = self.random;
+        let random = format!("{mean:.2} ({low:.2} to {high:.2})");
+        let (weights, episodes) = (&self.weights, self.episodes);
         format!(
-            "Greedy return ({} weights): {:.2}, 95% interval {:.2} to {:.2}, {} episodes; a random policy earns {:.2} ({:.2} to {:.2}).\n",
-            self.weights,
-            agent.mean,
-            agent.low,
-            agent.high,
-            self.episodes,
-            random.mean,
-            random.low,
-            random.high
+            "Greedy return ({weights} weights): {agent}, {episodes} episodes; a random policy earns {random}.\n"
         )
     }
 }
@@ -188,8 +183,8 @@ impl Summary {
             updates_relearned: replay.updates_relearned,
             replay_ratio: replay.replay_ratio(),
             episodes: episodes.count,
-            mean_return: episodes.mean_return.map(|it| it.mean),
-            mean_return_of: episodes.mean_return.map_or(0, |it| it.of as u64),
+            mean_return: episodes.mean_return,
+            mean_return_of: episodes.mean_return_of as u64,
             wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
@@ -272,14 +267,14 @@ impl Summary {
 
     /// How the run ended and what it counted, in one line.
     pub(crate) fn counts(&self) -> String {
-        let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
+        let (of, episodes) = (self.mean_return_of, self.episodes);
         let returns = match self.mean_return {
             None => "no episode ended".into(),
-            Some(mean) => format!(
-                "mean return {mean:.2} over the last {} of {} episodes",
-                self.mean_return_of, self.episodes
-            ),
+            Some(mean) => {
+                format!("mean return {mean:.2} over the last {of} of {episodes} episodes")
+            }
         };
+        let ratio = self.replay_ratio.map(|it| format!("{it:.2}"));
         let how = match self.outcome {
             Outcome::Finished => "finished",
             _ => "interrupted",
@@ -291,7 +286,7 @@ impl Summary {
             duration(Duration::from_secs_f64(self.wall_seconds)),
             self.frames_per_second,
             self.updates_per_second,
-            number(self.replay_ratio),
+            ratio.as_deref().unwrap_or("-"),
         )
     }
 }

@@ -63,7 +63,6 @@ impl Table {
         self.value(self.rows.last()?, name)
     }
 
-    /// The file's text: the header and the rows.
     pub(super) fn text(&self) -> Vec<u8> {
         let rows = self.rows.iter().flat_map(csv_row);
         csv_row(&self.header).into_iter().chain(rows).collect()
@@ -75,19 +74,19 @@ impl Table {
         path: &Path,
         is_kept: impl Fn(&Self, &StringRecord) -> anyhow::Result<bool>,
     ) -> anyhow::Result<()> {
-        let is_kept = self.rows.iter().map(|row| is_kept(self, row));
-        let is_kept = is_kept.collect::<anyhow::Result<Vec<_>>>()?;
-        let rows = std::mem::take(&mut self.rows).into_iter().zip(is_kept);
-        let (kept, aside): (Vec<_>, Vec<_>) = rows.partition(|(_, is_kept)| *is_kept);
-        let of = |rows: Vec<(StringRecord, bool)>| rows.into_iter().map(|it| it.0).collect();
-        self.rows = of(kept);
-        if aside.is_empty() {
+        let (mut kept, mut aside) = (Self::default(), Self::default());
+        for row in std::mem::take(&mut self.rows) {
+            let table = match is_kept(self, &row)? {
+                true => &mut kept,
+                false => &mut aside,
+            };
+            table.rows.push(row);
+        }
+        self.rows = kept.rows;
+        if aside.rows.is_empty() {
             return Ok(());
         }
-        let aside = Self {
-            header: self.header.clone(),
-            rows: of(aside),
-        };
+        aside.header.clone_from(&self.header);
         let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
         let free = (1..).map(free).find(|it| !it.exists());
         let beside = free.context("no name is free beside the table")?;
@@ -104,17 +103,14 @@ impl Table {
     }
 }
 
-/// The file and what is not in it yet.
 #[derive(Debug)]
 pub(super) struct AppendLog {
-    /// Its name, for messages.
     name: String,
     file: File,
     /// Bytes of it that are whole rows.
     length: u64,
     waiting: VecDeque<Vec<u8>>,
     lost: u64,
-    /// The first error.
     failed: Option<io::Error>,
 }
 
@@ -213,7 +209,6 @@ mod tests {
         assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
     }
 
-    /// A file on a full disk.
     fn full(path: &Path) -> AppendLog {
         let mut table = AppendLog::create(path, b"a\n").unwrap();
         table.file = File::options().append(true).open("/dev/full").unwrap();

@@ -84,18 +84,16 @@ fn of_disk((server, account): (&ServerAnswer, &PartsStatus)) -> Option<String> {
 }
 
 fn of_learner(view: &RunView) -> Option<String> {
-    let connects = view
-        .servers
-        .iter()
-        .map(|it| format!(" --connect {}", it.endpoint));
-    let flags = connects.collect::<String>() + certificates(&view.servers[0].endpoint);
+    let servers = view.servers.iter();
+    let connects: String = servers
+        .map(|it| format!(" --connect {}", it.endpoint))
+        .collect();
+    let tls = certificates(&view.servers[0].endpoint);
+    let command = format!("`driml learner{connects}{tls} --run-dir DIR`");
     match parts(view).find(|(_, part)| part.who == PartName::Learner) {
-        None => Some(format!(
-            "no learner has joined: start `driml learner{flags} --run-dir DIR`"
-        )),
+        None => Some(format!("no learner has joined: start {command}")),
         Some((_, learner)) if !learner.connected => Some(format!(
-            "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: \
-             `driml learner{flags} --run-dir DIR`",
+            "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: {command}",
             seconds(learner.since_s)
         )),
         Some(_) if view.learner_status().is_none() => Some(
@@ -106,9 +104,8 @@ fn of_learner(view: &RunView) -> Option<String> {
 }
 
 fn of_actors(view: &RunView) -> Vec<String> {
-    let actors: Vec<_> = parts(view)
-        .filter(|(_, part)| part.who != PartName::Learner)
-        .collect();
+    let is_actor = |(_, part): &(_, &PartStatus)| part.who != PartName::Learner;
+    let actors: Vec<_> = parts(view).filter(is_actor).collect();
     if !actors.iter().any(|(_, part)| part.connected) {
         let endpoint = &view.servers[0].endpoint;
         let what = match actors.is_empty() {
@@ -125,10 +122,9 @@ fn of_actors(view: &RunView) -> Vec<String> {
             return None;
         };
         if !part.connected {
+            let (since, tls) = (seconds(part.since_s), certificates(endpoint));
             return Some(format!(
-                "actor-{id} disconnected {} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{} --id {id}`",
-                seconds(part.since_s),
-                certificates(endpoint)
+                "actor-{id} disconnected {since} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{tls} --id {id}`"
             ));
         }
         let silent = seconds(silent_for(part)?);
@@ -139,7 +135,6 @@ fn of_actors(view: &RunView) -> Vec<String> {
     actors.iter().filter_map(of_actor).collect()
 }
 
-/// The flag that an endpoint with certificates wants.
 fn certificates(endpoint: &str) -> &'static str {
     match session::is_quic(endpoint) {
         true => " --tls-dir DIR",
@@ -149,10 +144,8 @@ fn certificates(endpoint: &str) -> &'static str {
 
 /// What to say below the live lines: the processes that do not respond, and for how long.
 pub(crate) fn notes(view: &RunView) -> Vec<String> {
-    let recovering = view.recovering();
-    let recovering: Vec<_> = recovering
-        .map(|(server, it)| recovery(&server.name, it))
-        .collect();
+    let recovering = view.recovering().map(|(it, how)| recovery(&it.name, how));
+    let recovering: Vec<_> = recovering.collect();
     if !recovering.is_empty() {
         return recovering;
     }
@@ -211,7 +204,6 @@ fn unresponsive_actors(view: &RunView) -> Vec<String> {
     words
 }
 
-/// A time in seconds for a person.
 pub(super) fn seconds(seconds: f64) -> String {
     duration(Duration::try_from_secs_f64(seconds).unwrap_or_default())
 }
@@ -222,25 +214,16 @@ mod tests {
     use expect_test::expect;
 
     use super::*;
-    use crate::run_view::Plan;
+    use crate::{run_view::Plan, testing::with};
 
     /// A run whose only replay server does not answer any more; `waiting` is what it answered last.
     fn silent(is_gone: bool, waiting: Waiting) -> RunView {
         let mut view = RunView::new(Plan::default());
-        view.take_replay(vec![ReplayStatus {
-            waiting,
-            ..ReplayStatus::default()
-        }]);
-        view.servers = vec![ServerAnswer {
-            name: "replay-server".into(),
-            endpoint: "tcp/host:1".into(),
-            replay: None,
-            parts: None,
-            recovering: None,
-            error: Some("no answer".into()),
-            is_gone,
-            is_another_run: false,
-        }];
+        view.take_replay(vec![with(|it: &mut ReplayStatus| it.waiting = waiting)]);
+        view.servers = vec![with(|it: &mut ServerAnswer| {
+            it.endpoint = "tcp/host:1".into();
+            (it.error, it.is_gone) = (Some("no answer".into()), is_gone);
+        })];
         view
     }
 

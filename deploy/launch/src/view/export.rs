@@ -15,14 +15,11 @@ use crate::{
     run_view::{Plan, RunView, ServerAnswer},
 };
 
-/// The object that `--json` prints.
 #[derive(Serialize)]
 struct Answer<'a> {
     #[serde(flatten)]
     plan: &'a Plan,
-    /// Nothing is missing.
     well: bool,
-    /// Everything is learned and saved.
     finished: bool,
     #[serde(flatten)]
     metrics: BTreeMap<&'static str, serde_json::Value>,
@@ -35,7 +32,6 @@ struct Answer<'a> {
     to_go_on: Vec<String>,
 }
 
-/// The run as one line of JSON.
 pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
     let to_go_on = needed(view);
     let answer = Answer {
@@ -97,14 +93,13 @@ fn prometheus(view: &RunView) -> String {
         let planned = [plan.frames_planned, plan.updates_planned].map(|it| it as f64);
         page.gauge("frames_planned", "Frames of the whole run.", planned[0]);
         page.gauge("updates_planned", "Updates of the whole run.", planned[1]);
-        let finished = view.is_finished().into();
-        page.gauge(
-            "finished",
+        let is_so = [view.is_finished(), needed(view).is_empty()].map(f64::from);
+        let [finished, well] = [
             "Whether everything is learned and saved.",
-            finished,
-        );
-        let well = needed(view).is_empty().into();
-        page.gauge("well", "Whether no process of the run is missing.", well);
+            "Whether no process of the run is missing.",
+        ];
+        page.gauge("finished", finished, is_so[0]);
+        page.gauge("well", well, is_so[1]);
     }
     page.text
 }
@@ -182,7 +177,6 @@ impl Page {
     }
 }
 
-/// A label's value.
 fn escaped(text: &str) -> String {
     let text = text.replace('\\', "\\\\").replace('"', "\\\"");
     text.replace('\n', "\\n")

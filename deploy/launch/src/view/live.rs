@@ -12,7 +12,6 @@ use crate::{
     run_view::Plan,
 };
 
-/// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// How long updates run before the rates are steady enough to estimate the time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
@@ -140,7 +139,7 @@ impl Display {
             progress(&self.plan, moment, true),
             format!(
                 "return {} ({} episodes){losses}{k}  {}{}",
-                number(moment.episodes.mean_return.map(|it| it.mean)),
+                number(moment.episodes.mean_return),
                 moment.episodes.count,
                 waiting(replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
@@ -154,7 +153,6 @@ fn plain(elapsed: Duration, texts: &[String]) -> String {
     format!("{}  {}", duration(elapsed), texts.join("  "))
 }
 
-/// Who waits for whom, and how many actors do.
 fn waiting(replay: &ReplayStatus) -> String {
     match (replay.waiting, replay.actors_waiting) {
         (Waiting::ActorsWaitForLearner, waiting @ 1..) if waiting <= replay.actors => {
@@ -186,16 +184,15 @@ mod tests {
 
     use super::*;
     use crate::{
-        moment::{Episodes, MeanReturn, Speed, Spread},
+        moment::{Speed, Spread},
         run_view::RunView,
+        testing::with,
     };
 
     fn display(frames_planned: u64, updates_planned: u64) -> Display {
-        let plan = Plan {
-            frames_planned,
-            updates_planned,
-            ..Plan::default()
-        };
+        let plan = with(|it: &mut Plan| {
+            (it.frames_planned, it.updates_planned) = (frames_planned, updates_planned);
+        });
         Display::new(Screen::plain(), plan, Instant::now(), 0)
     }
 
@@ -218,31 +215,17 @@ mod tests {
             actors_waiting: 23,
             ..ReplayStatus::default()
         };
-        let learner = LearnerStatus {
-            updates: 1000,
-            c51_kl: 0.1234,
-            losses: vec![("dim_4t4".into(), 4.0)],
-            ..LearnerStatus::default()
-        };
+        let learner = with(|it: &mut LearnerStatus| {
+            (it.updates, it.c51_kl) = (1000, 0.1234);
+            it.losses = vec![("dim_4t4".into(), 4.0)];
+        });
+        let (mean, sd) = (2.25, 1.0);
+        let (frames, updates) = (160.0, 5.0);
         let view = view(replay, learner);
-        let moment = Moment {
-            episodes: Episodes {
-                count: 45,
-                mean_return: Some(MeanReturn {
-                    mean: 1.234,
-                    of: 45,
-                }),
-            },
-            k: Some(Spread {
-                mean: 2.25,
-                sd: 1.0,
-            }),
-            speed: Speed {
-                frames: 160.0,
-                updates: 5.0,
-            },
-            ..view.moment()
-        };
+        let mut moment = view.moment();
+        (moment.episodes.count, moment.episodes.mean_return) = (45, Some(1.234));
+        moment.k = Some(Spread { mean, sd });
+        moment.speed = Speed { frames, updates };
         display.learns_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
@@ -253,41 +236,37 @@ mod tests {
     #[test]
     fn before_the_first_update_there_is_no_loss_and_no_time_left() {
         let mut display = display(8_000, 218);
-        let nothing = view(ReplayStatus::default(), LearnerStatus::default());
-        display.show(&nothing.moment(), &[]);
+        let mut shown = |frames, updates| {
+            let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = frames);
+            let view = view(replay, with(|it: &mut LearnerStatus| it.updates = updates));
+            display.show(&view.moment(), &[]);
+            display.text(&view.moment()).join("\n")
+        };
         expect![[r#"
             frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -
             return - (0 episodes)  neither side waits"#]]
-        .assert_eq(&display.text(&nothing.moment()).join("\n"));
-        let replay = ReplayStatus {
-            transitions_inserted: 8_192,
-            ..ReplayStatus::default()
-        };
-        let learner = LearnerStatus {
-            updates: 224,
-            ..LearnerStatus::default()
-        };
-        let all = view(replay, learner);
-        display.show(&all.moment(), &[]);
+        .assert_eq(&shown(0, 0));
         expect![[r#"
             frames 8000/8000 (+192) (0/s)  updates 218/218 (+6) (0.0/s)  replay ratio 0.00
             return - (0 episodes)  C51 0.000  neither side waits"#]]
-        .assert_eq(&display.text(&all.moment()).join("\n"));
+        .assert_eq(&shown(8_192, 224));
+        let nothing_happens = (10, 0.0);
+        assert_eq!(time_left(nothing_happens, (0, 0.0)), None);
     }
 
     #[test]
     fn an_actor_that_has_gone_is_none_of_those_connected() {
-        let with_connected = |actors| ReplayStatus {
-            waiting: Waiting::ActorsWaitForLearner,
-            actors,
-            actors_waiting: 2,
-            ..ReplayStatus::default()
-        };
-        let said = [2, 1].map(|actors| waiting(&with_connected(actors)));
-        expect![[r#"
-            2 of 2 actors wait for learner
-            chunks of 2 actors wait for learner"#]]
-        .assert_eq(&said.join("\n"));
+        let said = [2, 1].map(|actors| {
+            waiting(&with(|it: &mut ReplayStatus| {
+                it.waiting = Waiting::ActorsWaitForLearner;
+                (it.actors, it.actors_waiting) = (actors, 2);
+            }))
+        });
+        let expected = [
+            "2 of 2 actors wait for learner",
+            "chunks of 2 actors wait for learner",
+        ];
+        assert_eq!(said, expected);
     }
 
     #[test]
@@ -295,15 +274,6 @@ mod tests {
         let texts = ["frames 1/2", "return 3"].map(str::to_owned);
         let said = plain(Duration::from_secs(83), &texts);
         assert_eq!(said, "1 min 23 s  frames 1/2  return 3");
-    }
-
-    #[test]
-    fn no_time_is_left_to_guess_while_nothing_happens() {
-        assert_eq!(time_left((10, 0.0), (0, 0.0)), None);
-    }
-
-    #[test]
-    fn the_template_is_one() {
         assert!(indicatif::ProgressStyle::with_template(TEMPLATE).is_ok());
     }
 }

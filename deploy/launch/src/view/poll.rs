@@ -36,7 +36,6 @@ pub struct Poller {
     pub config: RunConfig,
     /// What they have answered.
     pub view: RunView,
-    /// One for each shard of the replay.
     servers: Vec<Reached>,
 }
 
@@ -154,30 +153,27 @@ impl Reached {
     fn ask(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
         let answers = replay.and_then(|it| Ok((it, self.client.fetch::<PartsStatus>(ANSWER_MAX)?)));
-        let is_another_run = matches!(
-            &answers,
-            Err(SessionError::Unreadable { why, .. }) if matches!(why, CodecError::RunSpec { .. })
-        );
-        let (answers, recovering, error) = match answers {
-            Ok(answers) => (Some(answers), None, None),
-            Err(SessionError::Recovering(it)) => (None, Some(it.progress), None),
-            Err(e) => (None, None, Some(e.to_string())),
-        };
-        let (replay, parts) = answers.unzip();
-        ServerAnswer {
+        let mut answer = ServerAnswer {
             name: self.name.clone(),
             endpoint: self.endpoint.clone(),
-            replay,
-            parts,
-            recovering,
-            is_gone: error.is_some() && reach::look(&self.endpoint).is_err(),
-            error,
-            is_another_run,
+            ..ServerAnswer::default()
+        };
+        match answers {
+            Ok((replay, parts)) => (answer.replay, answer.parts) = (Some(replay), Some(parts)),
+            Err(SessionError::Recovering(it)) => answer.recovering = Some(it.progress),
+            Err(e) => {
+                answer.is_another_run = matches!(
+                    &e,
+                    SessionError::Unreadable { why, .. } if matches!(why, CodecError::RunSpec { .. })
+                );
+                answer.is_gone = reach::look(&self.endpoint).is_err();
+                answer.error = Some(e.to_string());
+            }
         }
+        answer
     }
 }
 
-/// What a replay server says of its run to those who come.
 struct Greeting {
     config: RunConfig,
     /// Updates after which the run was resumed; none before its learner has joined.

@@ -1,7 +1,6 @@
 //! `driml watch` and `driml status`: the live lines, metrics and summary of a run that other commands have started, on any machine.
 //! It asks and never tells: the run does not depend on whether it is watched.
 
-mod folder;
 mod run_of_folder;
 mod watched;
 
@@ -21,11 +20,9 @@ use crate::{
     view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
 
-/// How often the run is asked.
 const POLL: Duration = Duration::from_secs(1);
 /// The same once all frames are in: the learner's last word is not to be missed, as its process may end soon after.
 const LAST_POLL: Duration = Duration::from_millis(200);
-/// How often a page is shown anew.
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
 /// How a run is looked at, a page at a time.

@@ -1,12 +1,11 @@
 //! Where the processes of the run in a folder can be asked, or what the folder says of a run that is over.
 
-use driml_machine::error::usage;
 use driml_protocol::reach;
-use driml_settings::config::RunConfig;
 
 use crate::{
+    chosen::config_of,
     resume,
-    run_folder::{RunFolder, Summary, progress},
+    run_folder::{Progress, RunFolder, Summary, progress},
 };
 
 /// Whether the run in a folder can be asked.
@@ -22,15 +21,8 @@ pub enum Live {
 /// # Errors
 /// It is not a run's, or one whose processes were started by hand.
 pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
-    let config = std::fs::read_to_string(folder.config()).map_err(|e| {
-        usage!(
-            "{} is not a run folder: reading {}: {e}",
-            folder.display(),
-            folder.config().display()
-        )
-    })?;
+    let config = config_of(folder)?;
     let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
-    let config = RunConfig::parse(&folder.config().display().to_string(), &config)?;
     // A launcher that runs there holds the lock.
     if folder.lock().is_err()
         && let Some(endpoints) = endpoints
@@ -53,9 +45,8 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         let summary = Summary::read(folder)?.describe(folder);
         return Ok(Live::Over(format!("the run is over\n{summary}")));
     }
-    let so_far = progress(folder).map_or("nothing".into(), |so_far| {
-        format!("{} frames and {} episodes", so_far.frames, so_far.episodes)
-    });
+    let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
+    let so_far = progress(folder).map_or("nothing".into(), counts);
     let next = match resume::is_resumable(&config.world, folder) {
         true => format!("`driml train --resume {}` resumes it", folder.display()),
         false => "it has no checkpoint to resume from".into(),

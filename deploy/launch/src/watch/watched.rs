@@ -2,19 +2,22 @@
 //! It asks for no more than the episodes that it records.
 
 use std::{
+    fs,
     path::PathBuf,
     time::{Duration, Instant},
 };
 
-use anyhow::bail;
-use driml_machine::units::duration;
-use driml_protocol::Waiting;
+use anyhow::{Context, bail};
+use driml_machine::{error::usage, units::duration};
+use driml_protocol::{RunSpec, Waiting};
+use driml_settings::config::RunConfig;
 
-use super::folder;
 use crate::{
+    chosen::config_of,
     console::{self, Screen},
+    launcher::process_names,
     moment::Moment,
-    run_folder::{Outcome, RunFolder, RunRecorder, Summary},
+    run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::RunView,
     view::{Display, Poller, TEMPLATE, notes},
 };
@@ -35,7 +38,6 @@ pub struct Outputs {
     pub prometheus: Option<PathBuf>,
 }
 
-/// A run that is watched.
 pub(super) struct Watched {
     screen: Screen,
     display: Display,
@@ -50,7 +52,7 @@ impl Watched {
         let (config, view) = (&poller.config, &poller.view);
         let mut recorder = None;
         if let Some(folder) = &outputs.run_dir {
-            let recorder = recorder.insert(folder::record(folder, config, view)?);
+            let recorder = recorder.insert(record(folder, config, view)?);
             if outputs.tensorboard {
                 recorder.write_events(folder)?;
             }
@@ -83,8 +85,7 @@ impl Watched {
         }
         if let Some(recorder) = self.recorder.as_mut().filter(|_| poller.view.is_answered()) {
             let ask = |shard, since| poller.episodes(shard, since);
-            let mut warnings = recorder.record_episodes(&poller.view, ask);
-            warnings.extend(recorder.record(&poller.view, &[]));
+            let warnings = recorder.record_all(&poller.view, &[], ask);
             warnings.iter().for_each(|line| self.screen.line(line));
         }
         let view = &poller.view;
@@ -93,7 +94,6 @@ impl Watched {
         self.is_over(poller)
     }
 
-    /// Writes a line above the live lines.
     pub(super) fn say(&self, line: &str) {
         self.screen.line(line);
     }
@@ -131,10 +131,12 @@ impl Watched {
             "the learner's last answer is missing: its updates are those whose batches were served, its losses and weights those before",
         );
         poller.view.learner.updates = updates;
-        if let Some(recorder) = &mut self.recorder {
-            let warnings = recorder.record(&poller.view, &[]);
-            warnings.iter().for_each(|line| self.screen.line(line));
-        }
+        let recorded = self.recorder.as_mut();
+        let warnings = recorded.map(|it| it.record(&poller.view, &[]));
+        warnings
+            .iter()
+            .flatten()
+            .for_each(|line| self.screen.line(line));
     }
 
     /// Takes the live lines away, says what could not be recorded, and gives the summary of a run that ended so.
@@ -161,12 +163,86 @@ impl Watched {
 
 /// What is shown of a run: of all of it where it is recorded.
 fn moment<'a>(recorder: Option<&'a RunRecorder>, view: &'a RunView) -> Moment<'a> {
-    recorder.map_or_else(
-        || Moment {
-            // Until it answers it has its last status.
-            learner: Some(&view.learner),
-            ..view.moment()
-        },
-        |it| it.moment(view),
+    let of_view = || Moment {
+        // Until it answers it has its last status.
+        learner: Some(&view.learner),
+        ..view.moment()
+    };
+    recorder.map_or_else(of_view, |it| it.moment(view))
+}
+
+/// Begins to record the run in `folder`, or continues.
+fn record(folder: &RunFolder, config: &RunConfig, view: &RunView) -> anyhow::Result<RunRecorder> {
+    let recorded = Recorded::of(config, process_names(config));
+    // A learner may have just begun there.
+    let is_run_s = folder.config().exists() || folder.checkpoints().is_dir();
+    let mut recorder = match is_run_s {
+        false => RunRecorder::create(folder, recorded)?,
+        true => {
+            check_same(folder, config)?;
+            let point = resume_point(folder, view)?;
+            RunRecorder::go_on(folder, recorded, point, u64::MAX).map_err(|e| in_use(folder, e))?
+        }
+    };
+    recorder.count_seconds_from(view.up_s().unwrap_or(0.0));
+    Ok(recorder)
+}
+
+/// Says so if another command writes there.
+fn in_use(folder: &RunFolder, e: anyhow::Error) -> anyhow::Error {
+    match folder.lock() {
+        Ok(_) => e,
+        Err(_) => usage!(
+            "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
+            folder.display()
+        )
+        .into(),
+    }
+}
+
+/// Refuses the folder of a run with other settings.
+fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
+    let there = match folder.config().exists() {
+        true => config_of(folder)?.run,
+        false => return Ok(()),
+    };
+    if there.hash() == config.run.hash() {
+        return Ok(());
+    }
+    let name = |it: &RunSpec| format!("{} with {}, seed {}", it.world, it.agent, it.seed);
+    Err(usage!(
+        "{} holds another run ({}) than the one that is watched ({}): choose another --run-dir",
+        folder.display(),
+        name(&there),
+        name(&config.run)
     )
+    .into())
+}
+
+/// Which of the rows that are there stay.
+fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoint> {
+    let path = folder.metrics();
+    let text = fs::read(&path).unwrap_or_default();
+    let rows = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+    let last = |name| rows.last::<u64>(name).unwrap_or(0);
+    let (frames, updates) = (last("frames"), last("updates"));
+    let now = view.replay.transitions_inserted;
+    let after_updates = view.after_updates.unwrap_or(0);
+    if after_updates == 0 && frames > now {
+        return Err(usage!(
+            "the run in {} had {frames} frames, and the watched run has {now}: it was restarted; choose another --run-dir",
+            folder.display()
+        )
+        .into());
+    }
+    Ok(ResumePoint {
+        // A run that was resumed makes the updates since its checkpoint again.
+        updates: match after_updates {
+            0 => updates,
+            _ => updates.min(view.learner.updates),
+        },
+        rows: view.replay.rows_sampled,
+        frames: now,
+        replay_is_kept: after_updates == 0,
+    })
 }

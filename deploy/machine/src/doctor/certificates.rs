@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
-use super::fact::Fact;
+use super::Fact;
 
 /// A certificate that expires sooner is a note.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
@@ -22,17 +22,15 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         }
     };
     // By the certificate or the key alone, too: then the other one is missing.
-    let names: BTreeSet<String> = entries
-        .flatten()
-        .filter_map(|entry| {
-            let path = entry.path();
-            let is_one = path
-                .extension()
-                .is_some_and(|it| it == "pem" || it == "key");
-            is_one.then(|| path.file_stem()?.to_str().map(str::to_owned))?
-        })
-        .filter(|name| name != "ca")
-        .collect();
+    let name = |entry: fs::DirEntry| {
+        let path = entry.path();
+        let is_one = path
+            .extension()
+            .is_some_and(|it| it == "pem" || it == "key");
+        let name = path.file_stem().filter(|it| is_one && *it != "ca")?;
+        name.to_str().map(str::to_owned)
+    };
+    let names: BTreeSet<_> = entries.flatten().filter_map(name).collect();
     let mut facts = Vec::new();
     let mut roles = Vec::new();
     for name in &names {

@@ -1,12 +1,10 @@
 //! The NVIDIA GPUs that this program can compute on, which it can only if it was built with the feature `cuda`.
 //! Nothing here is needed for training on the CPU, and nothing is computed on a device.
 
-use super::fact::{Fact, State};
+use super::{Fact, State};
 use crate::error::{Usage, usage};
 
-/// What the fact is about where there is no device.
 const DEVICES: &str = "cuda";
-/// How to get a program that can use a GPU.
 #[cfg(not(feature = "cuda"))]
 const TO_BUILD: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
      that has it, without a toolkit `deploy/cuda/build.sh`";

@@ -3,20 +3,20 @@
 
 use procgen_sys::{Engine, InstallError};
 
-use super::fact::Fact;
+use super::Fact;
 
 const WHAT: &str = "Procgen";
 
 /// Whether Procgen's engine is in the cache folder and loads.
 pub(super) fn fact() -> Fact {
     match Engine::locate() {
-        Ok(engine) => match engine.check_loads() {
-            Ok(()) => {
-                let library = engine.library().display();
-                Fact::ok(WHAT, format!("the engine is {library} and loads"))
+        Ok(engine) => {
+            let library = engine.library().display();
+            match engine.check_loads() {
+                Ok(()) => Fact::ok(WHAT, format!("the engine is {library} and loads")),
+                Err(why) => Fact::missing(WHAT, why.to_string()),
             }
-            Err(why) => Fact::missing(WHAT, why.to_string()),
-        },
+        }
         Err(InstallError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
         Err(why) => Fact::missing(WHAT, why.to_string()),
     }
@@ -38,16 +38,17 @@ fn not_there(reason: &str, source: Result<String, InstallError>) -> Fact {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::fact::State;
+    use crate::doctor::State;
 
     #[test]
     fn an_engine_that_can_be_fetched_is_a_note_and_one_that_cannot_is_missing() {
-        let fact = not_there("it is not installed", Ok("`pip`".into()));
-        assert_eq!(fact.state, State::Note);
-        assert!(fact.text.contains("`driml procgen install`"), "{fact}");
         let no_pip = InstallError::Fetch("install python3-pip".into());
-        let fact = not_there("it is not installed", Err(no_pip));
-        assert_eq!(fact.state, State::Missing);
-        assert!(fact.text.contains("python3-pip"), "{fact}");
+        for (source, state, text) in [
+            (Ok("`pip`".into()), State::Note, "`driml procgen install`"),
+            (Err(no_pip), State::Missing, "python3-pip"),
+        ] {
+            let fact = not_there("it is not installed", source);
+            assert!(fact.state == state && fact.text.contains(text), "{fact}");
+        }
     }
 }

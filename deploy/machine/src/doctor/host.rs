@@ -7,7 +7,7 @@ use driml_model::{Precision, kernels_in_words};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
-use super::fact::{Fact, State};
+use super::{Fact, State};
 use crate::{resources::Machine, units::gib};
 
 /// Below this a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.
@@ -20,23 +20,14 @@ const SHARED_MEMORY_ENOUGH: u64 = 256 << 20;
 const DISK_MIN: u64 = 100 << 20;
 /// What a long run's checkpoints, metrics and logs take, rounded up, bytes.
 const DISK_ENOUGH: u64 = 1 << 30;
-/// Bytes of one of Procgen's frames.
 const FRAME_BYTES: u64 = 64 * 64 * 3;
-
-/// Vector instructions that the kernels of the matrix products can use.
-#[derive(Clone, Copy, Debug)]
-struct Vectors {
-    avx2: bool,
-    fma: bool,
-    avx512f: bool,
-}
 
 /// All of them. `runs` is where run folders would be.
 pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let machine = Machine::this();
     vec![
         cores(machine.cores),
-        vectors(Vectors::this()),
+        vectors(floats_at_once()),
         kernels(),
         memory(&machine),
         shared_memory(shared_memory::free_bytes()),
@@ -45,54 +36,45 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     ]
 }
 
-impl Vectors {
-    #[cfg(target_arch = "x86_64")]
-    fn this() -> Option<Self> {
-        Some(Self {
-            avx2: std::is_x86_feature_detected!("avx2"),
-            fma: std::is_x86_feature_detected!("fma"),
-            avx512f: std::is_x86_feature_detected!("avx512f"),
-        })
-    }
-
-    #[cfg(not(target_arch = "x86_64"))]
-    fn this() -> Option<Self> {
-        None
-    }
-}
-
 fn cores(cores: u32) -> Fact {
     let machine = Machine {
         cores,
-        memory_bytes: 0,
-        fast_bf16: false,
+        ..Machine::default()
     };
-    let text = format!(
-        "{cores}, all of them for the learner; --actors is {} unless given",
-        machine.actors()
-    );
+    let actors = machine.actors();
+    let text = format!("{cores}, all of them for the learner; --actors is {actors} unless given");
     match cores {
         0 | 1 => Fact::note("cores", format!("{text}; all processes share it")),
         _ => Fact::ok("cores", text),
     }
 }
 
-fn vectors(found: Option<Vectors>) -> Fact {
+/// Floats that the vector instructions take at once which the kernels can use; 1 without AVX2 and FMA.
+#[cfg(target_arch = "x86_64")]
+fn floats_at_once() -> Option<u32> {
+    let has_avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+    Some(match (is_x86_feature_detected!("avx512f"), has_avx2) {
+        (true, _) => 16,
+        (false, true) => 8,
+        (false, false) => 1,
+    })
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn floats_at_once() -> Option<u32> {
+    None
+}
+
+fn vectors(at_once: Option<u32>) -> Fact {
     let what = "vectors";
-    match found {
-        None => Fact::note(
-            what,
-            format!(
-                "not x86-64 but {}: it was never measured there",
-                std::env::consts::ARCH
-            ),
-        ),
-        Some(Vectors { avx512f: true, .. }) => Fact::ok(what, "AVX-512: 16 float32 at once"),
-        Some(Vectors {
-            avx2: true,
-            fma: true,
-            ..
-        }) => Fact::ok(what, "AVX2 and FMA: 8 float32 at once; there is no AVX-512"),
+    match at_once {
+        None => {
+            let arch = std::env::consts::ARCH;
+            let text = format!("not x86-64 but {arch}: it was never measured there");
+            Fact::note(what, text)
+        }
+        Some(16) => Fact::ok(what, "AVX-512: 16 float32 at once"),
+        Some(8) => Fact::ok(what, "AVX2 and FMA: 8 float32 at once; there is no AVX-512"),
         Some(_) => Fact::note(
             what,
             "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?",
@@ -191,11 +173,9 @@ fn disk(runs: &Path) -> Fact {
     }
 }
 
-/// Bytes that this user can still write there.
 fn free(folder: &Path) -> Result<u64, String> {
-    statvfs(folder)
-        .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))
-        .map_err(|e| format!("{}: {e}", folder.display()))
+    let disk = statvfs(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
+    Ok(disk.blocks_available().saturating_mul(disk.fragment_size()))
 }
 
 #[cfg(test)]
@@ -204,34 +184,35 @@ mod tests {
 
     #[test]
     fn each_fact_has_its_state() {
-        let vectors_of = |avx2, fma, avx512f| vectors(Some(Vectors { avx2, fma, avx512f })).state;
-        assert_eq!(vectors_of(true, true, true), State::Ok);
-        assert_eq!(vectors_of(true, true, false), State::Ok);
-        assert_eq!(vectors_of(true, false, false), State::Note);
-        assert_eq!(vectors(None).state, State::Note);
-        let machine = |memory_bytes| Machine {
-            cores: 2,
-            memory_bytes,
-            fast_bf16: false,
+        let memory_of = |memory_bytes| {
+            memory(&Machine {
+                memory_bytes,
+                ..Machine::default()
+            })
         };
-        let memory_of = |bytes| memory(&machine(bytes)).state;
-        assert_eq!(memory_of(1 << 29), State::Missing);
-        assert_eq!(memory_of(2 << 30), State::Note);
-        assert_eq!(memory_of(8 << 30), State::Ok);
-        // What docker grants unless it is told otherwise.
-        assert_eq!(shared_memory(Ok(64 << 20)).state, State::Note);
-        assert_eq!(shared_memory(Ok(1 << 30)).state, State::Ok);
-        let none = shared_memory(Err("no such folder".into()));
-        assert_eq!(none.state, State::Note);
-        // The kernel's usual limit for an ordinary account.
-        let locked = locked_memory(Some(8 << 20));
-        assert_eq!(locked.state, State::Note);
-        let why = "`ulimit -l` allows 8192 KiB";
-        assert!(locked.text.contains(why), "{locked}");
-        assert_eq!(locked_memory(Some(1 << 30)).state, State::Ok);
-        assert_eq!(locked_memory(None).state, State::Ok);
-        assert_eq!(cores(1).state, State::Note);
-        assert_eq!(cores(2).state, State::Ok);
+        for (fact, state) in [
+            (vectors(Some(16)), State::Ok),
+            (vectors(Some(8)), State::Ok),
+            (vectors(Some(1)), State::Note),
+            (vectors(None), State::Note),
+            (memory_of(1 << 29), State::Missing),
+            (memory_of(2 << 30), State::Note),
+            (memory_of(8 << 30), State::Ok),
+            // What docker grants unless it is told otherwise.
+            (shared_memory(Ok(64 << 20)), State::Note),
+            (shared_memory(Ok(1 << 30)), State::Ok),
+            (shared_memory(Err("no such folder".into())), State::Note),
+            // The kernel's usual limit for an ordinary account.
+            (locked_memory(Some(8 << 20)), State::Note),
+            (locked_memory(Some(1 << 30)), State::Ok),
+            (locked_memory(None), State::Ok),
+            (cores(1), State::Note),
+            (cores(2), State::Ok),
+        ] {
+            assert_eq!(fact.state, state, "{fact}");
+        }
+        let locked = locked_memory(Some(8 << 20)).text;
+        assert!(locked.contains("`ulimit -l` allows 8192 KiB"), "{locked}");
     }
 
     #[test]

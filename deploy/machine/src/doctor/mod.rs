@@ -4,14 +4,68 @@
 mod certificates;
 pub(crate) mod cuda;
 mod engine;
-mod fact;
 mod host;
 
-use std::path::Path;
+use std::{fmt, path::Path};
 
 use anyhow::ensure;
+use serde::Serialize;
 
-use self::fact::{Fact, State};
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum State {
+    /// As it should be.
+    Ok,
+    /// It works without, or slower.
+    Note,
+    /// What is asked for cannot be had; the text says what to do.
+    Missing,
+}
+
+/// What was found out about one thing that a run needs.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+struct Fact {
+    state: State,
+    /// What it is about, such as `cores`.
+    what: String,
+    /// What is so, and what to do if that should change.
+    text: String,
+}
+
+impl Fact {
+    fn ok(what: &str, text: impl Into<String>) -> Self {
+        Self::new(State::Ok, what, text)
+    }
+
+    fn note(what: &str, text: impl Into<String>) -> Self {
+        Self::new(State::Note, what, text)
+    }
+
+    fn missing(what: &str, text: impl Into<String>) -> Self {
+        Self::new(State::Missing, what, text)
+    }
+
+    fn new(state: State, what: &str, text: impl Into<String>) -> Self {
+        Self {
+            state,
+            what: what.into(),
+            text: text.into(),
+        }
+    }
+}
+
+impl fmt::Display for Fact {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let state = match self.state {
+            State::Ok => "ok",
+            State::Note => "note",
+            State::Missing => "missing",
+        };
+        // One line a fact, whatever an error's text has.
+        let text = self.text.split_whitespace().collect::<Vec<_>>().join(" ");
+        write!(f, "{state:<8} {:<17} {text}", self.what)
+    }
+}
 
 /// What was found out, for the CPU and for CUDA.
 #[derive(Debug)]
@@ -79,7 +133,6 @@ fn describe(facts: &[Fact], verdict: &str) -> String {
     format!("{}\n{verdict}\n", lines.collect::<String>())
 }
 
-/// What can be trained on.
 fn verdict(cpu: &[Fact], cuda: &[Fact]) -> &'static str {
     let cpu = cpu.iter().all(|fact| fact.state != State::Missing);
     let cuda = cuda::is_ready(cuda);
@@ -112,9 +165,12 @@ mod tests {
 
     #[test]
     fn every_fact_is_a_line_and_the_verdict_stands_apart() {
-        let facts = [Fact::ok("cores", "2"), Fact::note("cuda", "none")];
+        let broken = Fact::missing("Procgen", "not there:\n  do this");
+        let facts = [Fact::ok("cores", "2"), broken.clone()];
         let text = describe(&facts, "Done.");
-        assert_eq!(text.lines().count(), 4, "{text}");
-        assert!(text.ends_with("\n\nDone.\n"), "{text}");
+        let lines = "ok       cores             2\nmissing  Procgen           not there: do this\n\nDone.\n";
+        assert_eq!(text, lines);
+        let json = serde_json::to_string(&broken).unwrap();
+        assert!(json.contains(r#""state":"missing""#), "{json}");
     }
 }

@@ -28,6 +28,18 @@ fn sets(sets: &[&str]) -> Flags {
     }
 }
 
+fn frames(frames: u64, set: &[&str]) -> Flags {
+    Flags {
+        frames: Some(frames),
+        ..sets(set)
+    }
+}
+
+fn of_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> {
+    let file = Source::File(name.into(), text);
+    resolve(&file, &sets(set), &MACHINE).map_err(|e| e.to_string())
+}
+
 fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
     resolve(&source("paper", world, agent), &sets(set), &MACHINE).map_err(|e| e.to_string())
 }
@@ -40,13 +52,12 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
             for agent in AGENTS {
                 let source = Source::Layers(preset, world, agent.name);
                 let config = match resolve(&source, &Flags::default(), &MACHINE) {
+                    Ok(config) => config,
                     Err(e) if e.0.contains("take --preset paper") => continue,
-                    other => other
-                        .unwrap_or_else(|e| panic!("{} {world} {}: {e}", preset.name, agent.name)),
+                    Err(e) => panic!("{} {world} {}: {e}", preset.name, agent.name),
                 };
                 let text = config.to_toml();
-                let file = Source::File("config.toml".into(), text.clone());
-                let again = resolve(&file, &Flags::default(), &MACHINE).unwrap();
+                let again = of_file("config.toml", text.clone(), &[]).unwrap();
                 assert_eq!(again.run.hash(), config.run.hash());
                 assert_eq!(again.to_toml(), text);
                 let mut read = RunConfig::parse("config.toml", &text).unwrap();
@@ -60,8 +71,8 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     }
     // Five presets are for all worlds, three for Procgen's games.
     let all = WorldName::all().count();
-    let games = WorldName::all().filter(|world| world.kind() == "procgen");
-    let games = games.count();
+    let is_game = |world: &WorldName| world.kind() == "procgen";
+    let games = WorldName::all().filter(is_game).count();
     assert_eq!(resolved, (5 * all + 3 * games) * AGENTS.len());
 }
 
@@ -116,12 +127,10 @@ fn frames_are_cut_where_nothing_reads_them() {
     let text = old.to_toml();
     assert!(!text.contains("[input.frame]"), "{text}");
     assert_eq!(RunConfig::parse("old.toml", &text).unwrap(), old);
-    let file = Source::File("old.toml".into(), text);
-    let again = resolve(&file, &sets(&["run.seed=7"]), &MACHINE).unwrap();
+    let again = of_file("old.toml", text, &["run.seed=7"]).unwrap();
     assert_eq!((sizes(&again), again.run.seed), (sizes(&old), 7));
-    let file = Source::File("new.toml".into(), cut.to_toml());
-    let size = sets(&["input.height=104", "input.width=80"]);
-    let again = resolve(&file, &size, &MACHINE).unwrap();
+    let size = ["input.height=104", "input.width=80"];
+    let again = of_file("new.toml", cut.to_toml(), &size).unwrap();
     assert_eq!(sizes(&again), sizes(&large));
     let wrong = cut
         .to_toml()
@@ -232,11 +241,7 @@ fn a_ladder_of_epsilons_is_for_the_actors_of_the_run() {
 #[test]
 fn a_file_at_odds_with_itself_is_refused() {
     let text = with("mspacman", "c51", &[]).unwrap().to_toml();
-    let said = |text: String| {
-        let file = Source::File("x.toml".into(), text);
-        let refused = resolve(&file, &Flags::default(), &MACHINE);
-        refused.unwrap_err().to_string()
-    };
+    let said = |text: String| of_file("x.toml", text, &[]).unwrap_err();
     expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
     expect![
         "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
@@ -256,33 +261,28 @@ fn a_file_at_odds_with_itself_is_refused() {
 
 #[test]
 fn a_run_prints_what_its_preset_gives_up() {
-    for (preset, price) in [
-        ("exact", None),
-        ("balanced", Some("6%")),
-        ("fast", Some("15%")),
-    ] {
+    let printed = |preset| {
         let source = source(preset, "mspacman", "c51");
         let notes = resolve(&source, &Flags::default(), &MACHINE).unwrap().notes;
-        let printed = notes.iter().find(|note| note.contains("results/tradeoff"));
-        assert_eq!(printed.is_some(), price.is_some(), "{notes:?}");
-        if let (Some(printed), Some(price)) = (printed, price) {
-            assert!(
-                printed.starts_with(preset) && printed.contains(price),
-                "{printed}"
-            );
-        }
+        notes.join("\n")
+    };
+    assert!(!printed("exact").contains("results/tradeoff"));
+    for (preset, price) in [("balanced", "6%"), ("fast", "15%")] {
+        let said = printed(preset);
+        let all = [price, "results/tradeoff"]
+            .iter()
+            .all(|it| said.contains(it));
+        assert!(said.starts_with(preset) && all, "{said}");
     }
 }
 
 #[test]
 fn flags_come_before_set_and_both_before_the_machine() {
     let flags = Flags {
-        replay_shards: None,
-        frames: Some(7_000),
         seed: Some(5),
         actors: Some(3),
         envs: Some(2),
-        sets: vec!["run.seed=6".into()],
+        ..frames(7_000, &["run.seed=6"])
     };
     let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
     let (run, local) = (&config.run, &config.local);
@@ -292,16 +292,13 @@ fn flags_come_before_set_and_both_before_the_machine() {
 
 #[test]
 fn an_automatic_precision_is_the_processors_fastest_and_f32_on_a_gpu() {
-    let of = |fast_bf16, sets: &[&str]| {
-        let flags = Flags {
-            sets: sets.iter().map(ToString::to_string).collect(),
-            ..Flags::default()
-        };
+    let of = |fast_bf16, set: &[&str]| {
         let machine = Machine {
             fast_bf16,
             ..MACHINE
         };
-        let config = resolve(&source("tuned", "procgen:maze", "c51"), &flags, &machine).unwrap();
+        let source = source("tuned", "procgen:maze", "c51");
+        let config = resolve(&source, &sets(set), &machine).unwrap();
         [config.actor.precision, config.learner.precision].map(|it| it.to_string())
     };
     let cuda = "local.learner_device=cuda:0";
@@ -314,26 +311,18 @@ fn an_automatic_precision_is_the_processors_fastest_and_f32_on_a_gpu() {
 
 #[test]
 fn the_replay_fits_the_memory_and_says_so() {
-    let flags = Flags {
-        frames: Some(50_000_000),
-        ..Flags::default()
-    };
-    let small = Machine {
-        memory_bytes: 8 << 30,
-        ..MACHINE
-    };
-    let of = |world, machine| {
+    let of = |world, gib: u64| {
+        let machine = Machine {
+            memory_bytes: gib << 30,
+            ..MACHINE
+        };
         let source = source("paper", world, "driml-fix");
-        resolve(&source, &flags, machine).unwrap()
+        resolve(&source, &frames(50_000_000, &[]), &machine).unwrap()
     };
-    let config = of("procgen:bigfish", &small);
+    let config = of("procgen:bigfish", 8);
     expect!["the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and it takes half, or what actors and learner leave"].assert_eq(&config.notes.join("\n"));
     assert!(config.replay.capacity_transitions < 400_000);
-    let large = Machine {
-        memory_bytes: 64 << 30,
-        ..MACHINE
-    };
-    let config = of("procgen:heist", &large);
+    let config = of("procgen:heist", 64);
     let capacity = config.replay.capacity_transitions;
     assert_eq!((capacity, config.notes.len()), (1_000_000, 0));
 }
@@ -344,10 +333,8 @@ fn a_compressed_replay_is_bounded_in_bytes_instead() {
     let million = "replay.transitions_max=1000000";
     let config = with("procgen:bigfish", "c51", &[lz4, million]).unwrap();
     let replay = &config.replay;
-    assert_eq!(
-        (replay.capacity_transitions, replay.compressed_bytes_max),
-        (1_000_000, Some((8 << 30) - 128_000_000))
-    );
+    let sizes = (replay.capacity_transitions, replay.compressed_bytes_max);
+    assert_eq!(sizes, (1_000_000, Some((8 << 30) - 128_000_000)));
     expect!["compressed frames may take 7.9 GiB, as 16.0 GiB of memory are free; if they compress badly, the replay holds fewer than 1000000 transitions"].assert_eq(&config.notes.join("\n"));
     // What fits without compressing at all needs no bound.
     let capacity = "replay.capacity_transitions=100000";
@@ -361,10 +348,7 @@ fn rows_are_drawn_by_the_rule_that_is_set() {
     let config = with("chain", "c51", &[]).unwrap();
     assert_eq!(config.replay.sampling, Sampling::Uniform);
     // Rainbow's numbers; beta rises over the whole run.
-    let flags = Flags {
-        frames: Some(33_000),
-        ..sets(&[all])
-    };
+    let flags = frames(33_000, &[all]);
     let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
     let updates = (33_000 - config.replay.warmup_transitions) as f64 * config.replay.replay_ratio
         / f64::from(config.learner.batch_size);
@@ -391,26 +375,18 @@ fn a_torso_has_settings_of_its_own() {
     assert!(nature.model.channels.is_empty() && !nature.model.scale_blocks);
     let impala = with(&["model.torso=impala"]).unwrap();
     let model = &impala.model;
-    assert_eq!(
-        (model.channels.as_slice(), model.scale_blocks),
-        (&[16, 32, 32][..], true)
-    );
-    assert!(model.conv.is_empty());
+    assert_eq!(model.channels, [16, 32, 32]);
+    assert!(model.scale_blocks && model.conv.is_empty());
     // Every pixel is read.
     assert_eq!((impala.run.frame_height, model.width), (64, 64));
     assert_eq!(RunConfig::parse("it", &impala.to_toml()).unwrap(), impala);
     let wide = with(&["model.channels=[32,64]", "model.torso=impoola"]).unwrap();
-    assert_eq!(
-        (wide.model.torso, wide.model.channels.len()),
-        (TorsoName::Impoola, 2)
-    );
+    assert_eq!(wide.model.torso, TorsoName::Impoola);
+    assert_eq!(wide.model.channels.len(), 2);
 
-    let of_file = |config: &RunConfig, set: &[&str]| {
-        let file = Source::File("it.toml".into(), config.to_toml());
-        resolve(&file, &sets(set), &MACHINE).map_err(|e| e.to_string())
-    };
-    let switched = of_file(&nature, &["model.torso=impala", "model.channels=[8]"]).unwrap();
+    let of_nature = |set: &[&str]| of_file("it.toml", nature.to_toml(), set);
+    let switched = of_nature(&["model.torso=impala", "model.channels=[8]"]).unwrap();
     assert!(switched.model.conv.is_empty() && switched.run.frame_height == 64);
     expect!["model configuration: channels is empty, and torso = impala is made of it: set model.channels, or set model.torso to nature"]
-        .assert_eq(&of_file(&nature, &["model.torso=impala"]).unwrap_err());
+        .assert_eq(&of_nature(&["model.torso=impala"]).unwrap_err());
 }

@@ -77,7 +77,6 @@ pub(crate) struct EvaluateArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
-/// Plays, and prints mean and standard deviation.
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.film.record {
         Film::check_name(path).map_err(|e| usage!("--record: {e}"))?;
@@ -137,41 +136,29 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         player.config.actor.precision,
         args.seed
     ))?;
-    let episodes = args.episodes as usize;
-    let mut progress = Progress::new(&spec.agent, episodes);
-    let returns = player.play_watched(
-        Who::Agent,
-        &world,
-        episodes,
-        args.seed,
-        &mut |step, returns| {
+    let play = |who, name: &str, see: &mut dyn FnMut(&Step<'_>)| {
+        let episodes = args.episodes as usize;
+        let mut progress = Progress::new(name, episodes);
+        let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             progress.see(returns);
-            if let Some(film) = &mut film {
-                film.see(step);
-            }
+            see(step);
             ControlFlow::Continue(())
-        },
-    );
-    drop(progress);
-    let returns = match (returns, film) {
-        (Err(e), Some(film)) => {
-            film.discard();
+        };
+        player.play_watched(who, &world, episodes, args.seed, watch)
+    };
+    let see = &mut |step: &Step<'_>| film.iter_mut().for_each(|film| film.see(step));
+    let returns = match (play(Who::Agent, &spec.agent, see), film) {
+        (Err(e), film) => {
+            film.into_iter().for_each(Recording::discard);
             return Err(e);
         }
-        (returns, film) => {
-            let returns = returns?;
+        (Ok(returns), film) => {
             film.map_or(Ok(()), |film| said(&film.finish()?))?;
             returns
         }
     };
     said(&describe(&spec.agent, &returns))?;
-    let mut progress = Progress::new("random", episodes);
-    let see = &mut |_: &Step<'_>, returns: &[f64]| {
-        progress.see(returns);
-        ControlFlow::Continue(())
-    };
-    let random = player.play_watched(Who::Random, &world, episodes, args.seed, see)?;
-    drop(progress);
+    let random = play(Who::Random, "random", &mut |_| ())?;
     said(&describe("random", &random))?;
     let played = [(spec.agent.as_str(), returns), ("random", random)];
     if let Some((path, file)) = &table {
@@ -183,7 +170,6 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Exports the network that plays into a file.
 fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_none_or(|it| it != "safetensors") {
         let name = path.display();

@@ -4,7 +4,6 @@ use std::time::{Duration, Instant};
 
 use driml_launch::{console::Screen, stats::mean_and_deviation, view::TEMPLATE};
 
-/// How often a line is written where there is no terminal.
 const PLAIN_PERIOD: Duration = Duration::from_secs(5);
 
 /// The view of one policy's episodes. Dropping it takes it away.
@@ -12,12 +11,10 @@ pub(super) struct Progress {
     policy: String,
     episodes: usize,
     screen: Screen,
-    /// When the next line is due.
     plain_next: Instant,
 }
 
 impl Progress {
-    /// Before the first episode of `policy`.
     pub(super) fn new(policy: &str, episodes: usize) -> Self {
         Self {
             policy: policy.to_owned(),
@@ -27,19 +24,14 @@ impl Progress {
         }
     }
 
-    /// Shows how far it is, if that is due.
     pub(super) fn see(&mut self, returns: &[f64]) {
         let now = Instant::now();
-        match self.screen.bar() {
-            Some(bar) => {
-                bar.set_position(returns.len() as u64);
-                bar.set_message(self.describe(returns));
-            }
-            None if now >= self.plain_next => {
-                self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&self.describe(returns));
-            }
-            None => {}
+        if let Some(bar) = self.screen.bar() {
+            bar.set_position(returns.len() as u64);
+            bar.set_message(self.describe(returns));
+        } else if now >= self.plain_next {
+            self.plain_next = now + PLAIN_PERIOD;
+            self.screen.line(&self.describe(returns));
         }
     }
 

@@ -37,13 +37,11 @@ pub(crate) struct RecordArgs {
     pub(crate) record_steps: u32,
 }
 
-/// A film in the making.
 pub(crate) struct Recording {
     path: PathBuf,
     film: Film,
     layout: Layout,
     overlay: Option<Overlay>,
-    /// What happened in each filmed copy up to now.
     copies: Vec<Copy>,
     episodes_max: u32,
     steps_max: u32,
@@ -91,22 +89,18 @@ impl Recording {
         };
         let played = Player::copies(episodes as usize);
         let copies = (args.record_copies as usize).min(played);
-        let overlay = match args.overlay {
-            false => None,
-            true => {
-                let viewer = player.viewer()?;
-                let ahead = match player.config.run.horizon {
-                    Horizon::Fixed { k } => k as usize,
-                    _ => 1,
-                };
-                let is_local = viewer.insight.local_shape().is_some() && played > 1;
-                let local_k = is_local.then_some(ahead);
-                Some(Overlay { viewer, local_k })
-            }
-        };
-        let local = overlay
-            .as_ref()
-            .and_then(|it| it.local_k.zip(it.viewer.insight.local_shape()));
+        let viewer = args.overlay.then(|| player.viewer()).transpose()?;
+        let overlay = viewer.map(|viewer| {
+            let ahead = match player.config.run.horizon {
+                Horizon::Fixed { k } => k as usize,
+                _ => 1,
+            };
+            let is_local = viewer.insight.local_shape().is_some() && played > 1;
+            let local_k = is_local.then_some(ahead);
+            Overlay { viewer, local_k }
+        });
+        let shown = overlay.as_ref();
+        let local = shown.and_then(|it| it.local_k.zip(it.viewer.insight.local_shape()));
         let layout = Layout::new(&player.config, copies, overlay.is_some(), local, played);
         let rate = player.config.world.steps_per_second();
         let film = Film::create(path, layout.size(), rate).map_err(cannot)?;
@@ -124,7 +118,6 @@ impl Recording {
         }))
     }
 
-    /// Whether nothing more is filmed.
     fn is_over(&self) -> bool {
         self.failed.is_some()
             || self.steps >= self.steps_max
@@ -157,11 +150,7 @@ impl Recording {
         let mut ahead = 0;
         if let Some(Overlay { viewer, local_k }) = &mut self.overlay {
             // Other copies than the filmed are what local DIM tells a state from.
-            let looked_at = if local_k.is_some() {
-                played
-            } else {
-                self.copies.len()
-            };
+            let looked_at = local_k.map_or(self.copies.len(), |_| played);
             let states = &step.states[..step.states.len() / played * looked_at];
             moment.seen = Some(viewer.look(states)?);
             moment.actions = step.actions.to_vec();
@@ -182,24 +171,21 @@ impl Recording {
             return Ok(());
         };
         let mut matches = None;
-        if let Some(Overlay {
-            viewer,
-            local_k: Some(k),
-        }) = &self.overlay
-            && ahead == *k
+        if let Some(overlay) = &self.overlay
+            && overlay.local_k == Some(ahead)
             && let Some(later) = self.waiting.get(ahead - 1).and_then(|it| it.seen.as_ref())
             && let Some(now) = &moment.seen
         {
-            matches = viewer.insight.local_matches(now, &moment.actions, later)?;
+            let insight = &overlay.viewer.insight;
+            matches = insight.local_matches(now, &moment.actions, later)?;
         }
         let (width, height) = self.layout.size();
         let mut picture = Picture::new(width, height)?;
         for (i, shot) in moment.shots.iter().enumerate() {
             // The end of an episode lies between a state and the one looked for: there is nothing to know.
             let between = self.waiting.iter().take(ahead.saturating_sub(1));
-            let mut ends = between
-                .filter_map(|it| it.ends.get(i))
-                .chain(moment.ends.get(i));
+            let between = between.filter_map(|it| it.ends.get(i));
+            let mut ends = between.chain(moment.ends.get(i));
             let continues = ends.all(|end| *end == StepEnd::Running);
             let look = moment.seen.as_ref().map(|seen| Look {
                 q_values: row(&seen.q_values, self.layout.actions(), i),
@@ -232,7 +218,6 @@ impl Recording {
         Ok(format!("filmed {steps} steps: {}\n", self.path.display()))
     }
 
-    /// Gives the film up.
     pub(crate) fn discard(self) {
         self.film.discard();
     }
@@ -276,10 +261,8 @@ fn row<T>(all: &[T], length: usize, index: usize) -> &[T] {
 fn cannot(error: FigureError) -> Usage {
     match &error {
         FigureError::Write { path, source } => {
-            usage!(
-                "--record {}: {source}: choose another place",
-                path.display()
-            )
+            let path = path.display();
+            usage!("--record {path}: {source}: choose another place")
         }
         _ => usage!("--record: {error}"),
     }

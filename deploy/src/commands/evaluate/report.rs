@@ -17,7 +17,6 @@ use serde_json::json;
 /// Who played, and the returns of the episodes.
 type Played<'a> = (&'a str, Vec<f64>);
 
-/// Writes all returns as a table.
 pub(super) fn write(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     let mut text = "policy,episode,return\n".to_owned();
     for (name, returns) in played {
@@ -28,7 +27,6 @@ pub(super) fn write(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-/// The object, on one line.
 pub(super) fn json(
     player: &Player,
     levels: Levels,

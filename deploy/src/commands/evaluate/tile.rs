@@ -15,7 +15,6 @@ const PANEL_HEIGHT: usize = 230;
 /// Pixels from line to line.
 const LEADING: usize = 19;
 
-/// What a copy showed and did in one step.
 #[derive(Clone, Debug)]
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.
@@ -26,11 +25,9 @@ pub(super) struct Shot {
     pub(super) total: f64,
     pub(super) reward: f64,
     pub(super) action: u8,
-    /// The episode ended with it.
     pub(super) is_last: bool,
 }
 
-/// What the network makes of it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Look<'a> {
     /// [A].
@@ -53,7 +50,6 @@ pub(super) struct Layout {
     support: Vec<f32>,
 }
 
-/// What local DIM's map shows.
 #[derive(Debug)]
 struct Local {
     k: usize,
@@ -110,10 +106,8 @@ impl Layout {
         let (width, height) = self.tile();
         let columns = self.columns();
         let rows = self.copies.div_ceil(columns);
-        (
-            MARGIN + columns * (width + MARGIN),
-            MARGIN + rows * (height + MARGIN),
-        )
+        let along = |count: usize, side: usize| MARGIN + count * (side + MARGIN);
+        (along(columns, width), along(rows, height))
     }
 
     /// Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
@@ -131,17 +125,19 @@ impl Layout {
 
     fn tile(&self) -> (usize, usize) {
         let (width, height) = self.enlarged();
-        match (self.has_panel, &self.local) {
-            (false, _) => (width, height),
-            (true, None) => (width + MARGIN + PANEL_WIDTH, height.max(PANEL_HEIGHT)),
-            (true, Some(_)) => (
-                2 * width + 2 * MARGIN + PANEL_WIDTH,
+        if !self.has_panel {
+            return (width, height);
+        }
+        let with_panel = width + MARGIN + PANEL_WIDTH;
+        match self.local {
+            None => (with_panel, height.max(PANEL_HEIGHT)),
+            Some(_) => (
+                with_panel + MARGIN + width,
                 (height + LEADING).max(PANEL_HEIGHT),
             ),
         }
     }
 
-    /// Draws copy `i`.
     pub(super) fn draw(
         &self,
         picture: &mut Picture,
@@ -192,15 +188,11 @@ impl Layout {
         let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let q = look.q_values[action];
         let chance = if q < best { " (by chance)" } else { "" };
+        let Shot { episode, step, .. } = shot;
+        let Shot { total, reward, .. } = shot;
         let lines = [
-            (
-                Ink::Soft,
-                format!("episode {}, step {}", shot.episode, shot.step),
-            ),
-            (
-                Ink::Plain,
-                format!("return {:.2} ({:+.2})", shot.total, shot.reward),
-            ),
+            (Ink::Soft, format!("episode {episode}, step {step}")),
+            (Ink::Plain, format!("return {total:.2} ({reward:+.2})")),
             (Ink::Plain, format!("value {best:.3}")),
             (Ink::Bold, format!("{name}{chance}")),
         ];

@@ -4,7 +4,6 @@
 //!
 //! Sources: `event.proto`, `summary.proto` and `record_writer.cc` of TensorFlow. Field numbers are theirs.
 
-/// What all of a file's events are read as.
 const FILE_VERSION: &str = "brain.Event:2";
 /// Protobuf's types on the wire.
 const VARINT: u8 = 0;
@@ -12,10 +11,8 @@ const FIXED64: u8 = 1;
 const BYTES: u8 = 2;
 const FIXED32: u8 = 5;
 
-/// One thing that is shown, under its name.
 #[derive(Debug)]
 pub(super) enum Value<'a> {
-    /// A point of a curve.
     Scalar(f32),
     /// How often each of 0, 1, 2, ... was counted.
     Counts(&'a [u64]),
@@ -33,7 +30,6 @@ pub(super) struct At {
     pub(super) step: u64,
 }
 
-/// The record that a file begins with.
 pub(super) fn version(at: At) -> Vec<u8> {
     let mut event = event(at);
     bytes(&mut event, 3, FILE_VERSION.as_bytes());
@@ -50,7 +46,6 @@ pub(super) fn begin_anew(at: At) -> Vec<u8> {
     record(&event)
 }
 
-/// A record of values by name.
 pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
     let mut all = Vec::new();
     for (name, value) in values {
@@ -142,7 +137,6 @@ fn varint(out: &mut Vec<u8>, mut value: u64) {
     out.push(value as u8);
 }
 
-/// Length, its checksum, the data, its checksum.
 fn record(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut record = length.to_vec();

@@ -29,7 +29,6 @@ const CELL: usize = 24;
 const CAPTION: usize = 22;
 const MARGIN: usize = 8;
 
-/// The event file of a run.
 #[derive(Debug)]
 pub(super) struct Events {
     file: AppendLog,
@@ -38,7 +37,6 @@ pub(super) struct Events {
     /// Counts when histograms were written last.
     k: Vec<u64>,
     actions: Vec<u64>,
-    /// Updates of the checkpoint whose A was drawn last.
     drawn: Option<u64>,
 }
 
@@ -80,20 +78,28 @@ impl Events {
             seconds: now(),
             step: replay.transitions_inserted,
         };
-        let points = points.iter();
-        let points = points.map(|(name, value)| (name.clone(), Value::Scalar(*value as f32)));
-        let points = encode::summary(at, &points.collect::<Vec<_>>());
-        let said = self.file.add(points);
-        let was = self.slow_at;
-        if !is_last && was.is_some_and(|last| last.elapsed() < SLOW_PERIOD) {
-            return said;
+        let curve = |(name, value): &(String, f64)| (name.clone(), Value::Scalar(*value as f32));
+        let curves: Vec<_> = points.iter().map(curve).collect();
+        let mut records = vec![encode::summary(at, &curves)];
+        let is_slow_due = self.slow_at.is_none_or(|it| it.elapsed() >= SLOW_PERIOD);
+        if is_last || is_slow_due {
+            self.slow_at = Some(Instant::now());
+            records.extend(self.histograms(at, replay));
+            records.extend(self.affinity(at));
         }
-        self.slow_at = Some(Instant::now());
+        self.file.add_all(records)
+    }
+
+    /// What was counted since the last histograms.
+    fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
         let mut counted = Vec::new();
-        let (k, actions) = (&replay.k_histogram, &replay.action_histogram);
         for (name, now, before) in [
-            ("k/served", k, &mut self.k),
-            ("actions/stored", actions, &mut self.actions),
+            ("k/served", &replay.k_histogram, &mut self.k),
+            (
+                "actions/stored",
+                &replay.action_histogram,
+                &mut self.actions,
+            ),
         ] {
             let since = since(now, before);
             before.clone_from(now);
@@ -104,14 +110,11 @@ impl Events {
         let histograms = counted.iter();
         let histograms = histograms.map(|(name, counts)| (name.clone(), Value::Counts(counts)));
         let histograms: Vec<_> = histograms.collect();
-        let has_counted = !histograms.is_empty();
-        let more = has_counted.then(|| self.file.add(encode::summary(at, &histograms)));
-        let drawn = self.affinity(at);
-        said.or(more.flatten()).or(drawn)
+        (!histograms.is_empty()).then(|| encode::summary(at, &histograms))
     }
 
     /// Draws A of a checkpoint that was not there before. One that cannot be read just now is tried again.
-    fn affinity(&mut self, at: At) -> Option<String> {
+    fn affinity(&mut self, at: At) -> Option<Vec<u8>> {
         let (updates, path) = newest(&self.checkpoints)?;
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
             return None;
@@ -130,11 +133,9 @@ impl Events {
             height,
             png: &png,
         };
-        let image = [("affinity/A".to_owned(), image)];
-        self.file.add(encode::summary(at, &image))
+        Some(encode::summary(at, &[("affinity/A".to_owned(), image)]))
     }
 
-    /// What is missing in the file, as [`AppendLog::missing`] says it.
     pub(super) fn missing(&self) -> Option<String> {
         self.file.missing()
     }
@@ -187,6 +188,7 @@ fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::with;
 
     #[test]
     fn counts_are_those_since_the_last_histogram() {
@@ -200,11 +202,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let mut events = Events::create(&folder, None).unwrap();
-        let replay = ReplayStatus {
-            transitions_inserted: 70,
-            k_histogram: vec![0, 4, 1],
-            ..ReplayStatus::default()
-        };
+        let replay = with(|it: &mut ReplayStatus| {
+            (it.transitions_inserted, it.k_histogram) = (70, vec![0, 4, 1]);
+        });
         let points = [("return/mean_return".to_owned(), 1.5)];
         assert_eq!(events.add(&points, &replay, false), None);
         let again = Events::create(&folder, Some(70)).unwrap();
