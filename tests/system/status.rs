@@ -106,7 +106,7 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     system
         .run("status --run nowhere")
         .expect_code(64)
-        .expect_said("nowhere is not a run folder");
+        .expect_said("nowhere is not the folder of a run");
 }
 
 /// Its launcher still plays the last checkpoint; no other process is left.

@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
-use super::Fact;
+use super::fact::Fact;
 
 /// A certificate that expires sooner is a note.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);

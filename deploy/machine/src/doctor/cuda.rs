@@ -1,7 +1,7 @@
 //! The NVIDIA GPUs that this program can compute on, which it can only if it was built with the feature `cuda`.
 //! Nothing here is needed for training on the CPU, and nothing is computed on a device.
 
-use super::{Fact, State};
+use super::fact::{Fact, State};
 use crate::error::{Usage, usage};
 
 const DEVICES: &str = "cuda";

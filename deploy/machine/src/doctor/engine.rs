@@ -3,7 +3,7 @@
 
 use procgen_sys::{Engine, InstallError};
 
-use super::Fact;
+use super::fact::Fact;
 
 const WHAT: &str = "Procgen";
 
@@ -38,7 +38,7 @@ fn not_there(reason: &str, source: Result<String, InstallError>) -> Fact {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::State;
+    use crate::doctor::fact::State;
 
     #[test]
     fn an_engine_that_can_be_fetched_is_a_note_and_one_that_cannot_is_missing() {

@@ -7,7 +7,7 @@ use driml_model::{Precision, kernels_in_words};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
-use super::{Fact, State};
+use super::fact::{Fact, State};
 use crate::{resources::Machine, units::gib};
 
 /// Below this a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.

@@ -4,68 +4,14 @@
 mod certificates;
 pub(crate) mod cuda;
 mod engine;
+mod fact;
 mod host;
 
-use std::{fmt, path::Path};
+use std::path::Path;
 
 use anyhow::ensure;
-use serde::Serialize;
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-enum State {
-    /// As it should be.
-    Ok,
-    /// It works without, or slower.
-    Note,
-    /// What is asked for cannot be had; the text says what to do.
-    Missing,
-}
-
-/// What was found out about one thing that a run needs.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-struct Fact {
-    state: State,
-    /// What it is about, such as `cores`.
-    what: String,
-    /// What is so, and what to do if that should change.
-    text: String,
-}
-
-impl Fact {
-    fn ok(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Ok, what, text)
-    }
-
-    fn note(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Note, what, text)
-    }
-
-    fn missing(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Missing, what, text)
-    }
-
-    fn new(state: State, what: &str, text: impl Into<String>) -> Self {
-        Self {
-            state,
-            what: what.into(),
-            text: text.into(),
-        }
-    }
-}
-
-impl fmt::Display for Fact {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let state = match self.state {
-            State::Ok => "ok",
-            State::Note => "note",
-            State::Missing => "missing",
-        };
-        // One line a fact, whatever an error's text has.
-        let text = self.text.split_whitespace().collect::<Vec<_>>().join(" ");
-        write!(f, "{state:<8} {:<17} {text}", self.what)
-    }
-}
+use self::fact::{Fact, State};
 
 /// What was found out, for the CPU and for CUDA.
 #[derive(Debug)]
