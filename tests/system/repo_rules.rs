@@ -31,7 +31,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_700),
     ("replay-server", 11_500),
     ("learner", 27_550),
-    ("deploy", 36_480),
+    ("deploy", 36_490),
     ("tests", 12_310),
 ];
 /// Most lines of one file.
