@@ -50,9 +50,9 @@ pub struct Speed {
 /// Mean and standard deviation over the rows served.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
-    /// Their mean.
+    /// Mean over the rows served.
     pub mean: f64,
-    /// Their standard deviation.
+    /// Standard deviation over the same rows.
     pub sd: f64,
 }
 

@@ -43,7 +43,7 @@ impl Features {
         })
     }
 
-    /// The features of these rows, each as often as it is listed. On the CPU only; gradients of a row's copies are summed first to last.
+    /// The features of these rows, each as often as listed. On the CPU only; gradients of a row's copies are summed first to last.
     ///
     /// # Errors
     /// A row that is not there.

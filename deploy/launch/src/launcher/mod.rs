@@ -111,7 +111,7 @@ pub fn run(
         interrupts,
         processes: Processes::default(),
         evaluator,
-        restarts: 0,
+        server_restarts: 0,
         actor_restarts: 0,
         poller: None,
     };
@@ -176,7 +176,7 @@ struct Launch<'a> {
     interrupts: Interrupts,
     processes: Processes,
     evaluator: Evaluator,
-    restarts: u32,
+    server_restarts: u32,
     actor_restarts: u32,
     poller: Option<Poller>,
 }
@@ -403,7 +403,7 @@ impl Launch<'_> {
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, &self.config.run, view);
-        summary.replay_servers_restarted = servers_before + self.restarts;
+        summary.replay_servers_restarted = servers_before + self.server_restarts;
         summary.actors_restarted = actors_before + self.actor_restarts;
         let written = summary.write(self.run_dir);
         (summary, written)

@@ -95,7 +95,7 @@ impl Launch<'_> {
 
     pub(super) fn revived(&self) -> Revived {
         Revived {
-            servers: self.config.local.durable && self.restarts < RESTARTS_MAX,
+            servers: self.config.local.durable && self.server_restarts < RESTARTS_MAX,
             actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
         }
     }
@@ -109,10 +109,10 @@ impl Launch<'_> {
                 continue;
             }
             let report = self.processes.replay_servers[shard].exit_report();
-            self.restarts += 1;
+            self.server_restarts += 1;
             let how = format!(
                 "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
-                self.servers[shard], self.restarts
+                self.servers[shard], self.server_restarts
             );
             self.note_restart(&report, &how);
             self.processes.replay_servers[shard] = self.start_server(shard)?;

@@ -162,12 +162,12 @@ impl TrainingEpisodes {
 
     /// What the shards knew of when the last episode was received: all but the newest, which are shared out in order.
     fn take_as_received(&mut self, shards: &[ReplayStatus]) {
-        let mut unheard: u64 = shards.iter().map(|it| it.episodes).sum();
-        unheard = unheard.saturating_sub(self.episode);
+        let mut left: u64 = shards.iter().map(|it| it.episodes).sum();
+        left = left.saturating_sub(self.episode);
         for (received, status) in self.received.iter_mut().zip(shards) {
-            let here = unheard.min(status.episodes);
+            let here = left.min(status.episodes);
             *received = status.episodes - here;
-            unheard -= here;
+            left -= here;
         }
     }
 

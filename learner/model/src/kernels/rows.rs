@@ -1,4 +1,4 @@
-//! Rows of a tensor, each as often as it is listed, as a candle operation whose gradient is summed in a fixed order.
+//! Rows of a tensor, each as often as listed, as a candle operation whose gradient is summed in a fixed order.
 //! It knows no network; it runs on the CPU only.
 //!
 //! candle's own selection adds its gradient on a single thread.

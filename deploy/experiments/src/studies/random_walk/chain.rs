@@ -91,7 +91,7 @@ impl Chain {
         (self.states as f64).ln() - entropy(&[self.alpha, 1.0 - self.alpha])
     }
 
-    /// The appendix's double sum for the mutual information, as it is printed, in nats.
+    /// The appendix's double sum for the mutual information, as printed, in nats.
     ///
     /// Its factor alpha^[j > i] (1 - alpha)^[j < i] is a law of steps only next to i; the printed sum has all i and j.
     pub(super) fn mutual_information_as_printed(&self) -> f64 {
