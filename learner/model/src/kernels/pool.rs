@@ -9,20 +9,38 @@ use crate::kernels::units::vectorized;
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
 
-/// For each window: its first scalar in the pooled maps, and of each of its pixels the number and the first scalar in the maps.
-fn windows(size: Size) -> impl Iterator<Item = (usize, impl Iterator<Item = (u8, usize)>)> {
+/// A window's pixels inside the maps: the number of each, 0 to 8, and its first scalar in the maps.
+struct Pixels {
+    each: [(u32, usize); 9],
+    count: usize,
+}
+
+impl Pixels {
+    fn inside(&self) -> &[(u32, usize)] {
+        &self.each[..self.count]
+    }
+}
+
+/// For each window: its first scalar in the pooled maps, and its pixels.
+fn windows(size: Size) -> impl Iterator<Item = (usize, Pixels)> {
     let (height, width, channels) = size;
     let (rows, cols, _) = pooled(size);
     (0..rows * cols).map(move |window| {
         let (y, x) = (window / cols * 2, window % cols * 2);
-        let pixels = (0..9).filter_map(move |at: u8| {
-            let (row, col) = (y + usize::from(at / 3), x + usize::from(at % 3));
-            let inside = (1..=height).contains(&row) && (1..=width).contains(&col);
-            inside.then(|| (at, ((row - 1) * width + col - 1) * channels))
-        });
-        (window * channels, pixels)
+        let (mut each, mut count) = ([(0, 0); 9], 0);
+        for at in 0..9 {
+            let (row, col) = (y + at / 3, x + at % 3);
+            if (1..=height).contains(&row) && (1..=width).contains(&col) {
+                each[count] = (at as u32, ((row - 1) * width + col - 1) * channels);
+                count += 1;
+            }
+        }
+        (window * channels, Pixels { each, count })
     })
 }
+
+/// Channels that are compared at once; the rest of an odd number goes one by one.
+const BLOCK: usize = 8;
 
 vectorized! {
     /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
@@ -34,22 +52,40 @@ vectorized! {
         taken: &'a mut [u8],
     ) {
         let channels = size.2;
+        let whole = channels - channels % BLOCK;
         for (to, pixels) in windows(size) {
             let (largest, taken) = (&mut largest[to..][..channels], &mut taken[to..][..channels]);
-            for (index, (at, from)) in pixels.enumerate() {
-                let values = &maps[from..][..channels];
-                if index == 0 {
-                    largest.copy_from_slice(values);
-                    taken.fill(at);
-                    continue;
-                }
-                for ((largest, taken), &value) in largest.iter_mut().zip(&mut *taken).zip(values) {
-                    let is_larger = value > *largest || value.is_nan();
-                    *largest = if is_larger { value } else { *largest };
-                    *taken = if is_larger { at } else { *taken };
-                }
+            for first in (0..whole).step_by(BLOCK) {
+                pool_block::<BLOCK>(maps, &pixels, first, largest, taken);
+            }
+            for first in whole..channels {
+                pool_block::<1>(maps, &pixels, first, largest, taken);
             }
         }
+    }
+}
+
+/// [`pool`] of one window's channels from `first` on. Values and pixels stay in registers of the same width.
+#[inline(always)]
+fn pool_block<const N: usize>(
+    maps: &[f32],
+    pixels: &Pixels,
+    first: usize,
+    largest: &mut [f32],
+    taken: &mut [u8],
+) {
+    let (mut best, mut best_at) = ([f32::NEG_INFINITY; N], [0; N]);
+    for (index, &(at, from)) in pixels.inside().iter().enumerate() {
+        let values = &maps[from + first..][..N];
+        for ((best, best_at), &value) in best.iter_mut().zip(&mut best_at).zip(values) {
+            let is_larger = index == 0 || value > *best || value.is_nan();
+            *best = if is_larger { value } else { *best };
+            *best_at = if is_larger { at } else { *best_at };
+        }
+    }
+    largest[first..][..N].copy_from_slice(&best);
+    for (taken, at) in taken[first..][..N].iter_mut().zip(best_at) {
+        *taken = at as u8;
     }
 }
 
@@ -63,14 +99,37 @@ vectorized! {
         grad_maps: &'a mut [f32],
     ) {
         let channels = size.2;
+        let whole = channels - channels % BLOCK;
         for (from, pixels) in windows(size) {
             let (grads, taken) = (&grads[from..][..channels], &taken[from..][..channels]);
-            for (at, to) in pixels {
-                let sums = &mut grad_maps[to..][..channels];
-                for ((sum, &grad), &taken) in sums.iter_mut().zip(grads).zip(taken) {
-                    *sum += if taken == at { grad } else { 0.0 };
-                }
+            for first in (0..whole).step_by(BLOCK) {
+                unpool_block::<BLOCK>(grads, &pixels, first, taken, grad_maps);
             }
+            for first in whole..channels {
+                unpool_block::<1>(grads, &pixels, first, taken, grad_maps);
+            }
+        }
+    }
+}
+
+/// [`unpool`] of one window's channels from `first` on.
+#[inline(always)]
+fn unpool_block<const N: usize>(
+    grads: &[f32],
+    pixels: &Pixels,
+    first: usize,
+    taken: &[u8],
+    grad_maps: &mut [f32],
+) {
+    let (mut own, mut own_at) = ([0.0; N], [0; N]);
+    own.copy_from_slice(&grads[first..][..N]);
+    for (at, &taken) in own_at.iter_mut().zip(&taken[first..][..N]) {
+        *at = u32::from(taken);
+    }
+    for &(at, to) in pixels.inside() {
+        let sums = &mut grad_maps[to + first..][..N];
+        for ((sum, &grad), &own_at) in sums.iter_mut().zip(&own).zip(&own_at) {
+            *sum += if own_at == at { grad } else { 0.0 };
         }
     }
 }
