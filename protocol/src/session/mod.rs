@@ -1,26 +1,25 @@
 //! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
 //! It does not scout, gossip or mesh: one part listens, the others connect and redial.
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+mod error;
+mod questions;
+
+use std::{sync::Arc, time::Duration};
 
 use serde::{Deserialize, Serialize};
-use zenoh::{
-    Session, Wait,
-    bytes::ZBytes,
-    handlers::FifoChannelHandler,
-    qos::{CongestionControl, Priority},
-    query::{ConsolidationMode, Query, QueryTarget, Reply},
+use zenoh::{Session, Wait};
+
+pub use self::{
+    error::SessionError,
+    questions::{PendingBytes, answer, ask, send},
 };
+pub(crate) use questions::put_off;
 
 use crate::{
-    messages::recovering::Recovering,
     process::shutdown::Shutdown,
-    reach::{self, Unreachable},
-    tls::{self, Credentials, Role, TlsError},
-    wire::{codec, error::CodecError, keys::Keys},
+    reach,
+    tls::{self, Credentials, Role},
+    wire::keys::Keys,
 };
 
 /// How a process reaches the others.
@@ -33,93 +32,6 @@ pub struct Endpoints {
     pub connect: Vec<String>,
 }
 
-/// Why a message could not be exchanged.
-#[derive(Debug, thiserror::Error)]
-pub enum SessionError {
-    /// The session could not be opened.
-    #[error("opening a zenoh session (listen {listen:?}, connect {connect:?}): {why}")]
-    Open {
-        /// Endpoints to listen on.
-        listen: Vec<String>,
-        /// Endpoints to connect to.
-        connect: Vec<String>,
-        /// What zenoh said.
-        why: String,
-    },
-    /// Nothing accepts connections where the session was to connect.
-    #[error(transparent)]
-    Unreachable(#[from] Unreachable),
-    /// Something listens that does not speak this protocol.
-    #[error(
-        "something listens on {} that is not driml ({what}): is the endpoint right? If it is, its process may be suspended",
-        .connect.join(", ")
-    )]
-    NotDriml {
-        /// Endpoints to connect to.
-        connect: Vec<String>,
-        /// What it says, or that it says nothing.
-        what: String,
-    },
-    /// No replay server lets this process in over QUIC. Whether none listens or one side rejects the other's certificate is known to
-    /// zenoh alone, whose log has it on the side that rejects.
-    #[error(
-        "no replay server lets this process in on {}: is it running, with --tls-dir, and is the endpoint right (its port is one of UDP)? If \
-         so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay server's log say why",
-        .connect.join(", ")
-    )]
-    NotLetIn {
-        /// Endpoints to connect to.
-        connect: Vec<String>,
-    },
-    /// A certificate is not good.
-    #[error(transparent)]
-    Tls(#[from] TlsError),
-    /// No process answers at this key.
-    #[error("{key}: no process answers there")]
-    NoAnswerer {
-        /// Where it was asked.
-        key: String,
-    },
-    /// No answer in time.
-    #[error("{key}: no answer within {within_ms} ms")]
-    NoReply {
-        /// Where it was asked.
-        key: String,
-        /// How long the reply was waited for.
-        within_ms: u128,
-    },
-    /// The replay server is reading its replay back from disk, and will answer then. It is there: this may be waited for as long as it
-    /// takes.
-    #[error("{0}")]
-    Recovering(Recovering),
-    /// A request that is larger than a message may be.
-    #[error("{key}: {why}")]
-    TooLarge {
-        /// Where it was to be asked.
-        key: String,
-        /// Which limit it is over.
-        why: CodecError,
-    },
-    /// A reply that is damaged, foreign or of another kind.
-    #[error("{key}: {why}")]
-    Unreadable {
-        /// Where it was asked.
-        key: String,
-        /// What is wrong with it.
-        why: CodecError,
-    },
-    /// zenoh could not send, or the other side replied with an error.
-    #[error("{key}: {why}")]
-    Zenoh {
-        /// Where it was asked.
-        key: String,
-        /// What zenoh said.
-        why: String,
-    },
-}
-
-/// What zenoh replies where a process does not.
-const TIMED_OUT: &str = "Timeout";
 /// What zenoh says where no endpoint could be connected to.
 const NOTHING_LISTENS: &str = "Unable to connect to any of";
 
@@ -317,151 +229,4 @@ fn open_with(
 /// launcher and for processes started by hand: many processes that start at once need not all look.
 pub fn sweep_shared_memory() {
     zenoh::shm::cleanup_orphaned_shm_segments();
-}
-
-/// The bytes of a reply that is to come.
-#[derive(Debug)]
-pub struct PendingBytes {
-    key: String,
-    timeout: Duration,
-    replies: FifoChannelHandler<Reply>,
-    /// Why the replies so far are no answer.
-    failed: Option<SessionError>,
-}
-
-/// Sends one question; questions of one priority arrive in the order in which they were sent.
-///
-/// # Errors
-/// zenoh refused. It may be tried again.
-pub fn send(
-    session: &Session,
-    key: &str,
-    payload: ZBytes,
-    priority: Priority,
-    timeout: Duration,
-) -> Result<PendingBytes, SessionError> {
-    let replies = session
-        .get(key)
-        .payload(payload)
-        // Foreign processes that answer, too: with one target zenoh might choose one of them.
-        .target(QueryTarget::All)
-        .consolidation(ConsolidationMode::None)
-        .congestion_control(CongestionControl::Block)
-        .priority(priority)
-        .timeout(timeout)
-        .wait()
-        .map_err(|e| SessionError::Zenoh {
-            key: key.into(),
-            why: e.to_string(),
-        })?;
-    Ok(PendingBytes {
-        key: key.into(),
-        timeout,
-        replies,
-        failed: None,
-    })
-}
-
-impl PendingBytes {
-    /// Waits for the one answer.
-    ///
-    /// # Errors
-    /// No process answers (at once), no answer in time, or the answerer's error. All may be tried again.
-    pub fn wait(mut self) -> Result<ZBytes, SessionError> {
-        self.wait_for(|bytes| Ok(bytes.clone()))
-    }
-
-    /// Waits for the one answer that `read` takes. Without certificates foreign processes may answer, too.
-    pub(crate) fn wait_for<T>(
-        &mut self,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
-    ) -> Result<T, SessionError> {
-        loop {
-            let reply = self.replies.recv().ok();
-            if let Some(answer) = self.read(reply, &read)? {
-                return Ok(answer);
-            }
-        }
-    }
-
-    /// [`PendingBytes::wait_for`] at most for `wait_max`; `None` if it has not come by then.
-    pub(crate) fn wait_for_within<T>(
-        &mut self,
-        wait_max: Duration,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
-    ) -> Result<Option<T>, SessionError> {
-        let deadline = Instant::now() + wait_max;
-        loop {
-            let reply = match self.replies.recv_deadline(deadline) {
-                Ok(None) => return Ok(None),
-                Ok(reply) => reply,
-                Err(_) => None,
-            };
-            if let Some(answer) = self.read(reply, &read)? {
-                return Ok(Some(answer));
-            }
-        }
-    }
-
-    /// What `read` takes of a reply; `None` if there may be another. `reply` is none if there is not.
-    fn read<T>(
-        &mut self,
-        reply: Option<Reply>,
-        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
-    ) -> Result<Option<T>, SessionError> {
-        let key = || self.key.clone();
-        let Some(reply) = reply else {
-            let none = || SessionError::NoAnswerer { key: key() };
-            return Err(self.failed.take().unwrap_or_else(none));
-        };
-        let failed = match reply.into_result() {
-            Ok(sample) => match read(sample.payload()) {
-                Ok(answer) => return Ok(Some(answer)),
-                Err(why) => SessionError::Unreadable { key: key(), why },
-            },
-            Err(e) => {
-                if let Ok((recovering, _)) = codec::decode(&e.payload().to_bytes(), None) {
-                    return Err(SessionError::Recovering(recovering));
-                }
-                let why = e.payload().try_to_string().unwrap_or_default().into_owned();
-                match why.as_str() {
-                    TIMED_OUT => SessionError::NoReply {
-                        key: key(),
-                        within_ms: self.timeout.as_millis(),
-                    },
-                    _ => SessionError::Zenoh { key: key(), why },
-                }
-            }
-        };
-        self.failed = Some(failed);
-        Ok(None)
-    }
-}
-
-/// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
-///
-/// # Errors
-/// As [`send`] and [`PendingBytes::wait`].
-pub fn ask(
-    session: &Session,
-    key: &str,
-    payload: ZBytes,
-    priority: Priority,
-    timeout: Duration,
-) -> Result<ZBytes, SessionError> {
-    send(session, key, payload, priority, timeout)?.wait()
-}
-
-/// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
-pub fn answer(query: &Query, payload: ZBytes) {
-    if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
-        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
-    }
-}
-
-/// Answers a question that cannot be dealt with now by an error, `payload`; its asker asks again.
-pub(crate) fn put_off(query: &Query, payload: ZBytes) {
-    if let Err(e) = query.reply_err(payload).wait() {
-        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
-    }
 }

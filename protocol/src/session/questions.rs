@@ -1,0 +1,164 @@
+//! Asking over a session, and answering.
+
+use std::time::{Duration, Instant};
+
+use zenoh::{
+    Session, Wait,
+    bytes::ZBytes,
+    handlers::FifoChannelHandler,
+    qos::{CongestionControl, Priority},
+    query::{ConsolidationMode, Query, QueryTarget, Reply},
+};
+
+use super::error::SessionError;
+use crate::wire::{codec, error::CodecError};
+
+/// What zenoh replies where a process does not.
+const TIMED_OUT: &str = "Timeout";
+
+/// The bytes of a reply that is to come.
+#[derive(Debug)]
+pub struct PendingBytes {
+    key: String,
+    timeout: Duration,
+    replies: FifoChannelHandler<Reply>,
+    /// Why the replies so far are no answer.
+    failed: Option<SessionError>,
+}
+
+/// Sends one question; questions of one priority arrive in the order in which they were sent.
+///
+/// # Errors
+/// zenoh refused. It may be tried again.
+pub fn send(
+    session: &Session,
+    key: &str,
+    payload: ZBytes,
+    priority: Priority,
+    timeout: Duration,
+) -> Result<PendingBytes, SessionError> {
+    let replies = session
+        .get(key)
+        .payload(payload)
+        // Foreign processes that answer, too: with one target zenoh might choose one of them.
+        .target(QueryTarget::All)
+        .consolidation(ConsolidationMode::None)
+        .congestion_control(CongestionControl::Block)
+        .priority(priority)
+        .timeout(timeout)
+        .wait()
+        .map_err(|e| SessionError::Zenoh {
+            key: key.into(),
+            why: e.to_string(),
+        })?;
+    Ok(PendingBytes {
+        key: key.into(),
+        timeout,
+        replies,
+        failed: None,
+    })
+}
+
+impl PendingBytes {
+    /// Waits for the one answer.
+    ///
+    /// # Errors
+    /// No process answers (at once), no answer in time, or the answerer's error. All may be tried again.
+    pub fn wait(mut self) -> Result<ZBytes, SessionError> {
+        self.wait_for(|bytes| Ok(bytes.clone()))
+    }
+
+    /// Waits for the one answer that `read` takes. Without certificates foreign processes may answer, too.
+    pub(crate) fn wait_for<T>(
+        &mut self,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<T, SessionError> {
+        loop {
+            let reply = self.replies.recv().ok();
+            if let Some(answer) = self.read(reply, &read)? {
+                return Ok(answer);
+            }
+        }
+    }
+
+    /// [`PendingBytes::wait_for`] at most for `wait_max`; `None` if it has not come by then.
+    pub(crate) fn wait_for_within<T>(
+        &mut self,
+        wait_max: Duration,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<Option<T>, SessionError> {
+        let deadline = Instant::now() + wait_max;
+        loop {
+            let reply = match self.replies.recv_deadline(deadline) {
+                Ok(None) => return Ok(None),
+                Ok(reply) => reply,
+                Err(_) => None,
+            };
+            if let Some(answer) = self.read(reply, &read)? {
+                return Ok(Some(answer));
+            }
+        }
+    }
+
+    /// What `read` takes of a reply; `None` if there may be another. `reply` is none if there is not.
+    fn read<T>(
+        &mut self,
+        reply: Option<Reply>,
+        read: impl Fn(&ZBytes) -> Result<T, CodecError>,
+    ) -> Result<Option<T>, SessionError> {
+        let key = || self.key.clone();
+        let Some(reply) = reply else {
+            let none = || SessionError::NoAnswerer { key: key() };
+            return Err(self.failed.take().unwrap_or_else(none));
+        };
+        let failed = match reply.into_result() {
+            Ok(sample) => match read(sample.payload()) {
+                Ok(answer) => return Ok(Some(answer)),
+                Err(why) => SessionError::Unreadable { key: key(), why },
+            },
+            Err(e) => {
+                if let Ok((recovering, _)) = codec::decode(&e.payload().to_bytes(), None) {
+                    return Err(SessionError::Recovering(recovering));
+                }
+                let why = e.payload().try_to_string().unwrap_or_default().into_owned();
+                match why.as_str() {
+                    TIMED_OUT => SessionError::NoReply {
+                        key: key(),
+                        within_ms: self.timeout.as_millis(),
+                    },
+                    _ => SessionError::Zenoh { key: key(), why },
+                }
+            }
+        };
+        self.failed = Some(failed);
+        Ok(None)
+    }
+}
+
+/// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
+///
+/// # Errors
+/// As [`send`] and [`PendingBytes::wait`].
+pub fn ask(
+    session: &Session,
+    key: &str,
+    payload: ZBytes,
+    priority: Priority,
+    timeout: Duration,
+) -> Result<ZBytes, SessionError> {
+    send(session, key, payload, priority, timeout)?.wait()
+}
+
+/// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
+pub fn answer(query: &Query, payload: ZBytes) {
+    if let Err(e) = query.reply(query.key_expr().clone(), payload).wait() {
+        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
+    }
+}
+
+/// Answers a question that cannot be dealt with now by an error, `payload`; its asker asks again.
+pub(crate) fn put_off(query: &Query, payload: ZBytes) {
+    if let Err(e) = query.reply_err(payload).wait() {
+        tracing::debug!("{}: the asker is gone: {e}", query.key_expr());
+    }
+}
