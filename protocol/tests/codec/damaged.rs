@@ -9,9 +9,8 @@ use driml_protocol::{
 };
 use proptest::prelude::*;
 
-use crate::samples::{
-    ACTIONS, SPEC, Sample, batch, chunk, episodes, forge, forge_whole, join, read_chunk, samples,
-};
+use crate::forged::{forge, forge_whole};
+use crate::samples::{ACTIONS, SPEC, Sample, batch, chunk, episodes, join, read_chunk, samples};
 
 #[test]
 fn episodes_that_did_not_end_are_refused() {

@@ -4,6 +4,7 @@
 
 mod batches;
 mod damaged;
+mod forged;
 mod run_hash;
 mod samples;
 

@@ -1,4 +1,4 @@
-//! A message of every kind, whole or forged, and what reads it.
+//! A message of every kind, and what reads it.
 //! It tests nothing but that each comes back.
 
 use std::fmt::Debug;
@@ -7,10 +7,10 @@ use driml_protocol::{
     ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
     ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
     Goodbye, Hello, InsertReply, JoinReply, Kind, Learned, LearnerJoin, LearnerStatus, Life,
-    LogStatus, Message, NO_ACTION, Origin, PROTOCOL_VERSION, PartName, PartStatus, PartsStatus,
-    Played, PriorityPart, PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report,
-    RequestId, Returns, RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    LogStatus, Message, NO_ACTION, Origin, PartName, PartStatus, PartsStatus, Played, PriorityPart,
+    PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId, Returns,
+    RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply,
+    WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self},
 };
 
@@ -444,38 +444,4 @@ pub(crate) fn samples() -> Vec<Sample> {
         read,
     }));
     samples
-}
-
-/// A message with a right checksum and whatever else.
-pub(crate) fn forge(
-    version: u16,
-    kind: u16,
-    lengths: (u32, u64),
-    header: &[u8],
-    payload: &[u8],
-) -> Vec<u8> {
-    let mut bytes = b"DRML".to_vec();
-    bytes.extend(version.to_le_bytes());
-    bytes.extend(kind.to_le_bytes());
-    bytes.extend(SPEC.to_le_bytes());
-    bytes.extend(lengths.0.to_le_bytes());
-    bytes.extend(lengths.1.to_le_bytes());
-    let mut hasher = crc32fast::Hasher::new();
-    [&bytes, header, payload]
-        .iter()
-        .for_each(|part| hasher.update(part));
-    bytes.extend(hasher.finalize().to_le_bytes());
-    bytes.extend_from_slice(header);
-    bytes.extend_from_slice(payload);
-    bytes
-}
-
-pub(crate) fn forge_whole(kind: Kind, header: &[u8], payload: &[u8]) -> Vec<u8> {
-    forge(
-        PROTOCOL_VERSION,
-        kind as u16,
-        (header.len() as u32, payload.len() as u64),
-        header,
-        payload,
-    )
 }
