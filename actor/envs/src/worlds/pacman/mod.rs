@@ -16,6 +16,8 @@ mod maze;
 mod render;
 mod saved;
 #[cfg(test)]
+mod state_tests;
+#[cfg(test)]
 mod tests;
 
 use rand_chacha::ChaCha8Rng;

@@ -6,7 +6,7 @@ use super::ghost::Mode;
 use super::maze::WIDTH;
 use super::*;
 
-fn config() -> PacmanConfig {
+pub(super) fn config() -> PacmanConfig {
     PacmanConfig {
         epsilon: 0.1,
         switch_probability: 0.5,
@@ -24,7 +24,7 @@ fn config() -> PacmanConfig {
 }
 
 /// Ghosts that keep to the mode they are put into.
-fn steady(config: &PacmanConfig) -> PacmanConfig {
+pub(super) fn steady(config: &PacmanConfig) -> PacmanConfig {
     PacmanConfig {
         epsilon: 0.0,
         switch_probability: 0.0,
@@ -32,27 +32,27 @@ fn steady(config: &PacmanConfig) -> PacmanConfig {
     }
 }
 
-fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
+pub(super) fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
     let places = world.maze.items().len() as u16;
     (0..places)
         .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
         .unwrap()
 }
 
-fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
+pub(super) fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
     let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
     world.step(&[action], &mut reward, &mut end).unwrap();
     (reward[0], end[0])
 }
 
-fn frame(world: &mut PacmanWorld) -> Vec<u8> {
+pub(super) fn frame(world: &mut PacmanWorld) -> Vec<u8> {
     let mut frames = vec![0; world.num_envs() * render::FRAME_BYTES];
     world.observe(&mut frames);
     frames
 }
 
 /// The bottom corridor, agent in column 9 and ghost 0 `apart` to the right, sure to come closer; the rest far away.
-fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
+pub(super) fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
     let mut world = PacmanWorld::new(&steady(config), 1, 0).unwrap();
     let (agent, hunter, far) = (
         at(&world, 19, 9),
@@ -67,7 +67,7 @@ fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
 }
 
 /// Frames, rewards and ends of `steps` random steps.
-fn play(
+pub(super) fn play(
     world: &mut PacmanWorld,
     steps: usize,
     seed: u64,
@@ -387,82 +387,6 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
     );
 }
 
-#[test]
-fn unusable_settings_and_actions_are_errors() {
-    let schedule = |episodes_per_task, order: &[u8]| {
-        Some(LethalSchedule {
-            episodes_per_task,
-            order: order.to_vec(),
-        })
-    };
-    let overlay = |temperature, sweeps_per_step| {
-        Some(IsingOverlay {
-            temperature,
-            sweeps_per_step,
-        })
-    };
-    for bad in [
-        PacmanConfig {
-            epsilon: 1.1,
-            ..config()
-        },
-        PacmanConfig {
-            epsilon: f64::NAN,
-            ..config()
-        },
-        PacmanConfig {
-            switch_probability: -0.1,
-            ..config()
-        },
-        PacmanConfig {
-            step_limit: 0,
-            ..config()
-        },
-        PacmanConfig {
-            reward_ghost: f32::INFINITY,
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(0, &[0]),
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(1, &[]),
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(1, &[4]),
-            ..config()
-        },
-        PacmanConfig {
-            ising: overlay(0.0, 1),
-            ..config()
-        },
-        PacmanConfig {
-            ising: overlay(0.4, 0),
-            ..config()
-        },
-    ] {
-        let error = PacmanWorld::new(&bad, 1, 0)
-            .err()
-            .expect("rejected")
-            .to_string();
-        assert!(
-            error.contains("must") || error.contains("0 to 3"),
-            "{error}"
-        );
-    }
-    assert!(PacmanWorld::new(&config(), 0, 0).is_err());
-    let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
-    let error = world
-        .step(&[5], &mut [0.0], &mut [StepEnd::Running])
-        .unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "action 5 of copy 0 is out of range: this world has 5 actions"
-    );
-}
-
 /// The returns of 1000 episodes of uniformly random actions, mean and its standard error.
 ///
 /// These are the reference numbers for a uniform policy in Ms. PacMan; run with `--nocapture` to read them.
@@ -500,47 +424,4 @@ fn a_uniform_policy_earns_its_reference_return() {
         println!("lethal {lethal:?}: {mean:.3} +- {error:.3}, {length:.1} env steps an episode");
         assert!((mean - reference).abs() < 5.0 * error);
     }
-}
-
-#[test]
-fn a_game_continues_where_it_was_saved() {
-    use crate::saved::tests::continues;
-
-    let overlay = IsingOverlay {
-        temperature: 2.0,
-        sweeps_per_step: 1,
-    };
-    let schedule = LethalSchedule {
-        episodes_per_task: 1,
-        order: vec![0, 1, 2, 3],
-    };
-    for (ising, lethal_schedule) in [(None, None), (Some(overlay), Some(schedule))] {
-        let config = PacmanConfig {
-            ising,
-            lethal_schedule,
-            step_limit: 40,
-            ..config()
-        };
-        let make =
-            || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
-        assert!(continues("Ms. PacMan", 100, make) > 3);
-    }
-}
-
-#[test]
-fn a_state_that_no_game_has_is_refused() {
-    let mut world = PacmanWorld::new(&config(), 1, 5).unwrap();
-    let maze = Maze::new();
-    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().copies.remove(0);
-    let mut refuse = |what: &str, change: fn(&mut Game)| {
-        let mut wrong = fine();
-        change(&mut wrong);
-        let said = world.copies[0].load(wrong.saved(), &maze).unwrap_err();
-        assert!(said.to_string().contains(what), "{said}");
-    };
-    refuse("the agent's place", |game| game.agent = 10_000);
-    refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));
-    refuse("the food", |game| game.pellets_left += 1);
-    refuse("the food", |game| game.items.clear());
-    refuse("a frame", |game| game.background.clear());
 }

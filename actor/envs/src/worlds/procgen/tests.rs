@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 
 /// The installed engine, or a line that says the test was skipped.
-fn engine(test: &str) -> Option<&'static Engine> {
+pub(super) fn engine(test: &str) -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|value| value == "1") {
         println!("skipped: {test} (DRIML_OFFLINE=1)");
@@ -20,7 +20,7 @@ fn engine(test: &str) -> Option<&'static Engine> {
     Some(ENGINE.get_or_init(|| Engine::install(&mut |line| println!("{line}")).unwrap()))
 }
 
-fn config(game: Game) -> ProcgenConfig {
+pub(super) fn config(game: Game) -> ProcgenConfig {
     ProcgenConfig {
         game,
         distribution_mode: DistributionMode::Easy,
@@ -37,14 +37,14 @@ fn config(game: Game) -> ProcgenConfig {
     }
 }
 
-fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
+pub(super) fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
     (0..num_envs)
         .map(|_| rng.random_range(0..NUM_ACTIONS as u8))
         .collect()
 }
 
 /// What a step gave: frames after it, rewards, ends.
-fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<StepEnd>) {
+pub(super) fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<StepEnd>) {
     let num_envs = world.num_envs();
     let (mut rewards, mut ends) = (vec![0.0; num_envs], vec![StepEnd::Running; num_envs]);
     world.step(actions, &mut rewards, &mut ends).unwrap();
@@ -55,7 +55,7 @@ fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<Ste
 
 /// One copy of the game at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
 /// was taken before: the engine aims shots with it, and does not forget it when a level starts.
-fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
+pub(super) fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
     let options = config.options(1, 0, 0).unwrap();
     let options = Options {
         num_levels: 1,
@@ -266,178 +266,6 @@ fn the_same_seed_gives_the_same_frames_and_copies_do_not_depend_on_their_number(
     assert!(tape == run(8, 5, 2));
     assert!(tape == run(4, 5, 0));
     assert!(tape != run(8, 6, 0));
-}
-
-#[test]
-fn completed_levels_are_followed_by_levels_of_the_set() {
-    let Some(engine) = engine("completed_levels_are_followed_by_levels_of_the_set") else {
-        return;
-    };
-    for (game, start_level, num_levels) in [
-        (Game::Leaper, 0, 500),
-        (Game::Maze, 30, 7),
-        (Game::Jumper, 900, 1),
-    ] {
-        let config = ProcgenConfig {
-            start_level,
-            num_levels,
-            ..config(game)
-        };
-        let mut world = ProcgenWorld::with_engine(engine, &config, 16, 3, 0).unwrap();
-        let mut rng = ChaCha8Rng::seed_from_u64(2);
-        let mut changes = 0;
-        for _ in 0..1000 {
-            let (_, rewards, ends) = step(&mut world, &draw(&mut rng, 16));
-            let set = start_level as i32..(start_level + num_levels) as i32;
-            assert!(
-                world.levels().iter().all(|level| set.contains(level)),
-                "{game}"
-            );
-            for (end, reward) in ends.into_iter().zip(rewards) {
-                if end == StepEnd::LevelChange {
-                    changes += 1;
-                    assert_eq!(
-                        reward, 10.0,
-                        "{game}: the step that completed the level keeps its reward"
-                    );
-                }
-            }
-        }
-        assert!(changes > 10, "{game}: {changes} levels completed");
-    }
-}
-
-/// Levels have no order: the next one is drawn.
-#[test]
-fn the_same_level_is_followed_by_different_ones() {
-    let Some(engine) = engine("the_same_level_is_followed_by_different_ones") else {
-        return;
-    };
-    let config = ProcgenConfig {
-        start_level: 30,
-        num_levels: 3,
-        ..config(Game::Maze)
-    };
-    let followers = |seed: u64| {
-        let mut world = ProcgenWorld::with_engine(engine, &config, 16, seed, 0).unwrap();
-        let mut rng = ChaCha8Rng::seed_from_u64(2);
-        let mut followers = std::collections::BTreeMap::<i32, Vec<i32>>::new();
-        for _ in 0..1000 {
-            let before = world.levels().to_vec();
-            let (_, _, ends) = step(&mut world, &draw(&mut rng, 16));
-            for ((before, after), end) in before.into_iter().zip(world.levels().to_vec()).zip(ends)
-            {
-                if end == StepEnd::LevelChange {
-                    followers.entry(before).or_default().push(after);
-                }
-            }
-        }
-        followers
-    };
-    let (one, other) = (followers(3), followers(4));
-    assert_ne!(one, other);
-    let (level, after) = one.iter().max_by_key(|(_, after)| after.len()).unwrap();
-    assert!(after.len() >= 10, "{one:?}");
-    for next in 30..33 {
-        assert!(
-            after.contains(&next),
-            "{level} is never followed by {next}: {after:?}"
-        );
-    }
-}
-
-/// A redrawn copy equals a fresh one of that level, also in the steps that follow, in every game.
-#[test]
-fn a_redrawn_level_is_the_level_itself() {
-    let Some(engine) = engine("a_redrawn_level_is_the_level_itself") else {
-        return;
-    };
-    for game in Game::ALL {
-        let config = config(game);
-        let mut world = ProcgenWorld::with_engine(engine, &config, 3, 11, 0).unwrap();
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut last_move = 7;
-        let mut draw = || {
-            let actions = draw(&mut rng, 3);
-            if actions[1] < 9 && actions[1] != 4 {
-                last_move = actions[1];
-            }
-            (actions, last_move)
-        };
-        for round in 0..3 {
-            let mut last_move = 7;
-            for _ in 0..15 {
-                let actions;
-                (actions, last_move) = draw();
-                step(&mut world, &actions);
-            }
-            let others = (world.game.state(0).unwrap(), world.game.state(2).unwrap());
-            world
-                .levels
-                .as_mut()
-                .unwrap()
-                .redraw(&mut world.game, 1)
-                .unwrap();
-            assert!(
-                others == (world.game.state(0).unwrap(), world.game.state(2).unwrap()),
-                "{game}"
-            );
-            let mut alone = alone(engine, &config, world.levels()[1], last_move);
-            let frame = FRAME_BYTES..2 * FRAME_BYTES;
-            assert!(
-                world.game.frames()[frame.clone()] == *alone.frames(),
-                "{game}, round {round}"
-            );
-            for t in 0..40 {
-                let (actions, _) = draw();
-                let (frames, rewards, ends) = step(&mut world, &actions);
-                alone.act(&[i32::from(actions[1])]).unwrap();
-                assert_eq!(
-                    rewards[1],
-                    alone.rewards()[0],
-                    "{game}, round {round}, step {t}"
-                );
-                if ends[1] != StepEnd::Running {
-                    break;
-                }
-                assert!(
-                    frames[frame.clone()] == *alone.frames(),
-                    "{game}, round {round}, step {t}"
-                );
-            }
-        }
-    }
-}
-
-#[test]
-fn redrawn_levels_are_uniform_over_the_set() {
-    let Some(engine) = engine("redrawn_levels_are_uniform_over_the_set") else {
-        return;
-    };
-    let config = ProcgenConfig {
-        num_levels: 10,
-        ..config(Game::Maze)
-    };
-    let mut world = ProcgenWorld::with_engine(engine, &config, 1, 17, 0).unwrap();
-    let mut counts = [0.0; 10];
-    for _ in 0..1000 {
-        world
-            .levels
-            .as_mut()
-            .unwrap()
-            .redraw(&mut world.game, 0)
-            .unwrap();
-        counts[world.levels()[0] as usize] += 1.0;
-    }
-    let chi_square: f64 = counts
-        .iter()
-        .map(|count: &f64| (count - 100.0).powi(2) / 100.0)
-        .sum();
-    // The 99.9 % quantile of chi-square with 9 degrees of freedom.
-    assert!(
-        chi_square < 27.88,
-        "chi-square {chi_square}, counts {counts:?}"
-    );
 }
 
 #[test]

@@ -1,0 +1,124 @@
+//! Tests of settings, actions and saved states of Ms. PacMan: what is read back, and what is refused.
+//! The rules of the game are in `tests`.
+
+use super::tests::*;
+use super::*;
+
+#[test]
+fn unusable_settings_and_actions_are_errors() {
+    let schedule = |episodes_per_task, order: &[u8]| {
+        Some(LethalSchedule {
+            episodes_per_task,
+            order: order.to_vec(),
+        })
+    };
+    let overlay = |temperature, sweeps_per_step| {
+        Some(IsingOverlay {
+            temperature,
+            sweeps_per_step,
+        })
+    };
+    for bad in [
+        PacmanConfig {
+            epsilon: 1.1,
+            ..config()
+        },
+        PacmanConfig {
+            epsilon: f64::NAN,
+            ..config()
+        },
+        PacmanConfig {
+            switch_probability: -0.1,
+            ..config()
+        },
+        PacmanConfig {
+            step_limit: 0,
+            ..config()
+        },
+        PacmanConfig {
+            reward_ghost: f32::INFINITY,
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(0, &[0]),
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(1, &[]),
+            ..config()
+        },
+        PacmanConfig {
+            lethal_schedule: schedule(1, &[4]),
+            ..config()
+        },
+        PacmanConfig {
+            ising: overlay(0.0, 1),
+            ..config()
+        },
+        PacmanConfig {
+            ising: overlay(0.4, 0),
+            ..config()
+        },
+    ] {
+        let error = PacmanWorld::new(&bad, 1, 0)
+            .err()
+            .expect("rejected")
+            .to_string();
+        assert!(
+            error.contains("must") || error.contains("0 to 3"),
+            "{error}"
+        );
+    }
+    assert!(PacmanWorld::new(&config(), 0, 0).is_err());
+    let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
+    let error = world
+        .step(&[5], &mut [0.0], &mut [StepEnd::Running])
+        .unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "action 5 of copy 0 is out of range: this world has 5 actions"
+    );
+}
+
+#[test]
+fn a_game_continues_where_it_was_saved() {
+    use crate::saved::tests::continues;
+
+    let overlay = IsingOverlay {
+        temperature: 2.0,
+        sweeps_per_step: 1,
+    };
+    let schedule = LethalSchedule {
+        episodes_per_task: 1,
+        order: vec![0, 1, 2, 3],
+    };
+    for (ising, lethal_schedule) in [(None, None), (Some(overlay), Some(schedule))] {
+        let config = PacmanConfig {
+            ising,
+            lethal_schedule,
+            step_limit: 40,
+            ..config()
+        };
+        let make =
+            || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
+        assert!(continues("Ms. PacMan", 100, make) > 3);
+    }
+}
+
+#[test]
+fn a_state_that_no_game_has_is_refused() {
+    let mut world = PacmanWorld::new(&config(), 1, 5).unwrap();
+    let maze = Maze::new();
+    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().copies.remove(0);
+    let mut refuse = |what: &str, change: fn(&mut Game)| {
+        let mut wrong = fine();
+        change(&mut wrong);
+        let said = world.copies[0].load(wrong.saved(), &maze).unwrap_err();
+        assert!(said.to_string().contains(what), "{said}");
+    };
+    refuse("the agent's place", |game| game.agent = 10_000);
+    refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));
+    refuse("the food", |game| game.pellets_left += 1);
+    refuse("the food", |game| game.items.clear());
+    refuse("a frame", |game| game.background.clear());
+}
