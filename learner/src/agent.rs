@@ -25,7 +25,7 @@ use crate::{
     },
     repeats::EqualStates,
     settings::LearnerSettings,
-    tensors::{flat, states},
+    tensors::{finite, flat, states},
 };
 
 /// What one update did: the numbers of a row of metrics.
@@ -266,21 +266,19 @@ impl Agent {
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
         fault::hold(self.updates());
         // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
-        rayon::scope(|_| self.update_here(batch))
-    }
-
-    fn update_here(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
-        let evaluation = self.evaluate(batch)?;
-        let grad_norm = self.apply(&evaluation.gradients)?;
-        let taken = evaluation.taken_logits.unsqueeze(1)?;
-        let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
-        Ok(UpdateReport {
-            c51_kl: evaluation.c51_kl,
-            row_kls: evaluation.row_kls,
-            losses: evaluation.losses,
-            total: evaluation.total,
-            grad_norm,
-            q_mean: q_sum / batch.rows as f32,
+        rayon::scope(|_| {
+            let evaluation = self.evaluate(batch)?;
+            let grad_norm = self.apply(&evaluation.gradients)?;
+            let taken = evaluation.taken_logits.unsqueeze(1)?;
+            let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
+            Ok(UpdateReport {
+                c51_kl: evaluation.c51_kl,
+                row_kls: evaluation.row_kls,
+                losses: evaluation.losses,
+                total: evaluation.total,
+                grad_norm,
+                q_mean: q_sum / batch.rows as f32,
+            })
         })
     }
 
@@ -421,7 +419,6 @@ impl Agent {
         Ok(norm)
     }
 
-    /// Replaces the averaged network.
     pub(crate) fn restore_average(&mut self, average: Parameters) {
         self.average = Some(average);
     }
@@ -448,16 +445,5 @@ impl Agent {
             .restore(adam_step, moments, &self.compute.device)?;
         self.updates = updates;
         Ok(())
-    }
-}
-
-fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
-    let value = loss.to_scalar::<f32>()?;
-    if value.is_finite() {
-        Ok(value)
-    } else {
-        Err(UpdateError::NonFinite {
-            what: what.to_owned(),
-        })
     }
 }

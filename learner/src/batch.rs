@@ -119,7 +119,6 @@ impl<'a> Batch<'a> {
         Ok(())
     }
 
-    /// The rows that bootstrap.
     pub(crate) fn bootstraps(&self) -> impl Iterator<Item = usize> {
         let discounts = self.bootstrap_discount.iter().enumerate();
         discounts.filter_map(|(row, &discount)| (discount != 0.0).then_some(row))

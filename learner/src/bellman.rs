@@ -16,7 +16,6 @@ use crate::{
     tensors::{flat, states},
 };
 
-/// The target of a batch.
 pub(crate) struct BellmanTarget {
     /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap.
     pub(crate) next_greedy_action: Vec<u8>,
@@ -145,7 +144,6 @@ pub(crate) fn distribution(
     Ok(network.noisy_logits(&f4, noise)?.detach())
 }
 
-/// Index of the first largest value.
 fn greedy(values: &[f32]) -> u8 {
     let mut best = 0;
     for (i, value) in values.iter().enumerate() {

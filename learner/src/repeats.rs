@@ -15,7 +15,6 @@ use serde::{Deserialize, Serialize};
 /// A pass is made shorter where at least one of this many states repeats another: below, what is saved is less than what it costs
 /// to pick states out and to hand their features round.
 const PAYS_ONE_IN: usize = 32;
-/// States that one task looks at.
 const TASK_STATES: usize = 16;
 
 /// The bytes of a state; none of a blank one, which stands where there is no state.

@@ -5,6 +5,8 @@ use std::borrow::Cow;
 use candle_core::{CpuStorage, Device, Layout, Tensor, bail};
 use driml_model::ModelConfig;
 
+use crate::error::UpdateError;
+
 /// The bytes of states as a tensor [B, H, W, C] u8 on `device`: bytes travel there, they become numbers there.
 pub(crate) fn states<'a>(
     model: &ModelConfig,
@@ -36,7 +38,6 @@ pub(crate) fn slice<'a>(
     }
 }
 
-/// [`slice`], to be written.
 pub(crate) fn slice_mut<'a>(
     storage: &'a mut CpuStorage,
     layout: &Layout,
@@ -47,5 +48,17 @@ pub(crate) fn slice_mut<'a>(
             "a tensor of shape {:?} is not contiguous f32",
             layout.shape()
         ),
+    }
+}
+
+/// A loss as a number; an error that names it unless it is finite.
+pub(crate) fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
+    let value = loss.to_scalar::<f32>()?;
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(UpdateError::NonFinite {
+            what: what.to_owned(),
+        })
     }
 }

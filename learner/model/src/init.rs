@@ -102,7 +102,6 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// That many standard normal numbers.
 pub(crate) fn normals(len: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
     let pairs = (0..len.div_ceil(2)).flat_map(|_| normal_pair(rng));
     pairs.take(len).collect()

@@ -172,7 +172,6 @@ fn weights(
 
 struct UnitWeights<U: Unit> {
     unit: U,
-    /// Bytes of a frame.
     frame_len: usize,
     torso: Box<dyn ActingTorso>,
     head: Dense<U>,

@@ -3,14 +3,13 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::AffinityError;
+use super::arrays::AffinityError;
 
 /// A map from raw to visible actions, and the visible ones numbered without gaps.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Alphabet {
     /// Dense index of each raw action's visible action [n], below `len`.
     index: Vec<u8>,
-    /// Number of visible actions, m.
     len: usize,
 }
 

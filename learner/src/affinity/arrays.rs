@@ -1,6 +1,9 @@
 //! Arrays of numbers that both estimates have: checks of a saved one, and the softmax of each row of a matrix.
 
-use super::error::AffinityError;
+/// What is wrong with the settings, the pairs of actions or the saved state of an affinity estimate.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("action affinity: {0}")]
+pub struct AffinityError(pub(super) String);
 
 /// Checks the length of an array by name, and that its numbers are finite.
 pub(super) fn check_array<T: Copy + Into<f64>>(
@@ -36,7 +39,6 @@ pub(super) fn check_probabilities<T: Copy + Into<f64>>(
     }
 }
 
-/// Row-wise softmax of `q` [m, m].
 pub(super) fn row_softmax(q: &[f64], m: usize) -> Vec<f64> {
     let mut matrix = Vec::with_capacity(q.len());
     for row in q.chunks_exact(m) {

@@ -7,9 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::DeserializeOwn
 pub(super) trait Bits: Copy {
     /// The integer type of the float's size.
     type Word: Serialize + DeserializeOwned;
-    /// The float's bits as an integer.
     fn word(self) -> Self::Word;
-    /// The float of these bits.
     fn of(word: Self::Word) -> Self;
 }
 
@@ -33,12 +31,10 @@ impl Bits for f64 {
     }
 }
 
-/// For `#[serde(with = "bits")]`.
 pub(super) fn serialize<T: Bits, S: Serializer>(values: &[T], to: S) -> Result<S::Ok, S::Error> {
     to.collect_seq(values.iter().map(|&value| value.word()))
 }
 
-/// For `#[serde(with = "bits")]`.
 pub(super) fn deserialize<'de, T: Bits, D: Deserializer<'de>>(from: D) -> Result<Vec<T>, D::Error> {
     Ok(Vec::<T::Word>::deserialize(from)?
         .into_iter()

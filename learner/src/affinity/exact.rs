@@ -7,9 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{check_array, check_probabilities},
+    arrays::{AffinityError, check_array, check_probabilities},
     bits,
-    error::AffinityError,
 };
 
 /// Decay and smoothing of the pair counts.

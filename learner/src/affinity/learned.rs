@@ -7,9 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     alphabet::Alphabet,
-    arrays::{check_array, check_probabilities, row_softmax},
+    arrays::{AffinityError, check_array, check_probabilities, row_softmax},
     bits,
-    error::AffinityError,
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -242,7 +241,6 @@ impl LearnedAffinity {
         gradient
     }
 
-    /// One step of Adam.
     fn step(&mut self, gradient: &[f64]) {
         let LearnedSettings {
             lr,

@@ -4,7 +4,6 @@
 pub mod alphabet;
 mod arrays;
 mod bits;
-mod error;
 pub mod exact;
 pub mod learned;
 
@@ -12,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 pub use alphabet::Alphabet;
-pub use error::AffinityError;
+pub use arrays::AffinityError;
 pub use exact::{ExactAffinity, ExactSettings};
 pub use learned::{LearnedAffinity, LearnedSettings};
 

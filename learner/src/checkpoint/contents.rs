@@ -12,9 +12,7 @@ use crate::{
 };
 
 pub(super) const FORMAT: u32 = 3;
-/// The online network.
 pub(super) const ONLINE: &str = "online.safetensors";
-/// The target network.
 pub(super) const TARGET: &str = "target.safetensors";
 /// CURL's key encoder; there for that objective alone.
 pub(super) const KEY: &str = "key.safetensors";
@@ -23,7 +21,6 @@ pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 /// The companion that the caller keeps with the checkpoint, if any.
 pub(super) const COMPANION: &str = "companion.bin";
-/// A [`StateFile`].
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which has those of the other files.
 pub(super) const STATE_SUM: &str = "state.json.sha256";

@@ -6,7 +6,6 @@ use candle_nn::ops::log_softmax;
 
 use super::scores::Scores;
 
-/// As [`super::c51::kl_loss`].
 pub(super) fn kl_loss(
     logits: &Tensor,
     target: Vec<f32>,

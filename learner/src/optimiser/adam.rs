@@ -28,7 +28,6 @@ const CHUNK: usize = 1 << 14;
 /// Steps from one flushing of subnormal moments to the next: in every step it would cost a quarter of the step's time.
 const FLUSH_PERIOD: u64 = 32;
 
-/// Learning rates that f32 holds.
 const LR: RangeInclusive<f64> = 1e-30..=1e38;
 /// Decays of a moment; beyond the largest `1 - beta` is off by more than 0.2% in f32.
 const BETA: RangeInclusive<f64> = 0.0..=0.99999;
@@ -87,9 +86,14 @@ impl AdamSettings {
 #[derive(Clone, Debug)]
 enum Moments {
     /// In the parameter's layout, for the fused step.
-    Fused { m: Vec<f32>, v: Vec<f32> },
-    /// In its shape, on its device.
-    Tensors { m: Tensor, v: Tensor },
+    Fused {
+        m: Vec<f32>,
+        v: Vec<f32>,
+    },
+    Tensors {
+        m: Tensor,
+        v: Tensor,
+    },
 }
 
 impl Moments {
@@ -345,7 +349,6 @@ impl Rule {
         not_finite == 0
     }
 
-    /// The same on tensors.
     fn apply_to_tensors(
         &self,
         p: &Var,

@@ -108,7 +108,6 @@ struct Sizes {
     action_embed: usize,
 }
 
-/// The planes of a [`Batch`].
 struct Inputs {
     states_t: Vec<u8>,
     anchors: Option<Vec<u8>>,
@@ -218,13 +217,11 @@ impl Case {
         }
     }
 
-    /// The tensors under `prefix`, without it.
     fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
         let all = self.tensors.0.iter();
         all.filter_map(move |(name, tensor)| Some((name.strip_prefix(prefix)?, tensor)))
     }
 
-    /// The online parameters, without their prefix.
     pub(super) fn online(&self) -> impl Iterator<Item = (&str, &Tensor)> {
         self.under("online.")
     }

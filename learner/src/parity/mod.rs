@@ -123,7 +123,6 @@ fn check(case: &Case, compute: &Compute) -> Result<Vec<ParityLine>, ParityError>
     Ok(check.lines)
 }
 
-/// A comparison under way.
 struct Check<'a> {
     case: &'a Case,
     allowed: Tolerances,
@@ -220,7 +219,6 @@ impl Check<'_> {
         Ok(())
     }
 
-    /// Parameters after the step.
     fn updated(&mut self, agent: &Agent) -> Result<(), ParityError> {
         let (case, allowed) = (self.case, self.allowed);
         let tolerance = allowed.updated + allowed.updated_rates * case.settings.adam.lr;

@@ -3,6 +3,7 @@
 
 pub mod batch_source;
 mod error;
+mod fetcher;
 mod publish;
 pub mod run;
 mod shards;

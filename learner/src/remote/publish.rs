@@ -18,14 +18,11 @@ use driml_protocol::{
 };
 use zenoh::query::Queryable;
 
-/// One delivery of the affinity matrix.
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
-/// One delivery of priorities.
 const PRIORITIES_TIMEOUT: Duration = Duration::from_secs(5);
 /// Updates whose priorities may wait to be sent. More than batches can be on their way: a replay server that answers to the one
 /// answers to the other. Beyond it the oldest are given up: their transitions keep the priorities that they have.
 const PRIORITIES_MAX: usize = 128;
-/// One delivery of weights.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause between two tries.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
@@ -53,7 +50,6 @@ struct Newest<T> {
 }
 
 impl<T> Newest<T> {
-    /// At most so many.
     fn of(most: usize) -> Arc<Self> {
         Arc::new(Self {
             waiting: Mutex::default(),
@@ -193,7 +189,6 @@ impl Outlets {
         }
     }
 
-    /// Changes the status that others see.
     pub(crate) fn with_status(&self, change: impl FnOnce(&mut LearnerStatus)) {
         change(&mut lock(&self.status));
     }

@@ -1,5 +1,5 @@
 //! The replay's shards as the learner sees them: joining them all, and which rows of a batch come from which.
-//! It fetches nothing: `batch_source` does.
+//! It fetches nothing: `fetcher` does.
 
 use std::{
     sync::Arc,
@@ -8,14 +8,14 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Alive, Hello, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
+    Alive, Batch, Hello, Keys, LearnerJoin, RequestId, RunClient, Shutdown, Tally, join,
     session::{self, Endpoints},
     tls::Credentials,
 };
 use rand::Rng;
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
-use crate::progress::Progress;
+use crate::progress::{Progress, ServedPart};
 
 /// Age up to which a shard's counts are used, and that of one that holds nothing.
 const AGE_MAX: Duration = Duration::from_millis(500);
@@ -149,11 +149,9 @@ fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a He
     Ok(first)
 }
 
-/// What is known of one shard.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Count {
     pub(crate) tally: Tally,
-    /// Transitions that it holds.
     pub(crate) held: u64,
     /// When it said so; none before it is asked first.
     pub(crate) last_seen: Option<Instant>,
@@ -213,6 +211,38 @@ pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Ta
             sum + count.tally + pending
         },
     )
+}
+
+/// The one batch that is assembled from the parts of several shards. It outlives a failed try, because a part that was
+/// given is counted as sampled.
+pub(super) struct PartialBatch {
+    pub(super) counts: Vec<Count>,
+    /// Rows that are still to come from each shard.
+    pub(super) pending: Vec<u32>,
+    /// The chance with which each row was given to each shard.
+    pub(super) shares: Vec<f64>,
+    /// The request for a part that each shard gets next.
+    pub(super) ids: Vec<RequestId>,
+    pub(super) parts: Vec<Batch>,
+    pub(super) from: Vec<ServedPart>,
+    /// All transitions of the run are in.
+    pub(super) all_in: bool,
+    pub(super) whole_at: Instant,
+}
+
+impl PartialBatch {
+    pub(super) fn new(shards: usize) -> Self {
+        Self {
+            counts: vec![Count::default(); shards],
+            pending: vec![0; shards],
+            shares: vec![0.0; shards],
+            ids: vec![RequestId::first(rand::random()); shards],
+            parts: Vec::new(),
+            from: Vec::new(),
+            all_in: false,
+            whole_at: Instant::now(),
+        }
+    }
 }
 
 #[cfg(test)]

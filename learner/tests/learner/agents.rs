@@ -19,11 +19,8 @@ const KEY_TAU: f64 = 0.25;
 
 /// The table `curl` with this pace, or nothing.
 fn curl_table(key_tau: Option<f64>) -> toml::Table {
-    let table = key_tau.map(|it| toml::Table::from_iter([("key_tau".to_owned(), it.into())]));
-    table
-        .map(|it| ("curl".to_owned(), it.into()))
-        .into_iter()
-        .collect()
+    let table = key_tau.map(|it| format!("curl.key_tau = {it:?}").to_lowercase());
+    table.unwrap_or_default().parse().unwrap()
 }
 
 /// The names and values of auxiliary losses.
@@ -51,13 +48,8 @@ pub(crate) fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerS
 
 fn agent(objective: Objective, lambda: Lambda) -> Agent {
     let (model, settings) = of(objective, lambda);
-    Agent::new(
-        model,
-        settings,
-        &Compute::CPU,
-        &mut ChaCha8Rng::seed_from_u64(1),
-    )
-    .unwrap()
+    let rng = &mut ChaCha8Rng::seed_from_u64(1);
+    Agent::new(model, settings, &Compute::CPU, rng).unwrap()
 }
 
 /// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.

@@ -111,7 +111,6 @@ impl Run {
     }
 }
 
-/// A run of two shards.
 pub(crate) fn progress() -> Progress {
     let tally = |inserted, rows_sampled| Tally {
         inserted,

@@ -69,7 +69,6 @@ fn gradients(evaluation: &Evaluation, agent: &Agent) -> Vec<(String, Vec<f32>)> 
     agent.online().iter().filter_map(of).collect()
 }
 
-/// All that an evaluation computes forward.
 fn forward(it: &Evaluation) -> (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>) {
     let mut losses = vec![it.c51_kl, it.total];
     losses.extend(it.losses.iter().map(|(_, loss)| loss));

@@ -121,7 +121,6 @@ pub(crate) const CANDLE: Compute = Compute {
     ..Compute::CPU
 };
 
-/// A batch that owns its planes.
 #[derive(Clone)]
 pub(crate) struct Rows {
     pub(crate) frames: [Vec<u8>; 3],
@@ -181,7 +180,6 @@ impl Rows {
 
 pub(crate) type Values = HashMap<String, Vec<f32>>;
 
-/// All parameters, by name.
 pub(crate) fn values(parameters: &Parameters) -> Values {
     let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
     parameters
@@ -190,7 +188,6 @@ pub(crate) fn values(parameters: &Parameters) -> Values {
         .collect()
 }
 
-/// `agent` with its online parameters changed.
 pub(crate) fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
     let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
         let mut tensors = HashMap::new();

@@ -22,7 +22,6 @@ use crate::{
     made_up::{CPC, CURL, DIM},
 };
 
-/// Bytes of a state.
 const STATE: usize = 20 * 24 * 2;
 
 pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
@@ -85,7 +84,6 @@ pub(crate) fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
     served_with(config, seed, |_| {})
 }
 
-/// [`served`], with its rows changed.
 fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScalars])) -> WireBatch {
     let positives = config.spec.horizon.positives();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);

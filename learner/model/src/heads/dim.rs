@@ -101,7 +101,6 @@ impl Block {
 }
 
 impl Head {
-    /// The head of this name.
     pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         Ok(Self {
             block: Block::new(name, parameters, kernels)?,

@@ -70,7 +70,6 @@ impl HeadLayer {
     }
 }
 
-/// The head's layers.
 #[derive(Debug)]
 pub(crate) struct Streams {
     /// Of N outputs; there in a dueling head.

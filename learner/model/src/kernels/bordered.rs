@@ -51,7 +51,6 @@ impl Border {
         start..start + self.width * self.channels
     }
 
-    /// Writes the zeros.
     pub(crate) fn clear<E: Element>(self, room: &mut [E]) {
         let mut end = 0;
         for y in 0..self.height {
@@ -125,7 +124,6 @@ impl<E: Element> BorderedConvolution<E> {
         &self.forward.bias
     }
 
-    /// The border around its input.
     pub(crate) const fn border(&self) -> Border {
         Border::of_input(self.shape())
     }

@@ -138,7 +138,6 @@ impl<U: Unit> ConvStack<U> {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    /// How many images these are.
     pub(crate) fn count(&self, images: Pixels<'_>) -> usize {
         images.len() / self.first().image_len()
     }
@@ -313,7 +312,6 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
     }
 }
 
-/// The scalars of contiguous images.
 pub(crate) fn pixels<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<Pixels<'a>> {
     match storage {
         CpuStorage::U8(bytes) => match layout.contiguous_offsets() {

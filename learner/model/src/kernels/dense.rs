@@ -6,7 +6,6 @@ use crate::kernels::linear::relu_of;
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::units::{Element, Left, Mode, Unit, vectorized};
 
-/// A fully connected layer.
 pub(crate) struct Dense<U: Unit> {
     /// Of [in, out].
     weight: Panels<U::Element>,

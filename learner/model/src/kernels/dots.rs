@@ -73,7 +73,6 @@ impl Dots {
         Located::Copied(copied)
     }
 
-    /// A product of one location.
     fn product<'a>(&self, a: Matrix<'a>, b: Matrix<'a>) -> Product<'a> {
         Product::new(Precision::F32, a, b).on(match self.locations {
             1 => Threads::Pool,

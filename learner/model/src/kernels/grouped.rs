@@ -116,7 +116,6 @@ impl Grouped {
         Matrix::new(&sorted[rows.start * len..rows.end * len], rows.len(), len)
     }
 
-    /// A group's weight [out, in].
     fn weight<'a>(&self, w: &'a [f32], group: usize) -> Matrix<'a> {
         let len = self.out * self.inputs;
         Matrix::new(&w[group * len..][..len], self.out, self.inputs)

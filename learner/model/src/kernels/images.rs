@@ -29,12 +29,10 @@ impl Pixels<'_> {
     }
 }
 
-/// What a convolution reads.
 #[derive(Clone, Copy)]
 pub(crate) enum Images<'a, E> {
     /// Images that are not operands yet: each becomes one when its turn comes, and stays in the first cache meanwhile.
     Pixels(Pixels<'a>),
-    /// The maps of another layer.
     Maps(&'a [E]),
 }
 
@@ -101,7 +99,6 @@ impl<E: Element> Images<'_, E> {
 pub(crate) struct Room<E: Element>(Option<Buffer<E>>);
 
 impl<E: Element> Room<E> {
-    /// Takes nothing yet.
     pub(crate) const fn new() -> Self {
         Self(None)
     }

@@ -91,7 +91,6 @@ impl<U: Unit> ResidualStages<U> {
     }
 }
 
-/// The bytes of images.
 fn bytes<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [u8]> {
     match pixels(storage, layout)? {
         Pixels::Bytes(bytes) => Ok(bytes),

@@ -67,7 +67,6 @@ impl<'a> Matrix<'a> {
     }
 }
 
-/// Who computes a product.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Threads {
     /// The calling thread alone: for callers that already split their work.
@@ -268,7 +267,6 @@ pub(crate) struct Rows<'a, E: Element> {
     steps: usize,
 }
 
-/// Where a left operand's scalars are.
 enum Operand<'a, E: Element> {
     InPlace(&'a [E]),
     Packed(Buffer<E>),

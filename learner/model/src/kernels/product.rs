@@ -53,7 +53,6 @@ impl<'a> Product<'a> {
         }
     }
 
-    /// By these threads.
     pub(crate) fn on(self, threads: Threads) -> Self {
         Self { threads, ..self }
     }
@@ -106,7 +105,6 @@ impl<'a> Product<'a> {
         self.run(&mut sums[first..last], stride, Mode::Add);
     }
 
-    /// The product as a new vector.
     pub(crate) fn to_vec(self) -> Vec<f32> {
         struct Made<'a>(Product<'a>);
         impl ForUnit for Made<'_> {

@@ -15,7 +15,6 @@ use crate::kernels::units::{Element, Unit, vectorized};
 /// Every stage with its parameters as the kernels want them.
 pub(crate) struct Stages<U: Unit> {
     unit: U,
-    /// Those of [`stages`].
     convolutions: Vec<BorderedConvolution<U::Element>>,
     output: (usize, usize, usize),
 }
@@ -58,7 +57,6 @@ impl<U: Unit> Stages<U> {
         }
     }
 
-    /// Bytes of an image.
     pub(crate) fn image_len(&self) -> usize {
         let first = self.convolutions[0].shape();
         (first.height - 2) * (first.width - 2) * first.channels_in
@@ -69,7 +67,6 @@ impl<U: Unit> Stages<U> {
         self.output
     }
 
-    /// Scalars of f3.
     pub(crate) const fn output_len(&self) -> usize {
         self.output.0 * self.output.1 * self.output.2
     }

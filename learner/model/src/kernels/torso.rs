@@ -62,7 +62,6 @@ pub(crate) fn torso(
     with_unit(precision, Apply(images, layers, fc))
 }
 
-/// The fully connected layer.
 struct Fc {
     weight: Tensor,
     bias: Tensor,

@@ -13,7 +13,6 @@ use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
 use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
 
-/// The convolutions of a stage.
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "conv",
     "block1.conv1",
@@ -25,7 +24,6 @@ const NAMES: [&str; STAGE_CONVOLUTIONS] = [
 #[derive(Debug)]
 pub(crate) struct Impala {
     input: (usize, usize, usize),
-    /// Channels of each stage.
     widths: Vec<usize>,
     /// Whether the second convolution of each block starts smaller, by the square root of the number of blocks.
     scale_blocks: bool,

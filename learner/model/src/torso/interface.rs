@@ -48,7 +48,6 @@ pub(crate) trait ActingTorso: Send + Sync {
     fn f4(&self, frames: &[u8]) -> Buffer<f32>;
 }
 
-/// One convolution of a torso.
 #[derive(Clone, Debug)]
 pub(crate) struct TorsoConvolution {
     /// Such as `torso.conv1`.
@@ -61,14 +60,12 @@ pub(crate) struct TorsoConvolution {
     pub(crate) initial_scale: f32,
 }
 
-/// Weight and bias of a layer.
 #[derive(Clone, Debug)]
 pub(crate) struct Layer<T> {
     pub(crate) weight: T,
     pub(crate) bias: T,
 }
 
-/// The parameters of a torso.
 #[derive(Clone, Debug)]
 pub(crate) struct TorsoParameters<T> {
     /// In the order of [`Torso::convolutions`].

@@ -155,7 +155,6 @@ pub(crate) fn residual(torso: TorsoName) -> ModelConfig {
     }
 }
 
-/// [`small`] with another head.
 pub(crate) fn small_with(head: HeadConfig) -> ModelConfig {
     ModelConfig { head, ..small() }
 }
@@ -178,7 +177,6 @@ pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
 }
 
-/// A policy with these weights.
 pub(crate) fn policy(
     config: &ModelConfig,
     parameters: &Parameters,

@@ -8,13 +8,13 @@ use std::sync::OnceLock;
 
 use half::bf16;
 
+use super::amx_permission::{granted, has_amx_bf16};
 use super::avx512::Brain;
 use super::element::Rounding;
 use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
 /// Steps, which are pairs of bf16, in a row of a tile register: 64 bytes.
 pub(super) const STEPS: usize = 16;
-/// Rows of a tile register.
 pub(super) const ROWS: usize = 16;
 /// Tile registers that hold sums.
 pub(super) const SUMS: usize = 4;
@@ -66,42 +66,6 @@ fn multiplies_right() -> bool {
     right
 }
 
-/// CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. That the operating system knows tiles is asked by `granted`.
-fn has_amx_bf16() -> bool {
-    let leaves = std::arch::x86_64::__cpuid(0).eax;
-    leaves >= 7 && {
-        let edx = std::arch::x86_64::__cpuid_count(7, 0).edx;
-        edx & (1 << 22) != 0 && edx & (1 << 24) != 0
-    }
-}
-
-/// Asks Linux for the 8 KiB of state that tiles are (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
-#[cfg(target_os = "linux")]
-fn granted() -> bool {
-    const ARCH_PRCTL: i64 = 158;
-    const ARCH_REQ_XCOMP_PERM: i64 = 0x1023;
-    const XTILEDATA: i64 = 18;
-    let result: i64;
-    // SAFETY: a system call with two numbers, which touches no memory; it clobbers rcx and r11.
-    unsafe {
-        asm!(
-            "syscall",
-            inlateout("rax") ARCH_PRCTL => result,
-            in("rdi") ARCH_REQ_XCOMP_PERM,
-            in("rsi") XTILEDATA,
-            lateout("rcx") _,
-            lateout("r11") _,
-            options(nostack)
-        );
-    }
-    result == 0
-}
-
-#[cfg(not(target_os = "linux"))]
-fn granted() -> bool {
-    false
-}
-
 /// Eight tile registers: four of sums, and a left and a right operand, each twice: for whole runs of `STEPS`, and for what is left.
 ///
 /// # Safety
@@ -117,7 +81,6 @@ pub(super) trait Tiles {
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize);
 }
 
-/// The processor's own.
 struct Hardware;
 
 /// What `ldtilecfg` reads.

@@ -16,7 +16,6 @@ enum Instructions {
     Amx,
 }
 
-/// What this processor has.
 fn instructions() -> Instructions {
     #[cfg(target_arch = "x86_64")]
     {

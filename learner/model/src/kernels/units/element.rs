@@ -52,7 +52,6 @@ pub(crate) trait Rounding: Copy {
     }
 }
 
-/// A stored scalar of an operand.
 pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// Neighbours along the sum that are stored together, and multiplied in one step.
     const DEPTH: usize;
@@ -69,7 +68,6 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.
     fn of_byte(byte: u8) -> Self;
 
-    /// The scalar, exactly.
     fn value(self) -> f32;
 
     /// Stores `DEPTH` rows that follow each other along the sum: `step` [columns, DEPTH], with 0 for what the rows do not have.

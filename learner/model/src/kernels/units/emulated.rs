@@ -19,7 +19,6 @@ struct Registers {
     sums: [[[f32; LANES]; ROWS]; SUMS],
 }
 
-/// Both of a pair.
 fn pair(pair: u32) -> [f32; 2] {
     [
         f32::from_bits(pair << 16),
@@ -73,7 +72,6 @@ impl Tiles for Registers {
     }
 }
 
-/// `Amx` without AMX.
 #[derive(Clone, Copy)]
 pub(super) struct EmulatedAmx;
 

@@ -2,8 +2,10 @@
 //! It knows neither matrices nor layers: a unit computes one tile, a few rows by a few columns, in registers.
 
 mod amx;
+mod amx_permission;
 mod avx2;
 mod avx512;
+mod avx512_rounding;
 mod choice;
 pub(crate) mod element;
 mod emulated;

@@ -19,11 +19,9 @@ pub(crate) struct Left<'a, E> {
     pub(crate) row_stride: usize,
     /// Scalars from one step to the next.
     pub(crate) step: usize,
-    /// Steps in a run.
     pub(crate) steps: usize,
     /// Scalars from one run to the next.
     pub(crate) run_stride: usize,
-    /// Runs that make up a row.
     pub(crate) runs: usize,
 }
 
@@ -38,7 +36,6 @@ impl<E: Element> Left<'_, E> {
     }
 }
 
-/// Where a tile's result goes.
 pub(crate) struct Columns<'a> {
     /// From the first row's first column on.
     pub(crate) out: &'a mut [f32],

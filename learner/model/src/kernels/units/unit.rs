@@ -35,7 +35,6 @@ pub(crate) struct RawTile<E> {
 ///
 /// A value of a unit exists only where the processor has its instructions: [`with_unit`] looks before it makes one.
 pub(crate) trait Unit: Rounding + Send + Sync + 'static {
-    /// What operands are stored as.
     type Element: Element;
 
     /// Most registers of columns in a tile.
@@ -63,12 +62,9 @@ pub(crate) trait Unit: Rounding + Send + Sync + 'static {
     fn vectorize<W: Loop>(self, work: W);
 }
 
-/// Work that any unit can do.
 pub(crate) trait ForUnit {
-    /// What it gives.
     type Output;
 
-    /// Does it on `unit`.
     fn run<U: Unit>(self, unit: U) -> Self::Output;
 }
 

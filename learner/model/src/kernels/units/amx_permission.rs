@@ -1,0 +1,42 @@
+//! Whether there is AMX for bf16, and leave from the kernel to use its registers.
+//! It knows no tile.
+#![allow(unsafe_code, reason = "a system call")]
+#![cfg(target_arch = "x86_64")]
+
+use std::arch::asm;
+
+/// CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. That the operating system knows tiles is asked by `granted`.
+pub(super) fn has_amx_bf16() -> bool {
+    let leaves = std::arch::x86_64::__cpuid(0).eax;
+    leaves >= 7 && {
+        let edx = std::arch::x86_64::__cpuid_count(7, 0).edx;
+        edx & (1 << 22) != 0 && edx & (1 << 24) != 0
+    }
+}
+
+/// Asks Linux for the 8 KiB of state that tiles are (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
+#[cfg(target_os = "linux")]
+pub(super) fn granted() -> bool {
+    const ARCH_PRCTL: i64 = 158;
+    const ARCH_REQ_XCOMP_PERM: i64 = 0x1023;
+    const XTILEDATA: i64 = 18;
+    let result: i64;
+    // SAFETY: a system call with two numbers, which touches no memory; it clobbers rcx and r11.
+    unsafe {
+        asm!(
+            "syscall",
+            inlateout("rax") ARCH_PRCTL => result,
+            in("rdi") ARCH_REQ_XCOMP_PERM,
+            in("rsi") XTILEDATA,
+            lateout("rcx") _,
+            lateout("r11") _,
+            options(nostack)
+        );
+    }
+    result == 0
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn granted() -> bool {
+    false
+}

@@ -1,0 +1,430 @@
+//! One thread that fetches batches: from one replay server, or each put together from the parts of several shards.
+//! It does not queue them: `batch_source` does.
+
+use std::{
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+        mpsc,
+    },
+    time::{Duration, Instant},
+};
+
+use driml_protocol::{
+    Batch, BatchReply, BatchRequest, BufferPool, Learned, PendingReply, ReplayStatus, RequestId,
+    RunClient, Seldom, Shutdown, Tally, Waiting, fault, session::SessionError,
+    shared_memory::Trust,
+};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::{
+    error::BatchError,
+    shards::{self, Count, PartialBatch},
+};
+use crate::progress::{Progress, ServedPart};
+
+/// One request; the replay server answers within a second, if only to say that there is nothing yet.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Pause between two tries when the replay server is out of reach.
+const RETRY_PAUSE: Duration = Duration::from_millis(200);
+
+/// Pause before shards that hold nothing are asked again.
+const LOOK_AGAIN: Duration = Duration::from_millis(50);
+/// How long the last batch is waited for once all transitions are in.
+const LAST_BATCH_MAX: Duration = Duration::from_secs(30);
+/// What is asked for, by whom, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Requests {
+    /// The learner that has joined the run.
+    pub learner: u64,
+    /// Rows of a batch.
+    pub rows: u32,
+    /// Requests on their way at once, and threads that wait for them.
+    pub in_flight: u32,
+    /// Whether batches may come through shared memory.
+    pub shared_memory: bool,
+    /// How long the replay server may be out of reach before the learner gives up.
+    pub unreachable_max: Duration,
+}
+
+/// How far the learner is, which it tells with each request.
+#[derive(Debug)]
+pub struct Counters {
+    /// Updates done.
+    pub updates: AtomicU64,
+    /// Updates in the newest checkpoint.
+    pub saved_updates: AtomicU64,
+    /// Rows received from each shard.
+    received: Vec<AtomicU64>,
+}
+
+impl Counters {
+    /// Those of a learner after so many updates, all of which are saved.
+    pub fn of(updates: u64, progress: &Progress) -> Arc<Self> {
+        let shards = progress.shards.iter();
+        Arc::new(Self {
+            updates: updates.into(),
+            saved_updates: updates.into(),
+            received: shards.map(|it| it.rows_sampled.into()).collect(),
+        })
+    }
+
+    /// Those of a learner that has learned nothing.
+    pub fn at_start(shards: usize) -> Arc<Self> {
+        let mut progress = Progress::default();
+        progress.spread_over(shards);
+        Self::of(0, &progress)
+    }
+
+    fn learned(&self, shard: usize) -> Learned {
+        Learned {
+            updates: self.updates.load(Ordering::Acquire),
+            saved_updates: self.saved_updates.load(Ordering::Acquire),
+            rows_received: self.received[shard].load(Ordering::Acquire),
+        }
+    }
+}
+
+/// A batch, and where its rows are from.
+pub struct Served {
+    /// The batch.
+    pub batch: Batch,
+    /// Its rows by shard.
+    pub parts: Vec<ServedPart>,
+}
+
+/// What a fetching thread says.
+pub(super) enum Fetched {
+    Batch(Box<Served>),
+    Finished,
+    Failed(BatchError),
+}
+
+/// What all fetching threads share.
+pub(super) struct Shared {
+    clients: Vec<RunClient>,
+    requests: Requests,
+    counters: Arc<Counters>,
+    pool: BufferPool,
+    partial: Mutex<PartialBatch>,
+    waiting: Mutex<Waiting>,
+    pub(super) shutdown: Shutdown,
+}
+
+impl Shared {
+    pub(super) fn new(
+        clients: &[RunClient],
+        requests: Requests,
+        counters: &Arc<Counters>,
+        shutdown: &Shutdown,
+    ) -> Arc<Self> {
+        Arc::new(Self {
+            clients: clients.to_vec(),
+            requests,
+            counters: counters.clone(),
+            // A batch a thread, and the one that is learned from.
+            pool: BufferPool::new(requests.in_flight as usize + clients.len()),
+            partial: Mutex::new(PartialBatch::new(clients.len())),
+            waiting: Mutex::default(),
+            shutdown: shutdown.clone(),
+        })
+    }
+
+    /// Which side waits for the other, by the last answer that was no batch.
+    pub(super) fn waiting(&self) -> Waiting {
+        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+pub(super) struct Fetcher {
+    shared: Arc<Shared>,
+    /// The request for a whole batch that comes next.
+    id: RequestId,
+    rng: ChaCha8Rng,
+    /// Whether batches may come through shared memory.
+    trust: Trust,
+    said: Seldom,
+}
+
+impl Fetcher {
+    pub(super) fn new(shared: &Arc<Shared>) -> Self {
+        // Which rows come from which shard follows from the order of answers, so this need not be the run's generator.
+        let mut rng = ChaCha8Rng::from_os_rng();
+        Self {
+            shared: shared.clone(),
+            id: RequestId::first(rng.random()),
+            rng,
+            trust: Trust::default(),
+            said: Seldom::default(),
+        }
+    }
+
+    pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
+        let mut answered = Instant::now();
+        while !self.shared.shutdown.is_set() {
+            fault::point("batches");
+            let fetched = match self.fetch() {
+                Ok(None) => {
+                    answered = Instant::now();
+                    continue;
+                }
+                Ok(Some(fetched)) => fetched,
+                Err(e)
+                    if !e.is_recovering()
+                        && answered.elapsed() > self.shared.requests.unreachable_max =>
+                {
+                    Fetched::Failed(BatchError::Unreachable {
+                        unreachable_max: self.shared.requests.unreachable_max,
+                        source: Box::new(e),
+                    })
+                }
+                Err(e) => {
+                    if e.is_recovering() {
+                        answered = Instant::now();
+                    }
+                    if let Some(more) = self.said.due() {
+                        tracing::warn!("asking for a batch again: {e}{more}");
+                    }
+                    self.shared.shutdown.wait_timeout(RETRY_PAUSE);
+                    continue;
+                }
+            };
+            if let Fetched::Batch(served) = &fetched {
+                let header = &served.batch.header;
+                let (newest, oldest) = header.weights_versions;
+                tracing::debug!(
+                    "a batch came: {} rows acted by weights {oldest} to {newest}",
+                    header.rows
+                );
+            }
+            let last = !matches!(fetched, Fetched::Batch(_));
+            if sender.send(fetched).is_err() || last {
+                return;
+            }
+            answered = Instant::now();
+        }
+    }
+
+    /// One batch; `None` where the replay has nothing yet.
+    fn fetch(&mut self) -> Result<Option<Fetched>, BatchError> {
+        if self.shared.clients.len() > 1 {
+            return self.fetch_from_shards();
+        }
+        self.id = self.id.again();
+        let asked = self.ask(0, self.id, self.shared.requests.rows, None)?;
+        let answer = self.answer(asked)?;
+        self.id = self.id.next();
+        Ok(match answer {
+            Answer::Batch(batch) => {
+                let parts = vec![self.received(0, &batch)];
+                Some(Fetched::Batch(Box::new(Served { batch, parts })))
+            }
+            Answer::Wait => None,
+            Answer::Finished => Some(Fetched::Finished),
+            Answer::Refused(why) => Some(Fetched::Failed(BatchError::Refused(why))),
+        })
+    }
+
+    /// Counts what has come from a shard.
+    fn received(&self, shard: usize, part: &Batch) -> ServedPart {
+        let rows = part.header.rows;
+        self.shared.counters.received[shard].fetch_add(rows.into(), Ordering::AcqRel);
+        ServedPart {
+            shard,
+            rows,
+            inserted: part.header.tally.inserted,
+        }
+    }
+
+    /// One batch, put together from what the shards give. One is put together at a time: each shard is told what the others
+    /// give, so that their rate limiters decide as one.
+    fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
+        let shared = self.shared.clone();
+        let mut partial = shared
+            .partial
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        if partial.parts.is_empty() && partial.pending.iter().all(|&rows| rows == 0) {
+            self.recount(&mut partial, |count, now| count.is_old(now))?;
+            match shards::split(self.shared.requests.rows, &partial.counts, &mut self.rng) {
+                Some(split) => {
+                    partial.pending = split;
+                    partial.shares = shards::shares(&partial.counts);
+                }
+                // A run that had all its updates when it was resumed: nothing comes to be held any more.
+                None if partial.all_in => return Ok(Some(Fetched::Finished)),
+                None => {
+                    self.shared.shutdown.wait_timeout(LOOK_AGAIN);
+                    return Ok(None);
+                }
+            }
+        }
+        let PartialBatch {
+            counts,
+            pending,
+            shares,
+            ids,
+            parts,
+            from,
+            ..
+        } = &mut *partial;
+        let mut asked = Vec::new();
+        for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
+            let other_shards = shards::other_shards(counts, pending, shard);
+            ids[shard] = ids[shard].again();
+            let part = self.ask(shard, ids[shard], pending[shard], Some(other_shards))?;
+            asked.push((shard, part));
+        }
+        let (mut finished, mut failed) = (false, None);
+        for (shard, asked) in asked {
+            // A part that did not arrive is requested again, alone.
+            let answer = match self.answer(asked) {
+                Ok(answer) => answer,
+                Err(e) => {
+                    failed.get_or_insert(e);
+                    continue;
+                }
+            };
+            ids[shard] = ids[shard].next();
+            match answer {
+                Answer::Batch(mut part) => {
+                    counts[shard] = Count {
+                        tally: part.header.tally,
+                        held: part.header.held,
+                        last_seen: Some(Instant::now()),
+                    };
+                    from.push(self.received(shard, &part));
+                    pending[shard] = 0;
+                    if part.header.origin.is_some() {
+                        part.scale_probabilities(shares[shard] as f32);
+                    }
+                    parts.push(part);
+                }
+                Answer::Wait => {}
+                Answer::Finished => finished = true,
+                Answer::Refused(why) => {
+                    return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
+                }
+            }
+        }
+        if let Some(e) = failed {
+            return Err(e);
+        }
+        if pending.iter().all(|&rows| rows == 0) {
+            let header = Batch::merged_header(parts).ok_or(BatchError::DifferentShards)?;
+            let memory = self.shared.pool.take_own(header.payload_bytes());
+            let batch = Batch::merge(parts, memory);
+            parts.clear();
+            let parts = std::mem::take(from);
+            partial.whole_at = Instant::now();
+            return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
+        }
+        self.recount(&mut partial, |_, _| true)?;
+        // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
+        let is_over = finished && partial.parts.is_empty();
+        if !is_over && partial.all_in && partial.whole_at.elapsed() > LAST_BATCH_MAX {
+            let left = partial.pending.iter().enumerate();
+            let left = left.filter(|(_, rows)| **rows > 0);
+            let left: Vec<_> = left
+                .map(|(shard, rows)| format!("{rows} rows of shard {shard}"))
+                .collect();
+            tracing::warn!(
+                "all transitions are in, and the last batch lacks {} since {} s: it is left out",
+                left.join(" and "),
+                LAST_BATCH_MAX.as_secs()
+            );
+            return Ok(Some(Fetched::Finished));
+        }
+        Ok(is_over.then_some(Fetched::Finished))
+    }
+
+    /// Asks the shards for which `is_due` says so what they have counted.
+    fn recount(
+        &self,
+        partial: &mut PartialBatch,
+        is_due: impl Fn(&Count, Instant) -> bool,
+    ) -> Result<(), BatchError> {
+        let now = Instant::now();
+        for (client, count) in self.shared.clients.iter().zip(&mut partial.counts) {
+            if !is_due(count, now) {
+                continue;
+            }
+            let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
+            *count = Count {
+                tally: Tally {
+                    inserted: status.transitions_inserted,
+                    rows_sampled: status.rows_sampled,
+                },
+                held: status.transitions_held,
+                last_seen: Some(Instant::now()),
+            };
+            partial.all_in |= status.finished;
+        }
+        Ok(())
+    }
+
+    /// Asks a shard for `rows` rows.
+    fn ask(
+        &mut self,
+        shard: usize,
+        id: RequestId,
+        rows: u32,
+        other_shards: Option<Tally>,
+    ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
+        let request = BatchRequest {
+            learner: self.shared.requests.learner,
+            id,
+            rows,
+            shared_memory: self.shared.requests.shared_memory && self.trust.ask(),
+            learned: self.shared.counters.learned(shard),
+            other_shards,
+        };
+        let client = &self.shared.clients[shard];
+        let asked = client.send(client.seal(&request)?, REQUEST_TIMEOUT)?;
+        Ok((asked, request.shared_memory))
+    }
+
+    fn answer(
+        &mut self,
+        (asked, shared_memory): (PendingReply<BatchReply>, bool),
+    ) -> Result<Answer, BatchError> {
+        // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
+        let (reply, payload) = asked.receive(&self.shared.pool).inspect_err(|e| {
+            let unheard = matches!(
+                e,
+                SessionError::NoReply { .. } | SessionError::NoAnswerer { .. }
+            );
+            if shared_memory && unheard {
+                self.trust.lost();
+            }
+        })?;
+        Ok(match reply {
+            BatchReply::Batch(_) | BatchReply::Prioritised(..) | BatchReply::Stacked(..) => {
+                if shared_memory {
+                    self.trust.worked();
+                }
+                let header = reply.header().expect("a batch has a header");
+                Answer::Batch(Batch::from_payload(header, payload)?)
+            }
+            BatchReply::Wait(waiting) => {
+                *self
+                    .shared
+                    .waiting
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner) = waiting;
+                Answer::Wait
+            }
+            BatchReply::Finished => Answer::Finished,
+            BatchReply::Refused { why } => Answer::Refused(why),
+        })
+    }
+}
+
+/// What a replay server answers.
+enum Answer {
+    Batch(Batch),
+    Wait,
+    Finished,
+    Refused(String),
+}
