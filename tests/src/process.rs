@@ -147,6 +147,15 @@ impl Process {
         }
     }
 
+    /// Kills it and waits for its end.
+    ///
+    /// # Panics
+    /// If it ended in another way.
+    pub fn kill(self) {
+        self.signal(Signal::SIGKILL);
+        assert_eq!(self.wait().signal, Some(Signal::SIGKILL as i32));
+    }
+
     /// Asks it to stop and waits for its end.
     pub fn stop(self) -> Ended {
         self.signal(Signal::SIGTERM);

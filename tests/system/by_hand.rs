@@ -110,8 +110,7 @@ fn a_replay_server_does_not_wait_for_a_frozen_actor_for_ever() {
         .wait()
         .expect_code(0)
         .expect_said("the run is over, and ");
-    frozen.signal(Signal::SIGKILL);
-    frozen.wait();
+    frozen.kill();
 }
 
 #[test]
@@ -169,8 +168,7 @@ fn an_actor_killed_and_started_again_continues() {
     client.wait_for_replay("some transitions", |replay| {
         replay.transitions_inserted > 500
     });
-    actor.signal(Signal::SIGKILL);
-    assert_eq!(actor.wait().signal, Some(Signal::SIGKILL as i32));
+    actor.kill();
     let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
     assert!(!before.finished);
 
@@ -203,8 +201,7 @@ fn a_killed_learner_s_successor_continues() {
     let client = system.connect();
     client.wait_for_learner("two checkpoints", |learner| learner.updates > 100);
     let before = client.learner().unwrap();
-    learner.signal(Signal::SIGKILL);
-    learner.wait();
+    learner.kill();
 
     let learner = system.start_learner("run");
     let after = client.wait_for_learner("later updates", |learner| {

@@ -1,4 +1,4 @@
-//! A run folder on a disk that is full: the run continues, logs it once, and ends with the first error.
+//! Run folders and replays on disks that are full or read-only: the run continues, logs it once, and ends with the first error.
 //! The disk is a small one in memory, which takes root's rights to mount; without them a line says what is skipped.
 
 use std::{
@@ -11,7 +11,7 @@ use std::{
 use driml_tests::{Process, TestSystem, skip, wait_for};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, system};
+use crate::{LONG, SHORT, system};
 
 /// A small disk. Dropping it takes it away.
 pub(crate) struct Disk {
@@ -199,4 +199,108 @@ fn check_nothing_is_left(system: &TestSystem, run: &Path) {
             assert!(!is_temporary, "{name}");
         }
     }
+}
+
+/// Batches that may have been on their way to a learner that ended.
+const IN_FLIGHT: u64 = 8;
+/// While there is no room nothing is stored and nothing served; then everything continues, and nothing was lost.
+#[test]
+fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
+    let system = system();
+    let name = "a_full_disk_makes_all_processes_wait_until_there_is_room";
+    let Some(disk) = Disk::mount(name, system.path("disk"), 20_000) else {
+        return;
+    };
+    let flags = format!("--agent c51 {LONG} --replay-dir disk/replay");
+    let mut server = system.start_replay_server(&flags);
+    let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
+    let client = system.connect();
+    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    let filler = disk.fill();
+    server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
+    let stopped = client.replay().unwrap();
+    let ask = format!("status --connect {}", system.endpoint());
+    wait_for("a status that says it", || {
+        let said = system.run(&ask).stdout;
+        let words = [
+            "replay on disk: ",
+            "REFUSED for",
+            "No space left on device",
+            "If the replay server dies now",
+            "to do: the disk of the replay server on",
+        ];
+        words.iter().all(|it| said.contains(it)).then_some(())
+    });
+    filler.remove();
+    client.wait_for_replay("more frames", |replay| {
+        replay.transitions_inserted > stopped.transitions_inserted + 1_000
+    });
+    server.wait_for_stderr("can be written again; nothing was lost");
+    let said = system.run(&ask).stdout;
+    assert!(
+        said.contains("replay on disk: ") && !said.contains("REFUSED"),
+        "{said}"
+    );
+    actor.stop().expect_code(0);
+    learner.stop().expect_code(0);
+    let before = client.replay().unwrap();
+    assert_eq!(
+        (before.transitions_lost, before.transitions_duplicated),
+        (0, 0)
+    );
+    server.kill();
+    let server = system.start_replay_server(&flags);
+    let after = wait_for("the server", || client.replay());
+    assert_eq!(after.transitions_inserted, before.transitions_inserted);
+    // Whatever was served while the disk was full was learned.
+    let learner = system.start_learner("run");
+    let rows = "rows that the learner's checkpoint has";
+    let after = client.wait_for_replay(rows, |replay| {
+        replay.rows_sampled >= before.rows_sampled - 16 * IN_FLIGHT
+    });
+    assert_eq!(after.updates_relearned, 0, "{after:#?}");
+    client.wait_for_learner("the learner", |_| true);
+    learner.stop().expect_code(0);
+    drop(client);
+    server.stop().expect_code(0);
+}
+
+#[test]
+fn a_folder_that_cannot_be_used_is_said() {
+    let system = system();
+    let flags = format!("--agent c51 {SHORT} --replay-dir replay");
+    let server = system.start_replay_server(&flags);
+    drop(system.connect());
+    let other = |flags: &str| {
+        let socket = system.path("other").display().to_string();
+        system.start_part(&format!(
+            "replay-server --listen unixsock-stream/{socket} {flags}"
+        ))
+    };
+    other(&flags)
+        .wait()
+        .expect_code(1)
+        .expect_said("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
+    server.stop().expect_code(0);
+    other(&flags.replace("c51", "driml-ada"))
+        .wait()
+        .expect_code(1)
+        .expect_said("replay holds the replay of another run (its run spec has the hash");
+
+    let name = "a_folder_that_cannot_be_used_is_said";
+    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+        return;
+    };
+    let mut remount = Command::new("mount");
+    remount.args(["-o", "remount,ro"]).arg(system.path("disk"));
+    match remount.status() {
+        Ok(status) if status.success() => {}
+        _ => return skip(name, "no read-only file system"),
+    }
+    other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
+        .wait()
+        .expect_code(1)
+        .expect_said("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
+    drop(disk);
+    assert!(fs::read_dir(system.path("replay")).unwrap().count() > 2);
 }

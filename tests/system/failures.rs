@@ -220,8 +220,7 @@ fn a_dead_replay_server_ends_the_run() {
 fn parts_end_with_their_launcher() {
     let system = system();
     let process = launched(&system, 100);
-    process.signal(Signal::SIGKILL);
-    process.wait();
+    process.kill();
     wait_for("the end of all processes", || {
         system.survivors().is_empty().then_some(())
     });
@@ -278,8 +277,7 @@ fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
     let process = launched(&system, 100);
     let [server, actor] = ["replay-server", "actor"].map(|part| system.find_part(part));
     actor.signal(Signal::SIGSTOP);
-    process.signal(Signal::SIGKILL);
-    process.wait();
+    process.kill();
     wait_for("the replay server's end", || {
         (!system.survivors().contains(&server)).then_some(())
     });

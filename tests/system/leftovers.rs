@@ -41,8 +41,7 @@ fn a_killed_launcher_leaves_nothing() {
     let (process, parts) = started(&system);
     let segments = all_shared_memory_of(&parts);
     assert_eq!(temporary(&system).len(), 1);
-    process.signal(Signal::SIGKILL);
-    process.wait();
+    process.kill();
     wait_until_all_have_ended(&system);
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);

@@ -268,8 +268,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         all.filter(|it| it.args.iter().any(is_world)).count()
     };
     assert_eq!(worlds(), 1);
-    hanging.signal(Signal::SIGKILL);
-    hanging.wait();
+    hanging.kill();
     wait_for("the world's end", || (worlds() == 0).then_some(()));
     drop(client);
     learner.stop().expect_code(0);

@@ -11,7 +11,6 @@ use driml_protocol::{
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, SlowMachine, TestSystem, new_learner, wait_for};
-use nix::sys::signal::Signal;
 use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
@@ -185,8 +184,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let client = system.connect();
     client.wait_for_learner("some updates", |it| it.updates > 50);
     drop(client);
-    server.signal(Signal::SIGKILL);
-    server.wait();
+    server.kill();
 
     let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);

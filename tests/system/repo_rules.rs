@@ -8,23 +8,6 @@ use std::{
     process::Command,
 };
 
-const ALL: &[&str] = &[
-    "driml",
-    "driml-actor",
-    "driml-bench",
-    "driml-envs",
-    "driml-experiments",
-    "driml-figure",
-    "driml-launch",
-    "driml-learner",
-    "driml-machine",
-    "driml-model",
-    "driml-protocol",
-    "driml-replay-server",
-    "driml-settings",
-    "procgen-sys",
-];
-
 /// Most lines of Rust in each top-level folder, tests included. These numbers only fall: a change that adds code pays for it.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 9_400),
@@ -35,118 +18,44 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("tests", 12_310),
 ];
 /// Most lines of one file.
-const FILE_LINES_MAX: usize = 650;
+const FILE_LINES_MAX: usize = 450;
 
-/// Every package of ours, where it lies, and which others of ours it may know. Tests and benches count too.
-const ARROWS: &[(&str, &str, &[&str])] = &[
-    ("driml-protocol", "protocol", &[]),
-    ("procgen-sys", "actor/procgen-sys", &[]),
-    ("driml-envs", "actor/envs", &["procgen-sys"]),
-    ("driml-model", "learner/model", &[]),
-    (
-        "driml-actor",
-        "actor",
-        &["driml-protocol", "driml-envs", "driml-model"],
-    ),
-    ("driml-replay-server", "replay-server", &["driml-protocol"]),
-    (
-        "driml-learner",
-        "learner",
-        &["driml-protocol", "driml-model"],
-    ),
-    ("driml-figure", "deploy/figure", &[]),
-    (
-        "driml-machine",
-        "deploy/machine",
-        &["driml-protocol", "driml-model", "procgen-sys"],
-    ),
-    (
-        "driml-settings",
-        "deploy/settings",
-        &[
-            "driml-protocol",
-            "driml-envs",
-            "driml-model",
-            "driml-actor",
-            "driml-replay-server",
-            "driml-learner",
-            "driml-machine",
-        ],
-    ),
-    (
-        "driml-launch",
-        "deploy/launch",
-        &[
-            "driml-protocol",
-            "driml-envs",
-            "driml-figure",
-            "driml-model",
-            "driml-actor",
-            "driml-replay-server",
-            "driml-learner",
-            "driml-machine",
-            "driml-settings",
-        ],
-    ),
-    (
-        "driml-experiments",
-        "deploy/experiments",
-        &[
-            "procgen-sys",
-            "driml-protocol",
-            "driml-envs",
-            "driml-model",
-            "driml-actor",
-            "driml-replay-server",
-            "driml-learner",
-            "driml-figure",
-            "driml-machine",
-            "driml-settings",
-            "driml-launch",
-        ],
-    ),
-    (
-        "driml-bench",
-        "deploy/bench",
-        &[
-            "procgen-sys",
-            "driml-protocol",
-            "driml-envs",
-            "driml-model",
-            "driml-actor",
-            "driml-replay-server",
-            "driml-learner",
-            "driml-machine",
-            "driml-settings",
-            "driml-launch",
-        ],
-    ),
-    ("driml", "deploy", ALL),
-    // As a user's own package: the program, and the registries that it adds to.
-    (
-        "driml-examples",
-        "deploy/examples",
-        &[
-            "driml",
-            "driml-envs",
-            "driml-learner",
-            "driml-model",
-            "driml-settings",
-        ],
-    ),
-    ("driml-tests", "tests", ALL),
-    (
-        "driml-decoders",
-        "tests/decoders",
-        &[
-            "driml-protocol",
-            "driml-actor",
-            "driml-replay-server",
-            "driml-learner",
-            "driml-settings",
-        ],
-    ),
-];
+/// Every package of ours, where it lies, and which others of ours it may know; * for all. Tests and benches count too.
+const ARROWS: &str = "
+driml-protocol      protocol            :
+procgen-sys         actor/procgen-sys   :
+driml-envs          actor/envs          : procgen-sys
+driml-model         learner/model       :
+driml-actor         actor               : driml-protocol driml-envs driml-model
+driml-replay-server replay-server       : driml-protocol
+driml-learner       learner             : driml-protocol driml-model
+driml-figure        deploy/figure       :
+driml-machine       deploy/machine      : driml-protocol driml-model procgen-sys
+driml-settings      deploy/settings     : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
+                                          driml-machine
+driml-launch        deploy/launch       : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
+                                          driml-machine driml-settings driml-figure
+driml-experiments   deploy/experiments  : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
+                                          driml-machine driml-settings driml-figure driml-launch procgen-sys
+driml-bench         deploy/bench        : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
+                                          driml-machine driml-settings driml-launch procgen-sys
+driml               deploy              : *
+driml-examples      deploy/examples     : driml driml-envs driml-learner driml-model driml-settings
+driml-tests         tests               : *
+driml-decoders      tests/decoders      : driml-protocol driml-actor driml-replay-server driml-learner driml-settings
+";
+
+/// A line of [`ARROWS`]: name, folder, and the packages that it may know.
+fn arrows() -> impl Iterator<Item = (&'static str, &'static str, Vec<&'static str>)> {
+    ARROWS.trim().lines().map(|line| {
+        let (package, known) = line
+            .split_once(':')
+            .expect("a package and what it may know");
+        let mut words = package.split_whitespace();
+        let mut word = || words.next().expect("a name and a folder");
+        (word(), word(), known.split_whitespace().collect())
+    })
+}
 
 pub(crate) fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -157,7 +66,7 @@ pub(crate) fn root() -> PathBuf {
 
 /// Where the packages of ours lie.
 pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
-    ARROWS.iter().map(|(_, folder, _)| *folder)
+    arrows().map(|(_, folder, _)| folder)
 }
 
 /// Packages of ours by name: their folder, and the packages of ours that they depend on in any way.
@@ -201,13 +110,13 @@ fn ours() -> BTreeMap<String, (PathBuf, BTreeSet<String>)> {
 fn arrows_between_crates_point_one_way() {
     let ours = ours();
     let names: BTreeSet<_> = ours.keys().map(String::as_str).collect();
-    let listed: BTreeSet<_> = ARROWS.iter().map(|(name, ..)| *name).collect();
+    let listed: BTreeSet<_> = arrows().map(|(name, ..)| name).collect();
     assert_eq!(
         names, listed,
         "a new package needs a line in ARROWS, and a reason"
     );
-    for (name, folder, allowed) in ARROWS {
-        let (found, dependencies) = &ours[*name];
+    for (name, folder, allowed) in arrows() {
+        let (found, dependencies) = &ours[name];
         assert_eq!(
             found.strip_prefix(root()).unwrap(),
             Path::new(folder),
@@ -215,7 +124,7 @@ fn arrows_between_crates_point_one_way() {
         );
         for dependency in dependencies {
             assert!(
-                allowed.contains(&dependency.as_str()),
+                allowed == ["*"] || allowed.contains(&dependency.as_str()),
                 "{name} may not know {dependency}"
             );
         }
@@ -448,7 +357,7 @@ fn points_at(line: &str, place: &str) -> bool {
 
 #[test]
 fn every_package_takes_the_workspace_s_lints_and_versions() {
-    for (_, folder, _) in ARROWS {
+    for folder in folders_of_crates() {
         let manifest: toml::Table = fs::read_to_string(root().join(folder).join("Cargo.toml"))
             .unwrap()
             .parse()

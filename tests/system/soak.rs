@@ -8,7 +8,6 @@ use std::{
 };
 
 use driml_tests::{Process, TestSystem, note};
-use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 
 use crate::system;
@@ -65,8 +64,7 @@ fn nothing_grows() {
         match actors[id].take() {
             None => actors[id] = Some(system.start_actor(id as u32)),
             Some(actor) if rng.random_bool(0.5) => {
-                actor.signal(Signal::SIGKILL);
-                actor.wait();
+                actor.kill();
                 deaths += 1;
             }
             Some(actor) => {

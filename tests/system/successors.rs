@@ -2,7 +2,6 @@
 //! How the launcher sees it is in `failures` and `resume`.
 
 use driml_tests::{Client, Process, TestSystem};
-use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
@@ -26,8 +25,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
     // Each learner is held at the first number, and its successor, which begins at the checkpoint, at the second.
     for (updates, successor) in [(390, 300), (300, 250), (250, 225)] {
         let killed = client.wait_for_learner("updates", |it| it.updates == updates);
-        learner.signal(Signal::SIGKILL);
-        learner.wait();
+        learner.kill();
         system.hold_at(successor);
         learner = system.start_learner("run");
         let next = client.wait_for_learner("the successor", |it| it.weights_version > version);
@@ -82,8 +80,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     let patience = "--set learner.unreachable_max_ms=1000";
     let (server, learner, client) = between_checkpoints(&system, patience);
     drop(client);
-    server.signal(Signal::SIGKILL);
-    server.wait();
+    server.kill();
     learner
         .wait()
         .expect_code(1)
@@ -103,8 +100,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
         (replay.actors, replay.actors_acting) == (1, 2)
     });
     drop(client);
-    server.signal(Signal::SIGKILL);
-    server.wait();
+    server.kill();
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000"
     ));
@@ -139,8 +135,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
 fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
-    learner.signal(Signal::SIGKILL);
-    learner.wait();
+    learner.kill();
     let stranger = |flags: &str| {
         let connect = system.endpoint();
         format!("learner --connect {connect} --run-dir elsewhere {flags}")

@@ -149,8 +149,7 @@ fn a_silent_part_is_named_and_a_restarted_server_found_again() {
 
     let before = client.replay().unwrap().transitions_inserted;
     drop(client);
-    server.signal(Signal::SIGKILL);
-    server.wait();
+    server.kill();
     watched.wait_for_stderr("replay server: no answer for ");
     let _server = run(&system, &listen);
     let frames = || {

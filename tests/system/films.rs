@@ -1,0 +1,66 @@
+//! `driml evaluate --record`: films of what is played, and those that cannot be made.
+//! What an evaluation prints is in `evaluate`.
+
+use std::fs;
+
+use crate::{evaluate::with_run, system};
+
+#[test]
+fn a_film_changes_nothing_that_is_played() {
+    let system = system();
+    system
+        .run("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run")
+        .expect_code(0);
+    let plain = system.run("evaluate run --episodes 3").expect_code(0);
+    let film =
+        "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-copies 2";
+    let filmed = system.run(film).expect_code(0);
+    let said: Vec<_> = filmed.stdout.lines().collect();
+    assert_eq!(said[1], "filmed 40 steps: play.gif");
+    let rest: Vec<_> = said
+        .iter()
+        .filter(|line| !line.starts_with("filmed"))
+        .copied()
+        .collect();
+    assert_eq!(rest, plain.stdout.lines().collect::<Vec<_>>());
+    let bytes = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes.starts_with(b"GIF89a") && bytes.ends_with(b";"));
+    system.run(film).expect_code(0);
+    let again = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes == again, "the same play is the same film");
+    assert!(!system.path("play.gif.tmp").exists());
+}
+
+#[test]
+fn films_that_cannot_be_are_refused_before_anything_is_played() {
+    let system = with_run();
+    for (flags, said) in [
+        ("--record play.mp4", "use one that ends in .gif"),
+        (
+            "--record none/play.gif",
+            "--record none/play.gif: No such file or directory",
+        ),
+        ("--overlay", "--record <FILE.gif>"),
+        (
+            "--record play.gif --record-steps 0",
+            "0 is not in 1..=10000",
+        ),
+    ] {
+        let ended = system.run(&format!("evaluate run {flags}")).expect_code(64);
+        ended.expect_said(said);
+    }
+    fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
+    system
+        .run("evaluate run --record play.gif")
+        .expect_code(64)
+        .expect_said("has no checkpoint yet");
+    let left = fs::read_dir(system.path(".")).unwrap();
+    let left = left.filter(|it| {
+        it.as_ref()
+            .unwrap()
+            .file_name()
+            .to_string_lossy()
+            .contains("play")
+    });
+    assert_eq!(left.count(), 0);
+}

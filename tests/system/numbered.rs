@@ -1,0 +1,213 @@
+//! Numbered transitions and counted batches through deaths of the replay server: each number is in the replay once, and each batch of the
+//! plan is served. Actors and learner are clients of these tests, as those of the program count nothing from outside.
+
+use std::{collections::BTreeSet, time::Duration};
+
+use driml_actor::{Delivery, DeliveryLimits};
+use driml_protocol::{
+    Batch, BatchReply, BatchRequest, Buffer, BufferPool, Chunk, ChunkHeader, End, Keys, Learned,
+    RequestId, RunClient, RunSpec, Shutdown,
+    config::Settings,
+    session::{self, Endpoints},
+};
+use driml_replay_server::{Config, PersistArgs, Replay};
+use driml_tests::{Process, TestSystem};
+
+use crate::system;
+
+/// Actors that number their transitions, chunks of each, and transitions of a chunk.
+const ACTORS: u32 = 3;
+const CHUNKS: u64 = 40;
+const STREAMS: u32 = 4;
+const STEPS: u32 = 8;
+const OF_AN_ACTOR: u64 = CHUNKS * (STREAMS * STEPS) as u64;
+const TRANSITIONS: u64 = ACTORS as u64 * OF_AN_ACTOR;
+/// What the preset `smoke` says.
+pub(crate) const WARMUP: u64 = 200;
+pub(crate) const ROWS: u32 = 16;
+/// Rows for each transition.
+const RATIO: u64 = 64;
+/// How often each transition is drawn at the end, on average: that one is never drawn has a probability of exp(-64).
+const DRAWN: u64 = 64;
+/// How often the server is killed.
+pub(crate) const KILLS: u64 = 6;
+
+fn session_with(system: &TestSystem) -> zenoh::Session {
+    session::open(&Endpoints {
+        listen: Vec::new(),
+        connect: vec![system.endpoint()],
+    })
+    .unwrap()
+}
+
+/// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
+fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
+    let limits = DeliveryLimits {
+        chunks_in_flight_max: 4,
+        ack_timeout: Duration::from_secs(2),
+        unreachable_max: Duration::from_secs(60),
+    };
+    let stop = Shutdown::default();
+    let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop).unwrap();
+    let mut header = ChunkHeader {
+        actor,
+        incarnation: 1,
+        sequence: 0,
+        first_transition: 0,
+        weights_version: 0,
+        leaving: false,
+        streams: STREAMS,
+        steps: STEPS,
+        frame_bytes,
+    };
+    while header.sequence < CHUNKS {
+        let mut chunk = Chunk::zeroed(header);
+        for row in 0..header.transitions() {
+            let number = u64::from(actor) * OF_AN_ACTOR + header.first_transition + row as u64;
+            chunk.set(row, 0, number as f32, End::Terminal);
+        }
+        header.sequence += 1;
+        header.first_transition += header.transitions() as u64;
+        assert!(delivery.send(chunk));
+    }
+    assert_eq!(delivery.finish().unwrap(), 0);
+}
+
+/// Asks for all batches there are, as a learner that asks again; gives their number.
+fn learn(run: &RunClient, learner: u64) -> u64 {
+    let pool = BufferPool::new(2);
+    let mut batches = 0;
+    let mut id = RequestId::first(learner);
+    let ask = |id, batches: u64| {
+        let request = BatchRequest {
+            learner,
+            id,
+            rows: ROWS,
+            shared_memory: false,
+            learned: Learned {
+                rows_received: batches * u64::from(ROWS),
+                ..Learned::default()
+            },
+            other_shards: None,
+        };
+        let asked = run.send(run.seal(&request)?, Duration::from_secs(2))?;
+        asked.receive(&pool)
+    };
+    loop {
+        id = id.again();
+        match ask(id, batches) {
+            Ok((
+                reply @ (BatchReply::Batch(_)
+                | BatchReply::Prioritised(..)
+                | BatchReply::Stacked(..)),
+                payload,
+            )) => {
+                let header = reply.header().unwrap();
+                Batch::from_payload(header, payload).unwrap();
+                batches += 1;
+                id = id.next();
+            }
+            Ok((BatchReply::Wait(_), _)) => id = id.next(),
+            Ok((BatchReply::Finished, _)) => return batches,
+            Ok((BatchReply::Refused { why }, _)) => panic!("{why}"),
+            // The server is away; it is asked again, as the same request.
+            Err(_) => std::thread::sleep(Duration::from_millis(20)),
+        }
+    }
+}
+
+/// The numbers of all transitions in a replay that is no longer in use: of rows that are drawn from it as often as need be.
+fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
+    let mut config: Config = Settings::parse(config_toml)
+        .unwrap()
+        .table("replay")
+        .unwrap();
+    config.replay_ratio = 1e6;
+    let args = PersistArgs {
+        dir: system.path("replay"),
+        shard: 0,
+        segment_bytes: None,
+        mark: None,
+    };
+    let (mut replay, recovery) = Replay::open(&args, spec, &config, ROWS).unwrap();
+    assert!(
+        recovery.found && recovery.warnings.is_empty(),
+        "{recovery:?}"
+    );
+    replay.check_valid();
+    let mut numbers = BTreeSet::new();
+    for number in 0..TRANSITIONS * DRAWN / u64::from(ROWS) {
+        let id = RequestId {
+            client_id: 1,
+            number,
+            attempt: 0,
+        };
+        let batch = replay.draw_for(id, ROWS, Buffer::zeroed).unwrap().unpack();
+        let returns = batch.n_step_returns();
+        numbers.extend(returns.into_iter().map(|it| it as u64));
+    }
+    numbers
+}
+
+/// Rows that are sampled of all transitions.
+pub(crate) const SAMPLED: u64 = (TRANSITIONS - WARMUP) * RATIO;
+
+/// Numbered transitions and counted batches through deaths of the server, after so many rows each: the sets are equal, and so are the
+/// counts.
+pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
+    let system = system();
+    let flags = format!(
+        "--agent c51 --env chain --preset smoke --frames {TRANSITIONS} --set replay.replay_ratio={RATIO} --replay-dir replay"
+    );
+    let mut server = Some(system.start_replay_server(&flags));
+    let client = system.connect();
+    for actor in 0..ACTORS {
+        client.join_as_actor(actor, 1);
+    }
+    client.join_as_learner(7);
+    let (spec_hash, frame_bytes) = (client.spec.hash(), client.spec.frame_bytes() as u32);
+    let run = || {
+        RunClient::new(
+            session_with(&system),
+            Keys::new("driml").unwrap(),
+            spec_hash,
+        )
+    };
+    let batches = std::thread::scope(|scope| {
+        for actor in 0..ACTORS {
+            let run = run();
+            scope.spawn(move || deliver(run, actor, frame_bytes));
+        }
+        let learner = run();
+        let learning = scope.spawn(move || learn(&learner, 7));
+        for rows in moments {
+            client.wait_for_replay("some more rows", |replay| replay.rows_sampled > rows);
+            server.take().into_iter().for_each(Process::kill);
+            server = Some(system.start_replay_server(&flags));
+        }
+        learning.join().unwrap()
+    });
+    assert_eq!(batches, SAMPLED / u64::from(ROWS));
+    // A server that has just started is not reached at once.
+    let replay = client.wait_for_replay("the counts in the end", |_| true);
+    assert_eq!(
+        (replay.transitions_lost, replay.transitions_duplicated),
+        (0, 0)
+    );
+    // As many are stored as there are numbers: if each number is there, none is there twice.
+    assert_eq!(replay.transitions_inserted, TRANSITIONS);
+    let (spec, config_toml) = (client.spec.clone(), client.config_toml.clone());
+    drop(client);
+    server.into_iter().for_each(Process::kill);
+    let numbers = numbers_in(&system, &spec, &config_toml);
+    let missing: Vec<_> = (0..TRANSITIONS)
+        .filter(|it| !numbers.contains(it))
+        .collect();
+    assert_eq!(missing, [0; 0]);
+    assert_eq!(numbers.len() as u64, TRANSITIONS);
+}
+
+#[test]
+fn a_killed_server_loses_and_doubles_no_transition_and_no_batch() {
+    kill_after_rows((1..=KILLS).map(|round| round * SAMPLED / (KILLS + 1)));
+}
