@@ -29,8 +29,8 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         settings.plan(point, seed)
     });
     let play = settings.play(Levels::Train);
-    let (runs, games) = (plans.len() as u64, settings.games.len() as u64);
-    let units = runs * (settings.frames + play.units) + games * play.units;
+    // Each run's agent plays, and a random policy beside it.
+    let units = plans.len() as u64 * (settings.frames + 2 * play.units);
     let report = args.queue.report;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
