@@ -22,8 +22,8 @@ use crate::{
     run_folder::RunFolder,
 };
 
-/// Probability of a random action. Source: section 2 of the project's specification, after rlpyt.
-const EPSILON: f64 = 0.001;
+/// Probability of a random action where none is asked for. Source: section 2 of the project's specification, after rlpyt.
+pub const EPSILON: f64 = 0.001;
 const COPIES_MAX: usize = 32;
 /// Steps of each copy after which an evaluation is given up; Procgen's longest episode has 6,000.
 const STEPS_A_ROUND_MAX: u64 = 20_000;
@@ -62,6 +62,8 @@ pub struct Player {
     pub updates: u64,
     /// They are an average over updates.
     pub is_averaged: bool,
+    /// Probability of a random action.
+    pub epsilon: f64,
 }
 
 impl Player {
@@ -91,6 +93,7 @@ impl Player {
             network: agent.online().clone(),
             updates: agent.updates(),
             is_averaged,
+            epsilon: EPSILON,
             config,
         })
     }
@@ -160,7 +163,8 @@ impl Player {
             }
             Who::Random => Box::new(random_policy(config)?),
         };
-        play_with(config, policy.as_mut(), world, episodes, seed, watch)
+        let evaluation = evaluation(config, episodes, self.epsilon);
+        play_with(config, policy.as_mut(), world, evaluation, seed, watch)
     }
 
     /// Copies of the world that play so many episodes.
@@ -193,7 +197,8 @@ impl Player {
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
     let mut policy = random_policy(config)?;
-    play_with(config, &mut policy, &world, episodes, seed, &mut play_on)
+    let evaluation = evaluation(config, episodes, EPSILON);
+    play_with(config, &mut policy, &world, evaluation, seed, &mut play_on)
 }
 
 fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
@@ -204,28 +209,30 @@ fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
     Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
 }
 
+fn evaluation(config: &RunConfig, episodes: usize, epsilon: f64) -> Evaluation {
+    let rounds = episodes.div_ceil(Player::copies(episodes)) as u64;
+    Evaluation {
+        frame_stack: config.run.frame_stack as usize,
+        epsilon,
+        episodes,
+        steps_max: rounds * STEPS_A_ROUND_MAX,
+    }
+}
+
 fn play_with(
     config: &RunConfig,
     policy: &mut dyn Policy,
     world: &WorldConfig,
-    episodes: usize,
+    evaluation: Evaluation,
     seed: u64,
     watch: Watch<'_>,
 ) -> anyhow::Result<Vec<f64>> {
-    let spec = &config.run;
-    let copies = Player::copies(episodes);
+    let copies = Player::copies(evaluation.episodes);
     let actions = world.actions(config.actor.actions);
     let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
-    let rounds = episodes.div_ceil(copies) as u64;
-    let evaluation = Evaluation {
-        frame_stack: spec.frame_stack as usize,
-        epsilon: EPSILON,
-        episodes,
-        steps_max: rounds * STEPS_A_ROUND_MAX,
-    };
     let (world, rng) = (CutFrames::of(fewer, sent(config))?, policy_rng(seed));
     episode_returns(world, policy, evaluation, rng, watch)
-        .with_context(|| format!("playing {}", spec.world))
+        .with_context(|| format!("playing {}", config.run.world))
 }
 
 /// Rows and columns of a frame as it travels.
@@ -279,11 +286,20 @@ mod tests {
     use rand::Rng;
 
     use super::*;
+    use crate::testing::{played, untrained};
 
     #[test]
-    fn an_evaluation_hardly_explores() {
+    fn an_evaluation_explores_as_asked() {
         // Source: section 2 of the project's specification.
         assert_eq!(EPSILON, 0.001);
+        let played_by = |agent, epsilon| {
+            let mut player = untrained("chain", agent);
+            player.epsilon = epsilon;
+            played(&player)
+        };
+        let at_random = played_by("c51", 1.0);
+        assert_eq!(at_random, played_by("rainbow", 1.0), "whatever the network");
+        assert_ne!(at_random, played_by("c51", 0.0));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::evaluate::Player;
+use crate::evaluate::{EPSILON, Player};
 
 /// Each game with its file in `deploy/pretrained/`.
 macro_rules! built_in_games {
@@ -101,6 +101,7 @@ fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
         network,
         updates: exported.updates,
         is_averaged: exported.is_averaged,
+        epsilon: EPSILON,
     })
 }
 
@@ -122,37 +123,11 @@ pub fn export(player: &Player) -> anyhow::Result<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
-
     use super::*;
-    use crate::{
-        evaluate::{Levels, Who},
-        testing::config,
-    };
-
-    /// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
-    fn untrained(world: &str, agent: &'static str) -> Player {
-        let config = config("smoke", world, agent, &[]);
-        let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
-        let weights = network.without_dim().unwrap();
-        Player {
-            weights: weights.to_safetensors(|_| true).unwrap(),
-            network,
-            config,
-            updates: 7,
-            is_averaged: true,
-        }
-    }
+    use crate::testing::{played, untrained};
 
     fn said(all: &[(&str, &[u8])], game: &str) -> String {
         format!("{:#}", built_in(all, game).map(drop).unwrap_err())
-    }
-
-    fn played(player: &Player) -> Vec<f64> {
-        let returns = player.returns(Who::Agent, Levels::Train, 4, 3).unwrap();
-        returns.unwrap()
     }
 
     #[test]

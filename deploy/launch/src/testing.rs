@@ -1,11 +1,17 @@
-//! Settings of runs, for tests.
+//! Settings of runs, and what plays with them, for tests.
 
+use driml_learner::Compute;
 use driml_machine::resources::Machine;
+use driml_model::Parameters;
 use driml_settings::{
     config::RunConfig,
     presets::preset,
     resolve::{Flags, Source, resolve},
 };
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::evaluate::{EPSILON, Levels, Player, Who};
 
 pub(crate) const MACHINE: Machine = Machine {
     cores: 2,
@@ -34,4 +40,26 @@ pub(crate) fn config(
         ..Flags::default()
     };
     resolve(&source, &flags, &MACHINE).unwrap()
+}
+
+/// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
+pub(crate) fn untrained(world: &str, agent: &'static str) -> Player {
+    let config = config("smoke", world, agent, &[]);
+    let rng = &mut ChaCha8Rng::seed_from_u64(1);
+    let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
+    let weights = network.without_dim().unwrap();
+    Player {
+        weights: weights.to_safetensors(|_| true).unwrap(),
+        network,
+        config,
+        updates: 7,
+        is_averaged: true,
+        epsilon: EPSILON,
+    }
+}
+
+/// Returns of a few episodes.
+pub(crate) fn played(player: &Player) -> Vec<f64> {
+    let returns = player.returns(Who::Agent, Levels::Train, 4, 3).unwrap();
+    returns.unwrap()
 }

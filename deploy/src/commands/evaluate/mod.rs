@@ -19,7 +19,7 @@ use driml_figure::Film;
 use driml_launch::{
     chosen::{Weights, Which},
     console::{self, print},
-    evaluate::{Levels, Player, Who, levels},
+    evaluate::{EPSILON, Levels, Player, Who, levels},
     keep::{Judged, keep},
     pretrained,
     run_folder::{RunFolder, sweep, write_whole},
@@ -49,6 +49,9 @@ pub(crate) struct EvaluateArgs {
     /// Seed of the worlds and of exploration
     #[arg(long, value_name = "S", default_value_t = 0)]
     pub(crate) seed: u64,
+    /// Probability of a random action [default: 0.001]
+    #[arg(long, value_name = "P", value_parser = probability)]
+    pub(crate) epsilon: Option<f64>,
     /// Checkpoint to play: a number of updates, or "best" for the best of evaluations.csv [default: newest]
     #[arg(long, value_name = "UPDATES")]
     pub(crate) checkpoint: Option<Which>,
@@ -56,10 +59,10 @@ pub(crate) struct EvaluateArgs {
     #[arg(long, value_enum)]
     pub(crate) weights: Option<Weights>,
     /// Write the weights as f16, with the run's settings, into this file, and play nothing
-    #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["keep", "exact", "returns", "json", "record"])]
+    #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["epsilon", "keep", "exact", "returns", "json", "record"])]
     pub(crate) export: Option<PathBuf>,
     /// Add the mean return to the run's evaluations.csv, and keep the checkpoint if it is the best
-    #[arg(long, conflicts_with_all = ["levels", "seed", "weights", "exact", "returns", "json", "record"])]
+    #[arg(long, conflicts_with_all = ["levels", "seed", "epsilon", "weights", "exact", "returns", "json", "record"])]
     pub(crate) keep: bool,
     /// Play with f32 weights and arithmetic, even if the run's actors used bf16 or f16
     #[arg(long)]
@@ -75,6 +78,14 @@ pub(crate) struct EvaluateArgs {
     /// End when the process that started this one, which has this number, ends
     #[arg(long, value_name = "PID", hide = true, requires = "keep")]
     pub(crate) exit_with_parent: Option<u32>,
+}
+
+fn probability(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    match (0.0..=1.0).contains(&value) {
+        true => Ok(value),
+        false => Err("use 0 to 1".into()),
+    }
 }
 
 pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
@@ -109,6 +120,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     if args.exact {
         player = player.exact()?;
     }
+    player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::line)?;
     // Before an hour of playing.
     let table = args.returns.as_ref().map(|path| {
@@ -127,14 +139,16 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     };
     let said = |text: &str| if args.json { Ok(()) } else { print(text) };
     said(&format!(
-        "{} {on}, {} episodes each, {} {} weights after {} updates played in {}, seed {}\n",
+        "{} {on}, {} episodes each, {} {} weights after {} updates played in {}, seed {}{}\n",
         spec.world,
         args.episodes,
         player.weights_name(),
         player.config.learner.publish_as,
         player.updates,
         player.config.actor.precision,
-        args.seed
+        args.seed,
+        args.epsilon
+            .map_or(String::new(), |it| format!(", epsilon {it}"))
     ))?;
     let play = |who, name: &str, see: &mut dyn FnMut(&Step<'_>)| {
         let episodes = args.episodes as usize;

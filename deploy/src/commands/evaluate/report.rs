@@ -52,6 +52,7 @@ pub(super) fn json(
         "arithmetic": player.config.actor.precision,
         "levels": levels.map(|it| it.get_name().to_owned()),
         "seed": seed,
+        "epsilon": player.epsilon,
         "policies": policies,
     });
     Ok(serde_json::to_string(&object)? + "\n")
