@@ -52,7 +52,7 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let (_, largest) = bounds(sizes.clone()).unwrap_or_default();
     let (smallest, _) = bounds(sizes.filter(|size| *size > 0.0)).unwrap_or_default();
     let (divisor, unit) = match largest {
-        size if size >= 1e7 => (1e6, "M"),
+        size if size >= 1e6 => (1e6, "M"),
         size if size >= 1e4 => (1e3, "k"),
         _ => (1.0, ""),
     };
@@ -132,6 +132,7 @@ mod tests {
             ["1", "10", "100", "1000"]
         );
         assert_eq!(labels(&[0.001, 0.01, 10.0]), ["0.001", "0.01", "10"]);
+        assert_eq!(labels(&[0.0, 5e5, 1e6]), ["0", "0.5M", "1.0M"]);
         assert_eq!(labels(&[5e6, 1e7]), ["5M", "10M"]);
     }
 

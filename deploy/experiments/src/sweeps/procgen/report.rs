@@ -47,7 +47,7 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
         panels.push(Panel::Chart(Chart::new(game.name, x, y, series)));
     }
     Ok(Figure {
-        title: format!("Training return, {} frames", settings.frames),
+        title: "Training return by game".into(),
         notes: vec![format!(
             "Mean of the last {RETURNS_OF} training episodes, with exploration; over several seeds mean and range. Dashed: the paper's \
              after 50 million frames. Grey: a random policy."
