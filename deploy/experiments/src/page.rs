@@ -25,6 +25,12 @@ impl Table {
         Self::new(&columns.split(',').collect::<Vec<_>>(), rows)
     }
 
+    /// [`Table::of`] lines of data, whose values have no comma.
+    pub(crate) fn of_lines(columns: &str, lines: impl IntoIterator<Item = String>) -> Self {
+        let row = |line: String| line.split(',').map(str::to_owned).collect();
+        Self::of(columns, lines.into_iter().map(row))
+    }
+
     /// A table of these rows.
     pub(crate) fn new(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Self {
         Self {
@@ -63,6 +69,11 @@ impl fmt::Display for Table {
 /// The cell of a number; empty in data where there is none.
 pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
+}
+
+/// Numbers as a line of data has them.
+pub(crate) fn numbers<const N: usize>(values: [f64; N], decimals: usize) -> String {
+    values.map(|it| format!("{it:.decimals$}")).join(",")
 }
 
 /// Mean, low and high end as a file of data has them; empty where there is none.
@@ -175,16 +186,19 @@ fn fill(template: &str, values: &Values) -> Result<String, Error> {
     environment.add_filter("mean", |list: Value| {
         of_list(&list, |all| Some(Spread::of(all.iter().copied())?.mean))
     });
-    environment.add_filter("spread", |list: Value| {
+    environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
+        let decimals = decimals.unwrap_or(3);
         of_list(&list, |all| {
-            Some(Spread::of(all.iter().copied())?.to_string())
+            let spread = Spread::of(all.iter().copied())?;
+            Some(format!("{spread:.decimals$}"))
         })
     });
     environment.add_filter("mean_and_sd", |list: Value, decimals: usize| {
         of_list(&list, |all| mean_and_sd(all, decimals))
     });
-    environment.add_filter("interval", |list: Value| {
-        of_list(&list, |all| Some(interval(all)?.to_string()))
+    environment.add_filter("interval", |list: Value, decimals: Option<usize>| {
+        let decimals = decimals.unwrap_or(2);
+        of_list(&list, |all| Some(format!("{:.decimals$}", interval(all)?)))
     });
     environment.add_filter("minus", |to: Value, from: Value| {
         let (to, from) = (list_of(&to)?, list_of(&from)?);

@@ -10,6 +10,7 @@ use self::{results::Results, settings::NAME};
 use crate::{
     cache::Session,
     flags::{PacmanArgs, this_command},
+    page::Page,
     sweep::{plan::seed_by_seed, queue},
 };
 
@@ -25,6 +26,10 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
     swept.check_any()?;
     let results = Results::read(settings, swept)?;
-    report::report(session, &results, &this_command(), args.flags.smoke)?;
+    session.figure("fig3", &figure::figure(&results))?;
+    report::write_data(&session, &results)?;
+    let (template, values) = (include_str!("pacman.md"), report::values(&results));
+    let page = Page::new(template, values, &this_command(), args.flags.smoke);
+    session.finish(&page)?;
     queue::check_made(&results.missing, report)
 }

@@ -19,7 +19,7 @@ use self::{
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values},
+    page::{Page, Table, Values, numbers},
     plot::Curve,
     stats::Spread,
 };
@@ -77,29 +77,25 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
-    let seeds = || (1..).zip(trained);
-    let number = |number: f64| format!("{number:.4}");
+    let seeds = || (1u32..).zip(trained);
     let checks = seeds().flat_map(|(seed, one)| {
         one.checks.iter().map(move |(update, it)| {
-            let numbers = [it.auc, it.auc_raw, it.auc_clear, it.auc_pairs, it.loss];
-            let head = [seed.to_string(), update.to_string()];
-            head.into_iter().chain(numbers.map(number)).collect()
+            let of_check = [it.auc, it.auc_raw, it.auc_clear, it.auc_pairs, it.loss];
+            format!("{seed},{update},{}", numbers(of_check, 4))
         })
     });
     let columns = "seed,updates,auc,auc_raw_score,auc_clear,auc_pairs,loss_nats";
-    session.csv("auc", &Table::of(columns, checks))?;
-    let losses = seeds().flat_map(|(seed, one): (u32, _)| {
-        smoothed(&one.loss)
-            .map(move |(update, loss)| vec![seed.to_string(), update.to_string(), number(loss)])
+    session.csv("auc", &Table::of_lines(columns, checks))?;
+    let losses = seeds().flat_map(|(seed, one)| {
+        smoothed(&one.loss).map(move |(update, loss)| format!("{seed},{update},{loss:.4}"))
     });
-    session.csv("loss", &Table::of("seed,updates,loss_nats", losses))?;
-    let maps = (1..)
-        .zip(&trained[0].maps)
-        .flat_map(|(episode, map): (u32, _)| {
-            let scores = map.iter().enumerate();
-            scores.map(move |(at, &score)| vec![episode.to_string(), at.to_string(), number(score)])
-        });
-    session.csv("maps", &Table::of("episode,location,score_nats", maps))
+    session.csv("loss", &Table::of_lines("seed,updates,loss_nats", losses))?;
+    let maps = (1u32..).zip(&trained[0].maps).flat_map(|(episode, map)| {
+        let scores = map.iter().enumerate();
+        scores.map(move |(at, score)| format!("{episode},{at},{score:.4}"))
+    });
+    let columns = "episode,location,score_nats";
+    session.csv("maps", &Table::of_lines(columns, maps))
 }
 
 /// Means of `LOSS_WINDOW` updates each, at their end.

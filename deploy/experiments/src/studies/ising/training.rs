@@ -65,7 +65,11 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     let dim = Dim { lambda, tanh_clip };
     let learner = DimLearner::new(&task.model, dim, adam, max_grad_norm, &mut rng)?;
     let mut scorer = Scorer { task, learner };
-    let mut pairs = Pairs::new(task, &mut rng)?;
+    let mut pairs = Pairs {
+        task,
+        episodes: Episodes::default(),
+        batches_left: 0,
+    };
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
     let period = (settings.updates / settings.checks.max(1)).max(1);
     for update in 0..settings.updates {
@@ -87,6 +91,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
 }
 
 /// Frames [T, N, H * W] of whole episodes of N copies, and the patches' first rows and columns.
+#[derive(Default)]
 pub(super) struct Episodes {
     pub(super) frames: Vec<Vec<u8>>,
     pub(super) origins: Vec<(usize, usize)>,
@@ -137,42 +142,25 @@ struct Pairs<'a> {
     batches_left: u32,
 }
 
-impl<'a> Pairs<'a> {
-    fn new(task: &'a Task, rng: &mut ChaCha8Rng) -> anyhow::Result<Self> {
-        let mut this = Self {
-            task,
-            episodes: Episodes {
-                frames: vec![],
-                origins: vec![],
-            },
-            batches_left: 0,
-        };
-        this.renew(rng)?;
-        Ok(this)
-    }
-
-    fn renew(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<()> {
+impl Pairs<'_> {
+    fn batch(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<(Vec<u8>, Vec<u8>)> {
         let Task {
             world, settings, ..
         } = self.task;
-        let steps = (world.episode_steps - 1).max(1);
-        // Below the measured worlds' seeds.
-        let seed = rng.random_range(0..MEASURED_SEED);
-        self.episodes = Episodes::play(world, settings.batch_size, steps, seed)?;
-        // As many batches as there are pairs in an episode: each is used once, on average.
-        self.batches_left = steps;
-        Ok(())
-    }
-
-    fn batch(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<(Vec<u8>, Vec<u8>)> {
+        let rows = settings.batch_size;
         if self.batches_left == 0 {
-            self.renew(rng)?;
+            let steps = (world.episode_steps - 1).max(1);
+            // Below the measured worlds' seeds.
+            let seed = rng.random_range(0..MEASURED_SEED);
+            self.episodes = Episodes::play(world, rows, steps, seed)?;
+            // As many batches as there are pairs in an episode: each is used once, on average.
+            self.batches_left = steps;
         }
         self.batches_left -= 1;
-        let bytes = self.task.world.frame_shape().bytes();
+        let bytes = world.frame_shape().bytes();
         let frames = &self.episodes.frames;
         let (mut now, mut next) = (Vec::new(), Vec::new());
-        for row in 0..self.task.settings.batch_size {
+        for row in 0..rows {
             let t = rng.random_range(0..frames.len() - 1);
             let place = row * bytes..(row + 1) * bytes;
             now.extend_from_slice(&frames[t][place.clone()]);

@@ -54,6 +54,10 @@ fn fine() -> impl Iterator<Item = f64> {
     (1..=97).map(|i| 0.02 + f64::from(i - 1) * 0.01)
 }
 
+fn by_alpha() -> Axis {
+    Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0])
+}
+
 fn curve(results: &Results, value: impl Fn(&Chain) -> f64) -> Vec<(f64, f64)> {
     let at = |alpha: f64| (alpha, value(&results.chain(alpha)));
     fine().map(at).collect()
@@ -73,7 +77,7 @@ fn information(results: &Results) -> Chart {
     });
     Chart::new(
         "(c) Mutual information of successive states",
-        Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0]),
+        by_alpha(),
         Axis::linear("I(S, S') [nats]").showing(&[0.0]),
         vec![
             Series::line(
@@ -100,7 +104,7 @@ fn inverse_gap(results: &Results) -> Chart {
     });
     Chart::new(
         "(d) Inverse spectral gap",
-        Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0]),
+        by_alpha(),
         Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").showing(&[0.0]),
         vec![
             Series::line(
@@ -156,7 +160,7 @@ pub(super) fn convergence(results: &Results) -> Figure {
             )),
             Panel::Chart(Chart::new(
                 &format!("Error after {} updates", settings.updates),
-                Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0]),
+                by_alpha(),
                 Axis::linear("total variation [probability]").showing(&[0.0]),
                 last.collect(),
             )),

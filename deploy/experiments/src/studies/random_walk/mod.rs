@@ -7,7 +7,7 @@ mod results;
 mod settings;
 mod training;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use self::{
     chain::Chain,
@@ -18,7 +18,7 @@ use self::{
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values, number},
+    page::{Page, Table, Values, number, numbers},
     plot::Curve,
     stats::Spread,
 };
@@ -44,8 +44,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         alphas.flat_map(move |&alpha| (1..=settings.seeds).map(move |seed| (sampling, alpha, seed)))
     });
     for (sampling, alpha, seed) in grid {
-        let states = settings.states;
-        let chain = Chain { states, alpha };
+        let chain = Chain::new(settings.states, alpha);
         let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
         let learnt = session.piece(&key, settings.updates, |progress| {
             train(&chain, &settings, sampling, seed.into(), progress)
@@ -64,17 +63,12 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     session.finish(&page(&results, args.smoke))
 }
 
-/// A number of the data.
-fn written(value: f64) -> String {
-    format!("{value:.6}")
-}
-
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let k = results.settings.states;
     let laws = results.settings.alphas.iter().map(|&alpha| {
         let chain = results.chain(alpha);
         let t = chain.transitions();
-        let numbers = [
+        let of_chain = [
             chain.mutual_information(),
             chain::mutual_information_numerically(&t, k),
             results.learnt_information(alpha).mean,
@@ -83,50 +77,47 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
             chain.spectral_gap(),
             chain::spectral_gap_numerically(&t, k),
         ];
-        let head = std::iter::once(alpha.to_string());
-        head.chain(numbers.map(written)).collect()
+        format!("{alpha},{}", numbers(of_chain, 6))
     });
     let columns = "alpha,mi_nats,mi_numerical_nats,mi_learnt_nats,mi_ring_nats,mi_as_printed_nats,gap,gap_numerical";
-    session.csv("alpha", &Table::of(columns, laws))?;
+    session.csv("alpha", &Table::of_lines(columns, laws))?;
 
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let entries = truth.iter().zip(&learnt).enumerate();
     let entries = entries.map(|(at, (truth, learnt))| {
-        let states = [at / k + 1, at % k + 1].map(|state| state.to_string());
-        let numbers = [*truth, learnt.mean, learnt.sd].map(written);
-        states.into_iter().chain(numbers).collect()
+        let (state, next) = (at / k + 1, at % k + 1);
+        let entry = numbers([*truth, learnt.mean, learnt.sd], 6);
+        format!("{state},{next},{entry}")
     });
     let columns = "state,next,true_ratio,learnt_mean,learnt_sd";
-    session.csv("ratio", &Table::of(columns, entries))?;
+    session.csv("ratio", &Table::of_lines(columns, entries))?;
 
     let times = results.trained.iter().map(|one| {
         let time = |measure| number(results.time(one, measure).map(|it| it as f64), 0);
-        vec![
-            one.sampling.name().to_owned(),
-            one.chain.alpha.to_string(),
-            one.seed.to_string(),
-            written(one.chain.spectral_gap()),
+        format!(
+            "{},{},{},{:.6},{},{},{}",
+            one.sampling.name(),
+            one.chain.alpha,
+            one.seed,
+            one.chain.spectral_gap(),
             time(Measure::Tv),
             time(Measure::Share),
-            written(one.final_tv()),
-            written(one.final_excess()),
-        ]
+            numbers([one.final_tv(), one.final_excess()], 6),
+        )
     });
     let columns =
         "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
-    session.csv("convergence", &Table::of(columns, times))?;
+    session.csv("convergence", &Table::of_lines(columns, times))?;
 
     let curves = results.shown().into_iter().flat_map(|alpha| {
         let Curve { points, band } = results.tv_curve(alpha);
         let rows = points.into_iter().zip(band);
         rows.map(move |((updates, mean), (_, min, max))| {
-            let numbers = [mean, min, max].map(|it| format!("{it:.5}"));
-            let head = [alpha.to_string(), updates.to_string()];
-            head.into_iter().chain(numbers).collect()
+            format!("{alpha},{updates},{}", numbers([mean, min, max], 5))
         })
     });
     let columns = "alpha,updates,tv_mean,tv_min,tv_max";
-    session.csv("curves", &Table::of(columns, curves))
+    session.csv("curves", &Table::of_lines(columns, curves))
 }
 
 fn page(results: &Results, smoke: bool) -> Page {
@@ -138,93 +129,66 @@ fn page(results: &Results, smoke: bool) -> Page {
     };
     let at_figure = || results.of(Sampling::Stationary, settings.figure_alpha);
     let errors: Vec<Spread> = at_figure().filter_map(of_seed).collect();
+    let of_errors = |part: fn(&Spread) -> f64| errors.iter().map(part).collect::<Vec<_>>();
     let holds = |measure| {
         let found = results.gap_correlations(Sampling::Stationary, measure);
-        found.is_some_and(|spread| spread.mean > 0.5)
+        Spread::of(found).is_some_and(|spread| spread.mean > 0.5)
     };
     // What follows from the closed forms alone, at any length of the experiment.
-    let states = settings.states;
     let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {
-        let chain = Chain { states, alpha };
+        let chain = results.chain(alpha);
         json!({
             "mi": chain.mutual_information(),
             "ring": chain.mutual_information_of_a_ring(),
             "printed": chain.mutual_information_as_printed(),
         })
     });
+    let final_tv = at_figure().map(Trained::final_tv);
     let mut values = Values::default();
     values
         .set("settings", settings)
         .set("seeds", settings.seeds)
-        .set(
-            "mean_errors",
-            errors.iter().map(|it| it.mean).collect::<Vec<_>>(),
-        )
-        .set(
-            "largest_errors",
-            errors.iter().map(|it| it.max).collect::<Vec<_>>(),
-        )
+        .set("mean_errors", of_errors(|it| it.mean))
+        .set("largest_errors", of_errors(|it| it.max))
         .set("largest_ratio", truth.iter().copied().fold(0.0, f64::max))
-        .set(
-            "final_tv",
-            at_figure().map(Trained::final_tv).collect::<Vec<_>>(),
-        )
+        .set("final_tv", final_tv.collect::<Vec<_>>())
         .set("convergence", convergence(results))
+        .set("missed", 1.0 - settings.share_reached)
+        .set("tv_reached", settings.tv_reached)
         .set("absolute", holds(Measure::Tv))
         .set("relative", holds(Measure::Share))
         .set("closed_forms", closed_forms)
-        .set("most", (states as f64).ln());
+        .set("most", (settings.states as f64).ln());
     Page::new(include_str!("page.md"), values, &this_command(), smoke)
 }
 
-/// How long each sampling takes, by either measure.
-fn convergence(results: &Results) -> Vec<String> {
+/// How long each sampling takes, by either measure: the updates at the first, the figure's and the last alpha.
+fn convergence(results: &Results) -> Vec<Value> {
     let settings = &results.settings;
     let alpha = settings.figure_alpha;
     let ends = [settings.alphas.first(), settings.alphas.last()];
     let [first, last] = ends.map(|end| end.copied().unwrap_or(alpha));
-    let share = 100.0 * (1.0 - settings.share_reached);
-    let measures = [
-        (
-            Measure::Tv,
-            format!("the total variation is {}", settings.tv_reached),
-        ),
-        (
-            Measure::Share,
-            format!("{share:.0}% of the mutual information is learnt"),
-        ),
-    ];
-    let all = measures
-        .iter()
-        .flat_map(|it| Sampling::ALL.map(|sampling| (it, sampling)));
-    let line = |((measure, what), sampling): (&(Measure, String), Sampling)| {
+    let measures = [Measure::Tv, Measure::Share].into_iter();
+    let all = measures.flat_map(|it| Sampling::ALL.map(|sampling| (it, sampling)));
+    let row = |(measure, sampling): (Measure, Sampling)| {
         let time_at = |alpha: f64| {
             let times = results.of(sampling, alpha);
-            let times = times.filter_map(|one| results.time(one, *measure));
-            let mean = Spread::of(times.map(|time| time as f64));
-            mean.map_or("never".to_owned(), |it| format!("{:.0}", it.mean))
+            let times = times.filter_map(|one| results.time(one, measure));
+            json!({ "alpha": alpha, "updates": times.collect::<Vec<_>>() })
         };
-        let trained = results
-            .trained
-            .iter()
-            .filter(|one| one.sampling == sampling);
-        let late = trained.filter(|one| results.time(one, *measure).is_none());
-        let late = match late.count() {
-            0 => String::new(),
-            late => format!(" ({late} trainings never got there)"),
-        };
-        let correlation = results.gap_correlations(sampling, *measure);
-        format!(
-            "Updates until {what}, `{}`: {} at alpha = {first}, {} at {alpha}, {} at {last}{late}. Rank correlation \
-             over alpha with the inverse spectral gap: {}.",
-            sampling.name(),
-            time_at(first),
-            time_at(alpha),
-            time_at(last),
-            correlation.map_or("none".to_owned(), |spread| format!("{spread:.2}")),
-        )
+        let trained = results.trained.iter();
+        let trained = trained.filter(|one| one.sampling == sampling);
+        let late = trained.filter(|one| results.time(one, measure).is_none());
+        let (times, late) = ([first, alpha, last].map(time_at), late.count());
+        json!({
+            "measure": measure,
+            "sampling": sampling.name(),
+            "times": times,
+            "late": late,
+            "correlations": results.gap_correlations(sampling, measure),
+        })
     };
-    all.map(line).collect()
+    all.map(row).collect()
 }
 
 #[cfg(test)]

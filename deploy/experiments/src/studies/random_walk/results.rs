@@ -1,5 +1,7 @@
 //! All trainings of the grid, and what follows from them together.
 
+use serde::Serialize;
+
 use super::{
     chain::Chain,
     settings::Settings,
@@ -42,10 +44,7 @@ impl Results {
     }
 
     pub(super) fn chain(&self, alpha: f64) -> Chain {
-        Chain {
-            states: self.settings.states,
-            alpha,
-        }
+        Chain::new(self.settings.states, alpha)
     }
 
     /// T / rho at the figure's bias, [K, K].
@@ -74,13 +73,9 @@ impl Results {
 
     /// The biases of the curves: the strongest below 0.5, one between, and the figure's.
     pub(super) fn shown(&self) -> Vec<f64> {
-        let Settings {
-            alphas,
-            figure_alpha,
-            ..
-        } = &self.settings;
-        let figure = alphas.iter().position(|alpha| alpha == figure_alpha);
-        let figure = figure.unwrap_or(0);
+        let alphas = &self.settings.alphas;
+        let is_figure = |alpha: &f64| *alpha == self.settings.figure_alpha;
+        let figure = alphas.iter().position(is_figure).unwrap_or(0);
         let mut shown = vec![0, figure / 2, figure];
         shown.dedup();
         shown.into_iter().map(|at| alphas[at]).collect()
@@ -111,25 +106,24 @@ impl Results {
     /// Of each seed, the rank correlation over alpha between 1 / gap and the updates until the error is small.
     ///
     /// A training that never got there counts as one update more than the longest.
-    pub(super) fn gap_correlations(&self, sampling: Sampling, measure: Measure) -> Option<Spread> {
+    pub(super) fn gap_correlations(&self, sampling: Sampling, measure: Measure) -> Vec<f64> {
         let of_seed = |seed: u32| {
-            let one = self.trained.iter();
-            let pairs: Vec<(f64, f64)> = one
-                .filter(|one| one.sampling == sampling && one.seed == seed)
-                .map(|one| {
-                    let time = self.time(one, measure);
-                    let time = time.unwrap_or(self.settings.updates + 1);
-                    (1.0 / one.chain.spectral_gap(), time as f64)
-                })
-                .collect();
-            rank_correlation(&pairs)
+            let all = self.trained.iter();
+            let of_seed = all.filter(|one| one.sampling == sampling && one.seed == seed);
+            let pairs = of_seed.map(|one| {
+                let time = self.time(one, measure);
+                let time = time.unwrap_or(self.settings.updates + 1);
+                (1.0 / one.chain.spectral_gap(), time as f64)
+            });
+            rank_correlation(&pairs.collect::<Vec<_>>())
         };
-        Spread::of((1..=self.settings.seeds).filter_map(of_seed))
+        (1..=self.settings.seeds).filter_map(of_seed).collect()
     }
 }
 
-/// When a training counts as converged.
-#[derive(Clone, Copy, PartialEq)]
+/// When a training counts as converged; the page names it.
+#[derive(Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub(super) enum Measure {
     /// The law of the next state is near the true one, however near a blind guess is.
     Tv,

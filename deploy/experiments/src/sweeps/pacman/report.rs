@@ -5,14 +5,12 @@ use driml_protocol::RETURNS_OF;
 use serde_json::{Value, json};
 
 use super::{
-    figure::figure,
-    results::{LOSSES, Loss, Results},
+    results::{LOSSES, Results, Trace},
     settings::{EPISODE_FRAMES_MAX, PART_NAMES, PARTS},
 };
 use crate::{
     cache::Session,
-    page::{Page, Table, Values, number},
-    stats::interval,
+    page::{Table, Values, number},
 };
 
 /// Names of ghosts 0 to 3.
@@ -20,51 +18,36 @@ const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 /// How the page names (b) and (c).
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
-/// Writes the tables, figure 3 and the page of what was run.
-pub(super) fn report(
-    session: Session,
-    results: &Results,
-    command: &str,
-    smoke: bool,
-) -> anyhow::Result<()> {
-    session.figure("fig3", &figure(results))?;
-    write_data(&session, results)?;
-    let values = values(results);
-    let template = include_str!("../pacman.md");
-    session.finish(&Page::new(template, values, command, smoke))
-}
-
-fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
-    let losses = || results.losses.iter();
-    let head = |it: &Loss| {
-        [
-            it.epsilon.to_string(),
-            it.seed.to_string(),
-            it.column.into(),
-        ]
-    };
-    let rows = losses().flat_map(|it| {
-        it.points.iter().map(move |(frames, loss)| {
-            [
-                &head(it)[..],
-                &[format!("{frames:.0}"), format!("{loss:.4}")],
-            ]
-            .concat()
-        })
+/// Writes the tables.
+pub(super) fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let losses = results.losses.iter();
+    let rows = losses.clone().flat_map(|it| {
+        let (epsilon, seed, column) = (it.epsilon, it.seed, it.column);
+        let points = it.points.iter();
+        points.map(move |(x, y)| format!("{epsilon},{seed},{column},{x:.0},{y:.4}"))
     });
-    session.csv("loss", &Table::of("epsilon,seed,loss,frames,nats", rows))?;
-    let rows =
-        losses().map(|it| [&head(it)[..], &[number(it.last, 4), number(it.whole, 4)]].concat());
+    let columns = "epsilon,seed,loss,frames,nats";
+    session.csv("loss", &Table::of_lines(columns, rows))?;
+    let rows = losses.map(|it| {
+        let (epsilon, seed, column) = (it.epsilon, it.seed, it.column);
+        let [last, whole] = [it.last, it.whole].map(|it| number(it, 4));
+        format!("{epsilon},{seed},{column},{last},{whole}")
+    });
     let columns = "epsilon,seed,loss,last_fifth_nats,whole_nats";
-    session.csv("final_loss", &Table::of(columns, rows))?;
+    session.csv("final_loss", &Table::of_lines(columns, rows))?;
     for (name, traces) in PART_NAMES.iter().zip(&results.traces) {
-        let rows = traces.iter().flat_map(|trace| {
-            trace.points.iter().map(|(episodes, mean)| {
-                let numbers = [format!("{episodes:.0}"), format!("{mean:.4}")];
-                [&[trace.agent.clone(), trace.seed.to_string()], &numbers[..]].concat()
-            })
-        });
-        session.csv(name, &Table::of("agent,seed,episodes,mean_return", rows))?;
+        let rows = traces.iter().flat_map(
+            |Trace {
+                 agent,
+                 seed,
+                 points,
+             }| {
+                let points = points.iter();
+                points.map(move |(x, y)| format!("{agent},{seed},{x:.0},{y:.4}"))
+            },
+        );
+        let columns = "agent,seed,episodes,mean_return";
+        session.csv(name, &Table::of_lines(columns, rows))?;
     }
     Ok(())
 }
@@ -111,80 +94,60 @@ fn tasks(part: usize, results: &Results) -> Vec<Value> {
     (0..continual.tasks).map(row).collect()
 }
 
-fn got_losses(results: &Results) -> Vec<String> {
-    let lines = LOSSES.iter().filter_map(|(column, what)| {
-        let (rank, runs) = results.order_of_epsilon(column)?;
-        Some(format!(
-            "(a) Rank correlation of epsilon and the final {what} loss over {runs} runs: {rank:.2} (1 if the loss rises with epsilon)."
-        ))
-    });
-    lines.collect()
-}
-
-/// The mean with its interval, and of how many seeds it is.
-fn with_interval(values: impl Iterator<Item = f64>) -> Option<String> {
-    let values: Vec<f64> = values.collect();
-    let found = interval(&values)?;
-    Some(match values.len() {
-        1 => format!("{found:.3}"),
-        seeds => format!("{found:.3} (95% interval over {seeds} seeds)"),
-    })
-}
-
-fn got_tasks(part: usize, results: &Results) -> Vec<String> {
-    let (continual, panel) = (results.settings.tasks(part), PANELS[part]);
+/// By seed, of each agent how much more it earns at the end of its last task than of its first, and how much more than the first agent
+/// over all tasks; where a run has both.
+fn differences(part: usize, results: &Results) -> Vec<Value> {
+    let continual = results.settings.tasks(part);
     let last = continual.tasks.saturating_sub(1);
     let agents = &results.settings.agents;
-    let mut lines = Vec::new();
-    for agent in agents {
-        let own = results.traces(part, agent);
-        let gains = own
-            .filter_map(|trace| Some(trace.task(continual, last)?.0 - trace.task(continual, 0)?.0));
-        lines.extend(with_interval(gains).map(|gain| {
-            format!("{panel} `{agent}`: return at the end of the last task minus that of the first: {gain}.")
-        }));
-    }
+    let gains = agents.iter().map(|agent| {
+        let gain = |it: &Trace| Some(it.task(continual, last)?.0 - it.task(continual, 0)?.0);
+        let gains = results.traces(part, agent).filter_map(gain);
+        (agent, None, gains.collect())
+    });
     let of_seed = |agent: &str, seed: u32| {
         let trace = results.traces(part, agent).find(|it| it.seed == seed)?;
         trace.over_tasks(continual)
     };
-    for agent in agents.iter().skip(1) {
+    let above_first = agents.iter().skip(1).map(|agent| {
         let first = &agents[0];
         let seeds = 1..=results.settings.seeds;
-        let apart = seeds.filter_map(|seed| Some(of_seed(agent, seed)? - of_seed(first, seed)?));
-        lines.extend(with_interval(apart).map(|apart| {
-            format!(
-                "{panel} `{agent}` minus `{first}`, return over all tasks, seed by seed: {apart}."
-            )
-        }));
-    }
-    lines
+        let above = seeds.filter_map(|seed| Some(of_seed(agent, seed)? - of_seed(first, seed)?));
+        (agent, Some(first), above.collect::<Vec<f64>>())
+    });
+    let all = gains.chain(above_first).filter(|it| !it.2.is_empty());
+    all.map(|(agent, first, values)| {
+        json!({ "panel": PANELS[part], "agent": agent, "first": first, "values": values })
+    })
+    .collect()
 }
 
 /// What the page says.
-fn values(results: &Results) -> Values {
+pub(super) fn values(results: &Results) -> Values {
     let settings = &results.settings;
     let (ghosts, noise) = (&settings.continual, &settings.noise);
-    let mut got = got_losses(results);
-    got.extend((0..PARTS).flat_map(|part| got_tasks(part, results)));
+    let ranks = LOSSES.iter().filter_map(|(column, what)| {
+        let (rank, runs) = results.order_of_epsilon(column)?;
+        Some(json!({ "what": what, "rank": rank, "runs": runs }))
+    });
+    let differences = (0..PARTS).flat_map(|part| differences(part, results));
     let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
     let mut sets = ghosts.sets.iter();
     let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));
-    let out_of_order = results.order_of_epsilon(LOSSES[1].0);
+    let order = results.order_of_epsilon(LOSSES[1].0);
+    let is_out_of_order = order.is_some_and(|(rank, _)| rank <= 0.0);
     let mut values = Values::default();
     values
         .set("settings", settings)
         .set("agents", &settings.agents)
         .set("seeds", settings.seeds)
-        .set("got", got)
+        .set("ranks", ranks.collect::<Vec<_>>())
+        .set("differences", differences.collect::<Vec<_>>())
         .set("losses", losses(results))
         .set("ghosts", tasks(0, results))
         .set("noise", tasks(1, results))
         .set("missing", &results.missing)
-        .set(
-            "out_of_order",
-            out_of_order.is_some_and(|(rank, _)| rank <= 0.0),
-        )
+        .set("out_of_order", is_out_of_order)
         .set("capacity", capacity)
         .set("short_tasks", short)
         .set("returns_of", RETURNS_OF)
