@@ -10,12 +10,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. These numbers only fall: a change that adds code pays for it.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 9_400),
-    ("actor", 13_700),
+    ("protocol", 9_370),
+    ("actor", 13_680),
     ("replay-server", 11_500),
     ("learner", 27_550),
-    ("deploy", 36_490),
-    ("tests", 12_310),
+    ("deploy", 36_400),
+    ("tests", 12_240),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
