@@ -48,8 +48,13 @@ impl Progress {
 
     /// Counts work that an earlier start did.
     pub(crate) fn find(&mut self, units: u64) {
-        self.done += units;
+        self.count(units);
         self.found += units;
+    }
+
+    fn count(&mut self, units: u64) {
+        self.done += units;
+        debug_assert!(self.done <= self.total, "more work than was announced");
     }
 
     /// Counts work that was done in vain and has to be done again.
@@ -62,7 +67,7 @@ impl Progress {
 
     /// Counts work done.
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
-        self.done += units;
+        self.count(units);
         let period = self.screen.bar().map_or(PLAIN_PERIOD, |_| BAR_PERIOD);
         if self.shown.elapsed() >= period {
             self.shown = Instant::now();

@@ -306,8 +306,9 @@ impl Tradeoff<'_> {
     fn make(mut self, plan: Plan) -> anyhow::Result<(Session, Results)> {
         let wanted = self.wanted(&plan)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
-        let work = wanted.iter().map(|(_, plan)| plan.units + units).sum();
-        self.session.work().1.again(work);
+        let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
+        // A random policy plays once.
+        self.session.work().1.again(work + units);
         let jobs = self.settings.common.jobs;
         let Swept { made, missing } = queue::make(&mut self.session, wanted, jobs, report_only)?;
         let play = Played {

@@ -299,7 +299,7 @@ mod tests {
         let chain = Chain::new(4, 0.4);
         for sampling in Sampling::ALL {
             let train = || {
-                let mut progress = Progress::new(1, Interrupts::default());
+                let mut progress = Progress::new(settings.updates, Interrupts::default());
                 train(&chain, &settings, sampling, 5, &mut progress).unwrap()
             };
             let learnt = train();
