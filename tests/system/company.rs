@@ -83,13 +83,10 @@ impl SyntheticActor {
         let next = ChunkHeader {
             actor,
             incarnation: 1,
-            sequence: 0,
-            first_transition: 0,
-            weights_version: 0,
-            leaving: false,
             streams: 4,
             steps: 8,
             frame_bytes: client.spec.frame_bytes() as u32,
+            ..ChunkHeader::default()
         };
         Self {
             delivery,

@@ -203,7 +203,8 @@ fn check_nothing_is_left(system: &TestSystem, run: &Path) {
 
 /// Batches that may have been on their way to a learner that ended.
 const IN_FLIGHT: u64 = 8;
-/// While there is no room nothing is stored and nothing served; then everything continues, and nothing was lost.
+
+/// While the disk is full nothing is stored or served; then everything continues, and nothing was lost.
 #[test]
 fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();

@@ -52,13 +52,10 @@ fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
     let mut header = ChunkHeader {
         actor,
         incarnation: 1,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
         streams: STREAMS,
         steps: STEPS,
         frame_bytes,
+        ..ChunkHeader::default()
     };
     while header.sequence < CHUNKS {
         let mut chunk = Chunk::zeroed(header);
@@ -116,7 +113,7 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     }
 }
 
-/// The numbers of all transitions in a replay that is no longer in use: of rows that are drawn from it as often as need be.
+/// The numbers of all transitions in a replay whose server has ended, from rows that are drawn until each was seen.
 fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSet<u64> {
     let mut config: Config = Settings::parse(config_toml)
         .unwrap()

@@ -101,12 +101,9 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
         return;
     }
     let system = system();
-    let ended = system
+    system
         .run("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table")
         .expect_code(0);
-    let percents = ended.stderr.lines().filter_map(|it| it.split_once("%  "));
-    let percents: Vec<u32> = percents.map(|it| it.0.trim().parse().unwrap()).collect();
-    assert!(percents.iter().all(|it| *it <= 100), "{percents:?}");
     let folder = system.path("table");
     let page = std::fs::read_to_string(folder.join("README.md")).unwrap();
     for part in [

@@ -71,13 +71,10 @@ fn header_of(actor: u32, frame_bytes: usize) -> ChunkHeader {
     ChunkHeader {
         actor,
         incarnation: 1,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
         streams: 1,
         steps: 1,
         frame_bytes: frame_bytes as u32,
+        ..ChunkHeader::default()
     }
 }
 

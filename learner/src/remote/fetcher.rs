@@ -51,7 +51,7 @@ pub struct Requests {
 /// How far the learner is, which it tells with each request.
 #[derive(Debug)]
 pub struct Counters {
-    /// Updates done.
+    /// Updates done in the whole run.
     pub updates: AtomicU64,
     /// Updates in the newest checkpoint.
     pub saved_updates: AtomicU64,
@@ -88,7 +88,7 @@ impl Counters {
 
 /// A batch, and where its rows are from.
 pub struct Served {
-    /// The batch.
+    /// What the learner learns from next.
     pub batch: Batch,
     /// Its rows by shard.
     pub parts: Vec<ServedPart>,

@@ -22,7 +22,7 @@ pub struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
-    /// Why the replies so far are no answer.
+    /// Why none of the replies so far was taken.
     failed: Option<SessionError>,
 }
 

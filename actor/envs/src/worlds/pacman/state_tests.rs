@@ -1,7 +1,7 @@
 //! Tests of settings, actions and saved states of Ms. PacMan: what is read back, and what is refused.
 //! The rules of the game are in `tests`.
 
-use super::tests::*;
+use super::tests::config;
 use super::*;
 
 #[test]

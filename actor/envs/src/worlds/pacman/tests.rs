@@ -24,7 +24,7 @@ pub(super) fn config() -> PacmanConfig {
 }
 
 /// Ghosts that keep to the mode they are put into.
-pub(super) fn steady(config: &PacmanConfig) -> PacmanConfig {
+fn steady(config: &PacmanConfig) -> PacmanConfig {
     PacmanConfig {
         epsilon: 0.0,
         switch_probability: 0.0,
@@ -32,27 +32,27 @@ pub(super) fn steady(config: &PacmanConfig) -> PacmanConfig {
     }
 }
 
-pub(super) fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
+fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
     let places = world.maze.items().len() as u16;
     (0..places)
         .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
         .unwrap()
 }
 
-pub(super) fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
+fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
     let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
     world.step(&[action], &mut reward, &mut end).unwrap();
     (reward[0], end[0])
 }
 
-pub(super) fn frame(world: &mut PacmanWorld) -> Vec<u8> {
+fn frame(world: &mut PacmanWorld) -> Vec<u8> {
     let mut frames = vec![0; world.num_envs() * render::FRAME_BYTES];
     world.observe(&mut frames);
     frames
 }
 
 /// The bottom corridor, agent in column 9 and ghost 0 `apart` to the right, sure to come closer; the rest far away.
-pub(super) fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
+fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
     let mut world = PacmanWorld::new(&steady(config), 1, 0).unwrap();
     let (agent, hunter, far) = (
         at(&world, 19, 9),
@@ -67,7 +67,7 @@ pub(super) fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
 }
 
 /// Frames, rewards and ends of `steps` random steps.
-pub(super) fn play(
+fn play(
     world: &mut PacmanWorld,
     steps: usize,
     seed: u64,
