@@ -2,7 +2,6 @@
 # Measures and trains on a machine with an NVIDIA GPU: driml doctor, parity and speed on the device, PyTorch on the same
 # device, then whole runs for so many minutes each. A call with the same --out skips finished steps and resumes
 # an interrupted run from its newest checkpoint, for the remaining minutes.
-# THIS SCRIPT HAS NOT BEEN RUN ON A GPU. It was checked on a machine without one, where it exits at the start.
 
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
@@ -109,7 +108,7 @@ step parity "$driml" parity "$root"/tests/parity/*.safetensors --device "$device
 step learner "$driml" bench learner --device "$device" --json "$out/learner.json"
 if [ -n "$python" ]; then
     if "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
-        torch_update() { "$python" "$root/deploy/bench/peers/torch_update.py" --device "$device" "$@"; }
+        torch_update() { PYTHONPATH=$root/deploy/python "$python" "$root/deploy/bench/peers/torch_update.py" --device "$device" "$@"; }
         step torch-parity torch_update --check "$root"/tests/parity/*.safetensors
         step torch-eager torch_update
         step torch-compiled torch_update --compile

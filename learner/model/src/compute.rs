@@ -217,7 +217,8 @@ impl DeviceName {
         match self {
             Self::Cpu => Ok(Compute::cpu(precision)),
             Self::Cuda(ordinal) => {
-                let device = Device::new_cuda(ordinal)
+                // One stream for all threads: `Device::new_cuda` gives each its own, unordered with the others'.
+                let device = Device::new_cuda_with_stream(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;
                 Ok(Compute::on(&device))
             }

@@ -133,9 +133,14 @@ pub(crate) struct Rows {
 
 impl Rows {
     pub(crate) fn random(rows: usize, seed: u64) -> Self {
+        Self::of_frames(rows, 20 * 24 * 2, seed)
+    }
+
+    /// With states of `frame_len` bytes.
+    pub(crate) fn of_frames(rows: usize, frame_len: usize, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut frames = || {
-            (0..rows * 20 * 24 * 2)
+            (0..rows * frame_len)
                 .map(|_| rng.random())
                 .collect::<Vec<u8>>()
         };

@@ -7,6 +7,8 @@ mod agents;
 mod augment;
 mod checkpoint;
 mod checkpoint_damage;
+#[cfg(feature = "cuda")]
+mod cuda;
 mod equal_states;
 mod errors;
 mod made_up;

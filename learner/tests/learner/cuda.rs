@@ -1,0 +1,42 @@
+//! Updates on an NVIDIA GPU beside those of the CPU. Built with the feature `cuda` alone; run with
+//! `cargo test --release --features driml-learner/cuda -p driml-learner --test learner -- --ignored cuda`.
+
+use driml_learner::{Agent, Compute, DeviceName, Precision};
+use driml_model::{ModelConfig, TorsoName};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::made_up::{ALL_DIM, Rows, model, settings};
+
+/// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had a stream, most updates
+/// after the first computed with states that were not there yet. Batches have to be large for that to show.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn updates_on_a_gpu_follow_those_on_the_cpu() {
+    let gpu = DeviceName::Cuda(0).open(Precision::F32).unwrap();
+    let (height, width, input_channels) = (64, 64, 3);
+    let rows = Rows::of_frames(256, height * width * input_channels, 3);
+    let totals = |compute: &Compute| {
+        let model = ModelConfig {
+            height,
+            width,
+            input_channels,
+            torso: TorsoName::Impala,
+            conv: vec![],
+            channels: vec![16, 32, 32],
+            ..model(ALL_DIM)
+        };
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let mut agent = Agent::new(model, settings(ALL_DIM), compute, rng).unwrap();
+        (0..10)
+            .map(|_| agent.update(&rows.batch()).unwrap().total)
+            .collect::<Vec<_>>()
+    };
+    let (cpu, gpu) = (totals(&Compute::CPU), totals(&gpu));
+    for (update, (cpu, gpu)) in cpu.iter().zip(&gpu).enumerate() {
+        assert!(
+            (cpu - gpu).abs() <= 0.01 * cpu.abs(),
+            "update {update}: {cpu} on the CPU, {gpu} on the GPU"
+        );
+    }
+}
