@@ -229,9 +229,6 @@ impl Agent {
     }
 
     /// Puts the averaged weights, if there are any, into torso and head of the online network, to play with. Says whether there were.
-    ///
-    /// # Errors
-    /// A tensor that cannot be copied on its device.
     pub fn take_average(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online.get(name) {
@@ -381,9 +378,6 @@ impl Agent {
 
     /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone. Without noise:
     /// of noisy layers the means serve.
-    ///
-    /// # Errors
-    /// States that do not fit the network.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
         let states = states(&self.model, batch.states_t, &self.compute.device)?;
         let logits = distribution(&self.online_network, &states, None)?;
@@ -392,9 +386,6 @@ impl Agent {
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
     /// Returns their global norm before clipping.
-    ///
-    /// # Errors
-    /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let norm = gradients.norm(self.compute.kernels)?;
         self.adam.step(

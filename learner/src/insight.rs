@@ -35,17 +35,11 @@ pub struct Seen {
 
 impl Insight {
     /// The network of `agent`, whose parameters it shares, computed as `compute` says; that is to be on the agent's device.
-    ///
-    /// # Errors
-    /// Kernels that the device does not have.
     pub fn of(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
         Self::new(agent.model(), agent.settings(), agent.online(), compute)
     }
 
     /// The network with these parameters, learned with these settings; without DIM's heads it compares no features.
-    ///
-    /// # Errors
-    /// As [`Insight::of`], and parameters that do not fit the model.
     pub fn new(
         model: &ModelConfig,
         settings: &LearnerSettings,
@@ -71,9 +65,6 @@ impl Insight {
     }
 
     /// What the network makes of states [B, H, W, C], of its input's size.
-    ///
-    /// # Errors
-    /// Bytes that are not whole states.
     pub fn look(&self, bytes: &[u8]) -> Result<Seen, UpdateError> {
         let features = self
             .network

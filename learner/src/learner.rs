@@ -70,9 +70,6 @@ pub struct Learner {
 
 impl Learner {
     /// A learner at its start, all generators derived from the run's seed.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
@@ -303,9 +300,6 @@ impl Learner {
     }
 
     /// The present weights as a new version.
-    ///
-    /// # Errors
-    /// The tensor library failed.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
         let safetensors = self.agent.weights_as(self.config.learner.publish_as)?;
         self.weights_version += 1;
@@ -325,9 +319,6 @@ impl Learner {
     }
 
     /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
-    ///
-    /// # Errors
-    /// As [`Learner::save`].
     pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
         let LearnerConfig {
             spec, model, input, ..

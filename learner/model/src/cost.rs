@@ -81,9 +81,6 @@ impl ModelConfig {
     }
 
     /// Bytes of a safetensors file of all parameters that this configuration has, names and shapes included.
-    ///
-    /// # Errors
-    /// A failing serialisation.
     pub fn weights_bytes(&self, stored: StoredAs) -> Result<usize> {
         let shapes = self.parameter_shapes();
         let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();

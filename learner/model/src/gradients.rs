@@ -37,9 +37,6 @@ pub struct Backward {
 
 impl Backward {
     /// Runs the backward pass of `loss`, a scalar.
-    ///
-    /// # Errors
-    /// An operation without a gradient, or one that failed.
     pub fn of(loss: &Tensor) -> Result<Self> {
         let _below = PassBelow(SUMS.replace(Some(Sums::new())));
         let store = loss.backward();
@@ -51,9 +48,6 @@ impl Backward {
     }
 
     /// Takes out the gradient of `var`, in its shape; `None` if the loss does not depend on it.
-    ///
-    /// # Errors
-    /// A failing copy of a gradient that is not contiguous.
     pub fn remove(&mut self, var: &Var) -> Result<Option<Tensor>> {
         let sum = self.sums.remove(&var.id());
         let sum = sum.map(|sum| Tensor::from_vec(sum, var.shape(), var.device()));

@@ -53,9 +53,6 @@ impl PolicyNetwork {
     }
 
     /// Replaces the weights. On an error the old ones stay.
-    ///
-    /// # Errors
-    /// As for [`PolicyNetwork::new`].
     pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
         self.weights = weights(&self.config, safetensors, self.precision)?;
         Ok(())
@@ -110,9 +107,6 @@ impl PolicyNetwork {
 
     /// Writes the action of largest expected return, the lowest on a tie, for each of `frames` [B, H, W, C] to
     /// `actions` [B].
-    ///
-    /// # Errors
-    /// As for [`PolicyNetwork::q_values`].
     pub fn greedy_actions(&mut self, frames: &[u8], actions: &mut [u8]) -> Result<()> {
         let count = self.config.num_actions;
         let mut values = std::mem::take(&mut self.values);

@@ -55,9 +55,6 @@ impl Dim {
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
     /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
-    ///
-    /// # Errors
-    /// A head that such a pair needs and `network` lacks.
     pub fn pair_losses(
         &self,
         network: &Network,
@@ -131,9 +128,6 @@ impl AuxiliaryLoss for Dim {
 /// Dot products for the `wanted` pairs, in the order of `settings::PAIRS`.
 ///
 /// Local features meet local ones at the same location; a global feature meets every location.
-///
-/// # Errors
-/// A head that a wanted pair needs and `network` lacks.
 pub fn dots(
     network: &Network,
     features_t: &Features,
@@ -161,9 +155,6 @@ pub struct Vectors {
 
 impl Vectors {
     /// The vectors that the `wanted` pairs need.
-    ///
-    /// # Errors
-    /// A head that a wanted pair needs and `network` lacks.
     pub fn new(
         network: &Network,
         features_t: &Features,
@@ -190,9 +181,6 @@ impl Vectors {
     }
 
     /// Dot products for the `wanted` pairs whose vectors are there, in the order of `settings::PAIRS`; as many anchors as candidates.
-    ///
-    /// # Errors
-    /// Vectors that do not fit each other.
     pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
         let Self {
             kernels,
@@ -217,9 +205,6 @@ impl Vectors {
 }
 
 /// Dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
-///
-/// # Errors
-/// Vectors that do not fit each other.
 pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
     Ok(Dots {
         dots: kernels.dot_products(psi, phi)?,

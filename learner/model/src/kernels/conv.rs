@@ -26,9 +26,6 @@ use crate::kernels::units::{ForUnit, Unit, with_unit};
 const TASK_IMAGES: usize = 16;
 
 /// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
-///
-/// # Errors
-/// As for [`conv_stack`].
 pub fn conv2d_relu(
     images: &Tensor,
     weight: &Tensor,

@@ -32,9 +32,6 @@ const SUM_LEN: usize = 1 << 12;
 /// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
 /// saves the separate addition. Operands of products are rounded to `precision`: each result and gradient is right to
 /// [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
-///
-/// # Errors
-/// Shapes that do not match, or other types.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
     apply(x, w, b, Form::Plain, precision)
 }
@@ -55,17 +52,11 @@ pub(crate) fn linear_of_maps(
 }
 
 /// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
-///
-/// # Errors
-/// Shapes that do not match, or other types.
 pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
     apply(x, w, b, Form::WithRelu, precision)
 }
 
 /// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
-///
-/// # Errors
-/// Another type than f32.
 pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
