@@ -17,7 +17,7 @@ use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::{Dense, activate};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
+use crate::kernels::units::{AnyUnit, Element, Unit, on_unit};
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
@@ -154,14 +154,9 @@ fn weights(
     safetensors: &[u8],
     precision: Precision,
 ) -> Result<Box<dyn Weights>> {
-    struct Decode<'a>(&'a ModelConfig, &'a [u8], Precision);
-    impl ForUnit for Decode<'_> {
-        type Output = Result<Box<dyn Weights>>;
-        fn run<U: Unit>(self, unit: U) -> Self::Output {
-            Ok(Box::new(UnitWeights::decode(unit, self.0, self.1, self.2)?))
-        }
-    }
-    with_unit(precision, Decode(config, safetensors, precision))
+    Ok(on_unit!(AnyUnit::of(precision), unit => {
+        Box::new(UnitWeights::decode(unit, config, safetensors, precision)?)
+    }))
 }
 
 struct UnitWeights<U: Unit> {
