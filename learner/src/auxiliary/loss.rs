@@ -48,7 +48,9 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
 
     /// The later states, each of so many bytes, that the loss needs the online network's features of, if any. They pass through it
     /// together with s_t, a blank one where there is none.
-    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>>;
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+        Vec::new()
+    }
 
     /// The losses of one batch, with their graphs.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
