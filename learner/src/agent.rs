@@ -229,9 +229,6 @@ impl Agent {
     }
 
     /// Puts the averaged weights, if there are any, into torso and head of the online network, to play with. Says whether there were.
-    ///
-    /// # Errors
-    /// A tensor that cannot be copied on its device.
     pub fn take_average(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
             if let Some(online) = self.online.get(name) {
@@ -264,10 +261,19 @@ impl Agent {
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
     /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
+        self.check(batch)?;
+        self.update_checked(batch)
+    }
+
+    /// [`Agent::update`] with a batch that passed [`Agent::check`].
+    pub(crate) fn update_checked(
+        &mut self,
+        batch: &Batch<'_>,
+    ) -> Result<UpdateReport, UpdateError> {
         fault::hold(self.updates());
         // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
         rayon::scope(|_| {
-            let evaluation = self.evaluate(batch)?;
+            let evaluation = self.evaluate_checked(batch, &self.noise())?;
             let grad_norm = self.apply(&evaluation.gradients)?;
             let taken = evaluation.taken_logits.unsqueeze(1)?;
             let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
@@ -310,6 +316,14 @@ impl Agent {
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
         self.check(batch)?;
+        self.evaluate_checked(batch, noise)
+    }
+
+    fn evaluate_checked(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<Evaluation, UpdateError> {
         // Neither needs the other: what one does on a single thread falls into the other's products.
         let (target, features) = rayon::join(
             || self.bellman().target(batch, noise),
@@ -381,9 +395,6 @@ impl Agent {
 
     /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone. Without noise:
     /// of noisy layers the means serve.
-    ///
-    /// # Errors
-    /// States that do not fit the network.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
         let states = states(&self.model, batch.states_t, &self.compute.device)?;
         let logits = distribution(&self.online_network, &states, None)?;
@@ -392,9 +403,6 @@ impl Agent {
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
     /// Returns their global norm before clipping.
-    ///
-    /// # Errors
-    /// As [`Agent::update`].
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
         let norm = gradients.norm(self.compute.kernels)?;
         self.adam.step(

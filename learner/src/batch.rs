@@ -40,9 +40,6 @@ pub struct Batch<'a> {
 
 impl<'a> Batch<'a> {
     /// Checks lengths against `model`, positives against what the auxiliary loss `wants`, actions, returns and discounts.
-    ///
-    /// # Errors
-    /// [`UpdateError::Batch`] with the first fault found.
     pub fn validate(&self, model: &ModelConfig, wants: Positives) -> Result<(), UpdateError> {
         let fault = |what: String| Err(UpdateError::Batch(what));
         let rows = self.rows;

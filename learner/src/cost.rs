@@ -114,35 +114,20 @@ impl UpdateCost {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, DimHeads, HeadConfig, TorsoName};
+    use driml_model::DimHeads;
 
     use super::*;
     use crate::auxiliary::settings::Lambda;
 
     /// 6 x 6 x 1, a map of 2 x 2 x 3, f4 of 5; rkhs 4, 2 actions of 3 atoms.
     fn model(dim: DimHeads) -> ModelConfig {
-        ModelConfig {
-            height: 6,
-            width: 6,
-            input_channels: 1,
-            num_actions: 2,
-            atoms: 3,
-            v_min: -1.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
-            conv: vec![ConvLayer {
-                out: 3,
-                kernel: 4,
-                stride: 2,
-            }],
-            channels: vec![],
-            scale_blocks: false,
-            hidden: 5,
-            rkhs: 4,
-            action_embed: 2,
-            dim,
-            head: HeadConfig::PLAIN,
-        }
+        let model: ModelConfig = toml::from_str(
+            "height = 6\nwidth = 6\ninput_channels = 1\nnum_actions = 2\natoms = 3\nv_min = -1.0\nv_max = 1.0\n\
+             conv = [{ out = 3, kernel = 4, stride = 2 }]\nhidden = 5\nrkhs = 4\naction_embed = 2\n\
+             dim = { psi3 = false, phi3 = false, psi4 = false, phi4 = false, action = false }",
+        )
+        .unwrap();
+        ModelConfig { dim, ..model }
     }
 
     #[test]

@@ -35,17 +35,11 @@ pub struct Seen {
 
 impl Insight {
     /// The network of `agent`, whose parameters it shares, computed as `compute` says; that is to be on the agent's device.
-    ///
-    /// # Errors
-    /// Kernels that the device does not have.
     pub fn of(agent: &Agent, compute: Compute) -> Result<Self, UpdateError> {
         Self::new(agent.model(), agent.settings(), agent.online(), compute)
     }
 
     /// The network with these parameters, learned with these settings; without DIM's heads it compares no features.
-    ///
-    /// # Errors
-    /// As [`Insight::of`], and parameters that do not fit the model.
     pub fn new(
         model: &ModelConfig,
         settings: &LearnerSettings,
@@ -71,9 +65,6 @@ impl Insight {
     }
 
     /// What the network makes of states [B, H, W, C], of its input's size.
-    ///
-    /// # Errors
-    /// Bytes that are not whole states.
     pub fn look(&self, bytes: &[u8]) -> Result<Seen, UpdateError> {
         let features = self
             .network
@@ -115,7 +106,7 @@ impl Insight {
         let only_local = [true, false, false, false];
         let (now, later) = (&now.features, &later.features);
         let vectors = Vectors::new(&self.network, now, later, &actions, only_local)?;
-        let (Some(psi), Some(phi)) = (&vectors.psi3, &vectors.phi3) else {
+        let (Some(psi), Some(phi)) = (&vectors.psi[0], &vectors.phi[0]) else {
             return Ok(None);
         };
         let dots = dots_of(vectors.kernels, psi, phi)?;
@@ -137,12 +128,15 @@ impl Insight {
 
 #[cfg(test)]
 mod tests {
-    use driml_model::{ConvLayer, HeadConfig, PolicyNetwork, Precision, TorsoName};
+    use driml_model::{PolicyNetwork, Precision};
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
     use crate::Lambda;
 
+    const MODEL: &str = "height = 10\nwidth = 12\ninput_channels = 2\nnum_actions = 3\natoms = 5\nv_min = -1.0\n\
+        v_max = 1.0\nconv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nrkhs = 8\naction_embed = 2\n\
+        dim = { psi3 = false, phi3 = false, psi4 = false, phi4 = false, action = false }";
     const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
         lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\
         target_tau = 0.95\nadam = { lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8 }";
@@ -151,28 +145,8 @@ mod tests {
         let settings: LearnerSettings = toml::from_str(UPDATE).unwrap();
         let settings = LearnerSettings { lambda, ..settings };
         let dim = settings.dim_heads(3);
-        let model = ModelConfig {
-            height: 10,
-            width: 12,
-            input_channels: 2,
-            num_actions: 3,
-            atoms: 5,
-            v_min: -1.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
-            conv: vec![ConvLayer {
-                out: 4,
-                kernel: 4,
-                stride: 2,
-            }],
-            channels: vec![],
-            scale_blocks: false,
-            hidden: 8,
-            rkhs: 8,
-            action_embed: 2,
-            dim,
-            head: HeadConfig::PLAIN,
-        };
+        let model: ModelConfig = toml::from_str(MODEL).unwrap();
+        let model = ModelConfig { dim, ..model };
         let rng = &mut ChaCha8Rng::seed_from_u64(5);
         Agent::new(model, settings, &Compute::CPU, rng).unwrap()
     }

@@ -3,22 +3,19 @@
 
 use std::path::{Path, PathBuf};
 
-use driml_model::{Compute, Enlarge, ModelConfig};
+use driml_model::Compute;
 use driml_protocol::{AffinityUpdate, Batch as WireBatch, LearnerStatus, Weights, WeightsHeader};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 
 use crate::{
     affinity::{AffinityError, AffinityEstimator},
     agent::{Agent, UpdateReport},
-    augment::Augment,
-    auxiliary::positives::Positives,
-    batch::Batch,
     checkpoint::{self, CheckpointError, RunState},
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
-    importance::{drawn_evenly, importance_weights},
+    importance::drawn_evenly,
+    prepare::{Columns, Preparation},
     progress::Progress,
 };
 
@@ -58,21 +55,13 @@ pub struct Learner {
     agent: Agent,
     affinity: Option<AffinityEstimator>,
     rng: ChaCha8Rng,
-    enlarge: Option<Enlarge>,
-    /// States of the last batch at the network's input size, if that is another: memory to use again.
-    enlarged: [Vec<u8>; 3],
-    augment: Option<Augment>,
-    /// What the auxiliary objective sees of the last batch, if that is not the plain states: memory to use again.
-    seen: [Vec<u8>; 2],
+    preparation: Preparation,
     weights_version: u64,
     progress: Progress,
 }
 
 impl Learner {
     /// A learner at its start, all generators derived from the run's seed.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub fn new(config: LearnerConfig, compute: &Compute) -> Result<Self, LearnerError> {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
@@ -89,27 +78,12 @@ impl Learner {
             .learner
             .affinity
             .estimator(config.model.num_actions, &mut rng)?;
-        let sent = (spec.frame_height as usize, spec.frame_width as usize);
-        let enlarge = config.input.enlarge(sent, &config.model)?;
-        let augment = config.learner.augment.map(|settings| {
-            let ModelConfig {
-                height,
-                width,
-                input_channels,
-                ..
-            } = config.model;
-            let size = (height, width, input_channels);
-            Augment::new(settings, size, spec.frame_channels as usize)
-        });
         Ok(Self {
             spec_hash: spec.hash(),
             agent,
             affinity,
             rng,
-            enlarge,
-            enlarged: Default::default(),
-            augment,
-            seen: Default::default(),
+            preparation: Preparation::new(&config)?,
             weights_version: 0,
             progress: Progress::default(),
             config,
@@ -191,71 +165,22 @@ impl Learner {
     /// A batch that does not fit, or arithmetic that left the finite numbers; nothing has changed then, except after
     /// [`UpdateError::Diverged`](crate::UpdateError::Diverged), when neither weights nor a checkpoint can be had any more.
     pub fn update(&mut self, batch: &WireBatch) -> Result<UpdateReport, LearnerError> {
-        // Stacks of frames are put together here, once an update.
-        let states = [batch.states_t(), batch.states_k(), batch.states_n()];
-        let mut frames = states.each_ref().map(|states| &states[..]);
-        if let Some(enlarge) = &self.enlarge {
-            for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
-                enlarge_all(enlarge, states, larger);
-                *states = larger;
-            }
-        }
-        let [states_t, mut states_k, states_n] = frames;
-        let (mut positives, mut valid) = (batch.positives(), batch.positive_valid());
-        let mut anchors = None;
+        let beta = self.config.sampling.beta(self.updates());
+        let columns = Columns::of(batch, beta);
         // Kept only if the update succeeds.
         let mut rng = self.rng.clone();
-        let all_valid;
-        if let Some(augment) = &mut self.augment {
-            if self.config.learner.update.objective.positives() == Positives::OtherView {
-                // Two views of the same state; every row has them.
-                all_valid = vec![1; batch.rows()];
-                (states_k, positives, valid) = (states_t, 1, all_valid.as_slice());
-            }
-            let [seen_t, seen_k] = &mut self.seen;
-            augment.apply(states_t, seen_t, &mut rng);
-            // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
-            let missing = states_k.len() < valid.len() * self.config.model.frame_len();
-            if missing {
-                spread(states_k, valid, self.config.model.frame_len(), seen_k);
-                let spread = std::mem::take(seen_k);
-                augment.apply(&spread, seen_k, &mut rng);
-            } else {
-                augment.apply(states_k, seen_k, &mut rng);
-            }
-            (anchors, states_k) = (Some(seen_t.as_slice()), seen_k);
-        }
-        let (returns, discounts) = (batch.n_step_returns(), batch.bootstrap_discounts());
-        let beta = self.config.sampling.beta(self.agent.updates());
-        let probabilities = batch.probabilities();
-        let weights = probabilities
-            .as_ref()
-            .map(|it| importance_weights(it, beta));
-        let batch = Batch {
-            rows: batch.rows(),
-            states_t,
-            anchors,
-            positives,
-            states_k,
-            states_n,
-            action: batch.actions(),
-            next_action: batch.next_actions(),
-            n_step_return: &returns,
-            bootstrap_discount: &discounts,
-            positive_valid: valid,
-            importance_weight: weights.as_deref(),
-        };
+        let batch = self.preparation.prepare(&columns, &mut rng);
         self.agent.check(&batch)?;
         let mut affinity = self.affinity.clone();
         if let Some(affinity) = &mut affinity {
             // Of rows drawn by priority it would be the affinity of surprising transitions.
-            let pairs = match &probabilities {
+            let pairs = match &columns.probabilities {
                 None => batch.action_pairs(),
                 Some(it) => batch.action_pairs_of(drawn_evenly(it, &mut rng)),
             };
             affinity.observe(&pairs, &mut rng)?;
         }
-        let report = self.agent.update(&batch)?;
+        let report = self.agent.update_checked(&batch)?;
         (self.rng, self.affinity) = (rng, affinity);
         Ok(report)
     }
@@ -303,9 +228,6 @@ impl Learner {
     }
 
     /// The present weights as a new version.
-    ///
-    /// # Errors
-    /// The tensor library failed.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
         let safetensors = self.agent.weights_as(self.config.learner.publish_as)?;
         self.weights_version += 1;
@@ -325,9 +247,6 @@ impl Learner {
     }
 
     /// Writes a checkpoint into `folder` and, in it, what its caller keeps with it: [`checkpoint::companion`] reads that.
-    ///
-    /// # Errors
-    /// As [`Learner::save`].
     pub fn save_with(&self, folder: &Path, companion: Option<&[u8]>) -> Result<(), LearnerError> {
         let LearnerConfig {
             spec, model, input, ..
@@ -350,27 +269,4 @@ impl Learner {
         tracing::info!("saved {}", path.display());
         Ok(())
     }
-}
-
-/// Puts `states`, those that are `there`, each in its place among blank ones, into `all`.
-fn spread(states: &[u8], there: &[u8], state_bytes: usize, all: &mut Vec<u8>) {
-    all.clear();
-    all.resize(there.len() * state_bytes, 0);
-    let places = all.chunks_exact_mut(state_bytes).zip(there);
-    let places = places.filter(|(_, there)| **there != 0);
-    for ((place, _), state) in places.zip(states.chunks_exact(state_bytes)) {
-        place.copy_from_slice(state);
-    }
-}
-
-/// Enlarges all `states` into `larger`, a share of them on each thread.
-fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
-    let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
-    let count = states.len() / from;
-    larger.resize(count * to, 0);
-    let share = count.div_ceil(rayon::current_num_threads()).max(1);
-    larger
-        .par_chunks_mut(share * to)
-        .zip(states.par_chunks(share * from))
-        .for_each(|(larger, states)| enlarge.apply(states, larger));
 }

@@ -66,6 +66,7 @@ pub mod losses;
 mod noise;
 pub mod optimiser;
 pub mod parity;
+mod prepare;
 mod progress;
 mod ranges;
 pub mod remote;

@@ -66,9 +66,6 @@ fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Erro
 
 impl LearnerSettings {
     /// Checks the ranges.
-    ///
-    /// # Errors
-    /// The first setting out of its range, with its value.
     pub fn validate(&self) -> Result<(), UpdateError> {
         check_range("tanh_clip", self.tanh_clip, TANH_CLIP)?;
         check_range("max_grad_norm", self.max_grad_norm, MAX_GRAD_NORM)?;

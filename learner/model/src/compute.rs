@@ -92,18 +92,6 @@ impl Kernels {
         }
     }
 
-    pub(crate) fn linear_relu(
-        self,
-        x: &Tensor,
-        w: &Tensor,
-        b: &Tensor,
-    ) -> candle_core::Result<Tensor> {
-        match self {
-            Self::Fused(precision) => linear::linear_relu(x, w, b, precision),
-            Self::Candle => candle::relu(&candle::linear(x, w, b)?),
-        }
-    }
-
     /// Dot products [L, B, B] of anchors and candidates, location by location, in f32. `psi` and `phi` are [B, L, R], or [B, R] where
     /// one vector meets every location of the other.
     ///

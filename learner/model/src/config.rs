@@ -324,3 +324,39 @@ impl ModelConfig {
         layers
     }
 }
+
+#[cfg(test)]
+impl ModelConfig {
+    /// A network for tests: 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every DIM head.
+    pub(crate) fn small() -> Self {
+        let conv = |out, kernel, stride| ConvLayer {
+            out,
+            kernel,
+            stride,
+        };
+        Self {
+            height: 8,
+            width: 8,
+            input_channels: 1,
+            num_actions: 3,
+            atoms: 6,
+            v_min: -1.0,
+            v_max: 1.0,
+            torso: TorsoName::Nature,
+            conv: vec![conv(4, 4, 2), conv(5, 2, 1)],
+            channels: vec![],
+            scale_blocks: false,
+            hidden: 7,
+            rkhs: 8,
+            action_embed: 2,
+            dim: DimHeads {
+                psi3: true,
+                phi3: true,
+                psi4: true,
+                phi4: true,
+                action: true,
+            },
+            head: HeadConfig::PLAIN,
+        }
+    }
+}

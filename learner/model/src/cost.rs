@@ -81,9 +81,6 @@ impl ModelConfig {
     }
 
     /// Bytes of a safetensors file of all parameters that this configuration has, names and shapes included.
-    ///
-    /// # Errors
-    /// A failing serialisation.
     pub fn weights_bytes(&self, stored: StoredAs) -> Result<usize> {
         let shapes = self.parameter_shapes();
         let scalars = |shape: &[usize]| shape.iter().product::<usize>() * stored.bytes();
@@ -107,47 +104,13 @@ mod tests {
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
-    use crate::config::{DimHeads, HeadConfig};
     use crate::geometry::ConvLayer;
     use crate::parameters::Parameters;
     use crate::torso::TorsoName;
 
-    /// 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every head.
-    fn every_head() -> ModelConfig {
-        let conv = |out, kernel, stride| ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
-        ModelConfig {
-            height: 8,
-            width: 8,
-            input_channels: 1,
-            num_actions: 3,
-            atoms: 6,
-            v_min: -1.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
-            conv: vec![conv(4, 4, 2), conv(5, 2, 1)],
-            channels: vec![],
-            scale_blocks: false,
-            hidden: 7,
-            rkhs: 8,
-            action_embed: 2,
-            dim: DimHeads {
-                psi3: true,
-                phi3: true,
-                psi4: true,
-                phi4: true,
-                action: true,
-            },
-            head: HeadConfig::PLAIN,
-        }
-    }
-
     #[test]
     fn a_small_network_is_counted_as_by_hand() {
-        let counted = every_head().layer_costs();
+        let counted = ModelConfig::small().layer_costs();
         // Multiplications of one state forward.
         let by_hand = [
             ("torso.conv1", 9 * 4 * 16),
@@ -185,7 +148,7 @@ mod tests {
     /// The value's stream has parameters and no products: it is added to the advantage's weight.
     #[test]
     fn a_dueling_head_has_the_products_of_a_plain_one() {
-        let plain = every_head();
+        let plain = ModelConfig::small();
         let mut dueling = plain.clone();
         dueling.head.dueling = true;
         let of_head = |config: &ModelConfig| {
@@ -220,7 +183,7 @@ mod tests {
             input_channels: 4,
             conv: vec![conv(32, 8, 4), conv(64, 4, 2), conv(64, 3, 1)],
             hidden: 512,
-            ..every_head().without_dim()
+            ..ModelConfig::small().without_dim()
         };
         let forward = model.layer_costs().into_iter().map(|layer| layer.forward);
         let by_hand = [
@@ -244,7 +207,7 @@ mod tests {
             conv: vec![],
             channels: vec![16, 32, 32],
             hidden: 512,
-            ..every_head().without_dim()
+            ..ModelConfig::small().without_dim()
         };
         let by_hand = [(64, 3, 16), (32, 16, 32), (16, 32, 32)];
         let convolutions = by_hand.map(|(side, channels_in, out): (usize, usize, usize)| {
@@ -267,7 +230,7 @@ mod tests {
 
     #[test]
     fn the_parameters_are_those_that_are_built() {
-        let every = every_head();
+        let every = ModelConfig::small();
         let mut dueling = every.without_dim();
         dueling.head.dueling = true;
         let mut noisy = dueling.clone();

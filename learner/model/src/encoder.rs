@@ -26,9 +26,6 @@ impl Encoder {
     }
 
     /// The encoder of a network of `config`, on `parameters`, which may hold more than it needs.
-    ///
-    /// # Errors
-    /// An invalid configuration, or a parameter that is missing.
     pub fn new(config: &ModelConfig, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         config.validate()?;
         Ok(Self {
@@ -38,9 +35,6 @@ impl Encoder {
     }
 
     /// psi_4(f4) [B, rkhs] of `frames` [B, H, W, C] u8, cut off from any graph.
-    ///
-    /// # Errors
-    /// Frames of another type or size.
     pub fn encode(&self, frames: &Tensor) -> Result<Tensor> {
         let (_, f4) = self.torso.features(frames, false)?;
         Ok(self.psi4.forward(&f4.detach(), None)?.detach())

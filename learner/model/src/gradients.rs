@@ -7,7 +7,7 @@
 use std::cell::RefCell;
 use std::collections::HashMap;
 
-use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore};
+use candle_core::{Result, Tensor, TensorId, Var, backprop::GradStore, bail};
 
 type Sums = HashMap<TensorId, Vec<f32>>;
 
@@ -37,9 +37,6 @@ pub struct Backward {
 
 impl Backward {
     /// Runs the backward pass of `loss`, a scalar.
-    ///
-    /// # Errors
-    /// An operation without a gradient, or one that failed.
     pub fn of(loss: &Tensor) -> Result<Self> {
         let _below = PassBelow(SUMS.replace(Some(Sums::new())));
         let store = loss.backward();
@@ -51,9 +48,6 @@ impl Backward {
     }
 
     /// Takes out the gradient of `var`, in its shape; `None` if the loss does not depend on it.
-    ///
-    /// # Errors
-    /// A failing copy of a gradient that is not contiguous.
     pub fn remove(&mut self, var: &Var) -> Result<Option<Tensor>> {
         let sum = self.sums.remove(&var.id());
         let sum = sum.map(|sum| Tensor::from_vec(sum, var.shape(), var.device()));
@@ -67,13 +61,33 @@ impl Backward {
     }
 }
 
+/// The gradient of `parameter` that `add` makes, as [`add_in_place`] calls it; none where it is not wanted or went where that of a
+/// variable is summed.
+pub(crate) fn summed(
+    parameter: &Tensor,
+    add: impl Fn(Option<Vec<f32>>) -> Vec<f32>,
+) -> Result<Option<Tensor>> {
+    if !parameter.track_op() || add_in_place(parameter, &add) {
+        return Ok(None);
+    }
+    Tensor::from_vec(add(None), parameter.shape(), parameter.device()).map(Some)
+}
+
+/// Adds to the gradient of a parameter; a parameter that is not a variable has none.
+pub(crate) fn sum_in_place(
+    parameter: &Tensor,
+    add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
+) -> Result<()> {
+    if parameter.is_variable() && !add_in_place(parameter, add) {
+        bail!("a backward pass through these layers has to be one of Backward::of");
+    }
+    Ok(())
+}
+
 /// Adds to the gradient of `parameter` in place, if that is a variable and the backward pass is one of [`Backward::of`]; says whether.
 ///
 /// `add` gets the sum so far, in the parameter's layout, and gives back the sum with its part.
-pub(crate) fn add_in_place(
-    parameter: &Tensor,
-    add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
-) -> bool {
+fn add_in_place(parameter: &Tensor, add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>) -> bool {
     if !parameter.is_variable() {
         return false;
     }

@@ -282,20 +282,8 @@ mod tests {
             let model = ModelConfig {
                 height: found.input.0,
                 width: found.input.1,
-                input_channels: 1,
-                num_actions: 1,
-                atoms: 2,
-                v_min: 0.0,
-                v_max: 1.0,
-                torso: TorsoName::Nature,
                 conv: conv.to_vec(),
-                channels: vec![],
-                scale_blocks: false,
-                hidden: 1,
-                rkhs: 1,
-                action_embed: 1,
-                dim: crate::DimHeads::NONE,
-                head: crate::HeadConfig::PLAIN,
+                ..ModelConfig::small()
             };
             let sent = cut(&image, frame.1, found.frame);
             let mut part = vec![0; found.input.0 * found.input.1];

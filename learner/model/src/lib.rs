@@ -62,7 +62,7 @@ pub use heads::noise::HeadNoise;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};
-pub use kernels::linear::{linear, linear_relu, relu};
+pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use kernels::units::{is_bf16_fast, kernels_in_words};
 pub use network::{Features, Network};

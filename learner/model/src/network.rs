@@ -24,17 +24,11 @@ pub struct Features {
 
 impl Features {
     /// f3.
-    ///
-    /// # Errors
-    /// The network that made them has no head that reads it.
     pub fn local(&self) -> Result<&Tensor> {
         self.f3.as_ref().ok_or(ModelError::NoHead("psi3 or phi3"))
     }
 
     /// Those of `rows` rows from `first` on.
-    ///
-    /// # Errors
-    /// There are fewer rows than that.
     pub fn narrow(&self, first: usize, rows: usize) -> candle_core::Result<Self> {
         let narrowed = |f3: &Tensor| f3.narrow(0, first, rows);
         Ok(Self {
@@ -44,9 +38,6 @@ impl Features {
     }
 
     /// The features of these rows, each as often as listed. On the CPU only; gradients of a row's copies are summed first to last.
-    ///
-    /// # Errors
-    /// A row that is not there.
     pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
         let selected = |f3: &Tensor| select_rows(f3, rows);
         Ok(Self {
@@ -74,18 +65,12 @@ pub struct Network {
 impl Network {
     /// The network of `config` on `parameters`, which may hold more than it needs (a target network's configuration
     /// with the online network's parameters).
-    ///
-    /// # Errors
-    /// An invalid configuration, or a parameter that is missing.
     pub fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
         let device = parameters.device();
         Self::with_kernels(config, parameters, Kernels::of(&device))
     }
 
     /// [`Network::new`] with these kernels, not the faster ones of the parameters' device.
-    ///
-    /// # Errors
-    /// As [`Network::new`].
     pub fn with_kernels(
         config: &ModelConfig,
         parameters: &Parameters,
@@ -120,9 +105,6 @@ impl Network {
     }
 
     /// f4, and f3 if a head reads it, of `frames` [B, H, W, C] u8, which are scaled by 1/255.
-    ///
-    /// # Errors
-    /// Frames of another type or size.
     pub fn features(&self, frames: &Tensor) -> Result<Features> {
         let local = self.psi3.is_some() || self.phi3.is_some();
         let (f3, f4) = self.torso.features(frames, local)?;
@@ -130,26 +112,17 @@ impl Network {
     }
 
     /// Logits [B, A, atoms] of `f4` [B, hidden] as [`Features`] has it, before its ReLU.
-    ///
-    /// # Errors
-    /// Another shape.
     pub fn logits(&self, f4: &Tensor) -> Result<Tensor> {
         self.head.logits(f4, None)
     }
 
     /// [`Network::logits`] with the noise of the head's noisy layers; without noise their means serve.
-    ///
-    /// # Errors
-    /// Another shape, or noise for a head without noisy layers.
     pub fn noisy_logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         self.head.logits(f4, noise)
     }
 
     /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
     /// are not computed. With the noise of the head's noisy layers; without noise their means serve.
-    ///
-    /// # Errors
-    /// Another shape, an action out of range, or noise for a head without noisy layers.
     pub fn taken_logits(
         &self,
         f4: &Tensor,
@@ -161,26 +134,17 @@ impl Network {
 
     /// Expected returns [B, A] of `logits` [B, A, atoms]. No gradient flows through them. On the CPU they are right to
     /// [`EXPECTED_RETURN_ERROR`](crate::EXPECTED_RETURN_ERROR) of the support's width beside their own last place.
-    ///
-    /// # Errors
-    /// Another shape.
     pub fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         self.head.q_values(logits)
     }
 
     /// Psi_3 [B, h * w, rkhs] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
-    ///
-    /// # Errors
-    /// Other shapes, an action out of range, or no such head.
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = self.psi3.as_ref().ok_or(ModelError::NoHead("psi3"))?;
         by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
     }
 
     /// Phi_3 [B, h * w, rkhs] of `f3` [B, h, w, c].
-    ///
-    /// # Errors
-    /// Another shape, or no such head.
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
         by_location(
             self.phi3
@@ -191,18 +155,12 @@ impl Network {
     }
 
     /// Psi_4 [B, rkhs] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
-    ///
-    /// # Errors
-    /// Other shapes, an action out of range, or no such head.
     pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = self.psi4.as_ref().ok_or(ModelError::NoHead("psi4"))?;
         head.forward(f4, self.embedded(actions)?.as_ref())
     }
 
     /// Phi_4 [B, rkhs] of `f4` [B, hidden].
-    ///
-    /// # Errors
-    /// Another shape, or no such head.
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
         self.phi4
             .as_ref()

@@ -23,9 +23,6 @@ impl Parameters {
     /// Orthogonal with gain sqrt(2) and zero bias: torso, action embedding, Psi_3, Phi_3, and the skip matrices of Psi_4 and
     /// Phi_4. Weight and bias uniform on +-1/sqrt(fan_in): the C51 head and the other layers of Psi_4 and Phi_4. Of noisy layers the
     /// means are drawn so, and every sigma is `noisy_sigma` / sqrt(fan_in).
-    ///
-    /// # Errors
-    /// An invalid configuration.
     pub fn init(config: &ModelConfig, rng: &mut ChaCha8Rng, device: &Device) -> Result<Self> {
         config.validate()?;
         let mut vars = BTreeMap::new();
@@ -52,9 +49,6 @@ impl Parameters {
     }
 
     /// [`Parameters::from_tensors`] for a part of the network: its parameters whose names pass `part`.
-    ///
-    /// # Errors
-    /// As [`Parameters::from_tensors`].
     pub fn part_from_tensors(
         config: &ModelConfig,
         part: impl Fn(&str) -> bool,
@@ -94,9 +88,6 @@ impl Parameters {
     }
 
     /// [`Parameters::load_safetensors`] for a part of the network: its parameters whose names pass `part`.
-    ///
-    /// # Errors
-    /// As [`Parameters::load_safetensors`].
     pub fn load_part(
         config: &ModelConfig,
         part: impl Fn(&str) -> bool,
@@ -132,9 +123,6 @@ impl Parameters {
 
     /// All parameters as a safetensors file whose metadata has `value` under `key`: for readers that know nothing else of the
     /// network. One entry, as more would be written in an order of their own each time.
-    ///
-    /// # Errors
-    /// As [`Parameters::to_safetensors_as`].
     pub fn to_described_safetensors(
         &self,
         stored: StoredAs,
@@ -198,25 +186,16 @@ impl Parameters {
     }
 
     /// A deep copy, which shares nothing with this one.
-    ///
-    /// # Errors
-    /// A failure to copy a variable.
     pub fn copy(&self) -> Result<Self> {
         self.copy_part(|_| true)
     }
 
     /// A deep copy without the DIM heads: what [`ModelConfig::without_dim`] describes, for a target network.
-    ///
-    /// # Errors
-    /// A failure to copy a variable.
     pub fn without_dim(&self) -> Result<Self> {
         self.copy_part(|name| !is_dim(name))
     }
 
     /// A deep copy of the parameters whose names pass `part`.
-    ///
-    /// # Errors
-    /// A failure to copy a variable.
     pub fn copy_part(&self, part: impl Fn(&str) -> bool) -> Result<Self> {
         let mut vars = BTreeMap::new();
         for (name, var) in self.iter().filter(|(name, _)| part(name)) {

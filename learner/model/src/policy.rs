@@ -17,7 +17,7 @@ use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::{Dense, activate};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
+use crate::kernels::units::{AnyUnit, Element, Unit, on_unit};
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
@@ -53,9 +53,6 @@ impl PolicyNetwork {
     }
 
     /// Replaces the weights. On an error the old ones stay.
-    ///
-    /// # Errors
-    /// As for [`PolicyNetwork::new`].
     pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
         self.weights = weights(&self.config, safetensors, self.precision)?;
         Ok(())
@@ -110,9 +107,6 @@ impl PolicyNetwork {
 
     /// Writes the action of largest expected return, the lowest on a tie, for each of `frames` [B, H, W, C] to
     /// `actions` [B].
-    ///
-    /// # Errors
-    /// As for [`PolicyNetwork::q_values`].
     pub fn greedy_actions(&mut self, frames: &[u8], actions: &mut [u8]) -> Result<()> {
         let count = self.config.num_actions;
         let mut values = std::mem::take(&mut self.values);
@@ -160,14 +154,9 @@ fn weights(
     safetensors: &[u8],
     precision: Precision,
 ) -> Result<Box<dyn Weights>> {
-    struct Decode<'a>(&'a ModelConfig, &'a [u8], Precision);
-    impl ForUnit for Decode<'_> {
-        type Output = Result<Box<dyn Weights>>;
-        fn run<U: Unit>(self, unit: U) -> Self::Output {
-            Ok(Box::new(UnitWeights::decode(unit, self.0, self.1, self.2)?))
-        }
-    }
-    with_unit(precision, Decode(config, safetensors, precision))
+    Ok(on_unit!(AnyUnit::of(precision), unit => {
+        Box::new(UnitWeights::decode(unit, config, safetensors, precision)?)
+    }))
 }
 
 struct UnitWeights<U: Unit> {

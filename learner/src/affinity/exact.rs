@@ -32,14 +32,14 @@ const SMOOTHING: RangeInclusive<f64> = 1e-100..=1e100;
 /// Decayed pair counts c and A = row softmax of `ln p(j | i) / p(j)`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ExactAffinity {
-    alphabet: Alphabet,
-    settings: ExactSettings,
+    pub(super) alphabet: Alphabet,
+    pub(super) settings: ExactSettings,
     /// [m, m] by dense visible indices.
     #[serde(with = "bits")]
     counts: Vec<f64>,
     /// [n, n] by raw actions.
     #[serde(with = "bits")]
-    matrix: Vec<f32>,
+    pub(super) matrix: Vec<f32>,
 }
 
 impl ExactSettings {
@@ -79,11 +79,6 @@ impl ExactAffinity {
         Ok(exact)
     }
 
-    /// Whether both estimate in the same way over the same actions.
-    pub(super) fn has_settings_of(&self, other: &Self) -> bool {
-        self.alphabet == other.alphabet && self.settings == other.settings
-    }
-
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
@@ -93,14 +88,6 @@ impl ExactAffinity {
             return Err(AffinityError(format!("counts is below 0 at index {at}")));
         }
         check_probabilities("matrix", &self.matrix, n * n)
-    }
-
-    pub(super) const fn alphabet(&self) -> &Alphabet {
-        &self.alphabet
-    }
-
-    pub(super) fn matrix(&self) -> &[f32] {
-        &self.matrix
     }
 
     pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), AffinityError> {
@@ -169,7 +156,7 @@ mod tests {
             [4.0 / (16.0 / 7.0 + 1.0), 2.0 / (12.0 / 7.0 + 1.0)],
             [2.0 / (12.0 / 7.0 + 1.0), 3.0 / (9.0 / 7.0 + 1.0)],
         ];
-        for (row, [a, b]) in exact.matrix().chunks_exact(2).zip(ratios) {
+        for (row, [a, b]) in exact.matrix.chunks_exact(2).zip(ratios) {
             assert!((f64::from(row[0]) - a / (a + b)).abs() < 1e-7);
             assert!((row[0] + row[1] - 1.0).abs() < 1e-6);
         }
@@ -196,7 +183,7 @@ mod tests {
                 .unwrap();
         }
         for exact in [always_1, odd_ones] {
-            for (action, row) in exact.matrix().chunks_exact(15).enumerate() {
+            for (action, row) in exact.matrix.chunks_exact(15).enumerate() {
                 assert!(uniform(row), "action {action}: {row:?}");
             }
         }
@@ -209,7 +196,7 @@ mod tests {
             for _ in 0..50 {
                 exact.observe(&[(0, 0), (0, 3), (3, 14), (14, 0)]).unwrap();
                 exact.check_valid().unwrap();
-                for row in exact.matrix().chunks_exact(15) {
+                for row in exact.matrix.chunks_exact(15) {
                     assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-5, "{row:?}");
                 }
             }

@@ -32,8 +32,8 @@ pub struct LearnedSettings {
 /// q(i, j) = out . relu(w_from[i] + w_to[j] + b) + c on one-hot pairs, its Adam, and the smoothed A.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LearnedAffinity {
-    alphabet: Alphabet,
-    settings: LearnedSettings,
+    pub(super) alphabet: Alphabet,
+    pub(super) settings: LearnedSettings,
     /// w_from [m, hidden], w_to [m, hidden], b [hidden], out [hidden], c [1], one after the other.
     #[serde(with = "bits")]
     parameters: Vec<f64>,
@@ -47,7 +47,7 @@ pub struct LearnedAffinity {
     smoothed: Vec<f64>,
     /// [n, n] by raw actions.
     #[serde(with = "bits")]
-    matrix: Vec<f32>,
+    pub(super) matrix: Vec<f32>,
 }
 
 /// Most hidden units; settings beyond it are refused.
@@ -122,11 +122,6 @@ impl LearnedAffinity {
         })
     }
 
-    /// Whether both estimate in the same way over the same actions.
-    pub(super) fn has_settings_of(&self, other: &Self) -> bool {
-        self.alphabet == other.alphabet && self.settings == other.settings
-    }
-
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
@@ -141,14 +136,6 @@ impl LearnedAffinity {
         }
         check_probabilities("smoothed", &self.smoothed, m * m)?;
         check_probabilities("matrix", &self.matrix, n * n)
-    }
-
-    pub(super) const fn alphabet(&self) -> &Alphabet {
-        &self.alphabet
-    }
-
-    pub(super) fn matrix(&self) -> &[f32] {
-        &self.matrix
     }
 
     /// One Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
@@ -315,7 +302,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let mut learned =
             LearnedAffinity::new(Alphabet::new(&[1, 1, 2]).unwrap(), SETTINGS, &mut rng).unwrap();
-        assert_eq!(learned.matrix(), [0.5; 9]);
+        assert_eq!(learned.matrix, [0.5; 9]);
         learned
             .observe(&[(0, 1), (2, 2), (1, 2)], &mut rng)
             .unwrap();

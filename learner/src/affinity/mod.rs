@@ -59,16 +59,20 @@ impl AffinityEstimator {
     /// Over one representative of each visible action a row sums to 1.
     pub fn matrix(&self) -> &[f32] {
         match self {
-            Self::Learned(learned) => learned.matrix(),
-            Self::Exact(exact) => exact.matrix(),
+            Self::Learned(learned) => &learned.matrix,
+            Self::Exact(exact) => &exact.matrix,
         }
     }
 
     /// Whether both estimate in the same way over the same actions, however far each has come.
     pub fn has_settings_of(&self, other: &Self) -> bool {
         match (self, other) {
-            (Self::Learned(a), Self::Learned(b)) => a.has_settings_of(b),
-            (Self::Exact(a), Self::Exact(b)) => a.has_settings_of(b),
+            (Self::Learned(a), Self::Learned(b)) => {
+                a.alphabet == b.alphabet && a.settings == b.settings
+            }
+            (Self::Exact(a), Self::Exact(b)) => {
+                a.alphabet == b.alphabet && a.settings == b.settings
+            }
             _ => false,
         }
     }
@@ -76,8 +80,8 @@ impl AffinityEstimator {
     /// Raw actions n, the side of the matrix.
     pub fn num_actions(&self) -> usize {
         match self {
-            Self::Learned(learned) => learned.alphabet().num_actions(),
-            Self::Exact(exact) => exact.alphabet().num_actions(),
+            Self::Learned(learned) => learned.alphabet.num_actions(),
+            Self::Exact(exact) => exact.alphabet.num_actions(),
         }
     }
 }

@@ -156,24 +156,19 @@ fn of_offset(
     anchors: &[u32],
     candidates: Range<usize>,
 ) -> candle_core::Result<Vectors> {
-    let psi = |psi: &Option<Tensor>| {
-        let Some(psi) = psi else { return Ok(None) };
-        if anchors.len() == rows {
-            return Ok(Some(psi.clone()));
-        }
-        let indices = Tensor::from_slice(anchors, anchors.len(), psi.device())?;
-        psi.index_select(&indices, 0).map(Some)
-    };
-    let phi = |phi: &Option<Tensor>| {
-        phi.as_ref()
-            .map(|phi| phi.narrow(0, candidates.start, candidates.len()))
-            .transpose()
-    };
-    Ok(Vectors {
+    let mut here = Vectors {
         kernels: vectors.kernels,
-        psi3: psi(&vectors.psi3)?,
-        phi3: phi(&vectors.phi3)?,
-        psi4: psi(&vectors.psi4)?,
-        phi4: phi(&vectors.phi4)?,
-    })
+        psi: vectors.psi.clone(),
+        phi: vectors.phi.clone(),
+    };
+    for psi in here.psi.iter_mut().flatten() {
+        if anchors.len() < rows {
+            let indices = Tensor::from_slice(anchors, anchors.len(), psi.device())?;
+            *psi = psi.index_select(&indices, 0)?;
+        }
+    }
+    for phi in here.phi.iter_mut().flatten() {
+        *phi = phi.narrow(0, candidates.start, candidates.len())?;
+    }
+    Ok(here)
 }

@@ -17,11 +17,9 @@ use super::{
     settings::AuxiliarySettings,
 };
 use crate::{
-    batch::Batch,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Scores},
     ranges::{TAU, check_range},
-    repeats::State,
 };
 
 /// Its line of the menu.
@@ -94,11 +92,6 @@ impl AuxiliaryLoss for Curl {
             global_scores: 1,
             ..Passes::default()
         }
-    }
-
-    /// None: the other view is the key encoder's.
-    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
-        Vec::new()
     }
 
     /// InfoNCE of the online network's vectors of one view with the key encoder's of the other. All rows take part: a state

@@ -55,9 +55,6 @@ impl Dim {
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
     /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
-    ///
-    /// # Errors
-    /// A head that such a pair needs and `network` lacks.
     pub fn pair_losses(
         &self,
         network: &Network,
@@ -131,9 +128,6 @@ impl AuxiliaryLoss for Dim {
 /// Dot products for the `wanted` pairs, in the order of `settings::PAIRS`.
 ///
 /// Local features meet local ones at the same location; a global feature meets every location.
-///
-/// # Errors
-/// A head that a wanted pair needs and `network` lacks.
 pub fn dots(
     network: &Network,
     features_t: &Features,
@@ -144,26 +138,20 @@ pub fn dots(
     Ok(Vectors::new(network, features_t, features_k, action, wanted)?.dots(wanted)?)
 }
 
-/// What the heads make of anchors (psi) and candidates (phi): [B, L, R] of local features, [B, R] of global ones.
+/// What the heads make of anchors (psi) and candidates (phi), each of local features, [B, L, R], and of global ones, [B, R]; there
+/// if they are compared.
 #[derive(Debug)]
 pub struct Vectors {
     /// What multiplies them.
     pub kernels: Kernels,
-    /// Psi_3 of the anchors; there if a local anchor is compared.
-    pub psi3: Option<Tensor>,
-    /// Phi_3 of the candidates; there if a local candidate is compared.
-    pub phi3: Option<Tensor>,
-    /// Psi_4 of the anchors; there if a global anchor is compared.
-    pub psi4: Option<Tensor>,
-    /// Phi_4 of the candidates; there if a global candidate is compared.
-    pub phi4: Option<Tensor>,
+    /// Psi_3 and Psi_4 of the anchors.
+    pub psi: [Option<Tensor>; 2],
+    /// Phi_3 and Phi_4 of the candidates.
+    pub phi: [Option<Tensor>; 2],
 }
 
 impl Vectors {
-    /// The vectors that the `wanted` pairs need.
-    ///
-    /// # Errors
-    /// A head that a wanted pair needs and `network` lacks.
+    /// The vectors that the `wanted` pairs need, of heads that `network` has.
     pub fn new(
         network: &Network,
         features_t: &Features,
@@ -172,54 +160,38 @@ impl Vectors {
         wanted: [bool; 4],
     ) -> Result<Self, UpdateError> {
         let [local_local, local_global, global_local, global_global] = wanted;
+        let psi3 = when(local_local || local_global, || {
+            network.psi3(features_t.local()?, action)
+        })?;
+        let phi3 = when(local_local || global_local, || {
+            network.phi3(features_k.local()?)
+        })?;
+        let psi4 = when(global_local || global_global, || {
+            network.psi4(&features_t.f4, action)
+        })?;
+        let phi4 = when(local_global || global_global, || {
+            network.phi4(&features_k.f4)
+        })?;
         Ok(Self {
             kernels: network.kernels(),
-            psi3: when(local_local || local_global, || {
-                network.psi3(features_t.local()?, action)
-            })?,
-            phi3: when(local_local || global_local, || {
-                network.phi3(features_k.local()?)
-            })?,
-            psi4: when(global_local || global_global, || {
-                network.psi4(&features_t.f4, action)
-            })?,
-            phi4: when(local_global || global_global, || {
-                network.phi4(&features_k.f4)
-            })?,
+            psi: [psi3, psi4],
+            phi: [phi3, phi4],
         })
     }
 
     /// Dot products for the `wanted` pairs whose vectors are there, in the order of `settings::PAIRS`; as many anchors as candidates.
-    ///
-    /// # Errors
-    /// Vectors that do not fit each other.
     pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
-        let Self {
-            kernels,
-            psi3,
-            phi3,
-            psi4,
-            phi4,
-        } = self;
-        let pair = |wanted: bool, psi: &Option<Tensor>, phi: &Option<Tensor>| {
-            let both = psi.as_ref().zip(phi.as_ref()).filter(|_| wanted);
-            both.map(|(psi, phi)| dots_of(*kernels, psi, phi))
-                .transpose()
-        };
-        let [local_local, local_global, global_local, global_global] = wanted;
-        Ok([
-            pair(local_local, psi3, phi3)?,
-            pair(local_global, psi3, phi4)?,
-            pair(global_local, psi4, phi3)?,
-            pair(global_global, psi4, phi4)?,
-        ])
+        let mut dots = [const { None }; 4];
+        for pair in (0..4).filter(|&pair| wanted[pair]) {
+            if let (Some(psi), Some(phi)) = (&self.psi[pair / 2], &self.phi[pair % 2]) {
+                dots[pair] = Some(dots_of(self.kernels, psi, phi)?);
+            }
+        }
+        Ok(dots)
     }
 }
 
 /// Dot products of `psi` of anchors and `phi` of candidates, each [B, L, R] or [B, R].
-///
-/// # Errors
-/// Vectors that do not fit each other.
 pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
     Ok(Dots {
         dots: kernels.dot_products(psi, phi)?,
@@ -246,61 +218,43 @@ mod tests {
         Tensor::from_vec(values, shape, &Device::Cpu).unwrap()
     }
 
-    /// [L, B, B] by its definition: `psi` and `phi` give the vector of a row at a location.
-    fn plain(
-        psi: impl Fn(usize, usize) -> Vec<f32>,
-        phi: impl Fn(usize, usize) -> Vec<f32>,
-    ) -> Vec<f32> {
-        let mut dots = Vec::new();
-        for l in 0..2 {
-            for i in 0..3 {
-                for j in 0..3 {
-                    dots.push(psi(i, l).iter().zip(phi(j, l)).map(|(a, b)| a * b).sum());
+    #[test]
+    fn every_pair_of_levels_meets_as_it_should() {
+        let (local, global) = (&[3, 2, 4][..], &[3, 4][..]);
+        // The vector of a row at a location.
+        let at = |vectors: &Tensor, row: usize, location: usize| -> Vec<f32> {
+            let row = vectors.get(row).unwrap();
+            let vector = if row.rank() == 2 {
+                row.get(location).unwrap()
+            } else {
+                row
+            };
+            vector.to_vec1().unwrap()
+        };
+        for (psi, phi) in [
+            (local, local),
+            (local, global),
+            (global, local),
+            (global, global),
+        ] {
+            let locations = psi.len().max(phi.len()) - 1;
+            let (psi, phi) = (ramp(psi, 1.0), ramp(phi, -2.0));
+            let mut wanted = Vec::new();
+            for l in 0..locations {
+                for (i, j) in (0..9).map(|pair| (pair / 3, pair % 3)) {
+                    let products = at(&psi, i, l).into_iter().zip(at(&phi, j, l));
+                    wanted.push(products.map(|(a, b)| a * b).sum::<f32>());
                 }
             }
+            for kernels in [
+                Kernels::FUSED,
+                Kernels::Fused(Precision::Bf16),
+                Kernels::Candle,
+            ] {
+                let dots = kernels.dot_products(&psi, &phi).unwrap();
+                let found = dots.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+                assert_eq!(found, wanted, "{kernels:?}");
+            }
         }
-        dots
-    }
-
-    #[test]
-    fn every_pair_of_levels_meets_as_it_should() -> candle_core::Result<()> {
-        for kernels in [
-            Kernels::FUSED,
-            Kernels::Fused(Precision::Bf16),
-            Kernels::Candle,
-        ] {
-            levels_meet(|psi, phi| kernels.dot_products(psi, phi))?;
-        }
-        Ok(())
-    }
-
-    fn levels_meet(
-        dots: impl Fn(&Tensor, &Tensor) -> candle_core::Result<Tensor>,
-    ) -> candle_core::Result<()> {
-        let (psi3, phi3) = (ramp(&[3, 2, 4], 1.0), ramp(&[3, 2, 4], -2.0));
-        let (psi4, phi4) = (ramp(&[3, 4], 3.0), ramp(&[3, 4], -1.0));
-        let local = |t: &Tensor| t.to_vec3::<f32>().unwrap();
-        let global = |t: &Tensor| t.to_vec2::<f32>().unwrap();
-        let (p3, q3, p4, q4) = (local(&psi3), local(&phi3), global(&psi4), global(&phi4));
-        let got = |t: Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        let (l, g) = (
-            |v: &Vec<Vec<Vec<f32>>>, i: usize, at: usize| v[i][at].clone(),
-            |v: &Vec<Vec<f32>>, i: usize| v[i].clone(),
-        );
-        assert_eq!(
-            got(dots(&psi3, &phi3)?),
-            plain(|i, at| l(&p3, i, at), |j, at| l(&q3, j, at))
-        );
-        assert_eq!(
-            got(dots(&psi3, &phi4)?),
-            plain(|i, at| l(&p3, i, at), |j, _| g(&q4, j))
-        );
-        assert_eq!(
-            got(dots(&psi4, &phi3)?),
-            plain(|i, _| g(&p4, i), |j, at| l(&q3, j, at))
-        );
-        let once = plain(|i, _| g(&p4, i), |j, _| g(&q4, j))[..9].to_vec();
-        assert_eq!(got(dots(&psi4, &phi4)?), once);
-        Ok(())
     }
 }

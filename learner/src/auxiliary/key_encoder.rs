@@ -18,9 +18,6 @@ pub struct KeyEncoder {
 impl KeyEncoder {
     /// The key encoder of a network of `model` on these parameters, of which it must have all. `tau` is the online network's share
     /// in a move, in (0, 1].
-    ///
-    /// # Errors
-    /// A parameter that is missing.
     pub fn new(
         model: &ModelConfig,
         tau: f64,
@@ -36,9 +33,6 @@ impl KeyEncoder {
     }
 
     /// What a key encoder has of `online`, copied: where it starts.
-    ///
-    /// # Errors
-    /// A parameter could not be copied on its device.
     pub fn copy_of(online: &Parameters) -> Result<Parameters, UpdateError> {
         Ok(online.copy_part(Encoder::has)?)
     }
@@ -49,17 +43,11 @@ impl KeyEncoder {
     }
 
     /// Keys [B, rkhs] of `frames` [B, H, W, C] u8, without a gradient.
-    ///
-    /// # Errors
-    /// Frames of another size.
     pub fn keys(&self, frames: &Tensor) -> Result<Tensor, UpdateError> {
         Ok(self.encoder.encode(frames)?)
     }
 
     /// Moves after an update: `key <- tau * online + (1 - tau) * key`.
-    ///
-    /// # Errors
-    /// An online network that lacks a parameter of it.
     pub fn follow(&self, online: &Parameters) -> Result<(), UpdateError> {
         target::follow(&self.parameters, online, self.tau, self.kernels)
     }

@@ -48,12 +48,11 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
 
     /// The later states, each of so many bytes, that the loss needs the online network's features of, if any. They pass through it
     /// together with s_t, a blank one where there is none.
-    fn later_states<'a>(&self, batch: &Batch<'a>, state_bytes: usize) -> Vec<State<'a>>;
+    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
+        Vec::new()
+    }
 
     /// The losses of one batch, with their graphs.
-    ///
-    /// # Errors
-    /// A head that is not there, or a failing operation.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError>;
 }
 
@@ -118,9 +117,6 @@ pub struct OnlineFeatures {
 
 impl OnlineFeatures {
     /// Passes what `loss` needs of `batch` through `network`; augmented states count as distinct, as each is drawn separately.
-    ///
-    /// # Errors
-    /// States that do not fit the network.
     pub fn new(
         network: &Network,
         model: &ModelConfig,
@@ -192,9 +188,6 @@ pub struct LossInputs<'a> {
 impl LossInputs<'_> {
     /// The key encoder's vectors [B, rkhs] of the batch's positives, without a gradient.
     ///
-    /// # Errors
-    /// The tensor library refused.
-    ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
@@ -203,9 +196,6 @@ impl LossInputs<'_> {
     }
 
     /// a_t [B], on the CPU, where the network looks at them.
-    ///
-    /// # Errors
-    /// A failing allocation.
     pub fn action(&self) -> Result<Tensor, UpdateError> {
         let action = self.batch.action;
         Ok(Tensor::from_slice(action, action.len(), &Device::Cpu)?)

@@ -75,9 +75,6 @@ impl Objective {
     }
 
     /// Makes the loss from settings.
-    ///
-    /// # Errors
-    /// Settings that are at odds with each other or out of their ranges, and what to do.
     pub fn loss(
         self,
         settings: &AuxiliarySettings<'_>,

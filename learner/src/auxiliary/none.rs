@@ -7,7 +7,7 @@ use super::{
     positives::Positives,
     settings::{AuxiliarySettings, PAIRS},
 };
-use crate::{batch::Batch, error::UpdateError, repeats::State};
+use crate::error::UpdateError;
 
 /// Its line of the menu.
 pub const NONE: MenuItem = MenuItem {
@@ -37,10 +37,6 @@ impl AuxiliaryLoss for ReturnAlone {
 
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes::default()
-    }
-
-    fn later_states<'a>(&self, _batch: &Batch<'a>, _state_bytes: usize) -> Vec<State<'a>> {
-        Vec::new()
     }
 
     fn losses(&self, _inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {

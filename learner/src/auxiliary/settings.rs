@@ -69,9 +69,6 @@ impl Lambda {
     }
 
     /// Checks that every weight is a number of 0 or above.
-    ///
-    /// # Errors
-    /// The first weight that is negative or not finite.
     pub fn validate(&self) -> Result<(), UpdateError> {
         for (name, value) in PAIRS.iter().zip(self.values()) {
             if !(value >= 0.0 && value.is_finite()) {
@@ -99,9 +96,6 @@ pub struct AuxiliarySettings<'a> {
 
 impl AuxiliarySettings<'_> {
     /// The loss's own table; `None` if it is not there.
-    ///
-    /// # Errors
-    /// A table that is not a `T`.
     pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
         let Some(table) = self.own.get(self.objective) else {
             return Ok(None);
@@ -114,9 +108,6 @@ impl AuxiliarySettings<'_> {
     }
 
     /// Checks that a loss that is weighed by lambda has a weight.
-    ///
-    /// # Errors
-    /// All weights are 0.
     pub fn check_weighted(&self) -> Result<(), UpdateError> {
         if self.lambda.wanted().contains(&true) {
             return Ok(());

@@ -42,9 +42,6 @@ pub(super) struct StateFile {
 }
 
 /// Reads a `state.json` and drops it, for fuzzing.
-///
-/// # Errors
-/// What is wrong with it.
 pub fn check_state(text: &[u8]) -> Result<(), String> {
     StateFile::read(text).map(drop)
 }

@@ -32,9 +32,6 @@ pub fn lock(folder: &Path) -> Result<File, CheckpointError> {
 }
 
 /// The checkpoints in `folder`, oldest first, as (updates, path). A folder that does not exist has none.
-///
-/// # Errors
-/// A folder that cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,

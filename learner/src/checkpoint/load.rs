@@ -38,9 +38,6 @@ pub struct Restored {
 }
 
 /// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
-///
-/// # Errors
-/// As [`load`].
 pub fn load_latest(
     folder: &Path,
     model: &ModelConfig,

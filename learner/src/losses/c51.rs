@@ -188,28 +188,32 @@ mod tests {
     const LOGITS: [f32; 6] = [2.0, 0.1, -0.4, 1.5, 1.4, -2.0];
     const TARGET: [f32; 6] = [0.2, 0.5, 0.3, 0.0, 0.0, 1.0];
 
-    #[test]
-    fn the_gradient_is_the_slope_of_the_loss() {
-        let mut gradient = [0f32; 6];
-        let mut scratch = [0f32; 6];
-        kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
-        for i in 0..LOGITS.len() {
+    /// Asserts that `gradient` is the slope of `loss` at LOGITS, by finite differences.
+    fn assert_slope(mut loss: impl FnMut(&[f32]) -> f64, gradient: &[f32]) {
+        for (i, &gradient) in gradient.iter().enumerate() {
             let mut shifted = |by: f32| {
                 let mut logits = LOGITS;
                 logits[i] += by;
-                (
-                    kl(&logits, &TARGET, ATOMS, &mut scratch),
-                    f64::from(logits[i]),
-                )
+                (loss(&logits), f64::from(logits[i]))
             };
             let ((high, x_high), (low, x_low)) = (shifted(1e-3), shifted(-1e-3));
             let slope = (high - low) / (x_high - x_low);
-            assert!(
-                (slope - f64::from(gradient[i])).abs() < 1e-6,
-                "logit {i}: {slope} and {}",
-                gradient[i]
-            );
+            let error = (slope - f64::from(gradient)).abs();
+            assert!(error < 1e-6, "logit {i}: {slope} and {gradient}");
         }
+    }
+
+    /// Loss and gradient of the operation on these logits.
+    fn operation(
+        logits: &[f32],
+        weights: Option<Vec<f32>>,
+        kernels: Kernels,
+    ) -> Result<(f32, Vec<f32>)> {
+        let logits = Var::from_slice(logits, (2, ATOMS), &Device::Cpu)?;
+        let loss = kl_loss(&logits, TARGET.to_vec(), weights, kernels)?;
+        let grads = loss.affine(3.0, 0.0)?.backward()?;
+        let gradient = grads.get(&logits).expect("a gradient").flatten_all()?;
+        Ok((loss.to_scalar()?, gradient.to_vec1()?))
     }
 
     #[test]
@@ -244,31 +248,16 @@ mod tests {
             let expected = f64::from(plain) * f64::from(weights[i / ATOMS]);
             assert!((f64::from(*slope) - expected).abs() < 1e-8, "logit {i}");
         }
-        // Finite differences.
         let mut scratch = [0f32; 6];
-        for i in 0..LOGITS.len() {
-            let mut shifted = |by: f32| {
-                let mut logits = LOGITS;
-                logits[i] += by;
-                let loss = weighted_kl(&logits, &TARGET, &weights, ATOMS, &mut scratch);
-                (loss, f64::from(logits[i]))
-            };
-            let ((high, x_high), (low, x_low)) = (shifted(1e-3), shifted(-1e-3));
-            let slope = (high - low) / (x_high - x_low);
-            assert!((slope - f64::from(gradient[i])).abs() < 1e-6, "logit {i}");
-        }
+        let by_hand = |logits: &[f32]| weighted_kl(logits, &TARGET, &weights, ATOMS, &mut scratch);
+        assert_slope(by_hand, &gradient);
         for kernels in [Kernels::FUSED, Kernels::Candle] {
-            let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
-            let loss = kl_loss(&logits, TARGET.to_vec(), Some(weights.to_vec()), kernels)?;
-            let error = f64::from(loss.to_scalar::<f32>()?) - weighted;
+            let (loss, got) = operation(&LOGITS, Some(weights.to_vec()), kernels)?;
+            let error = f64::from(loss) - weighted;
             assert!(error.abs() < 1e-6, "{kernels:?}: {error}");
-            let grads = loss.backward()?;
-            let got = grads.get(&logits).expect("a gradient").flatten_all()?;
-            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
-                assert!(
-                    (got - expected).abs() < 1e-6,
-                    "{kernels:?}: {got}, {expected}"
-                );
+            for (got, expected) in got.iter().zip(gradient) {
+                let error = (got / 3.0 - expected).abs();
+                assert!(error < 1e-6, "{kernels:?}: {got}, {expected}");
             }
         }
         let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
@@ -326,18 +315,12 @@ mod tests {
     }
 
     #[test]
-    fn the_operation_gives_the_function() -> Result<()> {
-        let logits = Var::from_slice(&LOGITS, (2, ATOMS), &Device::Cpu)?;
-        let loss = kl_loss(&logits, TARGET.to_vec(), None, Kernels::FUSED)?;
-        let grads = loss.affine(3.0, 0.0)?.backward()?;
-        let mut gradient = [0f32; 6];
+    fn the_operation_gives_the_function_and_the_gradient_is_its_slope() -> Result<()> {
+        let (mut gradient, mut scratch) = ([0f32; 6], [0f32; 6]);
         let expected = kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
-        assert_eq!(loss.to_scalar::<f32>()?, expected as f32);
-        let got = grads
-            .get(&logits)
-            .expect("a gradient")
-            .flatten_all()?
-            .to_vec1::<f32>()?;
+        assert_slope(|logits| kl(logits, &TARGET, ATOMS, &mut scratch), &gradient);
+        let (loss, got) = operation(&LOGITS, None, Kernels::FUSED)?;
+        assert_eq!(loss, expected as f32);
         assert_eq!(got, gradient.map(|g| g * 3.0));
         Ok(())
     }
@@ -346,16 +329,14 @@ mod tests {
     fn candle_s_own_operations_give_it_too() -> Result<()> {
         for scale in [1.0, 1e4] {
             let logits = LOGITS.map(|logit| logit * scale);
-            let var = Var::from_slice(&logits, (2, ATOMS), &Device::Cpu)?;
-            let loss = kl_loss(&var, TARGET.to_vec(), None, Kernels::Candle)?;
+            let (loss, got) = operation(&logits, None, Kernels::Candle)?;
             let mut gradient = [0f32; 6];
             let expected = kl(&logits, &TARGET, ATOMS, &mut gradient);
-            let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+            let error = f64::from(loss) - expected;
             assert!(error.abs() <= 1e-6 * expected, "{scale}: {error}");
-            let grads = loss.backward()?;
-            let got = grads.get(&var).expect("a gradient").flatten_all()?;
-            for (got, expected) in got.to_vec1::<f32>()?.iter().zip(gradient) {
-                assert!((got - expected).abs() < 1e-6, "{scale}: {got}, {expected}");
+            for (got, expected) in got.iter().zip(gradient) {
+                let error = (got / 3.0 - expected).abs();
+                assert!(error < 1e-6, "{scale}: {got}, {expected}");
             }
         }
         Ok(())

@@ -71,9 +71,6 @@ pub struct AdamSettings {
 
 impl AdamSettings {
     /// Checks each number against its range.
-    ///
-    /// # Errors
-    /// The first setting out of its range, with its value.
     pub fn validate(&self) -> Result<(), UpdateError> {
         check_range("adam.lr", self.lr, LR)?;
         check_range("adam.beta1", self.beta1, BETA)?;

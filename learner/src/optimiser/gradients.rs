@@ -24,9 +24,6 @@ pub struct Gradients {
 
 impl Gradients {
     /// The gradients of `loss`, a scalar, by `parameters`.
-    ///
-    /// # Errors
-    /// A backward pass that failed.
     pub fn of(parameters: &Parameters, loss: &Tensor) -> Result<Self, UpdateError> {
         let mut backward = Backward::of(loss)?;
         let mut by_name = BTreeMap::new();

@@ -30,9 +30,6 @@ pub struct ErrorOfUpdate {
 
 impl ErrorOfUpdate {
     /// Of `agent` on `batch` against `reference`, an agent of the same parameters on [`REFERENCE`]; with the noise of the first.
-    ///
-    /// # Errors
-    /// What the arithmetic of either says.
     pub fn of(agent: &Agent, batch: &Batch<'_>, reference: &Agent) -> Result<Self, UpdateError> {
         let noise = agent.noise();
         let own = agent.evaluate_with(batch, &noise)?;

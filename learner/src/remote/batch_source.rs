@@ -39,9 +39,6 @@ pub enum Next {
 
 impl BatchSource {
     /// Starts the threads that request batches.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
     pub fn start(
         clients: &[RunClient],
         requests: Requests,

@@ -18,7 +18,7 @@ const POSITIVES: usize = 3;
 const KEY_TAU: f64 = 0.25;
 
 /// The table `curl` with this pace, or nothing.
-fn curl_table(key_tau: Option<f64>) -> toml::Table {
+pub(crate) fn curl_table(key_tau: Option<f64>) -> toml::Table {
     let table = key_tau.map(|it| format!("curl.key_tau = {it:?}").to_lowercase());
     table.unwrap_or_default().parse().unwrap()
 }
@@ -117,17 +117,27 @@ fn cpc_is_the_mean_over_its_offsets() {
 
 #[test]
 fn positives_that_are_missing_change_nothing() {
-    let rows = Rows::random(6, 4);
-    let mut states_k = later(&rows);
+    let mut rows = Rows::random(6, 4);
+    rows.positive_valid = vec![1, 0, 1, 1, 0, 1];
+    let several = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-    let agent = agent(CPC, ALL_DIM);
-    let before = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
-    let bytes = states_k.len() / valid.len();
-    for at in (0..valid.len()).filter(|&at| valid[at] == 0) {
-        states_k[at * bytes..(at + 1) * bytes].fill(99);
+    for (objective, whole) in [(DIM, rows.batch()), (CPC, cpc(&rows, &several, &valid))] {
+        let agent = agent(objective, ALL_DIM);
+        let before = agent.evaluate(&whole).unwrap();
+        let mut states_k = whole.states_k.to_vec();
+        let bytes = states_k.len() / whole.positive_valid.len();
+        for (state, valid) in states_k.chunks_exact_mut(bytes).zip(whole.positive_valid) {
+            if *valid == 0 {
+                state.fill(99);
+            }
+        }
+        let batch = Batch {
+            states_k: &states_k,
+            ..whole
+        };
+        let after = agent.evaluate(&batch).unwrap();
+        assert_eq!((before.losses, before.total), (after.losses, after.total));
     }
-    let after = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
-    assert_eq!((before.losses, before.total), (after.losses, after.total));
 }
 
 /// `states` without those that are not `there`.

@@ -101,38 +101,24 @@ fn factors_do_what_their_names_say() {
     let augment = Augment::new(NOTHING, (1, 2, 3), 3);
     // Means of the pixels: 60 and 100; of all: 80.
     let state = [30, 60, 90, 80, 100, 120];
-    let changed = |view: View| {
+    for (name, factor, wanted) in [
+        ("brightness", 1.5, [45, 90, 135, 120, 150, 180]),
+        ("contrast", 0.5, [55, 70, 85, 80, 90, 100]),
+        ("saturation", 0.0, [60, 60, 60, 100, 100, 100]),
+        // Out of range ends at the range.
+        ("brightness", 3.0, [90, 180, 255, 240, 255, 255]),
+    ] {
+        let mut view = PLAIN;
+        let changed = match name {
+            "brightness" => &mut view.brightness,
+            "contrast" => &mut view.contrast,
+            _ => &mut view.saturation,
+        };
+        *changed = factor;
         let mut seen = [0; 6];
         augment.apply_view(&state, &view, &mut seen);
-        seen
-    };
-    let (brightness, contrast, saturation) = (1.5, 0.5, 0.0);
-    assert_eq!(
-        changed(View {
-            brightness,
-            ..PLAIN
-        }),
-        [45, 90, 135, 120, 150, 180]
-    );
-    assert_eq!(
-        changed(View { contrast, ..PLAIN }),
-        [55, 70, 85, 80, 90, 100]
-    );
-    assert_eq!(
-        changed(View {
-            saturation,
-            ..PLAIN
-        }),
-        [60, 60, 60, 100, 100, 100]
-    );
-    // Out of range ends at the range.
-    assert_eq!(
-        changed(View {
-            brightness: 3.0,
-            ..PLAIN
-        }),
-        [90, 180, 255, 240, 255, 255]
-    );
+        assert_eq!(seen, wanted, "{name} {factor}");
+    }
     // Without three channels there is no colour to turn or wash out.
     let grey = Augment::new(NOTHING, (2, 3, 1), 1);
     let mut seen = [0; 6];
@@ -360,44 +346,18 @@ fn a_stack_is_changed_as_one() {
 fn settings_out_of_range_are_named() {
     assert_eq!(PAPER.validate(), Ok(()));
     assert_eq!(NOTHING.validate(), Ok(()));
-    for (name, settings) in [
-        (
-            "augment.crop_side",
-            AugmentSettings {
-                crop_side: 0.0,
-                ..PAPER
-            },
-        ),
-        (
-            "augment.crop_side",
-            AugmentSettings {
-                crop_side: 1.1,
-                ..PAPER
-            },
-        ),
-        (
-            "augment.brightness",
-            AugmentSettings {
-                brightness: -0.1,
-                ..PAPER
-            },
-        ),
-        (
-            "augment.contrast",
-            AugmentSettings {
-                contrast: f64::NAN,
-                ..PAPER
-            },
-        ),
-        (
-            "augment.saturation",
-            AugmentSettings {
-                saturation: 1.5,
-                ..PAPER
-            },
-        ),
-        ("augment.hue", AugmentSettings { hue: 0.6, ..PAPER }),
+    for (name, value) in [
+        ("crop_side", 0.0),
+        ("crop_side", 1.1),
+        ("brightness", -0.1),
+        ("contrast", f64::NAN),
+        ("saturation", 1.5),
+        ("hue", 0.6),
     ] {
-        assert_eq!(settings.validate().unwrap_err().0, name);
+        let mut settings = toml::Table::try_from(PAPER).unwrap();
+        settings.insert(name.to_owned(), value.into());
+        let settings: AugmentSettings = settings.try_into().unwrap();
+        let found = settings.validate().unwrap_err().0;
+        assert_eq!(found, format!("augment.{name}"));
     }
 }

@@ -75,22 +75,26 @@ impl Run {
     }
 
     pub(crate) fn save(&self, folder: &Path, keep: usize) -> PathBuf {
-        let Self {
-            agent,
-            affinity,
-            rng,
-        } = self;
+        self.try_save(folder, keep, DESCRIPTION).unwrap()
+    }
+
+    pub(crate) fn try_save(
+        &self,
+        folder: &Path,
+        keep: usize,
+        description: &str,
+    ) -> Result<PathBuf, CheckpointError> {
         let state = RunState {
-            agent,
-            affinity: Some(affinity),
-            rng,
+            agent: &self.agent,
+            affinity: Some(&self.affinity),
+            rng: &self.rng,
             weights_version: 7,
             progress: &progress(),
             run_spec_hash: SPEC,
-            description: DESCRIPTION,
+            description,
             companion: None,
         };
-        save(folder, &state, keep).unwrap()
+        save(folder, &state, keep)
     }
 
     fn resume(folder: &Path) -> Self {
@@ -163,17 +167,8 @@ fn a_checkpoint_of_another_network_says_which_setting_differs() {
     let folder = Folder::new("model");
     let run = Run::new();
     let ours = model(ALL_DIM);
-    let state = RunState {
-        agent: &run.agent,
-        affinity: None,
-        rng: &run.rng,
-        weights_version: 7,
-        progress: &progress(),
-        run_spec_hash: SPEC,
-        description: &serde_json::json!({ "model": ours }).to_string(),
-        companion: None,
-    };
-    let path = save(&folder.0, &state, 1).unwrap();
+    let description = serde_json::json!({ "model": ours }).to_string();
+    let path = run.try_save(&folder.0, 1, &description).unwrap();
     let load = |model: &ModelConfig| {
         checkpoint::load(&path, model, &settings(ALL_DIM), &Compute::CPU, SPEC)
     };

@@ -4,13 +4,12 @@ use std::fs;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings,
-    checkpoint::{CheckpointError, RunState, save},
+    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, checkpoint::CheckpointError,
 };
 use driml_model::Compute;
 
 use crate::{
-    checkpoint::{DESCRIPTION, Folder, Run, SPEC, change_state, load, progress, sha256},
+    checkpoint::{DESCRIPTION, Folder, Run, change_state, load, sha256},
     errors::diverged,
     made_up::{ACTIONS, CANDLE},
 };
@@ -74,17 +73,8 @@ fn a_state_that_is_not_finite_is_not_saved() {
         run.save(&folder.0, 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
             run.agent = diverged(compute, name).0;
-            let state = RunState {
-                agent: &run.agent,
-                affinity: None,
-                progress: &progress(),
-                rng: &run.rng,
-                weights_version: 8,
-                run_spec_hash: SPEC,
-                description: DESCRIPTION,
-                companion: None,
-            };
-            let said = save(&folder.0, &state, 1).unwrap_err().to_string();
+            let said = run.try_save(&folder.0, 1, DESCRIPTION);
+            let said = said.unwrap_err().to_string();
             assert!(
                 said.starts_with("nothing is saved") && said.contains(name),
                 "{said}"

@@ -5,6 +5,7 @@ use driml_model::Kernels;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use crate::agents::{GLOBAL, curl_table};
 use crate::made_up::{ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, Rows, model, settings};
 
 const ROWS: usize = 40;
@@ -19,8 +20,7 @@ fn agent(
     (settings.objective, settings.double_dqn) = (objective, double_dqn);
     if objective == CURL {
         settings.condition_on_action = false;
-        let table = toml::Table::from_iter([("key_tau".to_owned(), 0.5.into())]);
-        settings.own.insert("curl".to_owned(), table.into());
+        settings.own = curl_table(Some(0.5));
     }
     let mut model = model(lambda);
     model.dim = settings.dim_heads(model.num_actions);
@@ -84,16 +84,12 @@ fn forward(it: &Evaluation) -> (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>) {
 
 #[test]
 fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alone() {
-    let curl_lambda = Lambda {
-        l4t4: 1.0,
-        ..NO_DIM
-    };
     for precision in [Precision::F32, Precision::Bf16] {
         for (objective, lambda) in [
             (Objective::NONE, NO_DIM),
             (DIM, ALL_DIM),
             (CPC, ALL_DIM),
-            (CURL, curl_lambda),
+            (CURL, GLOBAL),
         ] {
             for (repeat, double_dqn, is_weighted) in [
                 (Repeat::Nowhere, false, false),

@@ -147,12 +147,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
 #[test]
 fn an_augmenting_run_resumes_bit_for_bit() {
     for objective in [CURL, DIM] {
-        let folder = std::env::temp_dir().join(format!(
-            "driml-agents-{}-{}",
-            objective.name(),
-            std::process::id()
-        ));
-        let _ = fs::remove_dir_all(&folder);
+        let folder = Folder::new(&format!("augmenting-{}", objective.name()));
         let config = config(objective, Some(PAPER));
         let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
@@ -163,11 +158,11 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         learn(&mut straight, 0..8);
         let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
-        half.save(&folder).unwrap();
-        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder).unwrap();
+        half.save(&folder.0).unwrap();
+        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder.0).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
-        let (mut a, mut b) = (folder.join("a"), folder.join("b"));
+        let [a, b] = ["a", "b"].map(|name| folder.0.join(name));
         straight.save(&a).unwrap();
         resumed.save(&b).unwrap();
         let mut files = vec![
@@ -179,12 +174,10 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             files.push("key.safetensors");
         }
         for file in files {
-            let read = |folder: &mut std::path::PathBuf| {
-                fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap()
-            };
-            assert!(read(&mut a) == read(&mut b), "{objective:?}: {file}");
+            let [a, b] = [&a, &b]
+                .map(|folder| fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap());
+            assert!(a == b, "{objective:?}: {file}");
         }
-        fs::remove_dir_all(&folder).unwrap();
     }
 }
 

@@ -1,12 +1,13 @@
 //! Batches whose states are stacks of frames that travel once: a learner learns from them what it learns from whole states.
 
-use driml_learner::{AugmentSettings, Learner, LearnerConfig, Objective};
+use driml_learner::{Learner, LearnerConfig, Objective};
 use driml_model::Compute;
 use driml_protocol::{Batch, BatchHeader, Buffer, RowScalars, StackedFrames};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
+    augment::PAPER,
     made_up::{CPC, DIM},
     served::config,
 };
@@ -75,17 +76,10 @@ fn batches(config: &LearnerConfig, seed: u64) -> [Batch; 2] {
 /// Of plain frames, of frames that are enlarged, and of augmented ones: states, losses and weights are the same, to the last bit.
 #[test]
 fn frames_that_travel_once_change_no_bit() {
-    let augment = AugmentSettings {
-        crop_side: 0.8,
-        brightness: 0.4,
-        contrast: 0.4,
-        saturation: 0.4,
-        hue: 0.4,
-    };
     for (objective, size, augment) in [
         (DIM, (20, 24), None),
         (CPC, (10, 8), None),
-        (DIM, (10, 12), Some(augment)),
+        (DIM, (10, 12), Some(PAPER)),
     ] {
         let mut config = stacked(objective, size);
         config.learner.augment = augment;

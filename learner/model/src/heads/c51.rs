@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::{LinearLayer, Streams};
 use crate::kernels::exponentials::exp_below;
-use crate::kernels::linear::floats;
+use crate::kernels::tensors::floats;
 use crate::parameters::Parameters;
 
 /// Distributions that one task takes.

@@ -14,22 +14,18 @@ use crate::parameters::Parameters;
 /// A residual block on features, to which an action's embedding may be joined.
 #[derive(Debug)]
 pub(crate) struct Head {
-    block: Block,
-}
-
-/// The block's parameters; `out_bias` is the sum of the biases of `out` and, where it has one, `skip`.
-#[derive(Debug)]
-struct Block {
     kernels: Kernels,
     hidden_weight: Tensor,
     hidden_bias: Tensor,
     out_weight: Tensor,
     out_bias: Tensor,
     skip_weight: Tensor,
+    /// There in the action's embedding alone.
+    skip_bias: Option<Tensor>,
 }
 
-impl Block {
-    fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
+impl Head {
+    pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
         let (hidden, out, skip) = (
             format!("{name}.hidden"),
             format!("{name}.out"),
@@ -42,23 +38,19 @@ impl Block {
             out_weight: parameters.tensor(&out, "weight")?,
             out_bias: parameters.tensor(&out, "bias")?,
             skip_weight: parameters.tensor(&skip, "weight")?,
+            skip_bias: parameters.tensor(&skip, "bias").ok(),
         })
     }
 
-    /// The block on `x` [.., f], or on [x; joined], with further biases of its outputs.
+    /// Vectors [.., outputs] of `x` [.., f], or of [x; joined].
     ///
     /// `joined` [B, e] serves all locations of its row, so its products are biases of one group a row, and the tiled concatenation
     /// is never built.
-    fn forward(
-        &self,
-        x: &Tensor,
-        joined: Option<&Tensor>,
-        skip_bias: Option<&Tensor>,
-    ) -> Result<Tensor> {
+    pub(crate) fn forward(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
         let Kernels::Fused(precision) = self.kernels else {
-            return self.of_layers(x, joined, skip_bias);
+            return self.of_layers(x, joined);
         };
-        let out_biases = [Some(&self.out_bias), skip_bias];
+        let out_biases = [Some(&self.out_bias), self.skip_bias.as_ref()];
         let parameters = BlockParameters {
             hidden_weight: self.hidden_weight.clone(),
             hidden_bias: self.hidden_bias.clone(),
@@ -70,12 +62,7 @@ impl Block {
     }
 
     /// The same of candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
-    fn of_layers(
-        &self,
-        x: &Tensor,
-        joined: Option<&Tensor>,
-        skip_bias: Option<&Tensor>,
-    ) -> Result<Tensor> {
+    fn of_layers(&self, x: &Tensor, joined: Option<&Tensor>) -> Result<Tensor> {
         let with = self.kernels;
         let features = x.dim(D::Minus1)?;
         let bias = |weight: &Tensor, bias: &Tensor| -> Result<Tensor> {
@@ -85,7 +72,7 @@ impl Block {
             let weight = weight.narrow(1, features, weight.dim(1)? - features)?;
             Ok(with.linear(joined, &weight, bias)?)
         };
-        let out_bias = match skip_bias {
+        let out_bias = match &self.skip_bias {
             None => self.out_bias.clone(),
             Some(skip_bias) => (&self.out_bias + skip_bias)?,
         };
@@ -93,31 +80,17 @@ impl Block {
         let skip_bias = bias(&self.skip_weight, &out_bias)?;
         let hidden_weight = self.hidden_weight.narrow(1, 0, features)?;
         let skip_weight = self.skip_weight.narrow(1, 0, features)?;
-        let hidden = with.linear_relu(x, &hidden_weight, &hidden_bias)?;
+        let hidden = with.relu(&with.linear(x, &hidden_weight, &hidden_bias)?)?;
         // The skip's result is the bias of `out`, so nothing is added separately.
         let skip = with.linear(x, &skip_weight, &skip_bias)?;
         Ok(with.linear(&hidden, &self.out_weight, &skip)?)
     }
 }
 
-impl Head {
-    pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
-        Ok(Self {
-            block: Block::new(name, parameters, kernels)?,
-        })
-    }
-
-    /// Vectors [..., rkhs] of `features` [..., f], joined with `action` [B, e] if it is there.
-    pub(crate) fn forward(&self, features: &Tensor, action: Option<&Tensor>) -> Result<Tensor> {
-        self.block.forward(features, action, None)
-    }
-}
-
 /// The action's embedding: one-hot through a residual block, whose skip has a bias.
 #[derive(Debug)]
 pub(crate) struct ActionEmbedding {
-    block: Block,
-    skip_bias: Tensor,
+    block: Head,
     num_actions: usize,
 }
 
@@ -128,8 +101,7 @@ impl ActionEmbedding {
         kernels: Kernels,
     ) -> Result<Self> {
         Ok(Self {
-            block: Block::new("dim.action", parameters, kernels)?,
-            skip_bias: parameters.tensor("dim.action.skip", "bias")?,
+            block: Head::new("dim.action", parameters, kernels)?,
             num_actions: config.num_actions,
         })
     }
@@ -137,7 +109,7 @@ impl ActionEmbedding {
     /// Embeddings [B, e] of `actions` [B], integers below the number of actions; best on the CPU, where they are looked at.
     pub(crate) fn forward(&self, actions: &Tensor) -> Result<Tensor> {
         let one_hot = self.one_hot(actions)?;
-        self.block.forward(&one_hot, None, Some(&self.skip_bias))
+        self.block.forward(&one_hot, None)
     }
 
     fn one_hot(&self, actions: &Tensor) -> Result<Tensor> {

@@ -81,33 +81,17 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     use super::*;
-    use crate::{ConvLayer, DimHeads, HeadConfig, TorsoName};
+    use crate::HeadConfig;
 
     fn config(noisy_sigma: Option<f64>) -> ModelConfig {
         ModelConfig {
-            height: 8,
-            width: 8,
-            input_channels: 1,
-            num_actions: 3,
             atoms: 7,
-            v_min: -1.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
-            conv: vec![ConvLayer {
-                out: 2,
-                kernel: 4,
-                stride: 2,
-            }],
-            channels: vec![],
-            scale_blocks: false,
             hidden: 11,
-            rkhs: 4,
-            action_embed: 2,
-            dim: DimHeads::NONE,
             head: HeadConfig {
                 dueling: true,
                 noisy_sigma,
             },
+            ..ModelConfig::small()
         }
     }
 

@@ -5,7 +5,7 @@
 //! single thread for the bias's, and it always computes both. The layers are one operation because candle adds every
 //! gradient to fresh zeros; here the maps between layers, and their gradients, stay in the cache of the core at work.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp2, DType, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
@@ -14,21 +14,19 @@ use crate::geometry::{ConvLayer, ConvShape};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::images::Pixels;
-use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::linear::add_in_order;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::transpose;
 use crate::kernels::stack::{
     SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
 };
-use crate::kernels::units::{ForUnit, Unit, with_unit};
+use crate::kernels::tensors::{cpu, floats, values_of};
+use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
 
 /// relu(conv2d(images, weight) + bias) without padding: [`conv_stack`] of one layer.
-///
-/// # Errors
-/// As for [`conv_stack`].
 pub fn conv2d_relu(
     images: &Tensor,
     weight: &Tensor,
@@ -55,12 +53,10 @@ pub fn conv_stack(
     precision: Precision,
 ) -> Result<Tensor> {
     let (shapes, parameters) = stack_of(images, layers)?;
-    let stack = Apply {
-        images: &images.contiguous()?,
-        parameters: &parameters,
-        shapes,
-    };
-    with_unit(precision, stack)
+    let images = images.contiguous()?;
+    on_unit!(AnyUnit::of(precision), unit => {
+        images.apply_op2(&parameters, ConvStack::new(unit, shapes))
+    })
 }
 
 /// The shapes of `layers` on `images`, and their parameters, which are small, as one vector: an operation has at most three arguments.
@@ -97,27 +93,12 @@ pub(crate) fn stack_of(
     Ok((shapes, Tensor::cat(&parameters, 0)?))
 }
 
-struct Apply<'a> {
-    images: &'a Tensor,
-    parameters: &'a Tensor,
-    shapes: Vec<ConvShape>,
-}
-
-impl ForUnit for Apply<'_> {
-    type Output = Result<Tensor>;
-
-    fn run<U: Unit>(self, unit: U) -> Result<Tensor> {
-        let stack = ConvStack::new(unit, self.shapes);
-        self.images.apply_op2(self.parameters, stack)
-    }
-}
-
 /// Convolutions of one pass, forward and then backward, on slices.
 pub(crate) struct ConvStack<U: Unit> {
     unit: U,
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
-    saved: Mutex<Vec<SavedActivations<U::Element>>>,
+    saved: OnceLock<Vec<SavedActivations<U::Element>>>,
 }
 
 impl<U: Unit> ConvStack<U> {
@@ -126,7 +107,7 @@ impl<U: Unit> ConvStack<U> {
         Self {
             unit,
             shapes,
-            saved: Mutex::default(),
+            saved: OnceLock::new(),
         }
     }
 
@@ -174,7 +155,8 @@ impl<U: Unit> ConvStack<U> {
                 saved
             })
             .collect();
-        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved;
+        let first = self.saved.set(saved).is_ok();
+        assert!(first, "an operation passes forward once");
     }
 
     /// The gradient of the parameters for `grad_maps` in this layout, where `maps` are the pass's; the images' is written into
@@ -190,7 +172,7 @@ impl<U: Unit> ConvStack<U> {
     ) -> Vec<f32> {
         let wanted = !grad_images.is_empty();
         let layers = layers(self.unit, &self.shapes, parameters, true, wanted);
-        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
+        let saved = self.saved.get().expect("a forward pass came before");
         let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
         let grad_parts: Vec<Option<&mut [f32]>> = saved.iter().map(|_| grad_parts.next()).collect();
         let task_len = TASK_IMAGES * self.last().map_len();
@@ -291,16 +273,13 @@ impl<U: Unit> CustomOp2 for ConvStack<U> {
         let grad_maps = grad_maps.contiguous()?;
 
         let (images_storage, images_layout) = images.storage_and_layout();
-        let (parameters_storage, parameters_layout) = parameters.storage_and_layout();
-        let (maps_storage, maps_layout) = maps.storage_and_layout();
-        let (grad_storage, grad_layout) = grad_maps.storage_and_layout();
         let image_values = pixels(cpu(&images_storage)?, images_layout)?;
         let mut grad_images = vec![0.0f32; if needs_images { image_values.len() } else { 0 }];
         let grad_parameters = self.backward(
             image_values,
-            floats(cpu(&parameters_storage)?, parameters_layout)?,
-            floats(cpu(&maps_storage)?, maps_layout)?,
-            floats(cpu(&grad_storage)?, grad_layout)?,
+            &values_of(parameters)?,
+            &values_of(maps)?,
+            &values_of(&grad_maps)?,
             GradLayout::Maps,
             &mut grad_images,
         );

@@ -7,10 +7,10 @@ use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::kernels::buffer::Buffer;
-use crate::kernels::linear::{cpu, floats};
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
+use crate::kernels::tensors::{floats, values_of};
 use crate::kernels::units::Mode;
 
 /// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.
@@ -163,19 +163,15 @@ impl CustomOp2 for Dots {
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let grad = grad.detach().contiguous()?;
-        let (grad_storage, grad_layout) = grad.storage_and_layout();
-        let grad = floats(cpu(&grad_storage)?, grad_layout)?;
-        let (psi_storage, psi_layout) = psi.storage_and_layout();
-        let (phi_storage, phi_layout) = phi.storage_and_layout();
-        let psi_values = floats(cpu(&psi_storage)?, psi_layout)?;
-        let phi_values = floats(cpu(&phi_storage)?, phi_layout)?;
+        let grad = values_of(&grad)?;
+        let (psi_values, phi_values) = (values_of(psi)?, values_of(phi)?);
         let (own, others) = (self.psi_locations, self.phi_locations);
         let grad_psi = psi.track_op().then(|| {
-            let sum = self.gradient(grad, false, own, phi_values, others);
+            let sum = self.gradient(&grad, false, own, &phi_values, others);
             Tensor::from_vec(sum, psi.shape(), psi.device())
         });
         let grad_phi = phi.track_op().then(|| {
-            let sum = self.gradient(grad, true, others, psi_values, own);
+            let sum = self.gradient(&grad, true, others, &psi_values, own);
             Tensor::from_vec(sum, phi.shape(), phi.device())
         });
         Ok((grad_psi.transpose()?, grad_phi.transpose()?))

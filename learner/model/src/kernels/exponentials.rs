@@ -2,7 +2,7 @@
 //! It sums nothing, so that what is summed has the same bits on every processor.
 
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{ForUnit, Unit, vectorized, with_unit};
+use crate::kernels::units::{AnyUnit, on_unit, vectorized};
 
 /// Scores `c tanh(x / c)` of x = `scale` * dot, and their slopes by the dot.
 ///
@@ -18,27 +18,13 @@ pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slope
         dots.len() == scores.len() && dots.len() == slopes.len(),
         "a score and a slope for each dot product"
     );
-    struct Clip<'a>(&'a [f32], f64, f64, &'a mut [f64], &'a mut [f64]);
-    impl ForUnit for Clip<'_> {
-        type Output = ();
-        fn run<U: Unit>(self, unit: U) {
-            clip(unit, self.0, self.1, self.2, self.3, self.4);
-        }
-    }
-    with_unit(Precision::F32, Clip(dots, scale, bound, scores, slopes));
+    on_unit!(AnyUnit::of(Precision::F32), unit => clip(unit, dots, scale, bound, scores, slopes));
 }
 
 /// Puts `exp(value - max)` in the place of each value, none of which is above `max`: right to a relative 1e-15 beside the rounding
 /// of the difference; 0 below 1e-307; NaN of a NaN.
 pub fn exp_below(values: &mut [f64], max: f64) {
-    struct Exp<'a>(&'a mut [f64], f64);
-    impl ForUnit for Exp<'_> {
-        type Output = ();
-        fn run<U: Unit>(self, unit: U) {
-            exp_of_differences(unit, self.0, self.1);
-        }
-    }
-    with_unit(Precision::F32, Exp(values, max));
+    on_unit!(AnyUnit::of(Precision::F32), unit => exp_of_differences(unit, values, max));
 }
 
 vectorized! {

@@ -4,17 +4,17 @@
 //! All other outputs would be computed to be dropped, and their gradients are exactly 0. Rows of one group are put beside each
 //! other, so that each group is one product; sums are taken in the order in which the whole layer takes them.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::linear::{Biases, cpu, floats};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::Product;
+use crate::kernels::product::{Biases, Product};
+use crate::kernels::tensors::{floats, values_of};
 use crate::kernels::units::Mode;
 
 /// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
@@ -53,7 +53,7 @@ pub(crate) fn grouped_linear(
         inputs,
         out,
         precision,
-        sorted: Mutex::new(None),
+        sorted: OnceLock::new(),
     };
     x.contiguous()?
         .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
@@ -68,7 +68,7 @@ struct Grouped {
     out: usize,
     precision: Precision,
     /// x in that order: what the forward pass leaves to the backward pass.
-    sorted: Mutex<Option<Buffer<f32>>>,
+    sorted: OnceLock<Buffer<f32>>,
 }
 
 impl Grouped {
@@ -177,13 +177,13 @@ impl CustomOp3 for Grouped {
                 outputs: self.out,
                 each: self.order.len(),
             };
-            let biases = |_: usize, rows: &mut [f32]| biases.write(0, rows);
             let (x, w) = (Self::rows(&x, &rows, self.inputs), self.weight(w, group));
             Product::new(self.precision, x, w.transposed())
-                .added_to(&biases)
+                .added_to(biases)
                 .write(y, Mode::Replace);
         });
-        *self.sorted.lock().unwrap_or_else(PoisonError::into_inner) = Some(x);
+        let first = self.sorted.set(x).is_ok();
+        assert!(first, "an operation passes forward once");
         Ok((
             CpuStorage::F32(self.unsort(&y)),
             (self.order.len(), self.out).into(),
@@ -199,44 +199,31 @@ impl CustomOp3 for Grouped {
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let grad_y = grad_y.detach().contiguous()?;
-        let (grad_storage, grad_layout) = grad_y.storage_and_layout();
-        let grad = self.sort(floats(cpu(&grad_storage)?, grad_layout)?);
-        let sorted = self.sorted.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(sorted) = &*sorted else {
-            bail!("the backward pass of a grouped layer comes after its forward pass");
-        };
+        let grad = self.sort(&values_of(&grad_y)?);
+        let sorted = self.sorted.get().expect("a forward pass came before");
 
         let grad_x = x.track_op().then(|| -> Result<Tensor> {
-            let (storage, layout) = w.storage_and_layout();
-            let w = floats(cpu(&storage)?, layout)?;
+            let w = values_of(w)?;
             let mut grad_x = Buffer::new(self.order.len() * self.inputs);
             self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
-                let (grad, w) = (Self::rows(&grad, &rows, self.out), self.weight(w, group));
+                let (grad, w) = (Self::rows(&grad, &rows, self.out), self.weight(&w, group));
                 Product::new(self.precision, grad, w).write(grad_x, Mode::Replace);
             });
             Tensor::from_vec(self.unsort(&grad_x), x.shape(), x.device())
         });
-        let to_weight = |sum: &mut [f32]| self.add_to_weight(sum, &grad, sorted);
-        let to_bias = |sum: &mut [f32]| self.add_to_bias(sum, &grad);
-        Ok((
-            grad_x.transpose()?,
-            gradient_of(w, to_weight)?,
-            gradient_of(b, to_bias)?,
-        ))
+        let zeros = |like: &Tensor| vec![0.0; like.elem_count()];
+        let grad_w = gradients::summed(w, |sum| {
+            let mut sum = sum.unwrap_or_else(|| zeros(w));
+            self.add_to_weight(&mut sum, &grad, sorted);
+            sum
+        })?;
+        let grad_b = gradients::summed(b, |sum| {
+            let mut sum = sum.unwrap_or_else(|| zeros(b));
+            self.add_to_bias(&mut sum, &grad);
+            sum
+        })?;
+        Ok((grad_x.transpose()?, grad_w, grad_b))
     }
-}
-
-/// The gradient that `add` adds to zeros; none where it is not wanted or went where that of a variable is summed.
-fn gradient_of(parameter: &Tensor, add: impl Fn(&mut [f32])) -> Result<Option<Tensor>> {
-    let summed = |sum: Option<Vec<f32>>| {
-        let mut sum = sum.unwrap_or_else(|| vec![0.0; parameter.elem_count()]);
-        add(&mut sum);
-        sum
-    };
-    if !parameter.track_op() || gradients::add_in_place(parameter, summed) {
-        return Ok(None);
-    }
-    Tensor::from_vec(summed(None), parameter.shape(), parameter.device()).map(Some)
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The stages of an IMPALA torso as one candle operation with gradients, its batch split over the rayon pool.
 //! It runs on the CPU only; the layer after f3 is another operation.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
@@ -10,11 +10,12 @@ use crate::geometry::{STAGE_CONVOLUTIONS, stages};
 use crate::kernels::candle::BorderedTensors;
 use crate::kernels::conv::pixels;
 use crate::kernels::images::Pixels;
-use crate::kernels::linear::{add_in_order, cpu, floats};
+use crate::kernels::linear::add_in_order;
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{parameters_len, unpacked};
 use crate::kernels::stages::{Saved, Stages};
-use crate::kernels::units::{ForUnit, Unit, with_unit};
+use crate::kernels::tensors::{cpu, floats, values_of};
+use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 8;
@@ -47,34 +48,16 @@ pub(crate) fn residual_stages(
     }
     let parameters = layers.iter().flat_map(|&(weight, bias)| [weight, bias]);
     let parameters: Result<Vec<_>> = parameters.map(Tensor::flatten_all).collect();
-    let apply = Apply {
-        images: &images.contiguous()?,
-        parameters: &Tensor::cat(&parameters?, 0)?,
-        input,
-        widths,
-    };
-    with_unit(precision, apply)
-}
-
-struct Apply<'a> {
-    images: &'a Tensor,
-    parameters: &'a Tensor,
-    input: (usize, usize, usize),
-    widths: Vec<usize>,
-}
-
-impl ForUnit for Apply<'_> {
-    type Output = Result<Tensor>;
-
-    fn run<U: Unit>(self, unit: U) -> Result<Tensor> {
+    let (images, parameters) = (images.contiguous()?, Tensor::cat(&parameters?, 0)?);
+    on_unit!(AnyUnit::of(precision), unit => {
         let op = ResidualStages {
             unit,
-            input: self.input,
-            widths: self.widths,
-            saved: Mutex::default(),
+            input,
+            widths,
+            saved: OnceLock::new(),
         };
-        self.images.apply_op2(self.parameters, op)
-    }
+        images.apply_op2(&parameters, op)
+    })
 }
 
 struct ResidualStages<U: Unit> {
@@ -82,7 +65,7 @@ struct ResidualStages<U: Unit> {
     input: (usize, usize, usize),
     widths: Vec<usize>,
     /// Of each task, what the forward pass leaves to the backward pass.
-    saved: Mutex<Vec<Saved<U::Element>>>,
+    saved: OnceLock<Vec<Saved<U::Element>>>,
 }
 
 impl<U: Unit> ResidualStages<U> {
@@ -116,12 +99,16 @@ impl<U: Unit> CustomOp2 for ResidualStages<U> {
         let mut f3 = vec![0.0; count * stages.output_len()];
         let tasks = images.par_chunks(TASK_IMAGES * stages.image_len());
         let tasks = tasks.zip(f3.par_chunks_mut(TASK_IMAGES * stages.output_len()));
-        let saved = tasks.with_max_len(1).map(|(images, f3)| {
-            let mut saved = stages.saved(f3.len() / stages.output_len());
-            stages.forward(images, &mut saved, f3);
-            saved
-        });
-        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = saved.collect();
+        let saved: Vec<_> = tasks
+            .with_max_len(1)
+            .map(|(images, f3)| {
+                let mut saved = stages.saved(f3.len() / stages.output_len());
+                stages.forward(images, &mut saved, f3);
+                saved
+            })
+            .collect();
+        let first = self.saved.set(saved).is_ok();
+        assert!(first, "an operation passes forward once");
         let (height, width, channels) = stages.output();
         Ok((CpuStorage::F32(f3), (count, height, width, channels).into()))
     }
@@ -135,14 +122,10 @@ impl<U: Unit> CustomOp2 for ResidualStages<U> {
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let grad_f3 = grad_f3.contiguous()?;
         let (images, images_layout) = images.storage_and_layout();
-        let (values, values_layout) = parameters.storage_and_layout();
-        let (f3, f3_layout) = f3.storage_and_layout();
-        let (grad, grad_layout) = grad_f3.storage_and_layout();
         let images = bytes(cpu(&images)?, images_layout)?;
-        let f3 = floats(cpu(&f3)?, f3_layout)?;
-        let grad = floats(cpu(&grad)?, grad_layout)?;
-        let stages = self.stages(floats(cpu(&values)?, values_layout)?, true);
-        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
+        let (f3, grad) = (values_of(f3)?, values_of(&grad_f3)?);
+        let stages = self.stages(&values_of(parameters)?, true);
+        let saved = self.saved.get().expect("a forward pass came before");
         let task_len = TASK_IMAGES * stages.output_len();
         let tasks = images.par_chunks(TASK_IMAGES * stages.image_len());
         let tasks = tasks.zip(saved.par_iter());

@@ -1,22 +1,23 @@
-//! The fully connected layer as a candle operation with gradients, with optional ReLU or on maps, and ReLU by itself.
+//! The fully connected layer as a candle operation with gradients, also on maps, and ReLU by itself.
 //! It knows no network; it runs on the CPU only.
 //!
 //! candle's own path is a matrix product and a broadcast addition, whose backward pass sums the bias on a single thread,
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
 use std::ops::Deref;
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::Product;
+use crate::kernels::product::{Biases, Product};
 use crate::kernels::rounding::transpose;
-use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
+use crate::kernels::tensors::{floats, values_of};
+use crate::kernels::units::{AnyUnit, Mode, on_unit};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;
@@ -32,11 +33,8 @@ const SUM_LEN: usize = 1 << 12;
 /// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
 /// saves the separate addition. Operands of products are rounded to `precision`: each result and gradient is right to
 /// [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
-///
-/// # Errors
-/// Shapes that do not match, or other types.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, Form::Plain, precision)
+    apply(x, w, b, None, precision)
 }
 
 /// [`linear`] on maps [B, height, width, channels], flattened in the order of PyTorch's weights: channel, row, column.
@@ -47,36 +45,25 @@ pub(crate) fn linear_of_maps(
     precision: Precision,
 ) -> Result<Tensor> {
     let (_, height, width, channels) = maps.dims4()?;
-    let form = Form::OfMaps {
-        locations: height * width,
-        channels,
-    };
-    apply(maps, w, b, form, precision)
-}
-
-/// relu(x w^T + b): [`linear`] with the ReLU fused. Where the result is 0 the gradient is 0, as in PyTorch.
-///
-/// # Errors
-/// Shapes that do not match, or other types.
-pub fn linear_relu(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
-    apply(x, w, b, Form::WithRelu, precision)
+    apply(maps, w, b, Some((height * width, channels)), precision)
 }
 
 /// max(x, 0), whose gradient at exactly 0 is 0, as in PyTorch.
-///
-/// # Errors
-/// Another type than f32.
 pub fn relu(x: &Tensor) -> Result<Tensor> {
     x.contiguous()?.apply_op1(Relu)
 }
 
-fn apply(x: &Tensor, w: &Tensor, b: &Tensor, form: Form, precision: Precision) -> Result<Tensor> {
-    let inputs = match form {
-        Form::OfMaps {
-            locations,
-            channels,
-        } => locations * channels,
-        Form::Plain | Form::WithRelu => x.dims().last().copied().unwrap_or(0),
+/// `maps` are (locations, channels) if x is to be flattened.
+fn apply(
+    x: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    maps: Option<(usize, usize)>,
+    precision: Precision,
+) -> Result<Tensor> {
+    let inputs = match maps {
+        Some((locations, channels)) => locations * channels,
+        None => x.dims().last().copied().unwrap_or(0),
     };
     let outputs = w.dims().first().copied().unwrap_or(0);
     let fits =
@@ -98,24 +85,12 @@ fn apply(x: &Tensor, w: &Tensor, b: &Tensor, form: Form, precision: Precision) -
         inputs,
         outputs,
         groups,
-        form,
+        maps,
         precision,
-        flat: Mutex::new(None),
+        flat: OnceLock::new(),
     };
     x.contiguous()?
         .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
-}
-
-/// What a layer does beside x w^T + b.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Form {
-    Plain,
-    WithRelu,
-    /// x are maps [.., locations, channels], to be flattened to [.., channels * locations].
-    OfMaps {
-        locations: usize,
-        channels: usize,
-    },
 }
 
 struct Linear {
@@ -123,10 +98,11 @@ struct Linear {
     inputs: usize,
     outputs: usize,
     groups: usize,
-    form: Form,
+    /// Locations and channels of x, if it is maps [.., locations, channels] to be flattened to [.., channels * locations].
+    maps: Option<(usize, usize)>,
     precision: Precision,
     /// The flattened maps: what the forward pass leaves to the backward pass.
-    flat: Mutex<Option<Buffer<f32>>>,
+    flat: OnceLock<Buffer<f32>>,
 }
 
 impl CustomOp3 for Linear {
@@ -145,30 +121,24 @@ impl CustomOp3 for Linear {
     ) -> Result<(CpuStorage, Shape)> {
         let x = floats(x, x_layout)?;
         let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
-        let b = floats(b, b_layout)?;
         let biases = Biases {
-            values: b,
+            values: floats(b, b_layout)?,
             outputs: self.outputs,
             each: self.rows / self.groups,
         };
-        let biases = |first: usize, rows: &mut [f32]| biases.write(first, rows);
-        let relu = |_: usize, rows: &mut [f32]| relu_in_place(rows);
         let product = |x| {
             let x = Matrix::new(x, self.rows, self.inputs);
-            Product::new(self.precision, x, w.transposed())
+            Product::new(self.precision, x, w.transposed()).added_to(biases)
         };
         let mut dims = x_layout.dims().to_vec();
-        let y = match self.form {
-            Form::Plain => product(x).added_to(&biases).to_vec(),
-            Form::WithRelu => product(x).added_to(&biases).then(&relu).to_vec(),
-            Form::OfMaps {
-                locations,
-                channels,
-            } => {
+        let y = match self.maps {
+            None => product(x).to_vec(),
+            Some((locations, channels)) => {
                 let mut flat = Buffer::new(x.len());
                 transpose_each(x, locations, channels, &mut flat);
-                let y = product(&flat).added_to(&biases).to_vec();
-                *self.flat.lock().unwrap_or_else(PoisonError::into_inner) = Some(flat);
+                let y = product(&flat).to_vec();
+                let first = self.flat.set(flat).is_ok();
+                assert!(first, "an operation passes forward once");
                 dims.truncate(2);
                 y
             }
@@ -184,34 +154,20 @@ impl CustomOp3 for Linear {
         x: &Tensor,
         w: &Tensor,
         b: &Tensor,
-        y: &Tensor,
+        _y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = if self.form == Form::WithRelu {
-            masked(&y.detach(), &grad_y.detach())?
-        } else {
-            grad_y.detach().contiguous()?
-        };
-        let (x_storage, x_layout) = x.storage_and_layout();
-        let (w_storage, w_layout) = w.storage_and_layout();
-        let (grad_storage, grad_layout) = grad_y.storage_and_layout();
-        let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
-        let grad = Matrix::new(grad_values, self.rows, self.outputs);
-        let device = w.device();
+        let grad_y = grad_y.detach().contiguous()?;
+        let grad_values = values_of(&grad_y)?;
+        let grad = Matrix::new(&grad_values, self.rows, self.outputs);
 
         let grad_x = x.track_op().then(|| -> Result<Tensor> {
-            let w = Matrix::new(
-                floats(cpu(&w_storage)?, w_layout)?,
-                self.outputs,
-                self.inputs,
-            );
+            let w = values_of(w)?;
+            let w = Matrix::new(&w, self.outputs, self.inputs);
             let product = Product::new(self.precision, grad, w);
-            let grad_x = match self.form {
-                Form::Plain | Form::WithRelu => product.to_vec(),
-                Form::OfMaps {
-                    locations,
-                    channels,
-                } => {
+            let grad_x = match self.maps {
+                None => product.to_vec(),
+                Some((locations, channels)) => {
                     let mut grad_flat = Buffer::new(self.rows * self.inputs);
                     product.write(&mut grad_flat, Mode::Replace);
                     let mut grad_x = vec![0.0; grad_flat.len()];
@@ -219,29 +175,18 @@ impl CustomOp3 for Linear {
                     grad_x
                 }
             };
-            Tensor::from_vec(grad_x, x.shape(), device)
+            Tensor::from_vec(grad_x, x.shape(), x.device())
         });
-        let flat = self.flat.lock().unwrap_or_else(PoisonError::into_inner);
-        let x_values = match &*flat {
-            Some(flat) => flat,
-            None => floats(cpu(&x_storage)?, x_layout)?,
-        };
+        let x_values = values_of(x)?;
+        let x_values = self.flat.get().map_or(&x_values[..], |flat| &flat[..]);
         let x_values = Matrix::new(x_values, self.rows, self.inputs);
         let product = Product::new(self.precision, grad.transposed(), x_values);
-        let grad_w = if !w.track_op() || gradients::add_in_place(w, |sum| product.summed(sum)) {
-            None
-        } else {
-            Some(Tensor::from_vec(product.to_vec(), w.shape(), device)?)
-        };
-        let sums = || group_sums(grad_values, self.groups, self.outputs);
-        let grad_b = if !b.track_op() {
-            None
-        } else if self.groups == self.rows {
+        let grad_w = gradients::summed(w, |sum| product.summed(sum))?;
+        let grad_b = if b.track_op() && self.groups == self.rows {
             Some(grad_y.reshape(b.shape())?)
-        } else if gradients::add_in_place(b, |sum| add_to(sum, sums())) {
-            None
         } else {
-            Some(Tensor::from_vec(sums(), b.shape(), device)?)
+            let sums = || group_sums(&grad_values, self.groups, self.outputs);
+            gradients::summed(b, |sum| add_to(sum, sums()))?
         };
         Ok((grad_x.transpose()?, grad_w, grad_b))
     }
@@ -249,20 +194,14 @@ impl CustomOp3 for Linear {
 
 /// Transposes every image [rows, cols] of a batch.
 fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
-    struct Each<'a>(&'a [f32], usize, usize, &'a mut [f32]);
-    impl ForUnit for Each<'_> {
-        type Output = ();
-        fn run<U: Unit>(self, unit: U) {
-            let Self(values, rows, cols, result) = self;
-            result
-                .par_chunks_mut(rows * cols)
-                .zip(values.par_chunks(rows * cols))
-                .with_min_len(16)
-                .for_each(|(result, values)| transpose(unit, values, rows, cols, result));
-        }
-    }
     // Nothing is rounded.
-    with_unit(Precision::F32, Each(values, rows, cols, result));
+    on_unit!(AnyUnit::of(Precision::F32), unit => {
+        result
+            .par_chunks_mut(rows * cols)
+            .zip(values.par_chunks(rows * cols))
+            .with_min_len(16)
+            .for_each(|(result, values)| transpose(unit, values, rows, cols, result));
+    });
 }
 
 /// Sums of each group's rows: `grads` [rows, outputs] to [groups, outputs].
@@ -287,26 +226,6 @@ pub(crate) fn add_to(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
     let Some(mut sum) = sum else { return part };
     add_rows(&mut sum, &part);
     sum
-}
-
-/// Biases that products are added to.
-#[derive(Clone, Copy)]
-pub(crate) struct Biases<'a> {
-    /// [groups, outputs]
-    pub(crate) values: &'a [f32],
-    pub(crate) outputs: usize,
-    /// Rows that a group serves.
-    pub(crate) each: usize,
-}
-
-impl Biases<'_> {
-    /// Writes those of the rows from the `first` on.
-    pub(crate) fn write(self, first: usize, rows: &mut [f32]) {
-        for (row, to) in rows.chunks_exact_mut(self.outputs).enumerate() {
-            let group = (first + row) / self.each;
-            to.copy_from_slice(&self.values[group * self.outputs..][..self.outputs]);
-        }
-    }
 }
 
 fn add_rows(sum: &mut [f32], rows: &[f32]) {
@@ -359,10 +278,7 @@ pub(crate) fn relu_gradient(y: f32, grad: f32) -> f32 {
 /// `grad` where `y` is above 0, else 0.
 fn masked(y: &Tensor, grad: &Tensor) -> Result<Tensor> {
     let grad = grad.contiguous()?;
-    let (y_storage, y_layout) = y.storage_and_layout();
-    let (grad_storage, grad_layout) = grad.storage_and_layout();
-    let y_values = floats(cpu(&y_storage)?, y_layout)?;
-    let grad_values = floats(cpu(&grad_storage)?, grad_layout)?;
+    let (y_values, grad_values) = (values_of(y)?, values_of(&grad)?);
     let mut result = vec![0.0; y_values.len()];
     result
         .par_chunks_mut(TASK_LEN)
@@ -391,21 +307,5 @@ impl CustomOp1 for Relu {
 
     fn bwd(&self, _x: &Tensor, y: &Tensor, grad_y: &Tensor) -> Result<Option<Tensor>> {
         Ok(Some(masked(&y.detach(), &grad_y.detach())?))
-    }
-}
-
-/// The scalars of a contiguous f32 storage.
-pub(crate) fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
-    match layout.contiguous_offsets() {
-        Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
-        None => bail!("a tensor of shape {:?} must be contiguous", layout.shape()),
-    }
-}
-
-/// The storage, which must be on the CPU.
-pub(crate) fn cpu(storage: &Storage) -> Result<&CpuStorage> {
-    match storage {
-        Storage::Cpu(storage) => Ok(storage),
-        _ => bail!("this operation runs on the CPU only"),
     }
 }

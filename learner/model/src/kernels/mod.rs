@@ -4,7 +4,7 @@
 //! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does, with
 //! [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of [`panels`] and in
 //! tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
-//! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`precision`] is the setting. [`candle`] needs none of them.
+//! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`tensors`] reads candle's, [`precision`] is the setting. [`candle`] needs none of them.
 
 pub(crate) mod bordered;
 pub(crate) mod buffer;
@@ -27,5 +27,6 @@ pub(crate) mod rounding;
 pub(crate) mod rows;
 pub(crate) mod stack;
 pub(crate) mod stages;
+pub(crate) mod tensors;
 pub(crate) mod torso;
 pub(crate) mod units;

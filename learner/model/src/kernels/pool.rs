@@ -138,26 +138,26 @@ fn unpool_block<const N: usize>(
 mod tests {
     use super::*;
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{ForUnit, Unit, with_every_unit};
+    use crate::kernels::units::{AnyUnit, on_unit};
 
-    #[derive(Clone, Copy)]
-    struct Run<'a>(&'a [f32], Size);
-
-    impl ForUnit for Run<'_> {
-        /// The largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
-        type Output = (Vec<f32>, Vec<f32>);
-
-        fn run<U: Unit>(self, unit: U) -> Self::Output {
-            let Self(maps, size) = self;
-            let (rows, cols, channels) = pooled(size);
-            let len = rows * cols * channels;
+    /// On every unit the largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
+    fn pooled_and_back(maps: &[f32], size: Size) -> Vec<(Vec<f32>, Vec<f32>)> {
+        let (rows, cols, channels) = pooled(size);
+        let len = rows * cols * channels;
+        let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
+        let of_unit = |unit| {
             let (mut largest, mut taken) = (vec![f32::NAN; len], vec![u8::MAX; len]);
-            pool(unit, maps, size, &mut largest, &mut taken);
-            let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
             let mut grad_maps = vec![0.0; maps.len()];
-            unpool(unit, &grads, size, &taken, &mut grad_maps);
+            on_unit!(unit, unit => {
+                pool(unit, maps, size, &mut largest, &mut taken);
+                unpool(unit, &grads, size, &taken, &mut grad_maps);
+            });
             (largest, grad_maps)
-        }
+        };
+        AnyUnit::every(Precision::F32)
+            .into_iter()
+            .map(of_unit)
+            .collect()
     }
 
     /// By the definition: the first of the largest pixels of each window, or the first NaN.
@@ -194,7 +194,7 @@ mod tests {
                 let maps: Vec<f32> = (0..len)
                     .map(|at| (at * 383 % 1009 % values) as f32 - 2000.0)
                     .collect();
-                for got in with_every_unit(Precision::F32, Run(&maps, size)) {
+                for got in pooled_and_back(&maps, size) {
                     assert_eq!(got, wanted(&maps, size), "{size:?}, {values} values");
                 }
             }
@@ -206,7 +206,7 @@ mod tests {
         for at in 0..9 {
             let mut maps = [1.0; 9];
             maps[at] = f32::NAN;
-            for (largest, _) in with_every_unit(Precision::F32, Run(&maps, (3, 3, 1))) {
+            for (largest, _) in pooled_and_back(&maps, (3, 3, 1)) {
                 let touched = |window: usize| {
                     let is_near =
                         |window: usize, at: usize| window == 0 && at < 2 || window == 1 && at > 0;

@@ -5,15 +5,35 @@ use rayon::prelude::*;
 
 use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{Element, ForUnit, Mode, Unit, with_unit};
+use crate::kernels::units::{AnyUnit, Element, Mode, Unit, on_unit};
 
 /// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
 /// Multiplications below which a product is not split.
 const SPLIT_MIN: usize = 1 << 18;
 
-/// What a task does with its rows of the output: gets the number of the first one, and the rows one after the other.
+/// What a task does with its finished rows of the output: gets the number of the first one, and the rows one after the other.
 pub(crate) type RowsWork<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
+
+/// Biases that products are added to.
+#[derive(Clone, Copy)]
+pub(crate) struct Biases<'a> {
+    /// [groups, outputs]
+    pub(crate) values: &'a [f32],
+    pub(crate) outputs: usize,
+    /// Rows that a group serves.
+    pub(crate) each: usize,
+}
+
+impl Biases<'_> {
+    /// Writes those of the rows from the `first` on.
+    fn write(self, first: usize, rows: &mut [f32]) {
+        for (row, to) in rows.chunks_exact_mut(self.outputs).enumerate() {
+            let group = (first + row) / self.each;
+            to.copy_from_slice(&self.values[group * self.outputs..][..self.outputs]);
+        }
+    }
+}
 
 /// A product of `a` [m, k] and `b` [k, n], to be computed into rows of n scalars.
 ///
@@ -25,7 +45,7 @@ pub(crate) struct Product<'a> {
     a: Matrix<'a>,
     b: Matrix<'a>,
     threads: Threads,
-    before: Option<RowsWork<'a>>,
+    biases: Option<Biases<'a>>,
     after: Option<RowsWork<'a>>,
 }
 
@@ -48,7 +68,7 @@ impl<'a> Product<'a> {
             a,
             b,
             threads: Threads::Pool,
-            before: None,
+            biases: None,
             after: None,
         }
     }
@@ -57,10 +77,10 @@ impl<'a> Product<'a> {
         Self { threads, ..self }
     }
 
-    /// Added to what `before` writes: biases, in the cache of the core that multiplies.
-    pub(crate) fn added_to(self, before: RowsWork<'a>) -> Self {
-        let before = Some(before);
-        Self { before, ..self }
+    /// Added to `biases`, which are written in the cache of the core that multiplies.
+    pub(crate) fn added_to(self, biases: Biases<'a>) -> Self {
+        let biases = Some(biases);
+        Self { biases, ..self }
     }
 
     /// With `after` on each row that is done.
@@ -98,7 +118,7 @@ impl<'a> Product<'a> {
             sums.len() / stride.max(1)
         );
         assert!(
-            self.before.is_none() && self.after.is_none(),
+            self.biases.is_none() && self.after.is_none(),
             "rows have gaps"
         );
         let last = sums.len() - stride + end;
@@ -106,20 +126,13 @@ impl<'a> Product<'a> {
     }
 
     pub(crate) fn to_vec(self) -> Vec<f32> {
-        struct Made<'a>(Product<'a>);
-        impl ForUnit for Made<'_> {
-            type Output = Vec<f32>;
-            fn run<U: Unit>(self, unit: U) -> Vec<f32> {
-                let Self(product) = self;
-                let len = product.a.rows * product.b.cols;
-                // Clearing memory takes a core about as long as laying out the operands.
-                let (mut out, operands) =
-                    product.both(|| vec![0.0; len], || Operands::new(unit, product));
-                product.multiply(unit, operands, &mut out, product.b.cols, Mode::Replace);
-                out
-            }
-        }
-        with_unit(self.precision, Made(self))
+        let len = self.a.rows * self.b.cols;
+        on_unit!(AnyUnit::of(self.precision), unit => {
+            // Clearing memory takes a core about as long as laying out the operands.
+            let (mut out, operands) = self.both(|| vec![0.0; len], || Operands::new(unit, self));
+            self.multiply(unit, operands, &mut out, self.b.cols, Mode::Replace);
+            out
+        })
     }
 
     /// Added to `sum` [m, n], if there is one.
@@ -134,16 +147,9 @@ impl<'a> Product<'a> {
     }
 
     fn run(self, out: &mut [f32], stride: usize, mode: Mode) {
-        struct Into<'a>(Product<'a>, &'a mut [f32], usize, Mode);
-        impl ForUnit for Into<'_> {
-            type Output = ();
-            fn run<U: Unit>(self, unit: U) {
-                let Self(product, out, stride, mode) = self;
-                let operands = Operands::new(unit, product);
-                product.multiply(unit, operands, out, stride, mode);
-            }
-        }
-        with_unit(self.precision, Into(self, out, stride, mode));
+        on_unit!(AnyUnit::of(self.precision), unit => {
+            self.multiply(unit, Operands::new(unit, self), out, stride, mode);
+        });
     }
 
     /// Whether it is split, as it is large enough and may be.
@@ -175,10 +181,10 @@ impl<'a> Product<'a> {
             return;
         }
         let task = |first: usize, out: &mut [f32]| {
-            let mode = match self.before {
+            let mode = match self.biases {
                 None => mode,
-                Some(before) => {
-                    before(first, out);
+                Some(biases) => {
+                    biases.write(first, out);
                     Mode::Add
                 }
             };
@@ -349,14 +355,15 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_worked_on_before_and_after() {
+    fn rows_start_from_biases_and_are_worked_on_after() {
         // Split and not.
         for [m, k, n] in [[3, 2, 5], [100, 77, 64]] {
             let (a, b) = (values(m * k, 7), values(k * n, 11));
-            let before = |first: usize, rows: &mut [f32]| {
-                for (row, values) in rows.chunks_mut(n).enumerate() {
-                    values.fill((first + row) as f32);
-                }
+            let values: Vec<f32> = (0..m * n).map(|at| (at / n) as f32).collect();
+            let biases = Biases {
+                values: &values,
+                outputs: n,
+                each: 1,
             };
             let after =
                 |_: usize, rows: &mut [f32]| rows.iter_mut().for_each(|value| *value *= 2.0);
@@ -364,7 +371,7 @@ mod tests {
                 Product::new(Precision::F32, Matrix::new(&a, m, k), Matrix::new(&b, k, n));
             let (plain, edged) = (
                 product.to_vec(),
-                product.added_to(&before).then(&after).to_vec(),
+                product.added_to(biases).then(&after).to_vec(),
             );
             for (at, (edged, plain)) in edged.iter().zip(&plain).enumerate() {
                 let wanted = 2.0 * (plain + (at / n) as f32);

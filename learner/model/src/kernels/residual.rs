@@ -4,18 +4,17 @@
 //! As three layers, each would hand the other a gradient through candle, which adds every one of them to fresh zeros on a single thread;
 //! so would the parts of a weight that x and what is joined to it have.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 
-use crate::gradients;
+use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::linear::{
-    Biases, add_to, cpu, floats, group_sums, relu_gradient, relu_in_place,
-};
+use crate::kernels::linear::{add_to, group_sums, relu_gradient, relu_in_place};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::Product;
+use crate::kernels::product::{Biases, Product};
+use crate::kernels::tensors::{floats, values_of};
 use crate::kernels::units::Mode;
 
 /// The parameters of a block on x, or on x with `joined` behind it.
@@ -82,14 +81,13 @@ pub(crate) fn residual_block(
         hidden,
         outputs,
         precision,
-        saved: Mutex::new(None),
+        saved: OnceLock::new(),
     };
     let x = x.contiguous()?;
-    // As an argument a parameter ties the result to the backward pass, whatever x is.
-    let bias = &parameters.hidden_bias;
     match joined {
-        None => x.apply_op2(bias, block),
-        Some(joined) => x.apply_op3(&joined.contiguous()?, bias, block),
+        // As an argument a parameter ties the result to the backward pass, whatever x is.
+        None => x.apply_op2(&parameters.hidden_bias, block),
+        Some(joined) => x.apply_op2(&joined.contiguous()?, block),
     }
 }
 
@@ -105,18 +103,24 @@ struct Block {
     outputs: usize,
     precision: Precision,
     /// relu(hidden([x, joined])) [rows, hidden]: what the forward pass leaves to the backward pass.
-    saved: Mutex<Option<Buffer<f32>>>,
+    saved: OnceLock<Buffer<f32>>,
 }
 
 /// Gradients of x and of what is joined to it, where they are wanted.
 type Gradients = [Option<Vec<f32>>; 2];
 
 impl Block {
+    const fn is_joined(&self) -> bool {
+        self.joins > 0
+    }
+
     /// What `weight` [outputs, features + joined] multiplies x by, and what is joined.
     fn parts<'a>(&self, weight: &'a [f32]) -> (Matrix<'a>, Option<Matrix<'a>>) {
         let inputs = self.features + self.joins;
         let weight = Matrix::new(weight, weight.len() / inputs, inputs);
-        let joined = (self.joins > 0).then(|| weight.columns(self.features..inputs));
+        let joined = self
+            .is_joined()
+            .then(|| weight.columns(self.features..inputs));
         (weight.columns(0..self.features), joined)
     }
 
@@ -144,10 +148,9 @@ impl Block {
         let x = Matrix::new(x, self.rows, self.features);
         let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
 
-        let (weight, layout) = parameters.hidden_weight.storage_and_layout();
-        let (weight, of_joined) = self.parts(values_of(&weight, layout)?);
-        let (bias, layout) = parameters.hidden_bias.storage_and_layout();
-        let biases = self.biases(values_of(&bias, layout)?, joined.zip(of_joined));
+        let weight = values_of(&parameters.hidden_weight)?;
+        let (weight, of_joined) = self.parts(&weight);
+        let biases = self.biases(&values_of(&parameters.hidden_bias)?, joined.zip(of_joined));
         let biases = Biases {
             values: &biases,
             outputs: self.hidden,
@@ -155,16 +158,15 @@ impl Block {
         };
         let mut hidden = Buffer::new(self.rows * self.hidden);
         self.product(x, weight.transposed())
-            .added_to(&|first, rows| biases.write(first, rows))
+            .added_to(biases)
             .then(&|_, rows| relu_in_place(rows))
             .write(&mut hidden, Mode::Replace);
 
-        let (weight, layout) = parameters.skip_weight.storage_and_layout();
-        let (weight, of_joined) = self.parts(values_of(&weight, layout)?);
+        let weight = values_of(&parameters.skip_weight)?;
+        let (weight, of_joined) = self.parts(&weight);
         let mut bias = vec![0.0; self.outputs];
         for part in &parameters.out_biases {
-            let (part, layout) = part.storage_and_layout();
-            for (bias, part) in bias.iter_mut().zip(values_of(&part, layout)?) {
+            for (bias, part) in bias.iter_mut().zip(&*values_of(part)?) {
                 *bias += part;
             }
         }
@@ -176,37 +178,34 @@ impl Block {
         };
         let mut y = self
             .product(x, weight.transposed())
-            .added_to(&|first, rows| biases.write(first, rows))
+            .added_to(biases)
             .to_vec();
-        let (weight, layout) = parameters.out_weight.storage_and_layout();
-        let weight = Matrix::new(values_of(&weight, layout)?, self.outputs, self.hidden);
+        let weight = values_of(&parameters.out_weight)?;
+        let weight = Matrix::new(&weight, self.outputs, self.hidden);
         let active = Matrix::new(&hidden, self.rows, self.hidden);
         self.product(active, weight.transposed())
             .write(&mut y, Mode::Add);
-        *self.saved.lock().unwrap_or_else(PoisonError::into_inner) = Some(hidden);
+        let first = self.saved.set(hidden).is_ok();
+        assert!(first, "an operation passes forward once");
         Ok(y)
     }
 
     /// Gradients of `x` and `joined` for `grad_y`; the parameters' are summed in place.
     fn backward(&self, x: &Tensor, joined: Option<&Tensor>, grad_y: &Tensor) -> Result<Gradients> {
         let grad_y = grad_y.detach().contiguous()?;
-        let (grad, layout) = grad_y.storage_and_layout();
-        let grad_values = values_of(&grad, layout)?;
-        let grad = Matrix::new(grad_values, self.rows, self.outputs);
+        let grad_values = values_of(&grad_y)?;
+        let grad = Matrix::new(&grad_values, self.rows, self.outputs);
         let wanted = [Some(x), joined].map(|input| input.is_some_and(Tensor::track_op));
-        let (x, layout) = x.storage_and_layout();
-        let x = Matrix::new(values_of(&x, layout)?, self.rows, self.features);
-        let saved = self.saved.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(hidden) = &*saved else {
-            bail!("the backward pass of a residual block comes after its forward pass");
-        };
+        let x = values_of(x)?;
+        let x = Matrix::new(&x, self.rows, self.features);
+        let hidden = self.saved.get().expect("a forward pass came before");
         let parameters = &self.parameters;
         let active = Matrix::new(hidden, self.rows, self.hidden);
         let to_out = self.product(grad.transposed(), active);
         sum_in_place(&parameters.out_weight, |sum| to_out.summed(sum))?;
 
-        let (out, layout) = parameters.out_weight.storage_and_layout();
-        let out = Matrix::new(values_of(&out, layout)?, self.outputs, self.hidden);
+        let out = values_of(&parameters.out_weight)?;
+        let out = Matrix::new(&out, self.outputs, self.hidden);
         let mut grad_hidden = Buffer::new(self.rows * self.hidden);
         let mask = |first: usize, rows: &mut [f32]| {
             let active = &hidden[first * self.hidden..][..rows.len()];
@@ -224,28 +223,20 @@ impl Block {
         };
         let hidden_sums = of_groups(&grad_hidden, self.hidden);
         let hidden_sums = hidden_sums.as_deref().unwrap_or(&grad_hidden);
-        let out_sums = of_groups(grad_values, self.outputs);
-        let out_sums = out_sums.as_deref().unwrap_or(grad_values);
+        let out_sums = of_groups(&grad_values, self.outputs);
+        let out_sums = out_sums.as_deref().unwrap_or(&grad_values);
 
-        let joined = joined.map(Tensor::storage_and_layout);
-        let joined = match &joined {
-            None => None,
-            Some((joined, layout)) => Some(values_of(joined, layout)?),
-        };
+        let joined = joined.map(values_of).transpose()?;
+        let joined = joined.as_deref();
         let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
-        let (hidden_weight, hidden_layout) = parameters.hidden_weight.storage_and_layout();
-        let (skip_weight, skip_layout) = parameters.skip_weight.storage_and_layout();
+        let hidden_weight = values_of(&parameters.hidden_weight)?;
+        let skip_weight = values_of(&parameters.skip_weight)?;
         let mut gradients = [None, None];
         let layers = [
-            (
-                &parameters.skip_weight,
-                values_of(&skip_weight, skip_layout)?,
-                grad,
-                out_sums,
-            ),
+            (&parameters.skip_weight, &skip_weight, grad, out_sums),
             (
                 &parameters.hidden_weight,
-                values_of(&hidden_weight, hidden_layout)?,
+                &hidden_weight,
                 Matrix::new(&grad_hidden, self.rows, self.hidden),
                 hidden_sums,
             ),
@@ -294,38 +285,13 @@ impl Block {
     }
 }
 
-/// Adds to the gradient of a parameter; a parameter that is not a variable has none.
-pub(crate) fn sum_in_place(
-    parameter: &Tensor,
-    add: impl FnOnce(Option<Vec<f32>>) -> Vec<f32>,
-) -> Result<()> {
-    if parameter.is_variable() && !gradients::add_in_place(parameter, add) {
-        bail!("a backward pass through these layers has to be one of Backward::of");
-    }
-    Ok(())
-}
-
-/// The scalars behind a tensor on the CPU.
-pub(crate) fn values_of<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
-    floats(cpu(storage)?, layout)
-}
-
-/// The shape of x with `outputs` in place of its features.
-fn shape_of(x: &Layout, outputs: usize) -> Shape {
-    let mut dims = x.dims().to_vec();
-    if let Some(last) = dims.last_mut() {
-        *last = outputs;
-    }
-    dims.into()
-}
-
 /// `values` as a tensor like `input`.
 fn like(values: Option<Vec<f32>>, input: &Tensor) -> Result<Option<Tensor>> {
     let tensor = values.map(|values| Tensor::from_vec(values, input.shape(), input.device()));
     tensor.transpose()
 }
 
-/// Of x and the hidden layer's bias.
+/// Of x, and of what is joined to it or the hidden layer's bias.
 impl CustomOp2 for Block {
     fn name(&self) -> &'static str {
         "residual-block"
@@ -335,53 +301,27 @@ impl CustomOp2 for Block {
         &self,
         x: &CpuStorage,
         x_layout: &Layout,
-        _hidden_bias: &CpuStorage,
-        _hidden_bias_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let y = self.forward(floats(x, x_layout)?, None)?;
-        Ok((CpuStorage::F32(y), shape_of(x_layout, self.outputs)))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        _hidden_bias: &Tensor,
-        _y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let [grad_x, _] = self.backward(x, None, grad_y)?;
-        Ok((like(grad_x, x)?, None))
-    }
-}
-
-/// Of x, what is joined to it, and the hidden layer's bias.
-impl CustomOp3 for Block {
-    fn name(&self) -> &'static str {
-        "residual-block-of-joined"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
         joined: &CpuStorage,
         joined_layout: &Layout,
-        _hidden_bias: &CpuStorage,
-        _hidden_bias_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let y = self.forward(floats(x, x_layout)?, Some(floats(joined, joined_layout)?))?;
-        Ok((CpuStorage::F32(y), shape_of(x_layout, self.outputs)))
+        let joined = floats(joined, joined_layout)?;
+        let y = self.forward(floats(x, x_layout)?, self.is_joined().then_some(joined))?;
+        let mut dims = x_layout.dims().to_vec();
+        if let Some(last) = dims.last_mut() {
+            *last = self.outputs;
+        }
+        Ok((CpuStorage::F32(y), dims.into()))
     }
 
     fn bwd(
         &self,
         x: &Tensor,
         joined: &Tensor,
-        _hidden_bias: &Tensor,
         _y: &Tensor,
         grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let [grad_x, grad_joined] = self.backward(x, Some(joined), grad_y)?;
-        Ok((like(grad_x, x)?, like(grad_joined, joined)?, None))
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let of_joined = self.is_joined().then_some(joined);
+        let [grad_x, grad_joined] = self.backward(x, of_joined, grad_y)?;
+        Ok((like(grad_x, x)?, like(grad_joined, joined)?))
     }
 }

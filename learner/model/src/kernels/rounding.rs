@@ -87,27 +87,17 @@ vectorized! {
 mod tests {
     use super::*;
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{ForUnit, Unit, with_every_unit};
+    use crate::kernels::units::{AnyUnit, on_unit};
 
     #[test]
     fn every_unit_turns_images_of_any_size() {
-        #[derive(Clone, Copy)]
-        struct Turn<'a>(&'a [f32], usize, usize);
-        impl ForUnit for Turn<'_> {
-            type Output = Vec<f32>;
-            fn run<U: Unit>(self, unit: U) -> Vec<f32> {
-                let mut turned = vec![f32::NAN; self.0.len()];
-                transpose(unit, self.0, self.1, self.2, &mut turned);
-                turned
-            }
-        }
         for [rows, cols] in [[1, 1], [16, 64], [17, 15], [3, 70], [33, 32], [5, 0]] {
             let values: Vec<f32> = (0..rows * cols).map(|at| at as f32).collect();
-            for precision in Precision::ALL {
-                for turned in with_every_unit(precision, Turn(&values, rows, cols)) {
-                    for (at, &value) in turned.iter().enumerate() {
-                        assert_eq!(value, values[at % rows * cols + at / rows]);
-                    }
+            for unit in Precision::ALL.into_iter().flat_map(AnyUnit::every) {
+                let mut turned = vec![f32::NAN; values.len()];
+                on_unit!(unit, unit => transpose(unit, &values, rows, cols, &mut turned));
+                for (at, &value) in turned.iter().enumerate() {
+                    assert_eq!(value, values[at % rows * cols + at / rows]);
                 }
             }
         }

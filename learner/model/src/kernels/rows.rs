@@ -6,7 +6,7 @@
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::kernels::linear::{cpu, floats};
+use crate::kernels::tensors::{floats, values_of};
 
 /// Rows that one task takes.
 const TASK_ROWS: usize = 16;
@@ -67,8 +67,7 @@ impl CustomOp1 for Select {
 
     fn bwd(&self, x: &Tensor, _selected: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
         let grad = grad.detach().contiguous()?;
-        let (storage, layout) = grad.storage_and_layout();
-        let grad = floats(cpu(&storage)?, layout)?;
+        let grad = values_of(&grad)?;
         let count = x.dim(0)?;
         let len = x.elem_count() / count;
         let (starts, copies) = self.copies(count);

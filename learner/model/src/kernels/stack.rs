@@ -142,7 +142,7 @@ mod tests {
     use super::*;
     use crate::geometry::ConvLayer;
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{ForUnit, with_every_unit};
+    use crate::kernels::units::{AnyUnit, on_unit};
 
     /// Sizes that fill no register: odd runs, odd numbers of windows, channels beyond a panel.
     fn shapes() -> Vec<ConvShape> {
@@ -167,34 +167,21 @@ mod tests {
             .collect()
     }
 
-    #[derive(Clone, Copy)]
-    struct Run<'a> {
-        shapes: &'a [ConvShape],
-        parameters: &'a [f32],
-        images: Pixels<'a>,
-        grad_maps: &'a [f32],
-    }
-
-    impl ForUnit for Run<'_> {
-        /// Maps, gradients of parameters and of images.
-        type Output = [Vec<f32>; 3];
-
-        fn run<U: Unit>(self, unit: U) -> [Vec<f32>; 3] {
-            let layers = layers(unit, self.shapes, self.parameters, true, true);
-            let mut maps = vec![0.0; self.grad_maps.len()];
-            let saved = stack_forward(unit, &layers, self.images, &mut maps);
-            let mut grad_images = vec![0.0; self.images.len()];
-            let grads = stack_backward(
-                unit,
-                &layers,
-                self.images,
-                &saved,
-                &maps,
-                self.grad_maps,
-                Some(&mut grad_images),
-            );
-            [maps, grads.to_vec(), grad_images]
-        }
+    /// Maps, gradients of parameters and of images.
+    fn passed<U: Unit>(
+        unit: U,
+        shapes: &[ConvShape],
+        parameters: &[f32],
+        images: Pixels<'_>,
+        grad_maps: &[f32],
+    ) -> [Vec<f32>; 3] {
+        let layers = layers(unit, shapes, parameters, true, true);
+        let mut maps = vec![0.0; grad_maps.len()];
+        let saved = stack_forward(unit, &layers, images, &mut maps);
+        let mut grad_images = vec![0.0; images.len()];
+        let to = Some(&mut grad_images[..]);
+        let grads = stack_backward(unit, &layers, images, &saved, &maps, grad_maps, to);
+        [maps, grads.to_vec(), grad_images]
     }
 
     #[test]
@@ -208,13 +195,8 @@ mod tests {
         let grad_maps = values(count * last.map_len(), 17, 1.0);
         for images in [Pixels::Floats(&floats), Pixels::Bytes(&bytes)] {
             for precision in Precision::ALL {
-                let run = Run {
-                    shapes: &shapes,
-                    parameters: &parameters,
-                    images,
-                    grad_maps: &grad_maps,
-                };
-                let results = with_every_unit(precision, run);
+                let of_unit = |unit| on_unit!(unit, unit => passed(unit, &shapes, &parameters, images, &grad_maps));
+                let results: Vec<_> = AnyUnit::every(precision).into_iter().map(of_unit).collect();
                 let (wanted, others) = results.split_first().unwrap();
                 // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
                 let tolerance = match precision {

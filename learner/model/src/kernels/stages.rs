@@ -313,7 +313,7 @@ mod tests {
     use crate::kernels::candle::residual_stages;
     use crate::kernels::precision::Precision;
     use crate::kernels::stack::unpacked;
-    use crate::kernels::units::{ForUnit, with_every_unit};
+    use crate::kernels::units::{AnyUnit, on_unit};
 
     const INPUT: (usize, usize, usize) = (9, 14, 3);
     /// Odd runs, and channels beyond a register; maps of 5 x 7 and 3 x 4.
@@ -331,11 +331,9 @@ mod tests {
         grad_f3: &'a [f32],
     }
 
-    impl ForUnit for Run<'_> {
+    impl Run<'_> {
         /// f3, and the gradients of parameters.
-        type Output = [Vec<f32>; 2];
-
-        fn run<U: Unit>(self, unit: U) -> Self::Output {
+        fn on<U: Unit>(self, unit: U) -> [Vec<f32>; 2] {
             let stages = Stages::new(unit, INPUT, &WIDTHS, self.parameters, true);
             let mut f3 = vec![f32::NAN; self.grad_f3.len()];
             let mut saved = stages.saved(self.images.len() / stages.image_len());
@@ -402,7 +400,8 @@ mod tests {
                 // ReLUs and pools that choose otherwise, too.
                 Precision::Bf16 => 0.3,
             };
-            for found in with_every_unit(precision, run) {
+            for unit in AnyUnit::every(precision) {
+                let found = on_unit!(unit, unit => run.on(unit));
                 for (found, wanted) in found.iter().zip(&wanted) {
                     let off = found.iter().zip(wanted).map(|(a, b)| f64::from(*a) - b);
                     let error = off.map(|it| it * it).sum::<f64>().sqrt();

@@ -4,19 +4,20 @@
 //! Where nothing but that layer reads the maps they are no tensor: candle would add their gradient to fresh zeros on a single thread,
 //! and they are turned into the order of the layer's weight in the cache of the core that made them.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 
+use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::conv::{ConvStack, GradLayout, pixels, stack_of};
-use crate::kernels::linear::{Biases, add_to, cpu, floats, group_sums};
+use crate::kernels::linear::{add_to, group_sums};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::Product;
-use crate::kernels::residual::{sum_in_place, values_of};
-use crate::kernels::units::{ForUnit, Mode, Unit, with_unit};
+use crate::kernels::product::{Biases, Product};
+use crate::kernels::tensors::{cpu, floats, values_of};
+use crate::kernels::units::{AnyUnit, Mode, Unit, on_unit};
 
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack), to the last bit: [B, outputs] of
 /// `images` [B, H, W, C] u8.
@@ -30,36 +31,31 @@ pub(crate) fn torso(
     bias: &Tensor,
     precision: Precision,
 ) -> Result<Tensor> {
-    struct Apply<'a>(&'a Tensor, &'a [ConvLayerTensors<'a>], Fc);
-    impl ForUnit for Apply<'_> {
-        type Output = Result<Tensor>;
-        fn run<U: Unit>(self, unit: U) -> Result<Tensor> {
-            let Self(images, layers, fc) = self;
-            let (shapes, parameters) = stack_of(images, layers)?;
-            let stack = ConvStack::new(unit, shapes);
-            let (inputs, outputs) = (stack.last().map_len(), fc.outputs);
-            if fc.weight.dims() != [outputs, inputs] || fc.bias.dims() != [outputs] {
-                bail!(
-                    "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
-                    fc.weight.shape(),
-                    fc.bias.shape()
-                );
-            }
-            let torso = Torso {
-                stack,
-                fc,
-                kept: Mutex::default(),
-            };
-            images.contiguous()?.apply_op2(&parameters, torso)
-        }
-    }
     let fc = Fc {
         weight: weight.clone(),
         bias: bias.clone(),
         outputs: weight.dims2()?.0,
         precision,
     };
-    with_unit(precision, Apply(images, layers, fc))
+    let (shapes, parameters) = stack_of(images, layers)?;
+    let images = images.contiguous()?;
+    on_unit!(AnyUnit::of(precision), unit => {
+        let stack = ConvStack::new(unit, shapes);
+        let (inputs, outputs) = (stack.last().map_len(), fc.outputs);
+        if fc.weight.dims() != [outputs, inputs] || fc.bias.dims() != [outputs] {
+            bail!(
+                "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
+                fc.weight.shape(),
+                fc.bias.shape()
+            );
+        }
+        let torso = Torso {
+            stack,
+            fc,
+            kept: OnceLock::new(),
+        };
+        images.apply_op2(&parameters, torso)
+    })
 }
 
 struct Fc {
@@ -78,7 +74,7 @@ struct Kept {
 struct Torso<U: Unit> {
     stack: ConvStack<U>,
     fc: Fc,
-    kept: Mutex<Option<Kept>>,
+    kept: OnceLock<Kept>,
 }
 
 impl<U: Unit> CustomOp2 for Torso<U> {
@@ -102,19 +98,19 @@ impl<U: Unit> CustomOp2 for Torso<U> {
             stack.flatten(maps, flat);
         });
 
-        let (bias, layout) = fc.bias.storage_and_layout();
+        let (weight, bias) = (values_of(&fc.weight)?, values_of(&fc.bias)?);
         let biases = Biases {
-            values: values_of(&bias, layout)?,
+            values: &bias,
             outputs: fc.outputs,
             each: count,
         };
-        let (weight, layout) = fc.weight.storage_and_layout();
-        let weight = Matrix::new(values_of(&weight, layout)?, fc.outputs, inputs);
+        let weight = Matrix::new(&weight, fc.outputs, inputs);
         let x = Matrix::new(&flat, count, inputs);
         let y = Product::new(fc.precision, x, weight.transposed())
-            .added_to(&|first, rows| biases.write(first, rows))
+            .added_to(biases)
             .to_vec();
-        *self.kept.lock().unwrap_or_else(PoisonError::into_inner) = Some(Kept { maps, flat });
+        let first = self.kept.set(Kept { maps, flat }).is_ok();
+        assert!(first, "an operation passes forward once");
         Ok((CpuStorage::F32(y), (count, fc.outputs).into()))
     }
 
@@ -127,32 +123,27 @@ impl<U: Unit> CustomOp2 for Torso<U> {
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
         let (stack, fc) = (&self.stack, &self.fc);
         let grad_y = grad_y.detach().contiguous()?;
-        let (grad, layout) = grad_y.storage_and_layout();
-        let grad_values = values_of(&grad, layout)?;
+        let grad_values = values_of(&grad_y)?;
         let (count, inputs) = (grad_y.dims2()?.0, stack.last().map_len());
-        let grad = Matrix::new(grad_values, count, fc.outputs);
-        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(Kept { maps, flat }) = &*kept else {
-            bail!("the backward pass of a torso comes after its forward pass");
-        };
+        let grad = Matrix::new(&grad_values, count, fc.outputs);
+        let Kept { maps, flat } = self.kept.get().expect("a forward pass came before");
         let to_weight = Product::new(
             fc.precision,
             grad.transposed(),
             Matrix::new(flat, count, inputs),
         );
         sum_in_place(&fc.weight, |sum| to_weight.summed(sum))?;
-        let to_bias = group_sums(grad_values, 1, fc.outputs);
+        let to_bias = group_sums(&grad_values, 1, fc.outputs);
         sum_in_place(&fc.bias, |sum| add_to(sum, to_bias))?;
 
-        let (weight, layout) = fc.weight.storage_and_layout();
-        let weight = Matrix::new(values_of(&weight, layout)?, fc.outputs, inputs);
+        let weight = values_of(&fc.weight)?;
+        let weight = Matrix::new(&weight, fc.outputs, inputs);
         let mut grad_flat = Buffer::new(count * inputs);
         Product::new(fc.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
         let (images, images_layout) = images.storage_and_layout();
-        let (values, layout) = parameters.storage_and_layout();
         let gradient = stack.backward(
             pixels(cpu(&images)?, images_layout)?,
-            values_of(&values, layout)?,
+            &values_of(parameters)?,
             maps,
             &grad_flat,
             GradLayout::Flat,

@@ -1,5 +1,6 @@
 //! `impala`: stages of a convolution, a max pool and two residual blocks, and a fully connected layer on all of the last one's map.
 //! Source: Espeholt et al. 2018, the residual network of the Procgen paper (Cobbe et al. 2020).
+//! `impoola`: the same with a fully connected layer on the mean of the map over its locations. Source: Trumpp et al. 2025 (arXiv 2503.05546).
 
 use candle_core::{Result, Tensor};
 
@@ -11,7 +12,7 @@ use crate::kernels::dense::Dense;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
-use crate::kernels::units::{Element, ForUnit, Unit, with_unit};
+use crate::kernels::units::{AnyUnit, Element, Unit, on_unit};
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "conv",
@@ -21,64 +22,15 @@ const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "block2.conv2",
 ];
 
+/// On an input of (height, width, channels).
 #[derive(Debug)]
 pub(crate) struct Impala {
-    input: (usize, usize, usize),
-    widths: Vec<usize>,
+    pub(super) input: (usize, usize, usize),
+    pub(super) widths: Vec<usize>,
     /// Whether the second convolution of each block starts smaller, by the square root of the number of blocks.
-    scale_blocks: bool,
-}
-
-impl Impala {
-    /// On an input of (height, width, channels).
-    pub(crate) fn new(input: (usize, usize, usize), widths: &[usize], scale_blocks: bool) -> Self {
-        Self {
-            input,
-            widths: widths.to_vec(),
-            scale_blocks,
-        }
-    }
-
-    /// f3 [B, h, w, c] of `frames`.
-    pub(super) fn f3(
-        &self,
-        kernels: Kernels,
-        parameters: &TorsoParameters<Tensor>,
-        frames: &Tensor,
-    ) -> Result<Tensor> {
-        let layers = parameters.convolutions.iter();
-        let layers: Vec<_> = layers.map(|it| (&it.weight, &it.bias)).collect();
-        kernels.residual_stages(frames, &layers)
-    }
-
-    /// The actor's torso, whose fully connected layer takes all of f3, or its mean over the locations.
-    pub(super) fn acting_on(
-        &self,
-        precision: Precision,
-        parameters: TorsoParameters<Vec<f32>>,
-        takes_mean: bool,
-    ) -> Box<dyn ActingTorso> {
-        struct Build<'a>(&'a Impala, TorsoParameters<Vec<f32>>, bool);
-        impl ForUnit for Build<'_> {
-            type Output = Box<dyn ActingTorso>;
-            fn run<U: Unit>(self, unit: U) -> Self::Output {
-                let Self(impala, TorsoParameters { convolutions, fc }, takes_mean) = self;
-                let layers = convolutions
-                    .into_iter()
-                    .map(|it| [it.weight, it.bias].concat());
-                let parameters = layers.collect::<Vec<_>>().concat();
-                let stages = Stages::new(unit, impala.input, &impala.widths, &parameters, false);
-                let channels = stages.output().2;
-                Box::new(ActingStages {
-                    unit,
-                    fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
-                    stages,
-                    takes_mean,
-                })
-            }
-        }
-        with_unit(precision, Build(self, parameters, takes_mean))
-    }
+    pub(super) scale_blocks: bool,
+    /// Whether the fully connected layer takes the mean of f3 over its locations, as `impoola`'s does.
+    pub(super) takes_mean: bool,
 }
 
 impl Torso for Impala {
@@ -108,6 +60,14 @@ impl Torso for Impala {
         stages(self.input, &self.widths).1
     }
 
+    fn fc_inputs(&self) -> usize {
+        let (height, width, channels) = self.local_shape();
+        if self.takes_mean {
+            return channels;
+        }
+        height.saturating_mul(width).saturating_mul(channels)
+    }
+
     fn features(
         &self,
         kernels: Kernels,
@@ -115,8 +75,15 @@ impl Torso for Impala {
         frames: &Tensor,
         local: bool,
     ) -> Result<(Option<Tensor>, Tensor)> {
-        let f3 = self.f3(kernels, parameters, frames)?;
-        let f4 = kernels.linear_of_maps(&f3, &parameters.fc.weight, &parameters.fc.bias)?;
+        let layers = parameters.convolutions.iter();
+        let layers: Vec<_> = layers.map(|it| (&it.weight, &it.bias)).collect();
+        let f3 = kernels.residual_stages(frames, &layers)?;
+        let (weight, bias) = (&parameters.fc.weight, &parameters.fc.bias);
+        let f4 = if self.takes_mean {
+            kernels.linear(&f3.mean((1, 2))?, weight, bias)?
+        } else {
+            kernels.linear_of_maps(&f3, weight, bias)?
+        };
         Ok((local.then_some(f3), f4))
     }
 
@@ -125,7 +92,20 @@ impl Torso for Impala {
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
-        self.acting_on(precision, parameters, false)
+        let TorsoParameters { convolutions, fc } = parameters;
+        let layers = convolutions.into_iter();
+        let layers = layers.map(|it| [it.weight, it.bias].concat());
+        let parameters = layers.collect::<Vec<_>>().concat();
+        on_unit!(AnyUnit::of(precision), unit => {
+            let stages = Stages::new(unit, self.input, &self.widths, &parameters, false);
+            let channels = stages.output().2;
+            Box::new(ActingStages {
+                unit,
+                fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+                stages,
+                takes_mean: self.takes_mean,
+            })
+        })
     }
 }
 

@@ -2,7 +2,6 @@
 //! What a torso is stands in `interface`.
 
 mod impala;
-mod impoola;
 pub(crate) mod interface;
 mod nature;
 
@@ -10,7 +9,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use self::{impala::Impala, impoola::Impoola, interface::Torso, nature::Nature};
+use self::{impala::Impala, interface::Torso, nature::Nature};
 use crate::error::{ModelError, Result};
 use crate::geometry::{ConvLayer, reach};
 
@@ -58,11 +57,14 @@ impl TorsoName {
         input: (usize, usize, usize),
         settings: &TorsoSettings<'_>,
     ) -> Box<dyn Torso> {
-        let impala = || Impala::new(input, settings.channels, settings.scale_blocks);
         match self {
             Self::Nature => Box::new(Nature::new(input, settings.conv)),
-            Self::Impala => Box::new(impala()),
-            Self::Impoola => Box::new(Impoola(impala())),
+            Self::Impala | Self::Impoola => Box::new(Impala {
+                input,
+                widths: settings.channels.to_vec(),
+                scale_blocks: settings.scale_blocks,
+                takes_mean: self == Self::Impoola,
+            }),
         }
     }
 

@@ -12,7 +12,7 @@ use crate::kernels::dense::{Dense, whole_steps};
 use crate::kernels::images::{Images, Pixels};
 use crate::kernels::precision::Precision;
 use crate::kernels::torso::torso;
-use crate::kernels::units::{ForUnit, Unit, with_unit};
+use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 #[derive(Debug)]
 pub(crate) struct Nature {
@@ -89,25 +89,18 @@ impl Torso for Nature {
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
-        struct Build<'a>(&'a [ConvShape], TorsoParameters<Vec<f32>>);
-        impl ForUnit for Build<'_> {
-            type Output = Box<dyn ActingTorso>;
-            fn run<U: Unit>(self, unit: U) -> Self::Output {
-                let Self(shapes, TorsoParameters { convolutions, fc }) = self;
-                let layers = shapes.iter().zip(&convolutions);
-                let channels = shapes.last().map_or(1, |last| last.channels_out);
-                Box::new(ActingNature {
-                    unit,
-                    convolutions: layers
-                        .map(|(&shape, it)| {
-                            Convolution::new(unit, shape, &it.weight, &it.bias, false)
-                        })
-                        .collect(),
-                    fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
-                })
-            }
-        }
-        with_unit(precision, Build(&self.shapes, parameters))
+        let TorsoParameters { convolutions, fc } = parameters;
+        let channels = self.shapes.last().map_or(1, |last| last.channels_out);
+        on_unit!(AnyUnit::of(precision), unit => {
+            let layers = self.shapes.iter().zip(&convolutions);
+            let layers = layers
+                .map(|(&shape, it)| Convolution::new(unit, shape, &it.weight, &it.bias, false));
+            Box::new(ActingNature {
+                unit,
+                convolutions: layers.collect(),
+                fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+            })
+        })
     }
 }
 

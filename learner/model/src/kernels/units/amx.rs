@@ -9,7 +9,8 @@ use std::sync::OnceLock;
 use half::bf16;
 
 use super::amx_permission::{granted, has_amx_bf16};
-use super::avx512::Brain;
+use super::avx512::{Brain, bf16_rounding};
+use super::avx512_rounding;
 use super::element::Rounding;
 use super::unit::{LANES, Loop, Mode, RawTile, Unit};
 
@@ -18,14 +19,6 @@ pub(super) const STEPS: usize = 16;
 pub(super) const ROWS: usize = 16;
 /// Tile registers that hold sums.
 pub(super) const SUMS: usize = 4;
-
-/// Whether this processor and kernel have AMX for bf16, and it multiplies right. Asks the kernel once for leave to use the tile
-/// registers.
-pub(super) fn available() -> bool {
-    static AVAILABLE: OnceLock<bool> = OnceLock::new();
-    *AVAILABLE
-        .get_or_init(|| has_amx_bf16() && Brain::available() && granted() && multiplies_right())
-}
 
 /// Multiplies two small matrices whose product is exact in either order of the sum, in both ways that tiles are used, and looks at
 /// the result: a virtual machine may promise tiles that it does not keep.
@@ -52,7 +45,7 @@ fn multiplies_right() -> bool {
             cols: LANES,
             mode: Mode::Replace,
         };
-        // SAFETY: `available` has found the instructions and been granted the registers; the sizes are those of the vectors.
+        // SAFETY: `Amx::new` has found the instructions and been granted the registers; the sizes are those of the vectors.
         unsafe { compute(&mut Hardware, &tile, 20, 1) };
         for (at, &got) in out.iter().enumerate() {
             let (row, col) = (at / LANES, at % LANES);
@@ -193,49 +186,26 @@ impl Tiles for Hardware {
 
 /// bf16 operands in pairs, on tiles.
 #[derive(Clone, Copy)]
-pub(super) struct Amx(
+pub(crate) struct Amx(
     /// For all that is not a product: a processor with AMX's bf16 has AVX-512's.
     Brain,
 );
 
 impl Amx {
-    /// # Panics
-    /// If the processor or the kernel lacks it.
-    pub(super) fn here() -> Self {
-        assert!(available(), "no AMX");
-        Self(Brain::here())
+    /// It, if this processor and kernel have AMX for bf16, and it multiplies right. Asks the kernel once for leave to use the tile
+    /// registers.
+    pub(super) fn new() -> Option<Self> {
+        static IS_THERE: OnceLock<bool> = OnceLock::new();
+        let brain = Brain::new()?;
+        let is_there = IS_THERE.get_or_init(|| has_amx_bf16() && granted() && multiplies_right());
+        is_there.then_some(Self(brain))
     }
 }
 
 /// Most rows of a tile as the products are cut: four registers of them.
 pub(super) const ROWS_MAX: usize = SUMS * ROWS;
 
-impl Rounding for Amx {
-    #[inline(always)]
-    fn round(self, values: &[f32], to: &mut [bf16]) {
-        self.0.round(values, to);
-    }
-
-    #[inline(always)]
-    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-        self.0.round_pairs(first, second, pairs);
-    }
-
-    #[inline(always)]
-    fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
-        self.0.pair(first, second, pairs);
-    }
-
-    #[inline(always)]
-    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
-        self.0.of_bytes(bytes, to);
-    }
-
-    #[inline(always)]
-    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
-        self.0.pair_bytes(first, second, pairs);
-    }
-}
+bf16_rounding!(Amx);
 
 impl Unit for Amx {
     type Element = bf16;
@@ -246,7 +216,7 @@ impl Unit for Amx {
     }
 
     unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        // SAFETY: `here` found the instructions; the rest is the caller's.
+        // SAFETY: `new` found the instructions; the rest is the caller's.
         unsafe { compute(&mut Hardware, tile, rows, vecs) }
     }
 

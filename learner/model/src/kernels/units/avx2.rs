@@ -16,26 +16,20 @@ use super::{
     vector::{Vector, compute_sizes},
 };
 
-/// Whether this processor, and the operating system, have AVX2 and fused multiplication and addition.
-pub(super) fn available() -> bool {
-    is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma")
-}
-
 #[derive(Clone, Copy)]
-pub(super) struct Single(());
+pub(crate) struct Single(());
 
 /// bf16 operands in pairs, multiplied as f32.
 #[derive(Clone, Copy)]
-pub(super) struct Rounded(());
+pub(crate) struct Rounded(());
 
 macro_rules! unit {
     ($unit:ident, $element:ty) => {
         impl $unit {
-            /// # Panics
-            /// If the processor lacks it.
-            pub(super) fn here() -> Self {
-                assert!(available(), "no AVX2");
-                Self(())
+            /// It, if this processor and the operating system have AVX2 and fused multiplication and addition.
+            pub(super) fn new() -> Option<Self> {
+                let there = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+                there.then_some(Self(()))
             }
 
             #[target_feature(enable = "avx2,fma")]
@@ -55,13 +49,13 @@ macro_rules! unit {
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                // SAFETY: `here` found the instructions; the rest is the caller's.
+                // SAFETY: `new` found the instructions; the rest is the caller's.
                 unsafe { Self::compute_sized(tile, rows, vecs) }
             }
 
             #[inline(always)]
             fn vectorize<W: Loop>(self, work: W) {
-                // SAFETY: `here` found the instructions.
+                // SAFETY: `new` found the instructions.
                 unsafe { vectorized(work) }
             }
         }

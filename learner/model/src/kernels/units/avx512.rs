@@ -13,14 +13,14 @@ use std::mem::transmute;
 use half::bf16;
 
 use super::{
-    avx512_rounding::{first_lanes, of_bytes, paired, paired_bytes, rounded, rounded_pairs},
+    avx512_rounding::{self, first_lanes},
     element::Rounding,
     unit::{LANES, Loop, RawTile, Unit},
     vector::{Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX-512 as server processors do.
-pub(super) fn available() -> bool {
+fn is_there() -> bool {
     is_x86_feature_detected!("avx512f")
         && is_x86_feature_detected!("avx512bw")
         && is_x86_feature_detected!("avx512dq")
@@ -29,32 +29,22 @@ pub(super) fn available() -> bool {
 }
 
 #[derive(Clone, Copy)]
-pub(super) struct Single(());
+pub(crate) struct Single(());
 
 /// bf16 operands in pairs.
 #[derive(Clone, Copy)]
-pub(super) struct Brain(());
+pub(crate) struct Brain(());
 
 impl Single {
-    /// # Panics
-    /// If the processor lacks it.
-    pub(super) fn here() -> Self {
-        assert!(available(), "no AVX-512");
-        Self(())
+    pub(super) fn new() -> Option<Self> {
+        is_there().then_some(Self(()))
     }
 }
 
 impl Brain {
-    /// Whether this processor has AVX512_BF16 beside AVX-512.
-    pub(super) fn available() -> bool {
-        available() && is_x86_feature_detected!("avx512bf16")
-    }
-
-    /// # Panics
-    /// If the processor lacks it.
-    pub(super) fn here() -> Self {
-        assert!(Self::available(), "no AVX512_BF16");
-        Self(())
+    /// It, if this processor has AVX512_BF16 beside AVX-512.
+    pub(super) fn new() -> Option<Self> {
+        (is_there() && is_x86_feature_detected!("avx512bf16")).then_some(Self(()))
     }
 }
 
@@ -74,19 +64,19 @@ macro_rules! unit {
             }
 
             unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
-                // SAFETY: `here` found the instructions; the rest is the caller's.
+                // SAFETY: `new` found the instructions; the rest is the caller's.
                 unsafe { Self::compute_sized(tile, rows, vecs) }
             }
 
             #[inline(always)]
             fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
-                // SAFETY: `here` found the instructions.
+                // SAFETY: `new` found the instructions.
                 unsafe { transposed(block) }
             }
 
             #[inline(always)]
             fn vectorize<W: Loop>(self, work: W) {
-                // SAFETY: `here` found the instructions.
+                // SAFETY: `new` found the instructions.
                 unsafe { Self::vectorized(work) }
             }
         }
@@ -118,37 +108,45 @@ unit!(
 
 impl Rounding for Single {}
 
-impl Rounding for Brain {
-    #[inline(always)]
-    fn round(self, values: &[f32], to: &mut [bf16]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { rounded(values, to) }
-    }
+/// [`Rounding`] for a unit that has AVX512_BF16.
+macro_rules! bf16_rounding {
+    ($unit:ty) => {
+        impl Rounding for $unit {
+            #[inline(always)]
+            fn round(self, values: &[f32], to: &mut [bf16]) {
+                // SAFETY: `new` found the instructions.
+                unsafe { avx512_rounding::rounded(values, to) }
+            }
 
-    #[inline(always)]
-    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { rounded_pairs(first, second, pairs) }
-    }
+            #[inline(always)]
+            fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+                // SAFETY: `new` found the instructions.
+                unsafe { avx512_rounding::rounded_pairs(first, second, pairs) }
+            }
 
-    #[inline(always)]
-    fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { paired(first, second, pairs) }
-    }
+            #[inline(always)]
+            fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
+                // SAFETY: `new` found the instructions.
+                unsafe { avx512_rounding::paired(first, second, pairs) }
+            }
 
-    #[inline(always)]
-    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { of_bytes(bytes, to) }
-    }
+            #[inline(always)]
+            fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+                // SAFETY: `new` found the instructions.
+                unsafe { avx512_rounding::of_bytes(bytes, to) }
+            }
 
-    #[inline(always)]
-    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
-        // SAFETY: `here` found the instructions.
-        unsafe { paired_bytes(first, second, pairs) }
-    }
+            #[inline(always)]
+            fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
+                // SAFETY: `new` found the instructions.
+                unsafe { avx512_rounding::paired_bytes(first, second, pairs) }
+            }
+        }
+    };
 }
+pub(super) use bf16_rounding;
+
+bf16_rounding!(Brain);
 
 /// Transposes 16 registers of 16: pairs of 32 bits, of 64 bits, then quarters of registers twice.
 #[inline]

@@ -73,7 +73,7 @@ impl Tiles for Registers {
 }
 
 #[derive(Clone, Copy)]
-pub(super) struct EmulatedAmx;
+pub(crate) struct EmulatedAmx;
 
 impl Rounding for EmulatedAmx {}
 

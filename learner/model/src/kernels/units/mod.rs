@@ -14,10 +14,8 @@ mod tile;
 pub(crate) mod unit;
 mod vector;
 
-#[cfg(test)]
-pub(crate) use choice::with_every_unit;
-pub(crate) use choice::with_unit;
+pub(crate) use choice::{AnyUnit, on_unit};
 pub use choice::{is_bf16_fast, kernels_in_words};
 pub(crate) use element::Element;
 pub(crate) use tile::{Columns, Left, multiply_tile, row_tiles, tile_vecs};
-pub(crate) use unit::{ForUnit, LANES, Mode, Unit, vectorized};
+pub(crate) use unit::{LANES, Mode, Unit, vectorized};

@@ -9,11 +9,11 @@ use super::{
 };
 
 #[derive(Clone, Copy)]
-pub(super) struct Single;
+pub(crate) struct Single;
 
 /// bf16 operands in pairs, multiplied as f32.
 #[derive(Clone, Copy)]
-pub(super) struct Rounded;
+pub(crate) struct Rounded;
 
 macro_rules! unit {
     ($unit:ident, $element:ty) => {

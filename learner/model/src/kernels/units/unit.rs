@@ -33,7 +33,7 @@ pub(crate) struct RawTile<E> {
 
 /// An instruction set, with the type that its operands are stored as. Sums are f32.
 ///
-/// A value of a unit exists only where the processor has its instructions: [`with_unit`] looks before it makes one.
+/// A value of a unit exists only where the processor has its instructions: `new` looks before it makes one.
 pub(crate) trait Unit: Rounding + Send + Sync + 'static {
     type Element: Element;
 
@@ -60,12 +60,6 @@ pub(crate) trait Unit: Rounding + Send + Sync + 'static {
 
     /// Runs `work` compiled for the unit's instructions, so that its loops use its registers.
     fn vectorize<W: Loop>(self, work: W);
-}
-
-pub(crate) trait ForUnit {
-    type Output;
-
-    fn run<U: Unit>(self, unit: U) -> Self::Output;
 }
 
 /// Loops over slices, made by `vectorized!`.

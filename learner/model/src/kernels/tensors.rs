@@ -1,0 +1,50 @@
+//! The scalars behind candle's tensors and storages on the CPU.
+
+use std::ops::{Deref, Range};
+
+use candle_core::{CpuStorage, Layout, Result, Storage, StorageRef, Tensor, bail};
+
+/// The scalars of a contiguous f32 storage.
+pub(crate) fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
+    Ok(&storage.as_slice::<f32>()?[range(layout)?])
+}
+
+/// The storage, which must be on the CPU.
+pub(crate) fn cpu(storage: &Storage) -> Result<&CpuStorage> {
+    match storage {
+        Storage::Cpu(storage) => Ok(storage),
+        _ => bail!("this operation runs on the CPU only"),
+    }
+}
+
+fn range(layout: &Layout) -> Result<Range<usize>> {
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(start..end),
+        None => bail!("a tensor of shape {:?} must be contiguous", layout.shape()),
+    }
+}
+
+/// The scalars of a tensor, which is locked as long as they are held.
+pub(crate) struct Values<'a> {
+    storage: StorageRef<'a>,
+    range: Range<usize>,
+}
+
+/// The scalars of a contiguous f32 tensor on the CPU.
+pub(crate) fn values_of(tensor: &Tensor) -> Result<Values<'_>> {
+    let (storage, layout) = tensor.storage_and_layout();
+    cpu(&storage)?.as_slice::<f32>()?;
+    let range = range(layout)?;
+    Ok(Values { storage, range })
+}
+
+impl Deref for Values<'_> {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        match &*self.storage {
+            Storage::Cpu(CpuStorage::F32(values)) => &values[self.range.clone()],
+            _ => unreachable!("looked at by `values_of`"),
+        }
+    }
+}

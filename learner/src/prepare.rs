@@ -1,0 +1,149 @@
+//! From a batch as it travels to one that an update reads: states enlarged and augmented, rows weighted.
+//! It learns nothing.
+
+use std::borrow::Cow;
+
+use driml_model::{Enlarge, ModelError};
+use driml_protocol::Batch as WireBatch;
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use crate::{
+    augment::Augment, auxiliary::positives::Positives, batch::Batch, config::LearnerConfig,
+    importance::importance_weights,
+};
+
+/// The columns of a batch that do not lie in it as an update reads them.
+pub(crate) struct Columns<'a> {
+    batch: &'a WireBatch,
+    /// s_t, s_{t+k}, s_{t+n}, whose stacks of frames are put together here, once an update.
+    states: [Cow<'a, [u8]>; 3],
+    returns: Vec<f32>,
+    discounts: Vec<f32>,
+    /// The chance with which each row was drawn, where rows were not equally likely.
+    pub(crate) probabilities: Option<Vec<f32>>,
+    weights: Option<Vec<f32>>,
+    /// Every row has another view of itself.
+    all_valid: Vec<u8>,
+}
+
+impl<'a> Columns<'a> {
+    /// `beta` is the exponent of importance weights.
+    pub(crate) fn of(batch: &'a WireBatch, beta: f64) -> Self {
+        let probabilities = batch.probabilities();
+        let weights = probabilities.as_ref();
+        Self {
+            batch,
+            states: [batch.states_t(), batch.states_k(), batch.states_n()],
+            returns: batch.n_step_returns(),
+            discounts: batch.bootstrap_discounts(),
+            weights: weights.map(|it| importance_weights(it, beta)),
+            probabilities,
+            all_valid: vec![1; batch.rows()],
+        }
+    }
+}
+
+/// How states are prepared, with memory that is used again for each batch.
+pub(crate) struct Preparation {
+    positives: Positives,
+    state_bytes: usize,
+    enlarge: Option<Enlarge>,
+    /// States at the network's input size, if that is another.
+    enlarged: [Vec<u8>; 3],
+    augment: Option<Augment>,
+    /// What the auxiliary objective sees, if that is not the plain states.
+    seen: [Vec<u8>; 2],
+}
+
+impl Preparation {
+    pub(crate) fn new(config: &LearnerConfig) -> Result<Self, ModelError> {
+        let (spec, model) = (&config.spec, &config.model);
+        let sent = (spec.frame_height as usize, spec.frame_width as usize);
+        let size = (model.height, model.width, model.input_channels);
+        let channels = spec.frame_channels as usize;
+        let augment = config.learner.augment;
+        Ok(Self {
+            positives: config.learner.update.objective.positives(),
+            state_bytes: model.frame_len(),
+            enlarge: config.input.enlarge(sent, model)?,
+            enlarged: Default::default(),
+            augment: augment.map(|settings| Augment::new(settings, size, channels)),
+            seen: Default::default(),
+        })
+    }
+
+    /// The batch of `columns` as an update reads it; augmentation draws from `rng`.
+    pub(crate) fn prepare<'a>(
+        &'a mut self,
+        columns: &'a Columns<'_>,
+        rng: &mut ChaCha8Rng,
+    ) -> Batch<'a> {
+        let mut frames = columns.states.each_ref().map(|states| &states[..]);
+        if let Some(enlarge) = &self.enlarge {
+            for (states, larger) in frames.iter_mut().zip(&mut self.enlarged) {
+                enlarge_all(enlarge, states, larger);
+                *states = larger;
+            }
+        }
+        let [states_t, states_k, states_n] = frames;
+        let served = columns.batch;
+        let mut batch = Batch {
+            rows: served.rows(),
+            states_t,
+            anchors: None,
+            positives: served.positives(),
+            states_k,
+            states_n,
+            action: served.actions(),
+            next_action: served.next_actions(),
+            n_step_return: &columns.returns,
+            bootstrap_discount: &columns.discounts,
+            positive_valid: served.positive_valid(),
+            importance_weight: columns.weights.as_deref(),
+        };
+        if let Some(augment) = &mut self.augment {
+            if self.positives == Positives::OtherView {
+                // Two views of the same state.
+                batch.states_k = states_t;
+                batch.positives = 1;
+                batch.positive_valid = &columns.all_valid;
+            }
+            let [seen_t, seen_k] = &mut self.seen;
+            augment.apply(states_t, seen_t, rng);
+            // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
+            if batch.states_k.len() < batch.positive_valid.len() * self.state_bytes {
+                let spread = spread(batch.states_k, batch.positive_valid, self.state_bytes);
+                augment.apply(&spread, seen_k, rng);
+            } else {
+                augment.apply(batch.states_k, seen_k, rng);
+            }
+            batch.anchors = Some(seen_t);
+            batch.states_k = seen_k;
+        }
+        batch
+    }
+}
+
+/// `states`, those that are `there`, each in its place among blank ones.
+fn spread(states: &[u8], there: &[u8], state_bytes: usize) -> Vec<u8> {
+    let mut all = vec![0; there.len() * state_bytes];
+    let places = all.chunks_exact_mut(state_bytes).zip(there);
+    let places = places.filter(|(_, there)| **there != 0);
+    for ((place, _), state) in places.zip(states.chunks_exact(state_bytes)) {
+        place.copy_from_slice(state);
+    }
+    all
+}
+
+/// Enlarges all `states` into `larger`, a share of them on each thread.
+fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
+    let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
+    let count = states.len() / from;
+    larger.resize(count * to, 0);
+    let share = count.div_ceil(rayon::current_num_threads()).max(1);
+    larger
+        .par_chunks_mut(share * to)
+        .zip(states.par_chunks(share * from))
+        .for_each(|(larger, states)| enlarge.apply(states, larger));
+}
