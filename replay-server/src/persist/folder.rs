@@ -11,7 +11,6 @@ use driml_protocol::{lock_file, whole_file};
 use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
-use crate::config::ConfigError;
 
 /// Form of the log; one of another form is refused.
 pub(super) const FORMAT: u32 = 4;
@@ -48,7 +47,7 @@ pub enum PersistError {
     Stopped,
     /// Settings that cannot work.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(#[from] driml_protocol::config::ConfigError),
 }
 
 /// Makes an error of the file system one that says what was done with which file.
