@@ -177,10 +177,9 @@ impl DeliveryWorker {
         if self.shutdown.is_set() {
             let since = *self.draining_since.get_or_insert_with(Instant::now);
             if since.elapsed() > DRAIN_MAX {
-                return Err(DeliveryError::NotDrained {
-                    sequence,
-                    within: DRAIN_MAX,
-                });
+                return Err(DeliveryError::Failed(format!(
+                    "chunk {sequence} was not stored within {DRAIN_MAX:?} of the end"
+                )));
             }
         }
         let reply = match self.send_window().and_then(|()| self.wait_for_first()) {
@@ -226,7 +225,9 @@ impl DeliveryWorker {
             }
             // Judged while one before it waited; all of those are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
-            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Refused { why }),
+            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
+                "the replay server refused a chunk: {why}"
+            ))),
             Err(SessionError::Recovering(recovering)) => {
                 self.answered = Instant::now();
                 if let Some(more) = self.retries_said.due() {

@@ -13,7 +13,7 @@ use crate::{error::EnvError, saved::check};
 
 /// All of a [`Game`].
 #[derive(Serialize, Deserialize)]
-pub(super) struct SavedGame {
+pub(crate) struct SavedGame {
     rng: ChaCha8Rng,
     agent: Place,
     ghosts: [Ghost; GHOSTS],

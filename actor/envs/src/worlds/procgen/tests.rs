@@ -20,7 +20,7 @@ pub(super) fn engine(test: &str) -> Option<&'static Engine> {
     Some(ENGINE.get_or_init(|| Engine::install(&mut |line| println!("{line}")).unwrap()))
 }
 
-pub(super) fn config(game: Game) -> ProcgenConfig {
+pub(crate) fn config(game: Game) -> ProcgenConfig {
     ProcgenConfig {
         game,
         distribution_mode: DistributionMode::Easy,
@@ -149,47 +149,25 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
 
 #[test]
 fn wrong_settings_are_refused_without_an_engine() {
-    let refused = |config: ProcgenConfig, text: &str| {
-        let error = config.validate().unwrap_err().to_string();
-        assert!(error.contains(text), "{error}");
-    };
     let maze = || config(Game::Maze);
     maze().validate().unwrap();
-    refused(
-        ProcgenConfig {
-            distribution_mode: DistributionMode::Extreme,
-            ..maze()
-        },
-        "maze has no distribution",
-    );
-    refused(
-        ProcgenConfig {
-            num_levels: u32::MAX,
-            ..maze()
-        },
-        "num_levels = 4294967295",
-    );
-    refused(
-        ProcgenConfig {
-            start_level: i32::MAX as u32,
-            ..maze()
-        },
-        "past the last level",
-    );
-    refused(
-        ProcgenConfig {
-            num_levels: 0,
-            start_level: 3,
-            ..maze()
-        },
-        "no effect",
-    );
-    for frame_side in [0, 7, 65] {
-        let config = ProcgenConfig {
-            frame_side,
-            ..maze()
-        };
-        refused(config, &format!("frame_side = {frame_side}"));
+    let refused: [(fn(&mut ProcgenConfig), &str); 7] = [
+        (
+            |it| it.distribution_mode = DistributionMode::Extreme,
+            "maze has no distribution",
+        ),
+        (|it| it.num_levels = u32::MAX, "num_levels = 4294967295"),
+        (|it| it.start_level = i32::MAX as u32, "past the last level"),
+        (|it| (it.num_levels, it.start_level) = (0, 3), "no effect"),
+        (|it| it.frame_side = 0, "frame_side = 0"),
+        (|it| it.frame_side = 7, "frame_side = 7"),
+        (|it| it.frame_side = 65, "frame_side = 65"),
+    ];
+    for (change, text) in refused {
+        let mut config = maze();
+        change(&mut config);
+        let error = config.validate().unwrap_err().to_string();
+        assert!(error.contains(text), "{error}");
     }
     for (num_envs, threads, text) in [(0, 0, "0 copies"), (1, 1000, "1000 threads")] {
         let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
