@@ -9,7 +9,6 @@ use std::{
 };
 
 use driml_tests::{Process, TestSystem, skip, wait_for};
-use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
@@ -77,7 +76,7 @@ fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
         system.endpoint()
     ));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     process
 }
 
@@ -98,30 +97,22 @@ fn a_run_continues_while_the_disk_is_full() {
     process.wait_for_stderr("cannot be written: No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     filler.remove();
     let run = system.run_folder("disk/run");
     let now = client.learner().unwrap().updates;
-    wait_for("a row of metrics after that", || {
-        run.updates_recorded().filter(|&updates| updates > now)
-    });
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(130);
+    run.wait_for_updates(now);
+    let ended = process.interrupt().expect_code(130);
     assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
     assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
     run.check("interrupted");
     // No second is missing.
-    let (header, rows) = run.metrics();
-    let seconds = header.iter().position(|it| it == "seconds").unwrap();
-    let frames = header.iter().position(|it| it == "frames").unwrap();
-    let cells: Vec<[f64; 2]> = rows
-        .iter()
-        .map(|row| [seconds, frames].map(|at| row[at].parse().unwrap()))
-        .collect();
-    assert!(
-        cells.is_sorted_by(|a, b| a[0] < b[0] && a[1] <= b[1]),
-        "{cells:?}"
-    );
+    let numbers = |name| -> Vec<f64> {
+        let cells = run.column(name).into_iter();
+        cells.map(|it| it.parse().unwrap()).collect()
+    };
+    assert!(numbers("seconds").is_sorted_by(|a, b| a < b));
+    assert!(numbers("frames").is_sorted());
     check_nothing_is_left(&system, &system.path("disk/run"));
 }
 
@@ -135,8 +126,7 @@ fn the_first_error_is_the_one_shown() {
     let mut process = started(&system, NEVER);
     let filler = disk.fill();
     process.wait_for_stderr("cannot be written: No space left");
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(1);
+    let ended = process.interrupt().expect_code(1);
     // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
     let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
     let last = &ended.stderr[errors..];
@@ -173,7 +163,7 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
     process.wait_for_stderr("No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 600);
+    client.wait_for_updates(then + 600);
     let run = system.path("disk/run");
     filler.remove();
     let now = client.learner().unwrap().updates;
@@ -183,8 +173,7 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
         let mut saved = names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
         saved.any(|updates: u64| updates > now).then_some(())
     });
-    process.signal(Signal::SIGINT);
-    process.wait().expect_code(130);
+    process.interrupt().expect_code(130);
     system.run_folder("disk/run").check("interrupted");
     check_nothing_is_left(&system, &run);
 }
@@ -216,7 +205,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let mut server = system.start_replay_server(&flags);
     let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     let filler = disk.fill();
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
@@ -244,11 +233,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     );
     actor.stop().expect_code(0);
     learner.stop().expect_code(0);
-    let before = client.replay().unwrap();
-    assert_eq!(
-        (before.transitions_lost, before.transitions_duplicated),
-        (0, 0)
-    );
+    let before = client.check_nothing_lost();
     server.kill();
     let server = system.start_replay_server(&flags);
     let after = wait_for("the server", || client.replay());

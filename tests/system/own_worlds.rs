@@ -67,7 +67,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     };
     let first = lockstep(&flags, "first");
     assert_eq!(first, lockstep("--config first/config.toml", "again"));
-    let ended = system.run("evaluate --run run --episodes 8").expect_code(0);
+    let ended = system.run_ok("evaluate --run run --episodes 8");
     // Each episode ends with 1000, and what comes before is 2 a step at most.
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
@@ -100,9 +100,7 @@ fn lockstep_continues(env: &str, flags: &str, frames: u64) {
 
     let half = run(frames / 2, "half");
     assert_ne!(half.weights_sha256, whole.0);
-    system
-        .run(&format!("local --resume half --frames {frames}"))
-        .expect_code(0);
+    system.run_ok(&format!("local --resume half --frames {frames}"));
     let prolonged = system.run_folder("half").check_finished();
     assert_eq!(result(prolonged), whole, "prolonged");
 
@@ -113,15 +111,11 @@ fn lockstep_continues(env: &str, flags: &str, frames: u64) {
         let process = start(&system, &args, env);
         let run = system.run_folder(signal.as_str());
         // After a checkpoint and before the next: what follows it is done again.
-        wait_for("updates after a checkpoint", || {
-            run.updates_recorded().filter(|&updates| updates > 110)
-        });
+        run.wait_for_updates(110);
         process.signal(signal);
         system.let_go();
         process.wait();
-        system
-            .run(&format!("local --resume {signal}"))
-            .expect_code(0);
+        system.run_ok(&format!("local --resume {signal}"));
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(result(resumed), whole, "{signal}");
@@ -273,9 +267,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     drop(client);
     learner.stop().expect_code(0);
     server.stop().expect_code(0);
-    wait_for("the end of all", || {
-        system.survivors().is_empty().then_some(())
-    });
+    system.wait_until_all_have_ended();
 }
 
 /// A Python with Gymnasium and ALE, installed once into cargo's folder for tests; `None`, and a line that says so, where pip cannot.

@@ -120,8 +120,6 @@ fn a_panic_in_the_launcher_ends_the_run() {
         );
         let said = format!("error: the thread {point} panicked");
         assert!(ended.stderr.contains(&said), "{point}: {ended:#?}");
-        driml_tests::wait_for("the end of all processes", || {
-            system.survivors().is_empty().then_some(())
-        });
+        system.wait_until_all_have_ended();
     }
 }

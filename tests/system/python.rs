@@ -63,9 +63,7 @@ const RUNS: [&str; 5] = [
 /// A run, what its network is, and random states in a file beside it.
 fn trained(system: &TestSystem, flags: &str) -> (Agent, Vec<u8>) {
     let _ = fs::remove_dir_all(system.path("run"));
-    system
-        .run(&format!("local --lockstep {flags} --run-dir run"))
-        .expect_code(0);
+    system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
     let text = fs::read_to_string(system.path("run/config.toml")).unwrap();
     let config = RunConfig::parse("config.toml", &text).unwrap();
     let folder = system.path("run/checkpoints");

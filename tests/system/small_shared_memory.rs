@@ -84,21 +84,20 @@ fn a_run_continues_when_others_fill_it_up() {
     );
     let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     let mut filler = File::create(format!("/proc/{}/root/dev/shm/filler", process.pid())).unwrap();
     while filler.write_all(&[0; 4096]).is_ok() {}
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     // A process that starts now finds no room.
     system.find_part("actor").signal(Signal::SIGKILL);
     process.wait_for_stderr("is started again (1 of 16 times in a run)");
     process.wait_for_stderr("no shared memory, so messages go through sockets");
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("updates after that", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     drop(client);
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(130);
+    let ended = process.interrupt().expect_code(130);
     assert_eq!(warnings(&ended), 1, "{ended:#?}");
     let log = fs::read_to_string(system.path("run/logs/replay-server.log")).unwrap();
     assert!(!log.contains("panicked"), "{log}");

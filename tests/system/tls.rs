@@ -12,7 +12,8 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 use driml_tests::{
-    Certificates, Client, Process, TestSystem, Valid, skipped_without_openssl, wait_for,
+    Certificates, Client, Process, TestSystem, Valid, check_nothing_lost, skipped_without_openssl,
+    wait_for,
 };
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
@@ -153,10 +154,7 @@ fn a_run_over_tls() {
         (replay.transitions_inserted, replay.rows_sampled),
         (1280, 8640)
     );
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     // No process asked for more than its role allows.
     assert_eq!(replay.messages_refused, 0);
     assert!(
@@ -274,15 +272,9 @@ fn own_files_that_cannot_be_used() {
         .expect_code(64)
         .expect_said("old/replay-server.pem is not there");
     let server = server.replace("quic/127.0.0.1", "tcp/127.0.0.1");
-    tls.system
-        .run(&server)
-        .expect_code(64)
-        .expect_said("it is quic/127.0.0.1:1");
+    tls.system.refuses(&server, "it is quic/127.0.0.1:1");
     let without = "actor --connect quic/127.0.0.1:1";
-    tls.system
-        .run(without)
-        .expect_code(64)
-        .expect_said("add --tls-dir DIR");
+    tls.system.refuses(without, "add --tls-dir DIR");
 }
 
 /// A replay server rejects each certificate that is not good, and logs why; accepted connections stay.
@@ -325,7 +317,7 @@ fn strangers_at_a_replay_server() {
     // Who is let in is not disturbed.
     let learner = tls.start("learner --stay --run-dir run", "tls");
     let actor = tls.start("actor --id 1", "tls");
-    observer.wait_for_learner("some updates", |learner| learner.updates > 10);
+    observer.wait_for_updates(10);
     actor.stop().expect_code(0);
     learner.stop().expect_code(0);
 }
