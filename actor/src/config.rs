@@ -172,7 +172,6 @@ impl ActorSettings {
         )
     }
 
-    /// Bytes of one transition in a chunk.
     const fn transition_bytes(&self) -> usize {
         self.spec.frame_bytes() + TRANSITION_BYTES
     }

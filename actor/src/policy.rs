@@ -172,7 +172,6 @@ pub(crate) mod tests {
         policy_with(HeadConfig::PLAIN, seed)
     }
 
-    /// A small network.
     pub(crate) fn model() -> ModelConfig {
         ModelConfig {
             height: 4,

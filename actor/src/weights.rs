@@ -101,7 +101,6 @@ impl NewestWeights {
         state.slot.take()
     }
 
-    /// Takes note of newer weights.
     fn announce(&self, version: u64) {
         let mut state = self.state();
         state.announced = state.announced.max(version);

@@ -30,7 +30,6 @@ const TAKEN_MAX: Duration = Duration::from_secs(45);
 const SILENT_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its reply.
 const TRY_MAX: Duration = Duration::from_secs(2);
-/// Pause between two tries.
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a process could not join a run.
@@ -100,7 +99,6 @@ pub fn hello_within(
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
 struct Patience {
-    /// When the wait for an answer began.
     silent_since: Instant,
     silence_said: Seldom,
     recovery_said: Seldom,

@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 
-/// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
 
 /// Smallest segment of a replay that is kept on disk.

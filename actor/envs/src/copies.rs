@@ -103,7 +103,6 @@ pub(crate) fn copy_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
     rng
 }
 
-/// Rejects a world without copies.
 pub(crate) fn check_num_envs(num_envs: usize) -> Result<(), EnvError> {
     if num_envs == 0 {
         return Err(EnvError::Config(

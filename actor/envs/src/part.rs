@@ -23,7 +23,6 @@ pub enum ActionSet {
 /// Another world, with some of its actions, numbered without gaps, and the upper left part of its frames.
 pub struct PartOfWorld {
     world: Box<dyn Environment>,
-    /// What each action is in the world.
     actions: Vec<u8>,
     /// The world's actions of the step in progress [N].
     step: Vec<u8>,

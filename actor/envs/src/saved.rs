@@ -14,7 +14,6 @@ pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
         .map_err(|e| EnvError::State(e.to_string()))
 }
 
-/// The state that [`encode`] wrote.
 pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
     let (state, used) = bincode::serde::decode_from_slice(bytes, config)

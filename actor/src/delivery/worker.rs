@@ -29,7 +29,6 @@ const GOODBYE_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its answer: several must fit, as a message may be lost.
 const GOODBYE_TRY_MAX: Duration = Duration::from_secs(1);
 
-/// A chunk that is not settled yet.
 struct Outgoing {
     header: ChunkHeader,
     payload: ZBytes,
@@ -71,7 +70,6 @@ pub(super) struct DeliveryWorker {
     outgoing: VecDeque<Outgoing>,
     /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
     window: usize,
-    /// When the replay server last answered.
     answered: Instant,
     /// When the chunk that waits at the rate limiter began to wait.
     held_since: Option<Instant>,

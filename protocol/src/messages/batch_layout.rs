@@ -63,7 +63,6 @@ impl Column {
         matches!(self, Self::Transition | Self::Probability)
     }
 
-    /// Whether its values are states.
     pub(super) const fn is_of_states(self) -> bool {
         matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
     }
@@ -191,7 +190,6 @@ impl BatchLayout {
         }
     }
 
-    /// Bytes of a column.
     pub(super) const fn column_bytes(&self, column: Column) -> usize {
         match column {
             Column::Frames => match self.stacked {
@@ -209,7 +207,6 @@ impl BatchLayout {
         }
     }
 
-    /// Where a column lies in the payload.
     pub(super) fn range(&self, column: Column) -> Range<usize> {
         let before = Column::ALL[..column as usize].iter();
         let start = before.map(|&column| self.column_bytes(column)).sum();
@@ -289,7 +286,8 @@ mod tests {
             wrong.stacked.as_mut().map(change);
             assert_eq!(wrong.bytes(), None, "{wrong:?}");
         }
-        let layouts: [(BatchLayout, fn(&mut BatchLayout)); 5] = [
+        type Change = fn(&mut BatchLayout);
+        let layouts: [(BatchLayout, Change); 5] = [
             (stacks, |it| it.state_bytes = usize::MAX / 4 * 4),
             (small, |it| it.rows = usize::MAX),
             (small, |it| it.states_k = 5),

@@ -181,7 +181,6 @@ impl Credentials {
         }
     }
 
-    /// zenoh's settings for TLS, JSON5.
     pub(crate) fn zenoh_settings(&self) -> String {
         let paths = [
             ("root_ca_certificate", &self.authority),

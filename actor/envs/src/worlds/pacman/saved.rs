@@ -11,7 +11,6 @@ use super::{
 };
 use crate::{error::EnvError, saved::check};
 
-/// All of a [`Game`].
 #[derive(Serialize, Deserialize)]
 pub(crate) struct SavedGame {
     rng: ChaCha8Rng,

@@ -151,7 +151,8 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
 fn wrong_settings_are_refused_without_an_engine() {
     let maze = || config(Game::Maze);
     maze().validate().unwrap();
-    let refused: [(fn(&mut ProcgenConfig), &str); 7] = [
+    type Change = fn(&mut ProcgenConfig);
+    let refused: [(Change, &str); 7] = [
         (
             |it| it.distribution_mode = DistributionMode::Extreme,
             "maze has no distribution",
