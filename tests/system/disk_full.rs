@@ -18,8 +18,8 @@ pub(crate) struct Disk {
 }
 
 impl Disk {
-    /// One of so many KiB at `folder`; none, and a line that `test` is skipped, if it cannot be mounted.
-    pub(crate) fn mount(test: &str, folder: PathBuf, kib: u32) -> Option<Self> {
+    /// One of so many KiB at `folder`; none, and a line that the test is skipped, if it cannot be mounted.
+    pub(crate) fn mount(folder: PathBuf, kib: u32) -> Option<Self> {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
@@ -27,11 +27,11 @@ impl Disk {
             Ok(output) if output.status.success() => Some(Self { folder }),
             Ok(output) => {
                 let why = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                skip(test, &why);
+                skip(&why);
                 None
             }
             Err(e) => {
-                skip(test, &format!("mount: {e}"));
+                skip(&format!("mount: {e}"));
                 None
             }
         }
@@ -88,8 +88,7 @@ fn times(said: &str, words: &str) -> usize {
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
     let system = system();
-    let name = "a_run_continues_while_the_disk_is_full";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
@@ -119,8 +118,7 @@ fn a_run_continues_while_the_disk_is_full() {
 #[test]
 fn the_first_error_is_the_one_shown() {
     let system = system();
-    let name = "the_first_error_is_the_one_shown";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
@@ -154,8 +152,7 @@ fn the_first_error_is_the_one_shown() {
 #[test]
 fn a_checkpoint_that_finds_no_room_is_tried_again() {
     let system = system();
-    let name = "a_checkpoint_that_finds_no_room_is_tried_again";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, 200);
@@ -197,8 +194,7 @@ const IN_FLIGHT: u64 = 8;
 #[test]
 fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();
-    let name = "a_full_disk_makes_all_processes_wait_until_there_is_room";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 20_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 20_000) else {
         return;
     };
     let flags = format!("--agent c51 {LONG} --replay-dir disk/replay");
@@ -273,15 +269,14 @@ fn a_folder_that_cannot_be_used_is_said() {
         .expect_code(1)
         .expect_said("replay holds the replay of another run (its run spec has the hash");
 
-    let name = "a_folder_that_cannot_be_used_is_said";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut remount = Command::new("mount");
     remount.args(["-o", "remount,ro"]).arg(system.path("disk"));
     match remount.status() {
         Ok(status) if status.success() => {}
-        _ => return skip(name, "no read-only file system"),
+        _ => return skip("no read-only file system"),
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()

@@ -271,8 +271,8 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
 }
 
 /// A Python with Gymnasium and ALE, installed once into cargo's folder for tests; `None`, and a line that says so, where pip cannot.
-fn gymnasium(test: &str) -> Option<String> {
-    if skipped_offline(test) {
+fn gymnasium() -> Option<String> {
+    if skipped_offline() {
         return None;
     }
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("gymnasium");
@@ -293,7 +293,7 @@ fn gymnasium(test: &str) -> Option<String> {
             .unwrap();
         if !output.status.success() {
             let said = String::from_utf8_lossy(&output.stderr);
-            skip(test, said.lines().last().unwrap_or("no pip"));
+            skip(said.lines().last().unwrap_or("no pip"));
             return None;
         }
         fs::write(&ready, "").unwrap();
@@ -303,9 +303,7 @@ fn gymnasium(test: &str) -> Option<String> {
 
 #[test]
 fn atari_by_gymnasium_trains() {
-    let Some(python) = gymnasium("own_worlds::atari_by_gymnasium_trains") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let system = system();
     let env = format!(
         "exec:{python} {} ALE/Pong-v5 --atari",
@@ -333,9 +331,7 @@ fn atari_by_gymnasium_trains() {
 /// ALE's emulator, wrappers and generators come back as they were.
 #[test]
 fn atari_continues_exactly_in_lockstep() {
-    let Some(python) = gymnasium("own_worlds::atari_continues_exactly_in_lockstep") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let env = format!(
         "exec:{python} {} ALE/Breakout-v5 --atari --clip --size 20",
         file("deploy/python/driml_env.py")
@@ -349,9 +345,7 @@ fn atari_continues_exactly_in_lockstep() {
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
-    let Some(python) = gymnasium("own_worlds::the_adapter_keeps_gymnasium_s_episodes") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let output = std::process::Command::new(python)
         .arg(file("tests/worlds/check_adapter.py"))
         .output()

@@ -8,7 +8,7 @@ use crate::system;
 
 #[test]
 fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
-    if skipped_offline("procgen::bigfish_trains_and_is_evaluated_on_unseen_levels") {
+    if skipped_offline() {
         return;
     }
     let system = system();
@@ -30,7 +30,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
 /// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
-    if skipped_offline("procgen::a_border_that_no_convolution_reads_changes_no_bit") {
+    if skipped_offline() {
         return;
     }
     let system = system();
@@ -68,7 +68,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
-    if skipped_offline("procgen::an_agent_chooses_among_the_actions_that_differ") {
+    if skipped_offline() {
         return;
     }
     let system = system();
@@ -84,7 +84,7 @@ fn an_agent_chooses_among_the_actions_that_differ() {
 
 #[test]
 fn an_experiment_of_three_seeds_has_scores_over_games() {
-    if skipped_offline("procgen::an_experiment_of_three_seeds_has_scores_over_games") {
+    if skipped_offline() {
         return;
     }
     let system = system();

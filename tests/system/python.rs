@@ -86,7 +86,7 @@ fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
 
 #[test]
 fn pytorch_computes_what_driml_does() {
-    let Some(python) = python_with("python::pytorch_computes_what_driml_does", &["torch"]) else {
+    let Some(python) = python_with(&["torch"]) else {
         return;
     };
     let system = system();
@@ -126,8 +126,7 @@ fn pytorch_computes_what_driml_does() {
 #[test]
 fn onnx_runtime_computes_what_driml_does() {
     let modules = ["torch", "onnx", "onnxscript", "onnxruntime"];
-    let Some(python) = python_with("python::onnx_runtime_computes_what_driml_does", &modules)
-    else {
+    let Some(python) = python_with(&modules) else {
         return;
     };
     let system = system();
@@ -173,7 +172,7 @@ fn the_page_has_the_actions_in_their_order() {
 
 #[test]
 fn optuna_searches() {
-    let Some(python) = python_with("optuna_searches", &["optuna"]) else {
+    let Some(python) = python_with(&["optuna"]) else {
         return;
     };
     let system = system();
@@ -204,7 +203,7 @@ fn optuna_searches() {
 
 #[test]
 fn a_helper_without_its_package_says_which() {
-    let Some(python) = python_with("python::a_helper_without_its_package_says_which", &[]) else {
+    let Some(python) = python_with(&[]) else {
         return;
     };
     for (script, args, package) in [

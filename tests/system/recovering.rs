@@ -301,9 +301,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
 /// Each role receives it in place of the answer.
 #[test]
 fn roles_are_told_too() {
-    let Some(tls) = TlsSystem::new("roles_are_told_too") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     keep_for(&tls.system, "replay");
     let mut server = tls.start_server(&format!("{} --replay-dir replay", flags()));
     let slow = slow_down(&mut server);

@@ -74,8 +74,7 @@ fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
 
 #[test]
 fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
-    let test = "tensorboard::tensorboard_reads_what_a_run_recorded_and_continues_recording";
-    let Some(python) = python_with(test, &["tensorboard"]) else {
+    let Some(python) = python_with(&["tensorboard"]) else {
         return;
     };
     let system = system();

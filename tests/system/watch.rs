@@ -283,8 +283,7 @@ fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> 
 
 #[test]
 fn prometheus_reads_the_file_of_a_run_that_is_watched() {
-    let test = "watch::prometheus_reads_the_file_of_a_run_that_is_watched";
-    let Some(python) = python_with(test, &["prometheus_client"]) else {
+    let Some(python) = python_with(&["prometheus_client"]) else {
         return;
     };
     let system = system();

@@ -27,8 +27,8 @@ struct Guarded {
 }
 
 impl Guarded {
-    fn new(test: &str) -> Option<Self> {
-        let tls = TlsSystem::new(test)?;
+    fn new() -> Option<Self> {
+        let tls = TlsSystem::new()?;
         let server = tls.start_server(&format!("--agent driml-ada {LONG}"));
         let parts = [
             tls.start("learner --stay --run-dir run", "tls"),
@@ -59,9 +59,7 @@ impl Guarded {
 
 #[test]
 fn an_actor_asks_for_nothing_but_its_own() {
-    let Some(run) = Guarded::new("an_actor_asks_for_nothing_but_its_own") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let one = &run.tls.client(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
@@ -114,9 +112,7 @@ fn an_actor_asks_for_nothing_but_its_own() {
 /// It can neither answer in the place of others, nor publish or receive what is not for it, nor count as another process.
 #[test]
 fn an_actor_declares_nothing_but_its_own() {
-    let Some(run) = Guarded::new("an_actor_declares_nothing_but_its_own") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let one = run.tls.client(Role::Actor(1));
     let keys = &one.keys;
     let asked = Arc::<AtomicUsize>::default();
@@ -183,9 +179,7 @@ fn an_actor_declares_nothing_but_its_own() {
 
 #[test]
 fn an_observer_only_looks() {
-    let Some(run) = Guarded::new("an_observer_only_looks") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let observer = &run.tls.client(Role::Observer);
     assert!(observer.replay().is_some() && observer.learner().is_some());
     let keys = &observer.keys;
