@@ -186,40 +186,6 @@ fn an_actor_killed_and_started_again_continues() {
     learner.stop().expect_code(0);
 }
 
-/// A learner that was killed continues from its newest checkpoint, and the actors take its weights.
-#[test]
-fn a_killed_learner_s_successor_continues() {
-    let system = system();
-    let settings = "--set learner.checkpoint_period_updates=50";
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG} {settings}"));
-    let learner = system.start_learner("run");
-    let actor = system.start_actor(0);
-    let client = system.connect();
-    client.wait_for_updates(100);
-    let before = client.learner().unwrap();
-    learner.kill();
-
-    let learner = system.start_learner("run");
-    let after = client.wait_for_learner("later updates", |learner| {
-        learner.updates > before.updates && learner.weights_version > before.weights_version
-    });
-    assert!(after.updates > 100, "{after:#?}");
-    client.check_nothing_lost();
-    actor.stop().expect_code(0);
-    learner.stop().expect_code(0).expect_said("resumed after ");
-    drop(client);
-    server.stop().expect_code(0);
-
-    // What is in the folder is another run's to a run with other settings.
-    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let learner = system.start_learner("run");
-    learner
-        .wait()
-        .expect_code(1)
-        .expect_said("resume with the settings it was made with");
-    server.stop().expect_code(0);
-}
-
 /// However it is started, a process has the environment that candle and the C library read; what the user has set stays.
 #[test]
 fn a_part_by_hand_settles_its_environment() {

@@ -192,18 +192,6 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
 
-#[test]
-fn parts_end_with_their_launcher() {
-    let system = system();
-    let process = launched(&system, 100);
-    process.kill();
-    system.wait_until_all_have_ended();
-    assert!(
-        !system.run_folder("run").checkpoints().is_empty(),
-        "the learner saved"
-    );
-}
-
 /// They all notice it at once: the replay server stays until the others have delivered what they have and left.
 #[test]
 fn parts_whose_launcher_died_deliver_what_they_have() {

@@ -25,13 +25,14 @@ fn temporary(system: &TestSystem) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_killed_launcher_leaves_nothing() {
+fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     let system = system();
     let (process, parts) = started(&system);
     let segments = all_shared_memory_of(&parts);
     assert_eq!(temporary(&system).len(), 1);
     process.kill();
     system.wait_until_all_have_ended();
+    system.run_folder("run").newest_checkpoint();
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);
 }

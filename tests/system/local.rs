@@ -167,23 +167,6 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
     }
 }
 
-#[test]
-fn the_settings_that_a_run_leaves_repeat_it() {
-    let system = system();
-    system.run_ok(&format!(
-        "local --agent driml-randk {SHORT} --seed 5 --run-dir a"
-    ));
-    system.run_ok("local --config a/config.toml --run-dir b");
-    let (a, b) = (system.run_folder("a"), system.run_folder("b"));
-    assert_eq!(a.config(), b.config());
-    // Processes race, so the weights differ; the counts do not.
-    let (a, b) = (a.check_finished(), b.check_finished());
-    assert_eq!(
-        (a.frames, a.updates, a.rows_sampled),
-        (b.frames, b.updates, b.rows_sampled)
-    );
-}
-
 /// Two actors, one replay server each, and one learner: the counts are those of one replay.
 #[test]
 fn two_replay_shards_are_one_replay() {

@@ -40,6 +40,8 @@ fn seed_and_settings_decide_the_weights() {
         // And so do the settings that the first run left.
         let again = run(&system, "--config first/config.toml", "again");
         assert_eq!(first.weights_sha256, again.weights_sha256, "{flags} {own}");
+        let configs = ["first", "again"].map(|name| system.run_folder(name).config());
+        assert_eq!(configs[0], configs[1]);
     }
 }
 
@@ -95,7 +97,7 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
 #[test]
 fn a_run_that_is_prolonged_is_a_longer_one() {
     let mut runs = vec![("mspacman", "driml-ada"), ("mspacman", "rainbow")];
-    if !skipped_offline("lockstep::a_run_that_is_prolonged_is_a_longer_one (Procgen)") {
+    if !skipped_offline() {
         runs.extend([
             ("procgen:coinrun", "driml-ada"),
             ("procgen:maze", "driml-ada"),

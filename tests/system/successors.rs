@@ -45,13 +45,22 @@ fn killed_learners_cost_no_update_of_the_plan() {
     }
     system.let_go();
     let learned = client.wait_for_learner("the last update", |it| it.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     let planned = (replay.transitions_inserted - 200) * 8 / 16;
     assert_eq!(learned.updates, planned, "{replay:#?}");
     assert_eq!(replay.rows_sampled, 16 * planned);
     actor.wait().expect_code(0);
-    learner.stop().expect_code(0);
+    learner.stop().expect_code(0).expect_said("resumed after ");
     drop(client);
+    server.stop().expect_code(0);
+
+    // What is in the folder is another run's to a run with other settings.
+    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let learner = system.start_learner("run");
+    learner
+        .wait()
+        .expect_code(1)
+        .expect_said("resume with the settings it was made with");
     server.stop().expect_code(0);
 }
 
