@@ -1,7 +1,7 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
-use driml_envs::{CutFrames, FewerActions};
+use driml_envs::PartOfWorld;
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -80,23 +80,15 @@ impl Collector {
         let config = &settings.actor;
         let schedule = Schedule::new(config, life.actor)?;
         let world_seed = life.seed(spec, "world");
-        let world = settings
-            .world
-            .build(
-                config.envs as usize,
-                u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes")),
-                config.world_threads as usize,
-            )
-            .map_err(|source| ActError::NoWorld {
-                world: spec.world.clone(),
-                source,
-            })?;
+        let world_seed = u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes"));
+        let (envs, threads) = (config.envs as usize, config.world_threads as usize);
         let no_world = |source| ActError::NoWorld {
             world: spec.world.clone(),
             source,
         };
-        let world =
-            FewerActions::of(world, settings.world.actions(config.actions)).map_err(no_world)?;
+        let actions = settings.world.actions(config.actions);
+        let world = settings.world.build(envs, world_seed, threads);
+        let world = world.map_err(no_world)?;
         let shape = world.frame_shape();
         let sent = (spec.frame_height as usize, spec.frame_width as usize);
         let (whole_height, whole_width) = settings.input.whole_frame(sent);
@@ -110,17 +102,17 @@ impl Collector {
             shape.height as u32,
             shape.width as u32,
             shape.channels as u32,
-            world.num_actions() as u32,
+            actions.len() as u32,
         );
         if promised != given {
-            return Err(ActError::OtherShape {
-                world: spec.world.clone(),
-                given,
-                promised,
-            });
+            return Err(ActError::Other(format!(
+                "the world {} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \
+                 write the run's settings anew with `driml train`",
+                spec.world
+            )));
         }
         let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
-        let world = CutFrames::of(world, sent).map_err(no_world)?;
+        let world = PartOfWorld::of(world, actions, sent).map_err(no_world)?;
         let policy = NetworkPolicy::new(
             &settings.model,
             settings.input.enlarge(sent, &settings.model)?,
@@ -201,13 +193,12 @@ impl Collector {
 #[cfg(test)]
 mod tests {
     use driml_envs::{CorridorConfig, WorldConfig};
-    use driml_model::{
-        Compute, ConvLayer, DimHeads, HeadConfig, InputSize, ModelConfig, Parameters, TorsoName,
-    };
+    use driml_model::{Compute, ConvLayer, InputSize, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
     use super::*;
-    use crate::config::{Config, EpsilonLadder};
+    use crate::config::{Config, EpsilonLadder, tests::CONFIG};
+    use crate::policy::tests::model;
 
     const ENVS: u32 = 32;
     const STEPS: u32 = 32;
@@ -252,37 +243,20 @@ mod tests {
                 width: 12,
                 input_channels: 1,
                 num_actions: 3,
-                atoms: 5,
-                v_min: -1.0,
-                v_max: 1.0,
-                torso: TorsoName::Nature,
                 conv: vec![ConvLayer {
                     out: 2,
                     kernel: 4,
                     stride: 4,
                 }],
-                channels: vec![],
-                scale_blocks: false,
-                hidden: 4,
-                rkhs: 4,
-                action_embed: 4,
-                dim: DimHeads::NONE,
-                head: HeadConfig::PLAIN,
+                ..model()
             },
             actor: Config {
-                actions: driml_envs::ActionSet::All,
-                precision: driml_model::Precision::F32,
                 envs: ENVS,
                 steps_per_chunk: STEPS,
-                round_transitions_max: None,
-                chunks_in_flight_max: 1,
-                world_threads: 0,
                 epsilon_start: epsilon,
                 epsilon_end: epsilon,
                 epsilon_decay_frames: 0,
-                epsilon_ladder: None,
-                ack_timeout_ms: 1000,
-                unreachable_max_ms: 1000,
+                ..CONFIG
             },
             transport: TransportConfig {
                 shared_memory: false,
@@ -313,31 +287,20 @@ mod tests {
         let random = |life| actions(settings(1.0), life);
         let first = random(FIRST);
         assert_eq!(random(Incarnation { id: 2, ..FIRST }), first);
-        let at = |earlier_incarnations| Incarnation {
+        let at = |after_updates, earlier_incarnations| Incarnation {
+            after_updates,
             earlier_incarnations,
             ..FIRST
         };
         let lives = [
             FIRST,
-            at(1),
-            at(2),
+            at(0, 1),
+            at(0, 2),
             Incarnation { actor: 2, ..FIRST },
-            Incarnation {
-                after_updates: 7,
-                ..FIRST
-            },
-            Incarnation {
-                after_updates: 7,
-                ..at(1)
-            },
-            Incarnation {
-                after_updates: (1 << 32) + 7,
-                ..FIRST
-            },
-            Incarnation {
-                after_updates: 1 << 32,
-                ..at(1)
-            },
+            at(7, 0),
+            at(7, 1),
+            at((1 << 32) + 7, 0),
+            at(1 << 32, 1),
         ];
         let spec = settings(1.0).spec;
         let mut seen = Vec::new();

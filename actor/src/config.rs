@@ -3,9 +3,9 @@
 
 use driml_envs::{EnvError, WorldName};
 use driml_protocol::{
-    BufferPool, RunSpec, RunSpecError, TRANSITION_BYTES,
+    BufferPool, RunSpec, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
-    config::{Settings, TransportConfig},
+    config::{ConfigError, Settings, TransportConfig, check},
     transitions_max,
 };
 use serde::{Deserialize, Serialize};
@@ -127,15 +127,10 @@ impl ActorSettings {
         self.actor.validate()?;
         self.check_chunk()?;
         let longest = u64::from(envs) * u64::from(self.actor.chunk_steps(1));
-        if longest > most {
-            return Err(ConfigError {
-                key: "envs",
-                value: envs.to_string(),
-                why: "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
-                      actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)",
-            });
-        }
-        Ok(())
+        check(longest <= most, "actor.envs", envs, || {
+            "its chunks are longer than the replay server takes in this run, by the settings' actor.envs and \
+             actor.steps_per_chunk: use fewer, or start the run with more (--envs at the replay server)"
+        })
     }
 
     /// Takes the world's code from `world`, which a person on this machine has named, and not from the run's settings.
@@ -169,17 +164,14 @@ impl ActorSettings {
             ..
         } = self.actor;
         let bytes = u64::from(envs) * u64::from(steps_per_chunk) * self.transition_bytes() as u64;
-        if bytes > PAYLOAD_BYTES_MAX as u64 {
-            return Err(ConfigError {
-                key: "steps_per_chunk",
-                value: steps_per_chunk.to_string(),
-                why: "a chunk of so many steps of so many copies (actor.envs) is larger than a message may be, 512 MiB: use fewer",
-            });
-        }
-        Ok(())
+        check(
+            bytes <= PAYLOAD_BYTES_MAX as u64,
+            "actor.steps_per_chunk",
+            steps_per_chunk,
+            || "a chunk of so many steps of so many copies (actor.envs) is larger than a message may be, 512 MiB: use fewer",
+        )
     }
 
-    /// Bytes of one transition in a chunk.
     const fn transition_bytes(&self) -> usize {
         self.spec.frame_bytes() + TRANSITION_BYTES
     }
@@ -203,27 +195,12 @@ impl ActorSettings {
 /// Why a run's settings are of no use to an actor.
 #[derive(Debug, thiserror::Error)]
 pub enum SettingsError {
-    /// A table is missing or does not fit.
+    /// A table is missing or does not fit, or a value cannot work.
     #[error(transparent)]
-    Table(#[from] driml_protocol::config::ConfigError),
-    /// The run spec cannot work.
-    #[error(transparent)]
-    RunSpec(#[from] RunSpecError),
+    Config(#[from] ConfigError),
     /// The network cannot exist.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// The actor's own settings cannot work.
-    #[error(transparent)]
-    Actor(#[from] ConfigError),
-}
-
-/// Why the actor's settings cannot work.
-#[derive(Debug, thiserror::Error, PartialEq)]
-#[error("actor.{key} = {value} cannot work: {why}")]
-pub struct ConfigError {
-    key: &'static str,
-    value: String,
-    why: &'static str,
 }
 
 impl Config {
@@ -242,50 +219,38 @@ impl Config {
     /// # Errors
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let bad = |key, value: String, why| Err(ConfigError { key, value, why });
-        if !(1..=4096).contains(&self.envs) {
-            return bad(
-                "envs",
-                self.envs.to_string(),
-                "an actor steps 1 to 4096 copies",
-            );
-        }
-        if !(1..=4096).contains(&self.steps_per_chunk) {
-            return bad(
-                "steps_per_chunk",
-                self.steps_per_chunk.to_string(),
-                "a chunk has 1 to 4096 steps",
-            );
-        }
-        if !(1..=64).contains(&self.chunks_in_flight_max) {
-            return bad(
-                "chunks_in_flight_max",
-                self.chunks_in_flight_max.to_string(),
-                "1 to 64 chunks may wait",
-            );
+        let (copies, steps) = (
+            "an actor steps 1 to 4096 copies",
+            "a chunk has 1 to 4096 steps",
+        );
+        let (chunks, wait) = ("1 to 64 chunks may wait", "a wait lasts 100 ms to one day");
+        for (key, value, most, why) in [
+            ("actor.envs", self.envs, 4096, copies),
+            ("actor.steps_per_chunk", self.steps_per_chunk, 4096, steps),
+            (
+                "actor.chunks_in_flight_max",
+                self.chunks_in_flight_max,
+                64,
+                chunks,
+            ),
+        ] {
+            check((1..=most).contains(&value), key, value, || why)?;
         }
         for (key, epsilon) in [
-            ("epsilon_start", self.epsilon_start),
-            ("epsilon_end", self.epsilon_end),
+            ("actor.epsilon_start", self.epsilon_start),
+            ("actor.epsilon_end", self.epsilon_end),
         ] {
-            if !(0.0..=1.0).contains(&epsilon) {
-                return bad(
-                    key,
-                    epsilon.to_string(),
-                    "a probability lies between 0 and 1",
-                );
-            }
+            let why = "a probability lies between 0 and 1";
+            check((0.0..=1.0).contains(&epsilon), key, epsilon, || why)?;
         }
         if let Some(ladder) = &self.epsilon_ladder {
             ladder.validate()?;
         }
         for (key, ms) in [
-            ("ack_timeout_ms", self.ack_timeout_ms),
-            ("unreachable_max_ms", self.unreachable_max_ms),
+            ("actor.ack_timeout_ms", self.ack_timeout_ms),
+            ("actor.unreachable_max_ms", self.unreachable_max_ms),
         ] {
-            if !(100..=86_400_000).contains(&ms) {
-                return bad(key, ms.to_string(), "a wait lasts 100 ms to one day");
-            }
+            check((100..=86_400_000).contains(&ms), key, ms, || wait)?;
         }
         Ok(())
     }
@@ -298,62 +263,60 @@ impl EpsilonLadder {
             alpha,
             actors,
         } = *self;
-        let bad = |key, value: String, why| Err(ConfigError { key, value, why });
-        if !(base > 0.0 && base < 1.0) {
-            return bad(
-                "epsilon_ladder.base",
-                base.to_string(),
-                "the first actor's probability lies between 0 and 1, without the two",
-            );
-        }
-        if !(alpha >= 0.0 && alpha.is_finite()) {
-            return bad(
-                "epsilon_ladder.alpha",
-                alpha.to_string(),
-                "epsilons fall from actor to actor, so it is a number of at least 0",
-            );
-        }
-        if !(2..=ACTORS_MAX).contains(&actors) {
-            return bad(
-                "epsilon_ladder.actors",
-                actors.to_string(),
-                "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand",
-            );
-        }
-        Ok(())
+        check(
+            base > 0.0 && base < 1.0,
+            "actor.epsilon_ladder.base",
+            base,
+            || "the first actor's probability lies between 0 and 1, without the two",
+        )?;
+        check(
+            alpha >= 0.0 && alpha.is_finite(),
+            "actor.epsilon_ladder.alpha",
+            alpha,
+            || "epsilons fall from actor to actor, so it is a number of at least 0",
+        )?;
+        check(
+            (2..=ACTORS_MAX).contains(&actors),
+            "actor.epsilon_ladder.actors",
+            actors,
+            || "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand",
+        )
     }
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    pub(crate) const CONFIG: Config = Config {
+        actions: driml_envs::ActionSet::All,
+        precision: driml_model::Precision::F32,
+        envs: 1,
+        steps_per_chunk: 1,
+        round_transitions_max: None,
+        chunks_in_flight_max: 1,
+        world_threads: 0,
+        epsilon_start: 0.1,
+        epsilon_end: 0.01,
+        epsilon_decay_frames: 100_000,
+        epsilon_ladder: None,
+        ack_timeout_ms: 1000,
+        unreachable_max_ms: 1000,
+    };
 
     #[test]
     fn chunks_get_shorter_as_actors_get_many() {
         let config = |envs, steps_per_chunk, round_transitions_max| Config {
-            actions: driml_envs::ActionSet::All,
-            precision: driml_model::Precision::F32,
             envs,
             steps_per_chunk,
             round_transitions_max,
-            chunks_in_flight_max: 4,
-            world_threads: 0,
-            epsilon_start: 0.1,
-            epsilon_end: 0.01,
-            epsilon_decay_frames: 1,
-            epsilon_ladder: None,
-            ack_timeout_ms: 10_000,
-            unreachable_max_ms: 60_000,
+            ..CONFIG
         };
         let steps = |actors| config(16, 16, Some(1024)).chunk_steps(actors);
-        assert_eq!(
-            [0, 1, 4, 8, 16, 64, 4096].map(steps),
-            [16, 16, 16, 8, 4, 1, 1]
-        );
-        assert_eq!(
-            config(4096, 4096, Some(u64::MAX)).chunk_steps(u32::MAX),
-            4096
-        );
+        let found = [0, 1, 4, 8, 16, 64, 4096].map(steps);
+        assert_eq!(found, [16, 16, 16, 8, 4, 1, 1]);
+        let most = config(4096, 4096, Some(u64::MAX));
+        assert_eq!(most.chunk_steps(u32::MAX), 4096);
         assert_eq!(config(16, 16, None).chunk_steps(4096), 16);
     }
 }

@@ -79,8 +79,9 @@ impl NetworkPolicy {
         Ok(Self {
             network: PolicyNetwork::new(model, safetensors, precision)?,
             enlarge,
-            num_actions: u8::try_from(model.num_actions).map_err(|_| ActError::TooManyActions {
-                actions: model.num_actions,
+            num_actions: u8::try_from(model.num_actions).map_err(|_| {
+                let actions = model.num_actions;
+                ActError::Other(format!("{actions} actions: a world has at most 255"))
             })?,
             noise: false,
             deciding: Vec::new(),
@@ -154,7 +155,7 @@ impl Policy for NetworkPolicy {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use driml_model::{Compute, ConvLayer, DimHeads, HeadConfig, Parameters, TorsoName};
     use rand::SeedableRng;
 
@@ -171,8 +172,8 @@ mod tests {
         policy_with(HeadConfig::PLAIN, seed)
     }
 
-    fn policy_with(head: HeadConfig, seed: u64) -> NetworkPolicy {
-        let model = ModelConfig {
+    pub(crate) fn model() -> ModelConfig {
+        ModelConfig {
             height: 4,
             width: 4,
             input_channels: 1,
@@ -192,8 +193,12 @@ mod tests {
             rkhs: 4,
             action_embed: 4,
             dim: DimHeads::NONE,
-            head,
-        };
+            head: HeadConfig::PLAIN,
+        }
+    }
+
+    fn policy_with(head: HeadConfig, seed: u64) -> NetworkPolicy {
+        let model = ModelConfig { head, ..model() };
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         let weights = Parameters::init(&model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();

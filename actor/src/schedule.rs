@@ -87,22 +87,7 @@ fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, BeyondLadde
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const CONFIG: Config = Config {
-        actions: driml_envs::ActionSet::All,
-        precision: driml_model::Precision::F32,
-        envs: 1,
-        steps_per_chunk: 1,
-        round_transitions_max: None,
-        chunks_in_flight_max: 1,
-        world_threads: 0,
-        epsilon_start: 0.1,
-        epsilon_end: 0.01,
-        epsilon_decay_frames: 100_000,
-        epsilon_ladder: None,
-        ack_timeout_ms: 1000,
-        unreachable_max_ms: 1000,
-    };
+    use crate::config::tests::CONFIG;
 
     fn with_ladder(actors: u32) -> Config {
         Config {

@@ -38,30 +38,15 @@ pub enum WeightsError {
         /// Why the last pull failed, if it did.
         source: Option<Box<Self>>,
     },
-    /// The replay server cannot be asked.
-    #[error("asking for weights: {0}")]
-    Asking(SessionError),
     /// A request that cannot be sent, or an answer that did not come.
     #[error(transparent)]
     Session(#[from] SessionError),
     /// A piece that is damaged or not the next one, or a whole that is not what its header says.
     #[error(transparent)]
     Damaged(#[from] CodecError),
-    /// The pieces are fewer than their size says.
-    #[error("weights {version} have no last piece")]
-    Incomplete {
-        /// The version that was pulled.
-        version: u64,
-    },
-    /// Newer versions came so often that the replay server dropped this one before it was pulled.
-    #[error("weights {version} were replaced too often while they were pulled")]
-    Replaced {
-        /// The version that was pulled.
-        version: u64,
-    },
-    /// Announcements of new weights cannot be subscribed to.
-    #[error("listening for new weights: {0}")]
-    Listening(zenoh::Error),
+    /// Pieces that are missing or of another version, or announcements that cannot be heard.
+    #[error("{0}")]
+    Failed(String),
     /// The system starts no thread.
     #[error(transparent)]
     NoThread(#[from] std::io::Error),
@@ -116,7 +101,6 @@ impl NewestWeights {
         state.slot.take()
     }
 
-    /// Takes note of newer weights.
     fn announce(&self, version: u64) {
         let mut state = self.state();
         state.announced = state.announced.max(version);
@@ -212,7 +196,7 @@ impl WeightsSource {
         let announcements = self
             .client
             .subscribe(on_announcement)
-            .map_err(WeightsError::Listening)?;
+            .map_err(|e| WeightsError::Failed(format!("listening for new weights: {e}")))?;
         let slot = newest.clone();
         let work = move || {
             // For as long as the thread lives.
@@ -273,24 +257,21 @@ impl WeightsSource {
             {
                 asked.push_back(self.ask(request)?);
             }
-            let Some(next) = asked.pop_front() else {
-                return Err(WeightsError::Incomplete {
-                    version: weights.version,
-                });
+            let failed = |what: &str| {
+                let version = weights.version;
+                WeightsError::Failed(format!("weights {version} {what}"))
             };
-            match next.receive(&pool)? {
-                (
-                    WeightsReply::Piece {
-                        weights, offset, ..
-                    },
-                    piece,
-                ) => assembly.take(weights, offset, &piece)?,
-                _ => {
-                    return Err(WeightsError::Replaced {
-                        version: weights.version,
-                    });
-                }
-            }
+            let next = asked.pop_front();
+            let next = next.ok_or_else(|| failed("have no last piece"))?;
+            let (reply, piece) = next.receive(&pool)?;
+            // Newer versions came so often that the replay server dropped this one.
+            let WeightsReply::Piece {
+                weights, offset, ..
+            } = reply
+            else {
+                return Err(failed("were replaced too often while they were pulled"));
+            };
+            assembly.take(weights, offset, &piece)?;
         }
         Ok(Some(assembly.finish()?))
     }
@@ -299,7 +280,7 @@ impl WeightsSource {
         let request = self.client.seal(&request)?;
         self.client
             .send(request, PIECE_TIMEOUT)
-            .map_err(WeightsError::Asking)
+            .map_err(|e| WeightsError::Failed(format!("asking for weights: {e}")))
     }
 }
 

@@ -3,7 +3,7 @@
 
 use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
-    RunSpec, RunSpecError, Sampling,
+    RunSpec, Sampling,
     config::{Settings, TransportConfig},
 };
 use rand_chacha::ChaCha8Rng;
@@ -230,12 +230,9 @@ impl Config {
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnerConfigError {
-    /// Not TOML, or a table that is missing or does not fit.
+    /// Not TOML, a table that is missing or does not fit, or what all processes agree on cannot work.
     #[error(transparent)]
     Tables(#[from] driml_protocol::config::ConfigError),
-    /// What all processes agree on cannot work.
-    #[error(transparent)]
-    Spec(#[from] RunSpecError),
     /// The network cannot exist.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),

@@ -155,8 +155,7 @@ impl RunClient {
     }
 
     fn too_large<R: Request>(&self, why: CodecError) -> SessionError {
-        let key = self.keys.of::<R>();
-        SessionError::TooLarge { key, why }
+        SessionError::Failed(format!("{}: {why}", self.keys.of::<R>()))
     }
 
     /// Sends a request; requests of one priority arrive in the order in which they were sent.

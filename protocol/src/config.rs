@@ -1,25 +1,36 @@
-//! How a process finds its own tables in the run's resolved settings.
+//! How a process finds its own tables in the run's resolved settings, and how it says that a value cannot work.
 //! It does not know what the tables hold: each crate has its Config.
+
+use std::fmt::Display;
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-/// Why settings were refused.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The text is not TOML.
-    #[error("the settings are not valid TOML: {0}")]
-    Syntax(String),
-    /// A table is missing.
-    #[error("the settings have no [{0}] table: use a config.toml that driml wrote, or a preset")]
-    Missing(&'static str),
-    /// A table does not fit.
-    #[error("in the settings' [{table}] table: {why}")]
-    Table {
-        /// The table's name.
-        table: &'static str,
-        /// What is wrong.
-        why: String,
-    },
+/// Why settings were refused: which, what they are, and what to do.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ConfigError(String);
+
+impl ConfigError {
+    /// The value of a key, which is a path with its table, cannot work; `why` says what is wrong and what to do.
+    pub fn of(key: &str, value: impl Display, why: impl Display) -> Self {
+        Self(format!("{key} = {value} cannot work: {why}"))
+    }
+}
+
+/// Checks what must be so for the value of a key; if it is not, that is a [`ConfigError::of`] it.
+///
+/// # Errors
+/// It is not so.
+pub fn check<W: Display>(
+    is_so: bool,
+    key: &str,
+    value: impl Display,
+    why: impl FnOnce() -> W,
+) -> Result<(), ConfigError> {
+    match is_so {
+        true => Ok(()),
+        false => Err(ConfigError::of(key, value, why())),
+    }
 }
 
 /// What is wrong with a table, and at which of its keys, in one line.
@@ -46,10 +57,8 @@ impl Settings {
     /// # Errors
     /// Text that is not TOML.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let table = text
-            .parse::<toml::Table>()
-            .map_err(|e| ConfigError::Syntax(e.to_string()))?;
-        Ok(Self(table))
+        let why = |e: toml::de::Error| ConfigError(format!("the settings are not valid TOML: {e}"));
+        text.parse().map(Self).map_err(why)
     }
 
     /// Reads one table; unknown keys, missing keys and wrong types are refused by the type.
@@ -57,10 +66,14 @@ impl Settings {
     /// # Errors
     /// No such table, or one that does not fit `T`.
     pub fn table<T: DeserializeOwned>(&self, name: &'static str) -> Result<T, ConfigError> {
-        let value = self.0.get(name).ok_or(ConfigError::Missing(name))?;
-        let why = |e: toml::de::Error| ConfigError::Table {
-            table: name,
-            why: in_words(&e),
+        let missing = || {
+            ConfigError(format!(
+                "the settings have no [{name}] table: use a config.toml that driml wrote, or a preset"
+            ))
+        };
+        let value = self.0.get(name).ok_or_else(missing)?;
+        let why = |e: toml::de::Error| {
+            ConfigError(format!("in the settings' [{name}] table: {}", in_words(&e)))
         };
         value.clone().try_into().map_err(why)
     }

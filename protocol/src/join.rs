@@ -30,7 +30,6 @@ const TAKEN_MAX: Duration = Duration::from_secs(45);
 const SILENT_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its reply.
 const TRY_MAX: Duration = Duration::from_secs(2);
-/// Pause between two tries.
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a process could not join a run.
@@ -45,18 +44,9 @@ pub enum JoinError {
     /// An answer that cannot be read.
     #[error("the replay server's greeting: {0}")]
     Codec(#[from] CodecError),
-    /// Another process has the same role.
-    #[error("{why}, and has not ended within {} s", TAKEN_MAX.as_secs())]
-    Taken {
-        /// Who, and what to do.
-        why: String,
-    },
-    /// The replay server says no.
-    #[error("the replay server refuses: {why}")]
-    Refused {
-        /// The replay server's reason, a sentence.
-        why: String,
-    },
+    /// Another process has the same role and does not end, or the replay server refuses.
+    #[error("{0}")]
+    Refused(String),
 }
 
 /// What the replay server tells a process that it admits.
@@ -109,7 +99,6 @@ pub fn hello_within(
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
 struct Patience {
-    /// When the wait for an answer began.
     silent_since: Instant,
     silence_said: Seldom,
     recovery_said: Seldom,
@@ -207,10 +196,15 @@ fn take_part(
                     earlier_incarnations,
                 }));
             }
-            Ok(JoinReply::Refused { why }) => return Err(JoinError::Refused { why }),
+            Ok(JoinReply::Refused { why }) => {
+                let why = format!("the replay server refuses: {why}");
+                return Err(JoinError::Refused(why));
+            }
             Ok(JoinReply::Taken { why }) => match taken_since {
                 Some(since) if Instant::now() - since > TAKEN_MAX => {
-                    return Err(JoinError::Taken { why });
+                    let seconds = TAKEN_MAX.as_secs();
+                    let why = format!("{why}, and has not ended within {seconds} s");
+                    return Err(JoinError::Refused(why));
                 }
                 Some(_) => {}
                 None => {

@@ -72,8 +72,8 @@ pub use process::{
     whole_file,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
-pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, RunSpecError, TimeoutRule};
-pub use sampling::{Sampling, SamplingError};
+pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, TimeoutRule};
+pub use sampling::Sampling;
 pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},

@@ -16,59 +16,19 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(1)
 /// How long a foreign server may take to send its first bytes.
 const SAYS_MAX: Duration = Duration::from_secs(1);
 
-/// Why an endpoint cannot be reached.
+/// Why an endpoint cannot be reached, and what to do.
 #[derive(Debug, thiserror::Error)]
-pub enum Unreachable {
-    /// No such host.
-    #[error(
-        "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
-    )]
-    HostUnknown {
-        /// The endpoint as it was given.
-        endpoint: String,
-        /// What the system said.
-        why: String,
-        /// It may be otherwise in a moment.
-        is_temporary: bool,
-    },
-    /// The machine is there, and nothing listens at the port.
-    #[error(
-        "nothing listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
-         reached with quic/HOST:PORT, which is UDP, and --tls-dir"
-    )]
-    Refused {
-        /// The endpoint as it was given.
-        endpoint: String,
-    },
-    /// No socket of this name.
-    #[error(
-        "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
-    )]
-    NoSocket {
-        /// The endpoint as it was given.
-        endpoint: String,
-        /// What is there instead.
-        what: &'static str,
-    },
-    /// Whatever else the system says.
-    #[error(
-        "{endpoint} does not answer ({why}): is its machine up, is the address right, and does a firewall let this port through?"
-    )]
-    Silent {
-        /// The endpoint as it was given.
-        endpoint: String,
-        /// What the system said.
-        why: std::io::Error,
-    },
+#[error("{said}")]
+pub struct Unreachable {
+    said: String,
+    /// It makes sense to try again in a moment, as the replay server may be starting.
+    may_pass: bool,
 }
 
 impl Unreachable {
-    /// Whether it makes sense to try again in a moment, as the replay server may be starting.
-    const fn may_pass(&self) -> bool {
-        match self {
-            Self::HostUnknown { is_temporary, .. } => *is_temporary,
-            Self::Refused { .. } | Self::NoSocket { .. } | Self::Silent { .. } => true,
-        }
+    const fn for_now(said: String) -> Self {
+        let may_pass = true;
+        Self { said, may_pass }
     }
 }
 
@@ -84,12 +44,12 @@ pub fn look(endpoint: &str) -> Result<(), Unreachable> {
             let address = address.split('#').next().unwrap_or(address);
             let addresses = address.to_socket_addrs().map_err(|e| {
                 let why = e.to_string();
-                let why = why.rsplit(": ").next().unwrap_or(&why).to_owned();
-                Unreachable::HostUnknown {
-                    endpoint: endpoint.into(),
-                    is_temporary: why.contains("emporary"),
-                    why,
-                }
+                let why = why.rsplit(": ").next().unwrap_or(&why);
+                let said = format!(
+                    "the host of {endpoint} is unknown: {why}. Correct the name, or take the machine's address"
+                );
+                let may_pass = why.contains("emporary");
+                Unreachable { said, may_pass }
             })?;
             if protocol != "tcp" {
                 return Ok(());
@@ -110,11 +70,15 @@ pub fn look(endpoint: &str) -> Result<(), Unreachable> {
 }
 
 fn of_error(endpoint: &str, e: std::io::Error) -> Unreachable {
-    let endpoint = endpoint.to_owned();
-    match e.kind() {
-        ErrorKind::ConnectionRefused => Unreachable::Refused { endpoint },
-        _ => Unreachable::Silent { endpoint, why: e },
-    }
+    Unreachable::for_now(match e.kind() {
+        ErrorKind::ConnectionRefused => format!(
+            "nothing listens on {endpoint}: start the replay server first, with this --listen, or correct the port. One with --tls-dir is \
+             reached with quic/HOST:PORT, which is UDP, and --tls-dir"
+        ),
+        _ => format!(
+            "{endpoint} does not answer ({e}): is its machine up, is the address right, and does a firewall let this port through?"
+        ),
+    })
 }
 
 fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
@@ -126,10 +90,9 @@ fn look_at_socket(endpoint: &str, path: PathBuf) -> Result<(), Unreachable> {
         }
         Err(e) => return Err(of_error(endpoint, e)),
     };
-    Err(Unreachable::NoSocket {
-        endpoint: endpoint.into(),
-        what,
-    })
+    Err(Unreachable::for_now(format!(
+        "nothing listens on {endpoint}: {what}. Start the replay server first, on this machine and with this --listen, or correct the path"
+    )))
 }
 
 /// Waits until something accepts connections at one of `endpoints`.
@@ -147,7 +110,7 @@ pub(crate) fn wait_for_any(endpoints: &[String], wait_max: Duration) -> Result<(
         let Some(e) = failed else {
             return Ok(());
         };
-        if !e.may_pass() || started.elapsed() + pause > wait_max {
+        if !e.may_pass || started.elapsed() + pause > wait_max {
             return Err(e);
         }
         if started.elapsed() > TRY_MAX && !std::mem::replace(&mut said, true) {

@@ -16,7 +16,6 @@ use crate::{
 const PERIOD: Duration = Duration::from_secs(2);
 /// How often it looks whether something has.
 const TICK: Duration = Duration::from_millis(250);
-/// How long one report may take.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Tells the replay servers of `clients` once that `who`, the learner, has finished the run after so many

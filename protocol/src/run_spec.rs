@@ -4,7 +4,10 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::wire::codec;
+use crate::{
+    config::{ConfigError, check},
+    wire::codec,
+};
 
 /// Version of the fields below, for their hash. It is not the protocol's: messages may change while checkpoints stay good.
 const FIELDS: u16 = 1;
@@ -103,15 +106,6 @@ pub struct RunSpec {
     pub timeout: TimeoutRule,
 }
 
-/// Why a run spec cannot work.
-#[derive(Debug, thiserror::Error, PartialEq)]
-#[error("run.{key} = {value} cannot work: {why}")]
-pub struct RunSpecError {
-    key: &'static str,
-    value: String,
-    why: &'static str,
-}
-
 impl RunSpec {
     /// Bytes of one frame as it travels: neither stacked nor enlarged.
     pub const fn frame_bytes(&self) -> usize {
@@ -144,55 +138,31 @@ impl RunSpec {
     ///
     /// # Errors
     /// The first field that cannot work, and why.
-    pub fn validate(&self) -> Result<(), RunSpecError> {
-        let bad = |key, value: String, why| Err(RunSpecError { key, value, why });
-        let sides = [
-            ("frame_height", self.frame_height, 4096),
-            ("frame_width", self.frame_width, 4096),
-            ("frame_channels", self.frame_channels, 16),
-            ("frame_stack", self.frame_stack, FRAME_STACK_MAX),
-        ];
-        for (key, value, max) in sides {
-            if value == 0 || value > max {
-                return bad(
-                    key,
-                    value.to_string(),
-                    "it must be at least 1 and of a sensible size",
-                );
-            }
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        for (key, value, max) in [
+            ("run.frame_height", self.frame_height, 4096),
+            ("run.frame_width", self.frame_width, 4096),
+            ("run.frame_channels", self.frame_channels, 16),
+            ("run.frame_stack", self.frame_stack, FRAME_STACK_MAX),
+        ] {
+            let why = "it must be at least 1 and of a sensible size";
+            check((1..=max).contains(&value), key, value, || why)?;
         }
-        if self.num_actions == 0 || self.num_actions > 255 {
-            return bad(
-                "num_actions",
-                self.num_actions.to_string(),
-                "a world has 1 to 255 actions",
-            );
-        }
-        if self.n_step == 0 || self.n_step > 1000 {
-            return bad(
-                "n_step",
-                self.n_step.to_string(),
-                "a return spans 1 to 1000 steps",
-            );
-        }
-        if !(0.0..=1.0).contains(&self.gamma) {
-            return bad(
-                "gamma",
-                self.gamma.to_string(),
-                "a discount lies between 0 and 1",
-            );
-        }
-        let k_max = self.horizon.k_max();
-        if self.horizon != Horizon::None && (k_max == 0 || k_max > 1000) {
-            return bad("horizon", k_max.to_string(), "k lies between 1 and 1000");
-        }
-        if self.horizon.positives() > POSITIVES_MAX {
-            return bad(
-                "horizon",
-                k_max.to_string(),
-                "a row carries at most 32 positives",
-            );
-        }
-        Ok(())
+        let (actions, n_step, gamma) = (self.num_actions, self.n_step, self.gamma);
+        let fits = (1..=255).contains(&actions);
+        let why = "a world has 1 to 255 actions";
+        check(fits, "run.num_actions", actions, || why)?;
+        let fits = (1..=1000).contains(&n_step);
+        let why = "a return spans 1 to 1000 steps";
+        check(fits, "run.n_step", n_step, || why)?;
+        let fits = (0.0..=1.0).contains(&gamma);
+        let why = "a discount lies between 0 and 1";
+        check(fits, "run.gamma", gamma, || why)?;
+        let (horizon, k_max) = (self.horizon, self.horizon.k_max());
+        let fits = horizon == Horizon::None || (1..=1000).contains(&k_max);
+        check(fits, "run.horizon", k_max, || "k lies between 1 and 1000")?;
+        let fits = horizon.positives() <= POSITIVES_MAX;
+        let why = "a row carries at most 32 positives";
+        check(fits, "run.horizon", k_max, || why)
     }
 }

@@ -2,14 +2,14 @@
 //! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
 
 use driml_protocol::{
-    BatchHeader, RunSpec, RunSpecError, Sampling, SamplingError, TRANSITION_BYTES,
+    BatchHeader, RunSpec, Sampling, TRANSITION_BYTES,
     codec::PAYLOAD_BYTES_MAX,
+    config::{ConfigError, check},
 };
 use serde::{Deserialize, Serialize};
 
 use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
 
-/// Most shards of one replay.
 pub(crate) const SHARDS_MAX: u32 = 256;
 
 /// Smallest segment of a replay that is kept on disk.
@@ -81,48 +81,9 @@ pub struct Since {
     pub updates: u64,
 }
 
-/// Why settings were refused.
-#[derive(Debug, thiserror::Error, PartialEq)]
-pub enum ConfigError {
-    /// One key's value cannot work.
-    #[error("{key} = {value} cannot work: {why}")]
-    Key {
-        /// The key, with its table.
-        key: &'static str,
-        /// The value that it has.
-        value: String,
-        /// What is wrong and what to do.
-        why: String,
-    },
-    /// The run spec cannot work.
-    #[error(transparent)]
-    RunSpec(#[from] RunSpecError),
-}
-
-impl From<SamplingError> for ConfigError {
-    fn from(SamplingError { key, value, why }: SamplingError) -> Self {
-        let why = why.into();
-        Self::Key { key, value, why }
-    }
-}
-
 /// Environment steps that must follow an anchor in its stream, unless its episode ends before: max(n_step, k_max).
 pub(crate) fn reach(spec: &RunSpec) -> u32 {
     spec.n_step.max(spec.horizon.k_max())
-}
-
-/// Checks what must be so for the value of a key; if it is not, `why` says what is wrong and what to do.
-fn check(
-    is_so: bool,
-    key: &'static str,
-    value: impl ToString,
-    why: impl FnOnce() -> String,
-) -> Result<(), ConfigError> {
-    if is_so {
-        return Ok(());
-    }
-    let (value, why) = (value.to_string(), why());
-    Err(ConfigError::Key { key, value, why })
 }
 
 impl Config {
@@ -157,9 +118,12 @@ impl Config {
         let (ratio, capacity) = (self.replay_ratio, self.capacity_transitions);
         let (warmup, slack) = (self.warmup_transitions, self.slack_transitions);
         let is_ratio = ratio.is_finite() && ratio > 0.0;
-        check(is_ratio, "replay.replay_ratio", ratio, || {
-            "rows per transition must be a number above 0".into()
-        })?;
+        check(
+            is_ratio,
+            "replay.replay_ratio",
+            ratio,
+            || "rows per transition must be a number above 0",
+        )?;
         self.sampling.validate()?;
         let rows_max = rows_max(spec, &self.sampling);
         let fits = (1..=rows_max).contains(&batch_size);
@@ -179,14 +143,20 @@ impl Config {
         })?;
         let bytes = capacity.checked_mul(spec.frame_bytes() as u64);
         let fits = bytes.is_some_and(|bytes| bytes <= isize::MAX as u64);
-        check(fits, "replay.capacity_transitions", capacity, || {
-            "this many frames exceed any machine's address space; hold fewer".into()
-        })?;
+        check(
+            fits,
+            "replay.capacity_transitions",
+            capacity,
+            || "this many frames exceed any machine's address space; hold fewer",
+        )?;
         if let Some(max) = self.compressed_bytes_max {
             let key = "replay.compressed_bytes_max";
-            check(self.compression != Compression::None, key, max, || {
-                "nothing is compressed; use compression = \"lz4\", or capacity_transitions".into()
-            })?;
+            check(
+                self.compression != Compression::None,
+                key,
+                max,
+                || "nothing is compressed; use compression = \"lz4\", or capacity_transitions",
+            )?;
             let least = compressed_bytes_least(window, spec.frame_bytes()) * u64::from(self.shards);
             check(max >= least, key, max, || {
                 format!(

@@ -68,7 +68,7 @@ mod sampling;
 mod service;
 mod storage;
 
-pub use config::{Compression, Config, ConfigError, Since};
+pub use config::{Compression, Config, Since};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
 pub use rate_limiter::RateLimiter;

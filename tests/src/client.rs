@@ -31,22 +31,56 @@ pub struct Client {
     pub config_toml: String,
 }
 
+const NOTHING: Tally = Tally {
+    inserted: 0,
+    rows_sampled: 0,
+};
+
+/// A session with the process that listens at an endpoint.
+///
+/// # Panics
+/// At the deadline.
+pub fn connect(endpoint: &str) -> Session {
+    let deadline = Instant::now() + DEADLINE;
+    let endpoints = Endpoints {
+        listen: Vec::new(),
+        connect: vec![endpoint.to_owned()],
+    };
+    // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+    loop {
+        match session::open(&endpoints) {
+            Ok(session) => return session,
+            Err(e) => assert!(Instant::now() < deadline, "{e}"),
+        }
+    }
+}
+
+/// A session that listens at an endpoint, in the place of a replay server.
+pub fn listen(endpoint: &str) -> Session {
+    session::open(&Endpoints {
+        listen: vec![endpoint.to_owned()],
+        connect: Vec::new(),
+    })
+    .unwrap()
+}
+
 /// How a learner joins that has learned nothing yet.
 pub const fn new_learner(learner: u64) -> LearnerJoin {
     LearnerJoin {
         learner,
         run: learner,
         updates: 0,
-        tally: Tally {
-            inserted: 0,
-            rows_sampled: 0,
-        },
-        other_shards: Tally {
-            inserted: 0,
-            rows_sampled: 0,
-        },
+        tally: NOTHING,
+        other_shards: NOTHING,
         restart: false,
     }
+}
+
+/// Checks that no transition was lost or stored twice.
+#[track_caller]
+pub fn check_nothing_lost(replay: &ReplayStatus) {
+    let wrong = (replay.transitions_lost, replay.transitions_duplicated);
+    assert_eq!(wrong, (0, 0), "{replay:#?}");
 }
 
 impl Client {
@@ -73,19 +107,7 @@ impl Client {
     /// # Panics
     /// At the deadline.
     pub fn join(endpoint: &str) -> Self {
-        let deadline = Instant::now() + DEADLINE;
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
-        };
-        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-        let session = loop {
-            match session::open(&endpoints) {
-                Ok(session) => break session,
-                Err(e) => assert!(Instant::now() < deadline, "{e}"),
-            }
-        };
-        Self::over(session)
+        Self::over(connect(endpoint))
     }
 
     /// Sends bytes and gives the bytes of the answer.
@@ -143,6 +165,20 @@ impl Client {
         wait_for(what, || self.learner().filter(&wanted))
     }
 
+    /// Waits until the learner has made more than so many updates.
+    pub fn wait_for_updates(&self, updates: u64) -> LearnerStatus {
+        let what = format!("more than {updates} updates");
+        self.wait_for_learner(&what, |learner| learner.updates > updates)
+    }
+
+    /// The replay server's status, of which [`check_nothing_lost`] holds.
+    #[track_caller]
+    pub fn check_nothing_lost(&self) -> ReplayStatus {
+        let replay = self.replay().unwrap();
+        check_nothing_lost(&replay);
+        replay
+    }
+
     /// Takes part as an actor; its chunks are of this `incarnation`.
     ///
     /// # Panics
@@ -164,7 +200,13 @@ impl Client {
 
     /// Sends a chunk as an actor would.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
-        self.insert_bytes(chunk.header.actor, sealed(chunk, self.spec.hash()))
+        self.insert_bytes(chunk.header.actor, self.seal(chunk))
+    }
+
+    /// A chunk's bytes as a process of the run would send them.
+    pub fn seal(&self, chunk: &Chunk) -> Vec<u8> {
+        let (head, payload) = chunk.seal(self.spec.hash()).unwrap();
+        [&head, payload].concat()
     }
 
     /// Sends bytes to the place where the chunks of `actor` go.
@@ -177,13 +219,6 @@ impl Client {
             .expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }
-}
-
-/// A chunk's bytes as a process of the run with this hash would send them.
-fn sealed(chunk: &Chunk, spec_hash: u64) -> Vec<u8> {
-    let (mut bytes, payload) = chunk.seal(spec_hash).unwrap();
-    bytes.extend_from_slice(payload);
-    bytes
 }
 
 impl Drop for Client {

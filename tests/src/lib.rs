@@ -19,10 +19,10 @@ mod system;
 mod waiting;
 
 pub use certificates::{Certificates, Valid, skipped_without_openssl};
-pub use client::{Client, new_learner};
+pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
 pub use network::Network;
 pub use process::{Ended, Process};
-pub use run_folder::{EpisodeRow, RunFolder, Summary};
+pub use run_folder::{EpisodeRow, RunFolder, Summary, updates_of};
 pub use skipped::{note, skip, skipped_offline};
 pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};

@@ -33,8 +33,8 @@ fn check(what: &str, said: std::io::Result<Output>) -> Result<(), String> {
 }
 
 impl Network {
-    /// A network of these machines; none, and the `test` is skipped by name, where this process may not make one.
-    pub fn new(test: &str, machines: &[&str]) -> Option<Self> {
+    /// A network of these machines; none, and the test is skipped by name, where this process may not make one.
+    pub fn new(machines: &[&str]) -> Option<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let network = Self {
@@ -45,7 +45,7 @@ impl Network {
         match network.build() {
             Ok(()) => Some(network),
             Err(why) => {
-                skip(test, &format!("no network namespaces: {why}"));
+                skip(&format!("no network namespaces: {why}"));
                 None
             }
         }

@@ -156,6 +156,12 @@ impl Process {
         assert_eq!(self.wait().signal, Some(Signal::SIGKILL as i32));
     }
 
+    /// Sends it what Ctrl-C does and waits for its end.
+    pub fn interrupt(self) -> Ended {
+        self.signal(Signal::SIGINT);
+        self.wait()
+    }
+
     /// Asks it to stop and waits for its end.
     pub fn stop(self) -> Ended {
         self.signal(Signal::SIGTERM);
@@ -203,11 +209,19 @@ impl Ended {
     /// If it does not, with what it holds.
     #[track_caller]
     pub fn expect_said(self, words: &str) -> Self {
-        assert!(
-            self.stderr.contains(words),
-            "wanted {words:?} on stderr, found:\n{}",
-            self.stderr
-        );
+        let said = &self.stderr;
+        assert!(said.contains(words), "wanted {words:?} in:\n{said}");
+        self
+    }
+
+    /// Checks that standard output holds `words`.
+    ///
+    /// # Panics
+    /// If it does not, with what it holds.
+    #[track_caller]
+    pub fn expect_printed(self, words: &str) -> Self {
+        let said = &self.stdout;
+        assert!(said.contains(words), "wanted {words:?} in:\n{said}");
         self
     }
 }

@@ -7,8 +7,8 @@ use crate::skipped::skip;
 /// The variable that names the Python to take; without it `python3` is tried.
 const VARIABLE: &str = "DRIML_TEST_PYTHON";
 
-/// A Python that finds all these modules; none, and a line on stderr that names `test`, if there is none.
-pub fn python_with(test: &str, modules: &[&str]) -> Option<String> {
+/// A Python that finds all these modules; none, and a line on stderr that names the test, if there is none.
+pub fn python_with(modules: &[&str]) -> Option<String> {
     let python = std::env::var(VARIABLE).unwrap_or_else(|_| "python3".into());
     let find = "import importlib.util, sys; sys.exit(any(importlib.util.find_spec(m) is None for m in sys.argv[1:]))";
     let found = Command::new(&python)
@@ -19,13 +19,10 @@ pub fn python_with(test: &str, modules: &[&str]) -> Option<String> {
     if found.is_ok_and(|status| status.success()) {
         return Some(python);
     }
-    skip(
-        test,
-        &format!(
-            "{python} has not all of {}: name one that has with {VARIABLE}",
-            modules.join(", ")
-        ),
-    );
+    skip(&format!(
+        "{python} has not all of {}: name one that has with {VARIABLE}",
+        modules.join(", ")
+    ));
     None
 }
 

@@ -10,6 +10,8 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
+use crate::waiting::wait_for;
+
 /// The counts of `summary.json` that every run has.
 #[derive(Clone, Debug, Deserialize)]
 #[allow(
@@ -68,6 +70,13 @@ pub struct RunFolder {
     path: PathBuf,
 }
 
+/// Updates that a checkpoint's folder says it has.
+pub fn updates_of(checkpoint: &Path) -> u64 {
+    let name = checkpoint.file_name().unwrap().to_str().unwrap();
+    let updates = name.strip_prefix("checkpoint-").unwrap();
+    updates.parse().unwrap()
+}
+
 impl RunFolder {
     pub(crate) const fn new(path: PathBuf) -> Self {
         Self { path }
@@ -117,6 +126,24 @@ impl RunFolder {
         let text = fs::read_to_string(self.path.join("metrics.csv")).ok()?;
         let row = text.get(..text.rfind('\n')?)?.lines().skip(1).last()?;
         row.split(',').nth(2)?.parse().ok()
+    }
+
+    /// Waits until the metrics have a row with more than so many updates.
+    pub fn wait_for_updates(&self, updates: u64) {
+        wait_for(&format!("a row with more than {updates} updates"), || {
+            self.updates_recorded().filter(|&it| it > updates)
+        });
+    }
+
+    /// The cells of one column of `metrics.csv`.
+    #[track_caller]
+    pub fn column(&self, name: &str) -> Vec<String> {
+        let (header, rows) = self.metrics();
+        let at = header.iter().position(|it| it == name);
+        let at = at.unwrap_or_else(|| panic!("{name} is not in {header:?}"));
+        rows.into_iter()
+            .map(|mut row| row.swap_remove(at))
+            .collect()
     }
 
     /// The rows of `episodes.csv`.
@@ -187,16 +214,21 @@ impl RunFolder {
         paths
     }
 
+    /// The newest checkpoint.
+    pub fn newest_checkpoint(&self) -> PathBuf {
+        self.checkpoints().pop().expect("there is a checkpoint")
+    }
+
+    /// Updates of the newest checkpoint.
+    pub fn saved_updates(&self) -> u64 {
+        updates_of(&self.newest_checkpoint())
+    }
+
     /// SHA-256 of the newest checkpoint's weights as actors get them: torso and head alone, as a safetensors file.
     ///
     /// Computed from the file's own tensors, by the safetensors library alone.
     pub fn checkpoint_sha256(&self) -> String {
-        let path = self
-            .checkpoints()
-            .pop()
-            .expect("there is a checkpoint")
-            .join("online.safetensors");
-        let bytes = fs::read(path).unwrap();
+        let bytes = fs::read(self.newest_checkpoint().join("online.safetensors")).unwrap();
         let tensors = SafeTensors::deserialize(&bytes).unwrap();
         let published = tensors.iter().filter(|(name, _)| !name.starts_with("dim."));
         let file = safetensors::serialize(published, None).unwrap();
@@ -241,19 +273,12 @@ impl RunFolder {
         self.check_episodes(&summary);
 
         let (header, rows) = self.metrics();
-        assert!(
-            rows.iter().all(|row| row.len() == header.len()),
-            "{header:?}\n{rows:?}"
-        );
-        let column = |name: &str| {
-            header
-                .iter()
-                .position(|it| it == name)
-                .unwrap_or_else(|| panic!("no column {name}"))
-        };
-        let last = rows.last().expect("there is a row");
-        assert_eq!(last[column("frames")], summary.frames.to_string());
-        assert_eq!(last[column("updates")], summary.updates.to_string());
+        let is_whole = rows.iter().all(|row| row.len() == header.len());
+        assert!(is_whole, "{header:?}\n{rows:?}");
+        for (column, count) in [("frames", summary.frames), ("updates", summary.updates)] {
+            let last = self.column(column).pop().expect("there is a row");
+            assert_eq!(last, count.to_string(), "{column}");
+        }
 
         assert_eq!(
             self.checkpoint_sha256(),

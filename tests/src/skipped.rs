@@ -1,13 +1,15 @@
 //! Tests that are skipped for want of something, each by name.
 //! It looks for nothing but what the environment says.
 
-use std::io::Write;
+use std::{io::Write, thread};
 
-/// Says on stderr that `test` is skipped, and why.
+/// Says on stderr that the test of this thread is skipped, and why.
 ///
 /// The line does not go through `eprintln!`, whose output the test runner keeps to itself when a test passes.
-pub fn skip(test: &str, why: &str) {
-    note(&format!("skipped: {test} ({why})"));
+pub fn skip(why: &str) {
+    let test = thread::current();
+    let name = test.name().unwrap_or("a test");
+    note(&format!("skipped: {name} ({why})"));
 }
 
 /// Says a line on stderr, past the test runner.
@@ -17,12 +19,12 @@ pub fn note(line: &str) {
         .expect("stderr is there while tests run");
 }
 
-/// Whether `test`, which needs Procgen's engine, is to be skipped; a line on stderr then names it.
-pub fn skipped_offline(test: &str) -> bool {
+/// Whether a test that needs Procgen's engine is to be skipped; a line on stderr then names it.
+pub fn skipped_offline() -> bool {
     let offline =
         std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0");
     if offline {
-        skip(test, "DRIML_OFFLINE=1");
+        skip("DRIML_OFFLINE=1");
     }
     offline
 }

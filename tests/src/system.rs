@@ -138,6 +138,18 @@ impl TestSystem {
         self.start(args).wait()
     }
 
+    /// Runs the program to its end, which must be a success.
+    #[track_caller]
+    pub fn run_ok(&self, args: &str) -> Ended {
+        self.run(args).expect_code(0)
+    }
+
+    /// Runs the program to its end, which must be that of a wrong configuration, with `words` on standard error.
+    #[track_caller]
+    pub fn refuses(&self, args: &str, words: &str) -> Ended {
+        self.run(args).expect_code(64).expect_said(words)
+    }
+
     /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
     pub fn start_part(&self, args: &str) -> Process {
         let parent = std::process::id();

@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_protocol::Waiting;
-use driml_tests::Process;
+use driml_tests::{Process, check_nothing_lost};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -48,7 +48,7 @@ fn parts_find_each_other_and_end_in_order() {
         .expect_code(0)
         .expect_said("finished after 540 updates");
     // Its folder is as good as a launched run's for an evaluation.
-    system.run("evaluate --run run --episodes 5").expect_code(0);
+    system.run_ok("evaluate --run run --episodes 5");
     drop(client);
     server
         .stop()
@@ -88,7 +88,7 @@ fn parts_end_by_themselves_when_the_run_is_over() {
             part.wait().expect_code(0);
         }
         assert_eq!(system.survivors(), []);
-        system.run("evaluate --run run --episodes 2").expect_code(0);
+        system.run_ok("evaluate --run run --episodes 2");
     }
 }
 
@@ -123,17 +123,14 @@ fn parts_that_are_told_to_stop_lose_nothing() {
         actor.wait_for_stderr("steps 4 copies");
     }
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
 
     for actor in actors {
         actor.stop().expect_code(0).expect_said("leaves: ");
     }
     let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     assert!(
         learner.is_running() && server.is_running(),
         "they do not depend on actors"
@@ -149,8 +146,7 @@ fn parts_that_are_told_to_stop_lose_nothing() {
         .expect_said("saved run/checkpoints/checkpoint-");
     assert!(!system.run_folder("run").checkpoints().is_empty());
     drop(client);
-    server.signal(Signal::SIGINT);
-    server.wait().expect_code(0);
+    server.interrupt().expect_code(0);
 }
 
 #[test]
@@ -188,44 +184,6 @@ fn an_actor_killed_and_started_again_continues() {
         (0, 0, 0)
     );
     learner.stop().expect_code(0);
-}
-
-/// A learner that was killed continues from its newest checkpoint, and the actors take its weights.
-#[test]
-fn a_killed_learner_s_successor_continues() {
-    let system = system();
-    let settings = "--set learner.checkpoint_period_updates=50";
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG} {settings}"));
-    let learner = system.start_learner("run");
-    let actor = system.start_actor(0);
-    let client = system.connect();
-    client.wait_for_learner("two checkpoints", |learner| learner.updates > 100);
-    let before = client.learner().unwrap();
-    learner.kill();
-
-    let learner = system.start_learner("run");
-    let after = client.wait_for_learner("later updates", |learner| {
-        learner.updates > before.updates && learner.weights_version > before.weights_version
-    });
-    assert!(after.updates > 100, "{after:#?}");
-    let replay = client.replay().unwrap();
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
-    actor.stop().expect_code(0);
-    learner.stop().expect_code(0).expect_said("resumed after ");
-    drop(client);
-    server.stop().expect_code(0);
-
-    // What is in the folder is another run's to a run with other settings.
-    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let learner = system.start_learner("run");
-    learner
-        .wait()
-        .expect_code(1)
-        .expect_said("resume with the settings it was made with");
-    server.stop().expect_code(0);
 }
 
 /// However it is started, a process has the environment that candle and the C library read; what the user has set stays.

@@ -1,5 +1,5 @@
 //! No files of a crate form a circle: each can be read knowing only those that it names, and they never lead back to it.
-//! It reads the sources; it does not know what the compiler makes of macros' results.
+//! It reads the sources' tokens, those within macros' brackets too; it does not know what the compiler makes of macros' results.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -7,11 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use proc_macro2::{TokenStream, TokenTree};
-use syn::{
-    Attribute, Item, ItemMod, ItemUse, Macro, UseTree,
-    visit::{self, Visit},
-};
+use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 /// A module's path from the crate's root, which is empty itself.
 type ModulePath = Vec<String>;
@@ -33,60 +29,59 @@ impl Crate {
         };
         for root in ["lib.rs", "main.rs"].map(|name| folder.join(name)) {
             if root.exists() {
-                read.read_file(&root, &vec![], folder);
+                read.read_file(&root, &[], folder);
             }
         }
         read
     }
 
     /// Reads a module's file; files of its children lie in `folder`.
-    fn read_file(&mut self, file: &Path, module: &ModulePath, folder: &Path) {
+    fn read_file(&mut self, file: &Path, module: &[String], folder: &Path) {
         let text = fs::read_to_string(file).unwrap();
-        let items = syn::parse_file(&text)
-            .unwrap_or_else(|e| panic!("{}: {e}", file.display()))
-            .items;
-        self.files
-            .entry(module.clone())
-            .or_insert_with(|| file.into());
-        self.read_items(&items, file, module, folder);
+        let tokens = text.parse::<TokenStream>();
+        let tokens = tokens.unwrap_or_else(|e| panic!("{}: {e}", file.display()));
+        self.read_module(tokens, file, module, folder);
     }
 
-    fn read_items(&mut self, items: &[Item], file: &Path, module: &ModulePath, folder: &Path) {
-        let children: BTreeSet<_> = items
-            .iter()
-            .filter_map(|item| match item {
-                Item::Mod(child) => Some(child.ident.to_string()),
-                _ => None,
-            })
-            .collect();
-        for item in items {
-            if let Item::Mod(child) = item {
-                self.read_module(child, file, module, folder);
+    fn read_module(&mut self, tokens: TokenStream, file: &Path, module: &[String], folder: &Path) {
+        // That a program's root is its library's too changes nothing.
+        let files = self.files.entry(module.to_vec());
+        files.or_insert_with(|| file.into());
+        let tokens = without_tests(tokens);
+        let (mut own, mut children) = (Vec::new(), BTreeMap::new());
+        let mut rest = &tokens[..];
+        while let [first, after @ ..] = rest {
+            rest = after;
+            if let [TokenTree::Ident(name), body, after @ ..] = rest
+                && matches!(first, TokenTree::Ident(word) if word == "mod")
+            {
+                children.insert(name.to_string(), body.clone());
+                rest = after;
+            } else {
+                own.push(first.clone());
+            }
+        }
+        let mut names = Names {
+            module,
+            children: &children,
+            found: self.named.entry(file.into()).or_default(),
+        };
+        names.note_tokens(&own, &[]);
+        for (name, body) in children {
+            let path = [module, std::slice::from_ref(&name)].concat();
+            let inner = folder.join(&name);
+            if let TokenTree::Group(body) = body {
+                self.read_module(body.stream(), file, &path, &inner);
                 continue;
             }
-            let mut names = Names {
-                module,
-                children: &children,
-                found: self.named.entry(file.into()).or_default(),
+            let flat = folder.join(format!("{name}.rs"));
+            let found = if flat.exists() {
+                flat
+            } else {
+                inner.join("mod.rs")
             };
-            names.visit_item(item);
+            self.read_file(&found, &path, &inner);
         }
-    }
-
-    fn read_module(&mut self, child: &ItemMod, file: &Path, module: &ModulePath, folder: &Path) {
-        if is_test(&child.attrs) {
-            return;
-        }
-        let name = child.ident.to_string();
-        let path = [module.clone(), vec![name.clone()]].concat();
-        if let Some((_, items)) = &child.content {
-            self.files.insert(path.clone(), file.into());
-            return self.read_items(items, file, &path, &folder.join(name));
-        }
-        let flat = folder.join(format!("{name}.rs"));
-        let nested = folder.join(&name).join("mod.rs");
-        let found = if flat.exists() { flat } else { nested };
-        self.read_file(&found, &path, &folder.join(name));
     }
 
     /// The file in which `path` leads to an item, or to a module.
@@ -107,21 +102,33 @@ impl Crate {
     }
 }
 
-/// Whether what has these attributes is compiled for tests alone.
-fn is_test(attributes: &[Attribute]) -> bool {
-    attributes.iter().any(|attribute| {
-        let list = attribute
-            .path()
-            .is_ident("cfg")
-            .then(|| attribute.meta.require_list());
-        list.is_some_and(|list| list.is_ok_and(|list| list.tokens.to_string() == "test"))
-    })
+/// Tokens without the items that are compiled for tests alone.
+fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
+    let mut kept = Vec::new();
+    let mut tokens = tokens.into_iter();
+    while let Some(token) = tokens.next() {
+        let is_test = matches!(&token, TokenTree::Group(group)
+            if group.stream().to_string().replace(' ', "") == "cfg(test)");
+        if !is_test {
+            kept.push(token);
+            continue;
+        }
+        // The item goes to its end.
+        for token in tokens.by_ref() {
+            match token {
+                TokenTree::Punct(end) if end.as_char() == ';' => break,
+                TokenTree::Group(body) if body.delimiter() == Delimiter::Brace => break,
+                _ => {}
+            }
+        }
+    }
+    kept
 }
 
 /// Collects the paths of this crate that code names.
 struct Names<'a> {
-    module: &'a ModulePath,
-    children: &'a BTreeSet<String>,
+    module: &'a [String],
+    children: &'a BTreeMap<String, TokenTree>,
     found: &'a mut BTreeSet<ModulePath>,
 }
 
@@ -130,8 +137,8 @@ impl Names<'_> {
     fn note(&mut self, path: &[String]) {
         let mut from = match path.first().map(String::as_str) {
             Some("crate") => vec![],
-            Some("self" | "super") => self.module.clone(),
-            Some(first) if self.children.contains(first) => self.module.clone(),
+            Some("self" | "super") => self.module.to_vec(),
+            Some(first) if self.children.contains_key(first) => self.module.to_vec(),
             _ => return,
         };
         for segment in path {
@@ -144,97 +151,50 @@ impl Names<'_> {
         self.found.insert(from);
     }
 
-    fn note_use(&mut self, before: &[String], tree: &UseTree) {
-        let with = |name: &syn::Ident| [before, &[name.to_string()]].concat();
-        match tree {
-            UseTree::Path(path) => self.note_use(&with(&path.ident), &path.tree),
-            UseTree::Name(name) => self.note(&with(&name.ident)),
-            UseTree::Rename(rename) => self.note(&with(&rename.ident)),
-            UseTree::Glob(_) => self.note(before),
-            UseTree::Group(group) => {
-                for tree in &group.items {
-                    self.note_use(before, tree);
-                }
-            }
-        }
-    }
-
-    /// What is within a macro's brackets need not be Rust; paths in it are found by their looks.
-    fn note_tokens(&mut self, tokens: TokenStream) {
-        let mut path = Vec::new();
-        let mut colons = 0;
-        for token in tokens {
-            match token {
-                TokenTree::Ident(name) if path.is_empty() || colons == 2 => {
-                    path.push(name.to_string());
-                    colons = 0;
+    /// Notes all paths; `before` is the one that they continue, as those in the braces of a `use` do.
+    fn note_tokens(&mut self, tokens: &[TokenTree], before: &[String]) {
+        let mut rest = tokens;
+        while let [first, after @ ..] = rest {
+            rest = after;
+            let word = match first {
+                TokenTree::Ident(word) => word.to_string(),
+                TokenTree::Group(group) => {
+                    self.note_tokens(&without_tests(group.stream()), &[]);
                     continue;
                 }
-                TokenTree::Punct(punct) if punct.as_char() == ':' && !path.is_empty() => {
-                    colons += 1;
-                    continue;
+                _ => continue,
+            };
+            if word == "as" && !before.is_empty() {
+                // Another name for what was just noted.
+                rest = rest.get(1..).unwrap_or_default();
+                continue;
+            }
+            let mut path = [before, &[word]].concat();
+            let mut is_whole = path.len() > 1;
+            while let [
+                TokenTree::Punct(one),
+                TokenTree::Punct(two),
+                next,
+                after @ ..,
+            ] = rest
+                && [one, two].iter().all(|it| it.as_char() == ':')
+            {
+                match next {
+                    TokenTree::Ident(word) => path.push(word.to_string()),
+                    TokenTree::Group(group) => {
+                        self.note_tokens(&without_tests(group.stream()), &path);
+                        path.clear();
+                    }
+                    // All of it, or the types that it is given.
+                    _ => {}
                 }
-                _ => {}
+                is_whole = true;
+                rest = after;
             }
-            self.note_written(&mut path);
-            colons = 0;
-            match token {
-                TokenTree::Ident(name) => path.push(name.to_string()),
-                TokenTree::Group(group) => self.note_tokens(group.stream()),
-                _ => {}
+            if is_whole {
+                self.note(&path);
             }
         }
-        self.note_written(&mut path);
-    }
-
-    fn note_written(&mut self, path: &mut Vec<String>) {
-        if path.len() > 1 {
-            self.note(path);
-        }
-        path.clear();
-    }
-}
-
-impl Visit<'_> for Names<'_> {
-    fn visit_item(&mut self, item: &Item) {
-        let attributes = match item {
-            Item::Fn(item) => &item.attrs,
-            Item::Impl(item) => &item.attrs,
-            Item::Use(item) => &item.attrs,
-            Item::Const(item) => &item.attrs,
-            Item::Struct(item) => &item.attrs,
-            _ => return visit::visit_item(self, item),
-        };
-        if !is_test(attributes) {
-            visit::visit_item(self, item);
-        }
-    }
-
-    fn visit_impl_item_fn(&mut self, function: &syn::ImplItemFn) {
-        if !is_test(&function.attrs) {
-            visit::visit_impl_item_fn(self, function);
-        }
-    }
-
-    fn visit_item_use(&mut self, item: &ItemUse) {
-        self.note_use(&[], &item.tree);
-    }
-
-    fn visit_path(&mut self, path: &syn::Path) {
-        let segments: Vec<_> = path
-            .segments
-            .iter()
-            .map(|it| it.ident.to_string())
-            .collect();
-        if segments.len() > 1 {
-            self.note(&segments);
-        }
-        visit::visit_path(self, path);
-    }
-
-    fn visit_macro(&mut self, call: &Macro) {
-        self.note_tokens(call.tokens.clone());
-        visit::visit_macro(self, call);
     }
 }
 

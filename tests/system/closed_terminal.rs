@@ -5,7 +5,7 @@ use std::{
     fs::{File, OpenOptions},
     io::{BufRead, BufReader, Read, pipe},
     os::{fd::AsFd, unix::fs::OpenOptionsExt},
-    process::{Child, Command, ExitStatus, Stdio},
+    process::{Child, ExitStatus, Stdio},
     sync::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
@@ -21,7 +21,7 @@ use nix::{
     sys::signal::Signal,
 };
 
-use crate::{LONG, launched, system};
+use crate::{LONG, PARTS, launched, system};
 
 /// A terminal whose window a test can close. Until then what is written there is read, as a window does it.
 struct Window {
@@ -87,11 +87,6 @@ fn start(system: &TestSystem, output: impl Into<Stdio>, errors: impl Into<Stdio>
     command.spawn().unwrap()
 }
 
-fn wait_until_it_learns(system: &TestSystem) {
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
-}
-
 fn end(child: &mut Child) -> ExitStatus {
     wait_for("the launcher's end", || child.try_wait().unwrap())
 }
@@ -109,7 +104,7 @@ fn a_closed_window_saves_the_run() {
     let system = system();
     let (window, terminal) = Window::open();
     let mut child = start(&system, terminal.try_clone().unwrap(), terminal);
-    wait_until_it_learns(&system);
+    system.connect().wait_for_updates(100);
     wait_for("the progress bar", || {
         window.shown().contains("replay ratio 7").then_some(())
     });
@@ -126,7 +121,7 @@ fn a_pipe_closed_after_two_lines_saves_the_run() {
     let mut lines = BufReader::new(reader).lines();
     let head = [lines.next(), lines.next()];
     assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
-    wait_until_it_learns(&system);
+    system.connect().wait_for_updates(100);
     drop(lines);
     check_saved(&system, end(&mut child));
 }
@@ -141,9 +136,7 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     let mut child = command.stderr(writer).spawn().unwrap();
     drop(command);
     let run = system.run_folder("run");
-    wait_for("a row of metrics with updates", || {
-        run.updates_recorded().filter(|&updates| updates > 100)
-    });
+    run.wait_for_updates(100);
     drop(reader);
     check_saved(&system, end(&mut child));
 }
@@ -152,7 +145,7 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
 fn by_hand(system: &TestSystem) -> [Process; 3] {
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let parts = [server, system.start_learner("run"), system.start_actor(0)];
-    wait_until_it_learns(system);
+    system.connect().wait_for_updates(100);
     parts
 }
 
@@ -188,30 +181,20 @@ fn a_hangup_ends_a_launched_run_once() {
 #[test]
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
-    let run = system.command(&format!(
+    let run = format!(
         "local --agent driml-ada {LONG} --listen {} --run-dir run",
         system.endpoint()
-    ));
-    let mut command = Command::new("sh");
-    command.args(["-c", "trap '' HUP; exec \"$0\" \"$@\""]);
-    command.arg(run.get_program()).args(run.get_args());
-    command.current_dir(run.get_current_dir().unwrap());
-    for (name, value) in run.get_envs() {
-        match value {
-            Some(value) => command.env(name, value),
-            None => command.env_remove(name),
-        };
-    }
+    );
+    let words = ["sh", "-c", "trap '' HUP; exec \"$0\" \"$@\""].map(String::from);
+    let command = system.command_after(&words, &run);
     let process = Process::start("nohup driml local".into(), command);
     let client = system.connect();
-    let before = client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    let before = client.wait_for_updates(100);
     process.signal(Signal::SIGHUP);
-    for part in ["replay-server", "learner", "actor"] {
+    for part in PARTS {
         system.find_part(part).signal(Signal::SIGHUP);
     }
-    client.wait_for_learner("more updates", |learner| {
-        learner.updates > before.updates + 500
-    });
+    client.wait_for_updates(before.updates + 500);
     process.stop().expect_code(130);
     system.run_folder("run").check("interrupted");
 }

@@ -3,25 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use driml_actor::{Delivery, DeliveryLimits};
-use driml_protocol::{
-    BufferPool, Chunk, ChunkHeader, Keys, RunClient, Shutdown,
-    session::{self, Endpoints},
-};
-use driml_tests::{Client, Summary, TestSystem};
+use driml_actor::DeliveryLimits;
+use driml_protocol::{ChunkHeader, Keys, RunClient, Shutdown};
+use driml_tests::connect;
 use nix::sys::signal::Signal;
-use zenoh::Wait;
 
-use crate::{LONG, SHORT, system};
-
-/// Nothing was lost, stored twice or sent twice.
-fn check_quiet(summary: &Summary) {
-    assert_eq!(
-        (summary.transitions_lost, summary.transitions_duplicated),
-        (0, 0)
-    );
-    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
-}
+use crate::{LONG, SHORT, synthetic_actor::SyntheticActor, system};
 
 /// The learner is so slow, by a replay ratio of 64, that every actor waits nearly all of the time.
 #[test]
@@ -29,12 +16,11 @@ fn twenty_four_actors_wait_for_one_learner() {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 6000");
     assert_ne!(longer, SHORT);
-    let ended = system
-        .run(&format!(
-            "local --agent c51 {longer} --actors 24 --set replay.replay_ratio=64 --run-dir run"
-        ))
-        .expect_code(0);
-    check_quiet(&system.run_folder("run").check_finished());
+    let ended = system.run_ok(&format!(
+        "local --agent c51 {longer} --actors 24 --set replay.replay_ratio=64 --run-dir run"
+    ));
+    let summary = system.run_folder("run").check_finished();
+    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
     assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
 }
 
@@ -50,64 +36,10 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let client = system.connect();
     client.wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
     drop(client);
-    process.signal(Signal::SIGINT);
-    process.wait().expect_code(130);
-    check_quiet(&system.run_folder("run").check("interrupted"));
+    process.interrupt().expect_code(130);
+    let summary = system.run_folder("run").check("interrupted");
+    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
     assert_eq!(system.survivors(), []);
-}
-
-/// An actor without a world: chunks of chain frames through the real delivery.
-struct SyntheticActor {
-    delivery: Delivery,
-    session: zenoh::Session,
-    next: ChunkHeader,
-}
-
-impl SyntheticActor {
-    fn join(
-        system: &TestSystem,
-        client: &Client,
-        actor: u32,
-        limits: DeliveryLimits,
-        stop: &Shutdown,
-    ) -> Self {
-        let session = session::open(&Endpoints {
-            listen: Vec::new(),
-            connect: vec![system.endpoint()],
-        })
-        .unwrap();
-        client.join_as_actor(actor, 1);
-        let keys = Keys::new("driml").unwrap();
-        let run = RunClient::new(session.clone(), keys, client.spec.hash());
-        let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop.clone()).unwrap();
-        let next = ChunkHeader {
-            actor,
-            incarnation: 1,
-            streams: 4,
-            steps: 8,
-            frame_bytes: client.spec.frame_bytes() as u32,
-            ..ChunkHeader::default()
-        };
-        Self {
-            delivery,
-            session,
-            next,
-        }
-    }
-
-    /// Sends chunk after chunk, as fast as it may, until it is told to stop; then delivers what it has, although nothing makes
-    /// room. Gives the number of its transitions.
-    fn run(mut self, stop: &Shutdown) -> u64 {
-        while !stop.is_set() {
-            let chunk = Chunk::zeroed(self.next);
-            self.next.sequence += 1;
-            self.next.first_transition += chunk.header.transitions() as u64;
-            assert!(self.delivery.send(chunk));
-        }
-        assert_eq!(self.delivery.finish().unwrap(), 0);
-        self.session.close().wait().unwrap();
-        self.next.first_transition
-    }
 }
 
 /// A limiter that never opens, as where the learner is gone, and time-outs that are long past before the test is: an actor that
@@ -123,14 +55,33 @@ fn an_actor_waits_for_as_long_as_it_must() {
         ack_timeout: Duration::from_secs(10),
         unreachable_max: patience,
     };
-    let actors: Vec<_> = (0..16)
-        .map(|actor| SyntheticActor::join(&system, &client, actor, limits, &stop))
-        .collect();
+    let synthetic = |actor| {
+        client.join_as_actor(actor, 1);
+        let session = connect(&system.endpoint());
+        let run = RunClient::new(session, Keys::new("driml").unwrap(), client.spec.hash());
+        let first = ChunkHeader {
+            actor,
+            incarnation: 1,
+            streams: 4,
+            steps: 8,
+            frame_bytes: client.spec.frame_bytes() as u32,
+            ..ChunkHeader::default()
+        };
+        SyntheticActor::start(run, first, limits, &stop)
+    };
+    let actors: Vec<_> = (0..16).map(synthetic).collect();
     let produced: u64 = std::thread::scope(|scope| {
-        let runs: Vec<_> = actors
+        // Each sends as fast as it may, then delivers what it has, although nothing makes room.
+        let run = |mut actor: SyntheticActor| {
+            while !stop.is_set() {
+                actor.send(0);
+            }
+            actor.finish()
+        };
+        let runs = actors
             .into_iter()
-            .map(|actor| scope.spawn(|| actor.run(&stop)))
-            .collect();
+            .map(|actor| scope.spawn(move || run(actor)));
+        let runs: Vec<_> = runs.collect();
         let before = client.wait_for_replay("16 that wait", |replay| replay.actors_waiting == 16);
         // The warm-up, what may run ahead of a learner, and the chunk that overshoots.
         assert!(before.transitions_inserted <= 200 + 256 + 32, "{before:#?}");
@@ -162,9 +113,7 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let mut frozen = system.start_actor(1);
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
-    let version = client
-        .wait_for_learner("weights", |it| it.updates > 0)
-        .weights_version;
+    let version = client.wait_for_updates(0).weights_version;
     client.wait_for_learner("weights to pull", |it| it.weights_version > version + 5);
     frozen.signal(Signal::SIGSTOP);
     // Long past the moment when the link is given up, and short of the session's lease, which would end it in any case.
@@ -188,11 +137,7 @@ fn a_frozen_actor_does_not_stop_the_others() {
     for actor in [healthy, frozen] {
         actor.stop().expect_code(0).expect_said("leaves: ");
     }
-    let status = client.replay().unwrap();
-    assert_eq!(
-        (status.transitions_lost, status.transitions_duplicated),
-        (0, 0)
-    );
+    client.check_nothing_lost();
     learner.stop().expect_code(0);
 }
 
@@ -227,7 +172,7 @@ fn a_second_learner_gets_nothing_while_the_first_is_there() {
     let first = system.start_learner("first");
     let actor = system.start_actor(0);
     let client = system.connect();
-    client.wait_for_learner("updates", |learner| learner.updates > 10);
+    client.wait_for_updates(10);
     let mut second = system.start_learner("second");
     second.wait_for_stderr("another learner takes part in this run, which has one alone");
     second.stop().expect_code(0);

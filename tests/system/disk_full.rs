@@ -9,7 +9,6 @@ use std::{
 };
 
 use driml_tests::{Process, TestSystem, skip, wait_for};
-use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
@@ -19,8 +18,8 @@ pub(crate) struct Disk {
 }
 
 impl Disk {
-    /// One of so many KiB at `folder`; none, and a line that `test` is skipped, if it cannot be mounted.
-    pub(crate) fn mount(test: &str, folder: PathBuf, kib: u32) -> Option<Self> {
+    /// One of so many KiB at `folder`; none, and a line that the test is skipped, if it cannot be mounted.
+    pub(crate) fn mount(folder: PathBuf, kib: u32) -> Option<Self> {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
@@ -28,11 +27,11 @@ impl Disk {
             Ok(output) if output.status.success() => Some(Self { folder }),
             Ok(output) => {
                 let why = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                skip(test, &why);
+                skip(&why);
                 None
             }
             Err(e) => {
-                skip(test, &format!("mount: {e}"));
+                skip(&format!("mount: {e}"));
                 None
             }
         }
@@ -77,7 +76,7 @@ fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
         system.endpoint()
     ));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     process
 }
 
@@ -89,8 +88,7 @@ fn times(said: &str, words: &str) -> usize {
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
     let system = system();
-    let name = "a_run_continues_while_the_disk_is_full";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
@@ -98,45 +96,35 @@ fn a_run_continues_while_the_disk_is_full() {
     process.wait_for_stderr("cannot be written: No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     filler.remove();
     let run = system.run_folder("disk/run");
     let now = client.learner().unwrap().updates;
-    wait_for("a row of metrics after that", || {
-        run.updates_recorded().filter(|&updates| updates > now)
-    });
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(130);
+    run.wait_for_updates(now);
+    let ended = process.interrupt().expect_code(130);
     assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
     assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
     run.check("interrupted");
     // No second is missing.
-    let (header, rows) = run.metrics();
-    let seconds = header.iter().position(|it| it == "seconds").unwrap();
-    let frames = header.iter().position(|it| it == "frames").unwrap();
-    let cells: Vec<[f64; 2]> = rows
-        .iter()
-        .map(|row| [seconds, frames].map(|at| row[at].parse().unwrap()))
-        .collect();
-    assert!(
-        cells.is_sorted_by(|a, b| a[0] < b[0] && a[1] <= b[1]),
-        "{cells:?}"
-    );
+    let numbers = |name| -> Vec<f64> {
+        let cells = run.column(name).into_iter();
+        cells.map(|it| it.parse().unwrap()).collect()
+    };
+    assert!(numbers("seconds").is_sorted_by(|a, b| a < b));
+    assert!(numbers("frames").is_sorted());
     check_nothing_is_left(&system, &system.path("disk/run"));
 }
 
 #[test]
 fn the_first_error_is_the_one_shown() {
     let system = system();
-    let name = "the_first_error_is_the_one_shown";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
     let filler = disk.fill();
     process.wait_for_stderr("cannot be written: No space left");
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(1);
+    let ended = process.interrupt().expect_code(1);
     // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
     let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
     let last = &ended.stderr[errors..];
@@ -164,8 +152,7 @@ fn the_first_error_is_the_one_shown() {
 #[test]
 fn a_checkpoint_that_finds_no_room_is_tried_again() {
     let system = system();
-    let name = "a_checkpoint_that_finds_no_room_is_tried_again";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, 200);
@@ -173,7 +160,7 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
     process.wait_for_stderr("No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 600);
+    client.wait_for_updates(then + 600);
     let run = system.path("disk/run");
     filler.remove();
     let now = client.learner().unwrap().updates;
@@ -183,8 +170,7 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
         let mut saved = names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
         saved.any(|updates: u64| updates > now).then_some(())
     });
-    process.signal(Signal::SIGINT);
-    process.wait().expect_code(130);
+    process.interrupt().expect_code(130);
     system.run_folder("disk/run").check("interrupted");
     check_nothing_is_left(&system, &run);
 }
@@ -208,15 +194,14 @@ const IN_FLIGHT: u64 = 8;
 #[test]
 fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();
-    let name = "a_full_disk_makes_all_processes_wait_until_there_is_room";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 20_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 20_000) else {
         return;
     };
     let flags = format!("--agent c51 {LONG} --replay-dir disk/replay");
     let mut server = system.start_replay_server(&flags);
     let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     let filler = disk.fill();
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
@@ -244,11 +229,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     );
     actor.stop().expect_code(0);
     learner.stop().expect_code(0);
-    let before = client.replay().unwrap();
-    assert_eq!(
-        (before.transitions_lost, before.transitions_duplicated),
-        (0, 0)
-    );
+    let before = client.check_nothing_lost();
     server.kill();
     let server = system.start_replay_server(&flags);
     let after = wait_for("the server", || client.replay());
@@ -288,15 +269,14 @@ fn a_folder_that_cannot_be_used_is_said() {
         .expect_code(1)
         .expect_said("replay holds the replay of another run (its run spec has the hash");
 
-    let name = "a_folder_that_cannot_be_used_is_said";
-    let Some(disk) = Disk::mount(name, system.path("disk"), 3_000) else {
+    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut remount = Command::new("mount");
     remount.args(["-o", "remount,ro"]).arg(system.path("disk"));
     match remount.status() {
         Ok(status) if status.success() => {}
-        _ => return skip(name, "no read-only file system"),
+        _ => return skip("no read-only file system"),
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()

@@ -3,13 +3,13 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{RunFolder, Survivor, TestSystem, note, wait_for};
+use driml_tests::{RunFolder, Survivor, TestSystem, check_nothing_lost, note, wait_for};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    LONG, SHORT,
+    PARTS, SHORT, launched_with,
     numbered::{KILLS, ROWS, SAMPLED, WARMUP, kill_after_rows},
     system,
 };
@@ -51,21 +51,12 @@ const fn planned(frames: u64) -> u64 {
 
 fn check_exactly_once(run: &RunFolder) {
     let summary = run.summary();
-    assert_eq!(
-        (summary.transitions_lost, summary.transitions_duplicated),
-        (0, 0),
-        "{summary:#?}"
-    );
-    assert_eq!(
-        summary.updates,
-        planned(summary.transitions_inserted),
-        "{summary:#?}"
-    );
-    assert_eq!(
-        summary.rows_sampled,
-        summary.updates * u64::from(ROWS),
-        "{summary:#?}"
-    );
+    let said = format!("{summary:#?}");
+    let wrong = (summary.transitions_lost, summary.transitions_duplicated);
+    assert_eq!(wrong, (0, 0), "{said}");
+    let updates = planned(summary.transitions_inserted);
+    assert_eq!(summary.updates, updates, "{said}");
+    assert_eq!(summary.rows_sampled, updates * u64::from(ROWS), "{said}");
 }
 
 #[test]
@@ -80,24 +71,16 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     ));
     let run = system.run_folder("run");
     for updates in [900, 2_900, 4_900] {
-        wait_for("some more updates", || {
-            run.updates_recorded().filter(|it| *it > updates)
-        });
+        run.wait_for_updates(updates);
         kill_server(&system);
     }
     system.let_go();
-    let ended = process
+    process
         .wait()
         .expect_code(0)
         .expect_said("replay-server was killed by signal 9 SIGKILL")
-        .expect_said(
-            "replay-server is started again with what it has kept (3 of 8 times in a run)",
-        );
-    assert!(
-        ended.stdout.contains("of disk, in the run folder"),
-        "{}",
-        ended.stdout
-    );
+        .expect_said("replay-server is started again with what it has kept (3 of 8 times in a run)")
+        .expect_printed("of disk, in the run folder");
     check_exactly_once(&run);
     assert_eq!(run.check_finished().replay_servers_restarted, 3);
     assert_eq!(system.survivors(), []);
@@ -106,13 +89,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
 #[test]
 fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     let system = system();
-    let process = system.start(&format!(
-        "local --durable --agent c51 {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    ));
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
-    drop(client);
+    let process = launched_with(&system, "--durable --agent c51", 100);
     for _ in 0..=8 {
         kill_server(&system);
     }
@@ -140,7 +117,7 @@ fn parts_by_hand_go_on_when_the_server_is_started_again() {
     let learner = system.start_learner("run");
     let actors = [system.start_actor(0), system.start_actor(1)];
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 500);
+    client.wait_for_updates(500);
     server.kill();
     let [first, second] = actors;
     first.kill();
@@ -154,10 +131,7 @@ fn parts_by_hand_go_on_when_the_server_is_started_again() {
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.replay().unwrap();
     assert_eq!(status.updates, planned(replay.transitions_inserted));
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     learner.stop().expect_code(0);
     drop(client);
     server
@@ -184,9 +158,7 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
     let run = system.run_folder("run");
     let mut kills = 0;
     for updates in moments {
-        wait_for("some more updates", || {
-            run.updates_recorded().filter(|it| *it > updates)
-        });
+        run.wait_for_updates(updates);
         kill_server(&system);
         kills += 1;
     }
@@ -195,28 +167,18 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
         "is started again with what it has kept ({kills} of 8"
     ));
     check_exactly_once(&run);
-    for shard in ["shard-0", "shard-1"] {
-        assert!(
-            run.path()
-                .join("replay")
-                .join(shard)
-                .join("log.toml")
-                .exists()
-        );
+    for log in ["replay/shard-0/log.toml", "replay/shard-1/log.toml"] {
+        assert!(run.path().join(log).exists());
     }
 }
 
 #[test]
 fn a_resumed_run_continues_with_its_replay() {
     let system = system();
-    let process = system.start(&format!(
-        "local --durable --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let process = launched_with(&system, "--durable --agent driml-ada", 1_000);
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 1_000);
     // All at once, as when the machine stops; but the actor first, so that nothing is made after the last look.
-    let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
+    let parts = PARTS.map(|part| system.find_part(part));
     parts[2].signal(Signal::SIGSTOP);
     let before = client.replay().unwrap();
     drop(client);
@@ -225,9 +187,7 @@ fn a_resumed_run_continues_with_its_replay() {
     process.wait();
 
     let frames = before.transitions_inserted + 2_000;
-    system
-        .run(&format!("local --resume run --frames {frames}"))
-        .expect_code(0);
+    system.run_ok(&format!("local --resume run --frames {frames}"));
     let run = system.run_folder("run");
     let summary = run.check_finished();
     check_exactly_once(&run);
@@ -261,19 +221,15 @@ fn a_resumed_run_continues_with_its_replay() {
 fn a_run_whose_launcher_was_killed_continues() {
     let system = system();
     let listen = format!("--listen {}", system.endpoint());
-    let process = system.start(&format!(
-        "local --durable --agent c51 {LONG} {listen} --run-dir run"
-    ));
+    let process = launched_with(&system, "--durable --agent c51", 1_000);
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 1_000);
     let actor = system.find_part("actor");
     actor.signal(Signal::SIGSTOP);
     let frames = client.replay().unwrap().transitions_inserted + 20_000;
     drop(client);
     process.kill();
     system
-        .run(&format!("local --resume run --frames {frames} {listen}"))
-        .expect_code(0)
+        .run_ok(&format!("local --resume run --frames {frames} {listen}"))
         .expect_said("processes of the run in run still end: waiting");
     actor.signal(Signal::SIGKILL);
     let run = system.run_folder("run");

@@ -4,27 +4,26 @@
 use std::fs;
 
 use driml_launch::keep::SELECTION_SEED;
-use driml_tests::TestSystem;
+use driml_tests::{TestSystem, updates_of};
 
 use crate::{SHORT, system};
 
 /// A system with a run in `run`.
 pub(crate) fn with_run() -> TestSystem {
+    with_run_of("")
+}
+
+fn with_run_of(flags: &str) -> TestSystem {
     let system = system();
-    system
-        .run(&format!(
-            "local --lockstep --agent driml-fix {SHORT} --run-dir run"
-        ))
-        .expect_code(0);
+    let run = format!("{SHORT} --agent driml-fix {flags} --run-dir run");
+    system.run_ok(&format!("local --lockstep {run}"));
     system
 }
 
 #[test]
 fn it_prints_the_agent_beside_a_random_policy() {
     let system = with_run();
-    let ended = system
-        .run("evaluate --run run --episodes 7 --seed 2")
-        .expect_code(0);
+    let ended = system.run_ok("evaluate --run run --episodes 7 --seed 2");
     let lines: Vec<_> = ended.stdout.lines().collect();
     assert_eq!(lines.len(), 3, "{lines:?}");
     assert_eq!(
@@ -37,28 +36,21 @@ fn it_prints_the_agent_beside_a_random_policy() {
             "{line}"
         );
     }
-    let again = system
-        .run("evaluate --run run --episodes 7 --seed 2")
-        .expect_code(0);
+    let again = system.run_ok("evaluate --run run --episodes 7 --seed 2");
     assert_eq!(
         ended.stdout, again.stdout,
         "the same seed plays the same episodes"
     );
     // The chain has no levels to hold back.
-    system
-        .run("evaluate --run run --levels unseen")
-        .expect_code(64)
-        .expect_said("use --levels train");
+    system.refuses("evaluate --run run --levels unseen", "use --levels train");
 }
 
 #[test]
 fn it_tells_programs_what_it_tells_people() {
     let system = with_run();
     let flags = "evaluate run --episodes 7 --seed 2";
-    let lines = system.run(flags).expect_code(0).stdout;
-    let ended = system
-        .run(&format!("{flags} --json --returns returns.csv"))
-        .expect_code(0);
+    let lines = system.run_ok(flags).stdout;
+    let ended = system.run_ok(&format!("{flags} --json --returns returns.csv"));
     let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
     assert_eq!(
         (&told["world"], &told["updates"]),
@@ -91,37 +83,26 @@ fn it_tells_programs_what_it_tells_people() {
 fn it_plays_any_checkpoint_that_is_there() {
     let system = with_run();
     let kept = system.run_folder("run").checkpoints();
-    let oldest = kept[0].file_name().unwrap().to_str().unwrap();
-    let oldest: u64 = oldest.strip_prefix("checkpoint-").unwrap().parse().unwrap();
+    let oldest = updates_of(&kept[0]);
     assert!(oldest < 540);
-    let ended = system
-        .run(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
-        .expect_code(0);
+    let ended = system.run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"));
     let said = format!("weights after {oldest} updates");
-    assert!(ended.stdout.contains(&said), "{}", ended.stdout);
-    system
-        .run("evaluate run --checkpoint 7")
-        .expect_code(64)
-        .expect_said("no checkpoint after 7 updates; it has those after");
+    ended.expect_printed(&said);
+    system.refuses(
+        "evaluate run --checkpoint 7",
+        "no checkpoint after 7 updates; it has those after",
+    );
 }
 
-/// A run with averaged weights in `run`.
+/// A system with a run with averaged weights in `run`.
 fn with_averages() -> TestSystem {
-    let system = system();
-    system
-        .run(&format!(
-            "local --lockstep --agent driml-fix {SHORT} --set learner.update.average_tau=0.01 --run-dir run"
-        ))
-        .expect_code(0);
-    system
+    with_run_of("--set learner.update.average_tau=0.01")
 }
 
 #[test]
 fn it_plays_averaged_weights_where_a_run_has_them() {
     let system = with_averages();
-    system
-        .run("evaluate run --keep --episodes 2")
-        .expect_code(0);
+    system.run_ok("evaluate run --keep --episodes 2");
     for (flags, weights) in [
         ("", "averaged"),
         ("--checkpoint newest", "averaged"),
@@ -137,38 +118,29 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
         let told: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
         assert_eq!(told["averaged"], weights == "averaged");
     }
-    system
-        .run("evaluate run --checkpoint average")
-        .expect_code(64)
-        .expect_said("leave it out");
+    system.refuses("evaluate run --checkpoint average", "leave it out");
 }
 
 #[test]
 fn an_exported_network_is_played_without_its_run() {
     let system = with_averages();
-    let said = system
-        .run("evaluate run --export net.safetensors")
-        .expect_code(0);
+    let said = system.run_ok("evaluate run --export net.safetensors");
     assert!(
         said.stdout
             .starts_with("averaged weights after 540 updates as f16"),
         "{}",
         said.stdout
     );
-    let run = system
-        .run("evaluate run --episodes 3 --exact")
-        .expect_code(0);
+    let run = system.run_ok("evaluate run --episodes 3 --exact");
     fs::rename(system.path("run"), system.path("moved")).unwrap();
-    let net = system
-        .run("evaluate net.safetensors --episodes 3 --record play.gif --overlay")
-        .expect_code(0);
+    let net = system.run_ok("evaluate net.safetensors --episodes 3 --record play.gif --overlay");
     let lines: Vec<_> = net.stdout.lines().collect();
     assert!(
         lines[0].contains("averaged f16 weights after 540 updates"),
         "{lines:?}"
     );
     assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
-    let online = system.run_folder("moved").checkpoints().pop().unwrap();
+    let online = system.run_folder("moved").newest_checkpoint();
     let online = online.join("online.safetensors").display().to_string();
     for (args, said) in [
         ("net.safetensors --keep", "is a single network"),
@@ -189,11 +161,9 @@ fn a_finished_run_says_what_its_weights_earn() {
     let system = system();
     for (flags, is_played) in [("--set local.play=true", true), ("--no-play", false)] {
         let name = if is_played { "played" } else { "left-out" };
-        let ended = system
-            .run(&format!(
-                "local --agent c51 {SHORT} {flags} --run-dir {name}"
-            ))
-            .expect_code(0);
+        let ended = system.run_ok(&format!(
+            "local --agent c51 {SHORT} {flags} --run-dir {name}"
+        ));
         let line = "Greedy return (online weights): ";
         assert_eq!(ended.stdout.contains(line), is_played, "{}", ended.stdout);
         let text = fs::read_to_string(system.path(name).join("summary.json")).unwrap();
@@ -215,11 +185,9 @@ fn it_plays_checkpoints_while_the_run_continues() {
     let system = system();
     for (name, lockstep, rows_min) in [("processes", "", 1), ("lockstep", "--lockstep", 5)] {
         let flags = "--agent c51 --evaluate-every 100 --evaluate-episodes 4";
-        let ended = system
-            .run(&format!(
-                "local {SHORT} {flags} {lockstep} --run-dir {name}"
-            ))
-            .expect_code(0);
+        let ended = system.run_ok(&format!(
+            "local {SHORT} {flags} {lockstep} --run-dir {name}"
+        ));
         assert!(ended.stderr.contains("evaluated after"), "{}", ended.stderr);
         let folder = system.run_folder(name);
         let table = fs::read_to_string(folder.path().join("evaluations.csv")).unwrap();
@@ -246,11 +214,9 @@ fn it_plays_checkpoints_while_the_run_continues() {
         let most = rows.iter().map(|row| row[4]).fold(f64::MIN, f64::max);
         let best = rows.iter().find(|row| row[4] == most).unwrap();
         // Played again with the same seed, the best earns the same.
-        let again = system
-            .run(&format!(
-                "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
-            ))
-            .expect_code(0);
+        let again = system.run_ok(&format!(
+            "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
+        ));
         assert!(
             again
                 .stdout
@@ -259,45 +225,36 @@ fn it_plays_checkpoints_while_the_run_continues() {
             "{}{table}",
             again.stdout
         );
-        system
-            .run(&format!(
-                "plot {name} --column evaluated_return --out {name}.svg"
-            ))
-            .expect_code(0);
+        system.run_ok(&format!(
+            "plot {name} --column evaluated_return --out {name}.svg"
+        ));
     }
 }
 
 #[test]
 fn an_evaluation_can_be_kept_by_hand() {
     let system = with_run();
-    system
-        .run("evaluate run --checkpoint best")
-        .expect_code(64)
-        .expect_said("run has no best checkpoint");
+    system.refuses(
+        "evaluate run --checkpoint best",
+        "run has no best checkpoint",
+    );
     let keep = "evaluate run --keep --episodes 3";
-    let said = system.run(keep).expect_code(0).stdout;
+    let said = system.run_ok(keep).stdout;
     assert!(
         said.ends_with("over 3 episodes, the most so far\n"),
         "{said}"
     );
-    system
-        .run("evaluate run --checkpoint best --episodes 1")
-        .expect_code(0);
+    system.run_ok("evaluate run --checkpoint best --episodes 1");
     // The episodes that choose are never those of a report.
-    system
-        .run(&format!("{keep} --seed 0"))
-        .expect_code(64)
-        .expect_said("'--keep' cannot be used with");
-    system
-        .run("evaluate run --checkpoint bset")
-        .expect_code(64)
-        .expect_said("the updates of a checkpoint");
-    system
-        .run(&format!(
-            "local {SHORT} --evaluate-every 150 --set learner.checkpoint_period_updates=100"
-        ))
-        .expect_code(64)
-        .expect_said("local.evaluation.every_updates = 150: checkpoints are played");
+    system.refuses(&format!("{keep} --seed 0"), "'--keep' cannot be used with");
+    system.refuses(
+        "evaluate run --checkpoint bset",
+        "the updates of a checkpoint",
+    );
+    system.refuses(
+        &format!("local {SHORT} --evaluate-every 150 --set learner.checkpoint_period_updates=100"),
+        "local.evaluation.every_updates = 150: checkpoints are played",
+    );
 }
 
 /// A checkpoint is compared with the best over as many episodes as that was played for, or more.
@@ -305,8 +262,7 @@ fn an_evaluation_can_be_kept_by_hand() {
 fn fewer_episodes_do_not_displace_the_best() {
     let system = with_run();
     let oldest = system.run_folder("run").checkpoints().remove(0);
-    let name = oldest.display().to_string();
-    let updates = name.rsplit('-').next().unwrap().trim_start_matches('0');
+    let updates = &updates_of(&oldest).to_string();
     let keep = |flags: &str| {
         let ended = system.run(&format!("evaluate run --keep {flags}"));
         ended.expect_code(0).stdout
@@ -343,10 +299,9 @@ fn fewer_episodes_do_not_displace_the_best() {
 fn it_plays_in_the_precision_of_the_run() {
     let system = system();
     system
-        .run(&format!(
+        .run_ok(&format!(
             "local --lockstep --agent c51 {SHORT} --set learner.publish_as=bf16 --set actor.precision=bf16 --run-dir run"
-        ))
-        .expect_code(0);
+        ));
     for (flags, words) in [
         ("", "bf16 weights after 540 updates played in bf16"),
         ("--exact", "f32 weights after 540 updates played in f32"),
@@ -355,9 +310,7 @@ fn it_plays_in_the_precision_of_the_run() {
         let said = said.expect_code(0).stdout;
         assert!(said.contains(words), "{said}");
     }
-    let json = system
-        .run("evaluate run --episodes 2 --json")
-        .expect_code(0);
+    let json = system.run_ok("evaluate run --episodes 2 --json");
     let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
     assert_eq!(
         (&told["weights"], &told["arithmetic"]),
@@ -382,16 +335,13 @@ fn a_folder_that_is_no_run_s() {
         );
     }
     fs::write(system.path("empty/config.toml"), "[run]\n").unwrap();
-    system
-        .run("evaluate --run empty")
-        .expect_code(64)
-        .expect_said("config.toml that driml wrote");
+    system.refuses("evaluate --run empty", "config.toml that driml wrote");
 }
 
 #[test]
 fn a_damaged_checkpoint_is_named_and_not_used() {
     let system = with_run();
-    let newest = system.run_folder("run").checkpoints().pop().unwrap();
+    let newest = system.run_folder("run").newest_checkpoint();
     let name = newest.file_name().unwrap().to_str().unwrap();
     for file in [
         "online.safetensors",
@@ -420,7 +370,7 @@ fn a_damaged_checkpoint_is_named_and_not_used() {
             .expect_said(&format!("{file} is damaged: it is missing"));
         fs::write(&path, &whole).unwrap();
     }
-    system.run("evaluate --run run --episodes 1").expect_code(0);
+    system.run_ok("evaluate --run run --episodes 1");
 }
 
 fn flipped(bytes: &[u8]) -> Vec<u8> {
@@ -442,8 +392,5 @@ fn weights_of_another_run_are_refused() {
         .expect_said("belongs to a run with specification")
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system
-        .run("evaluate --run run")
-        .expect_code(64)
-        .expect_said("has no checkpoint yet");
+    system.refuses("evaluate --run run", "has no checkpoint yet");
 }

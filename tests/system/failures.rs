@@ -3,7 +3,7 @@
 
 use std::{fs, process::Command};
 
-use driml_tests::{Process, TestSystem, wait_for};
+use driml_tests::{Ended, Process, TestSystem, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
@@ -12,13 +12,12 @@ use crate::{LONG, SHORT, launched, system};
 fn an_interrupt_saves_and_ends_all_parts() {
     let system = system();
     let process = launched(&system, 100);
-    process.signal(Signal::SIGINT);
     let ended = process
-        .wait()
+        .interrupt()
         .expect_code(130)
         .expect_said("stopping: actors deliver what they have");
     assert_eq!(system.survivors(), []);
-    assert!(ended.stdout.contains("interrupted: "), "{}", ended.stdout);
+    ended.expect_printed("interrupted: ");
     let summary = system.run_folder("run").check("interrupted");
     assert!(summary.updates > 100, "{summary:#?}");
 }
@@ -31,7 +30,15 @@ fn a_second_interrupt_ends_at_once() {
     system.find_part("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
-    // Signals at nearly the same time count as one request, so this repeats it until it is noticed.
+    interrupt_until_it_ends(process)
+        .expect_code(1)
+        .expect_said("stopped at once by a second interrupt: what was not saved is lost");
+    assert_eq!(system.survivors(), []);
+    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+}
+
+/// Signals at nearly the same time count as one request, so this repeats it until it is noticed.
+fn interrupt_until_it_ends(mut process: Process) -> Ended {
     wait_for("the launcher's end", || {
         if process.is_running() {
             process.signal(Signal::SIGINT);
@@ -39,12 +46,7 @@ fn a_second_interrupt_ends_at_once() {
         }
         Some(())
     });
-    process
-        .wait()
-        .expect_code(1)
-        .expect_said("stopped at once by a second interrupt: what was not saved is lost");
-    assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    process.wait()
 }
 
 /// No process listens for signals yet.
@@ -55,14 +57,9 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
         // In the same folder: nothing was learned in it.
         let process = system.start(&format!("local --agent c51 {SHORT} --run-dir run"));
         system.find_part("replay-server");
-        process.signal(Signal::SIGINT);
-        let ended = process.wait().expect_code(130);
+        let ended = process.interrupt().expect_code(130);
         assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
-        assert!(
-            ended.stdout.contains("no episode ended"),
-            "{}",
-            ended.stdout
-        );
+        ended.expect_printed("no episode ended");
         assert_eq!(system.run_folder("run").summary().outcome, "interrupted");
         assert_eq!(system.survivors(), []);
     }
@@ -86,11 +83,11 @@ fn complete_but_for_a_frozen_actor(system: &TestSystem) -> Process {
 fn a_complete_run_is_finished_though_an_actor_stands_still() {
     let system = system();
     let process = complete_but_for_a_frozen_actor(&system);
-    let ended = process
+    process
         .wait()
         .expect_code(0)
-        .expect_said("did not end within 1 min 0 s and was killed");
-    assert!(ended.stdout.contains("finished: "), "{}", ended.stdout);
+        .expect_said("did not end within 1 min 0 s and was killed")
+        .expect_printed("finished: ");
     assert_eq!(system.run_folder("run").summary().outcome, "finished");
     assert_eq!(system.survivors(), []);
 }
@@ -99,16 +96,9 @@ fn a_complete_run_is_finished_though_an_actor_stands_still() {
 #[test]
 fn an_interrupt_of_a_complete_run_leaves_it_finished() {
     let system = system();
-    let mut process = complete_but_for_a_frozen_actor(&system);
-    wait_for("the launcher's end", || {
-        if process.is_running() {
-            process.signal(Signal::SIGINT);
-            return None;
-        }
-        Some(())
-    });
-    let ended = process.wait().expect_code(0);
-    assert!(ended.stdout.contains("finished: "), "{}", ended.stdout);
+    interrupt_until_it_ends(complete_but_for_a_frozen_actor(&system))
+        .expect_code(0)
+        .expect_printed("finished: ");
     assert_eq!(system.run_folder("run").summary().outcome, "finished");
     assert_eq!(system.survivors(), []);
 }
@@ -126,25 +116,22 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     assert_eq!(system.survivors(), []);
 }
 
-/// Kills one process of a run; the launcher must name it, say how to continue, and end the others.
-fn dies(part: &str, name: &str) {
-    let system = system();
-    let process = launched(&system, 100);
-    system.find_part(part).signal(Signal::SIGKILL);
-    process
-        .wait()
-        .expect_code(1)
-        .expect_said(&format!(
-            "error: {name} was killed by signal 9 SIGKILL (log: "
-        ))
-        .expect_said("`driml train --resume run` resumes it");
-    assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
-}
-
 #[test]
-fn a_dead_learner_ends_the_run() {
-    dies("learner", "learner");
+fn a_dead_learner_or_replay_server_ends_the_run() {
+    for part in ["learner", "replay-server"] {
+        let system = system();
+        let process = launched(&system, 100);
+        system.find_part(part).signal(Signal::SIGKILL);
+        process
+            .wait()
+            .expect_code(1)
+            .expect_said(&format!(
+                "error: {part} was killed by signal 9 SIGKILL (log: "
+            ))
+            .expect_said("`driml train --resume run` resumes it");
+        assert_eq!(system.survivors(), []);
+        assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    }
 }
 
 /// What the dead one had not delivered is gone with it, and in no count; all else is as planned.
@@ -176,15 +163,9 @@ fn a_dead_actor_is_started_again() {
         .expect_said("was killed by signal 9 SIGKILL (log: ");
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.actors_restarted, 2);
-    assert_eq!(
-        (summary.transitions_lost, summary.transitions_duplicated),
-        (0, 0)
-    );
     assert_eq!(system.survivors(), []);
 
-    system
-        .run("local --resume run --frames 13000")
-        .expect_code(0);
+    system.run_ok("local --resume run --frames 13000");
     let summary = system.run_folder("run").summary();
     assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
@@ -211,25 +192,6 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
 
-#[test]
-fn a_dead_replay_server_ends_the_run() {
-    dies("replay-server", "replay-server");
-}
-
-#[test]
-fn parts_end_with_their_launcher() {
-    let system = system();
-    let process = launched(&system, 100);
-    process.kill();
-    wait_for("the end of all processes", || {
-        system.survivors().is_empty().then_some(())
-    });
-    assert!(
-        !system.run_folder("run").checkpoints().is_empty(),
-        "the learner saved"
-    );
-}
-
 /// They all notice it at once: the replay server stays until the others have delivered what they have and left.
 #[test]
 fn parts_whose_launcher_died_deliver_what_they_have() {
@@ -241,25 +203,14 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
         $driml actor --connect $endpoint --id 0 --exit-with-parent $$ 2> actor &
         wait";
     let system = system();
-    let command = system.command(&format!("{} --agent c51 {LONG}", system.endpoint()));
-    let mut launcher = Command::new("sh");
-    launcher.args(["-c", LAUNCHER, "sh"]);
-    launcher.arg(command.get_program()).args(command.get_args());
-    launcher.envs(
-        command
-            .get_envs()
-            .filter_map(|(name, value)| Some((name, value?))),
-    );
-    launcher.env_remove("DRIML_LOG");
-    launcher.current_dir(system.path(""));
-    let launcher = Process::start("a launcher".into(), launcher);
+    let words = ["sh", "-c", LAUNCHER, "sh"].map(String::from);
+    let args = format!("{} --agent c51 {LONG}", system.endpoint());
+    let launcher = Process::start("a launcher".into(), system.command_after(&words, &args));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     drop(client);
     launcher.signal(Signal::SIGKILL);
-    wait_for("the end of all processes", || {
-        system.survivors().is_empty().then_some(())
-    });
+    system.wait_until_all_have_ended();
     let said = |part: &str| std::fs::read_to_string(system.path(part)).unwrap();
     for (part, words) in [
         ("actor", "actor 0 leaves: "),
@@ -282,9 +233,7 @@ fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
         (!system.survivors().contains(&server)).then_some(())
     });
     actor.signal(Signal::SIGKILL);
-    wait_for("the end of all processes", || {
-        system.survivors().is_empty().then_some(())
-    });
+    system.wait_until_all_have_ended();
 }
 
 #[test]
@@ -294,7 +243,6 @@ fn a_part_whose_launcher_died_before_it_looked_ends() {
     let system = system();
     let listen = format!("replay-server --listen {} {SHORT}", system.endpoint());
     system
-        .run(&format!("{listen} --exit-with-parent {}", launcher.id()))
-        .expect_code(0)
+        .run_ok(&format!("{listen} --exit-with-parent {}", launcher.id()))
         .expect_said("replay server stops");
 }

@@ -9,12 +9,11 @@ use crate::{evaluate::with_run, system};
 fn a_film_changes_nothing_that_is_played() {
     let system = system();
     system
-        .run("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run")
-        .expect_code(0);
-    let plain = system.run("evaluate run --episodes 3").expect_code(0);
+        .run_ok("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run");
+    let plain = system.run_ok("evaluate run --episodes 3");
     let film =
         "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-copies 2";
-    let filmed = system.run(film).expect_code(0);
+    let filmed = system.run_ok(film);
     let said: Vec<_> = filmed.stdout.lines().collect();
     assert_eq!(said[1], "filmed 40 steps: play.gif");
     let rest: Vec<_> = said
@@ -25,7 +24,7 @@ fn a_film_changes_nothing_that_is_played() {
     assert_eq!(rest, plain.stdout.lines().collect::<Vec<_>>());
     let bytes = fs::read(system.path("play.gif")).unwrap();
     assert!(bytes.starts_with(b"GIF89a") && bytes.ends_with(b";"));
-    system.run(film).expect_code(0);
+    system.run_ok(film);
     let again = fs::read(system.path("play.gif")).unwrap();
     assert!(bytes == again, "the same play is the same film");
     assert!(!system.path("play.gif.tmp").exists());
@@ -50,10 +49,7 @@ fn films_that_cannot_be_are_refused_before_anything_is_played() {
         ended.expect_said(said);
     }
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system
-        .run("evaluate run --record play.gif")
-        .expect_code(64)
-        .expect_said("has no checkpoint yet");
+    system.refuses("evaluate run --record play.gif", "has no checkpoint yet");
     let left = fs::read_dir(system.path(".")).unwrap();
     let left = left.filter(|it| {
         it.as_ref()

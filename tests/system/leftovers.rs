@@ -3,13 +3,10 @@
 
 use std::{fs, path::PathBuf};
 
-use driml_tests::{Process, Survivor, TestSystem, wait_for};
+use driml_tests::{Process, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, launched, system};
-
-/// The processes of a run.
-const PARTS: [&str; 3] = ["replay-server", "learner", "actor"];
+use crate::{LONG, PARTS, SHORT, launched, system};
 
 /// A run that has learned something, whose temporary folder is `tmp` in the system's; and its processes.
 fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
@@ -18,9 +15,7 @@ fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
     let run = format!("local --agent driml-ada {LONG} --run-dir run");
     let process = system.start_with("TMPDIR", temporary.to_str().unwrap(), &run);
     let run = system.run_folder("run");
-    wait_for("a row of metrics with updates", || {
-        run.updates_recorded().filter(|&updates| updates > 100)
-    });
+    run.wait_for_updates(100);
     (process, PARTS.map(|part| system.find_part(part)))
 }
 
@@ -29,20 +24,15 @@ fn temporary(system: &TestSystem) -> Vec<PathBuf> {
     entries.map(|entry| entry.unwrap().path()).collect()
 }
 
-fn wait_until_all_have_ended(system: &TestSystem) {
-    wait_for("the end of all processes", || {
-        system.survivors().is_empty().then_some(())
-    });
-}
-
 #[test]
-fn a_killed_launcher_leaves_nothing() {
+fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     let system = system();
     let (process, parts) = started(&system);
     let segments = all_shared_memory_of(&parts);
     assert_eq!(temporary(&system).len(), 1);
     process.kill();
-    wait_until_all_have_ended(&system);
+    system.wait_until_all_have_ended();
+    system.run_folder("run").newest_checkpoint();
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);
 }
@@ -55,7 +45,7 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     process.signal(Signal::SIGKILL);
     parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
     process.wait();
-    wait_until_all_have_ended(&system);
+    system.wait_until_all_have_ended();
     assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
     let temporary_folder = system.path("tmp");
     let next = format!("local --agent c51 {SHORT} --run-dir next");
@@ -74,7 +64,7 @@ fn parts_started_by_hand_leave_no_shared_memory() {
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     let segments = all_shared_memory_of(&PARTS.map(|part| system.find_part(part)));
     // A client may hold what it has seen.
     drop(client);

@@ -73,7 +73,5 @@ fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
         .expect_code(0);
     let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
     system
-        .run(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"))
-        .expect_code(64)
-        .expect_said("the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
+        .refuses(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");
 }

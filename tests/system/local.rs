@@ -7,16 +7,13 @@ use std::{
 };
 
 use driml_tests::{Client, wait_for};
-use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
     let system = system();
-    let ended = system
-        .run(&format!("local --agent c51 {SHORT} --run-dir run"))
-        .expect_code(0);
+    let ended = system.run_ok(&format!("local --agent c51 {SHORT} --run-dir run"));
     let run = system.run_folder("run");
     let summary = run.check_finished();
     // Chosen so that chunks and batches fit without a remainder; the promise is within 1%.
@@ -25,23 +22,11 @@ fn c51_leaves_a_whole_run_folder() {
     assert!(summary.episodes > 0 && summary.mean_return.is_some());
     assert_eq!(summary.mean_k, None, "c51 draws no positive");
 
-    let (header, rows) = run.metrics();
-    for name in [
-        "seconds",
-        "frames",
-        "replay_ratio",
-        "c51_kl",
-        "total_loss",
-        "waiting",
-        "rss_mib_learner",
-        "rss_mib_actor_0",
-    ] {
-        assert!(
-            header.iter().any(|it| it == name),
-            "{name} is not in {header:?}"
-        );
+    let columns =
+        "seconds frames replay_ratio c51_kl total_loss waiting rss_mib_learner rss_mib_actor_0";
+    for name in columns.split(' ') {
+        assert!(!run.column(name).is_empty());
     }
-    assert!(!rows.is_empty());
     for part in ["replay-server", "learner", "actor-0"] {
         let log = run.log(part);
         assert!(
@@ -54,18 +39,9 @@ fn c51_leaves_a_whole_run_folder() {
         .lines()
         .find(|line| line.contains(" WARN ") || line.contains(" ERROR "));
     assert_eq!(warned, None, "an orderly run warns of nothing");
-    assert!(
-        ended.stdout.contains("trains      c51 on chain, seed 1"),
-        "{}",
-        ended.stdout
-    );
-    assert!(
-        ended
-            .stdout
-            .contains("finished: 1280 frames and 540 updates"),
-        "{}",
-        ended.stdout
-    );
+    ended
+        .expect_printed("trains      c51 on chain, seed 1")
+        .expect_printed("finished: 1280 frames and 540 updates");
     assert_eq!(system.survivors(), []);
 }
 
@@ -100,16 +76,8 @@ fn driml_ada_with_two_actors_over_tcp() {
         );
     }
     // The replay server says whose affinity it used; the learner sends one after each update.
-    let (header, rows) = run.metrics();
-    let affinity = header
-        .iter()
-        .position(|it| it == "affinity_version")
-        .unwrap();
-    assert_ne!(
-        rows.last().unwrap()[affinity],
-        "0",
-        "the learner's affinity reached the replay server"
-    );
+    let affinity = run.column("affinity_version").pop().unwrap();
+    assert_ne!(affinity, "0", "it reached the replay server");
 }
 
 /// `driml local --listen` lets actors of other machines play, in the same run folder.
@@ -131,8 +99,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
             .then_some(())
     });
     outside.stop().expect_code(0).expect_said("actor 5 leaves");
-    run.signal(Signal::SIGINT);
-    run.wait().expect_code(130);
+    run.interrupt().expect_code(130);
     let run = system.run_folder("run");
     run.check("interrupted");
     let actors: BTreeSet<_> = run.episodes().iter().map(|it| it.actor).collect();
@@ -154,8 +121,7 @@ fn free_tcp_endpoint() -> String {
 fn mspacman_with_stacked_and_enlarged_frames() {
     let system = system();
     system
-        .run("local --env mspacman --agent driml-fix --preset smoke --frames 320 --run-dir run")
-        .expect_code(0);
+        .run_ok("local --env mspacman --agent driml-fix --preset smoke --frames 320 --run-dir run");
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.updates, 7);
     assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
@@ -166,23 +132,18 @@ fn mspacman_with_stacked_and_enlarged_frames() {
 fn cpc_and_curl_get_what_they_need_and_no_more() {
     let system = system();
     for (agent, served, loss) in [("cpc", 5, "cpc_4t4"), ("curl", 0, "curl")] {
-        system
-            .run(&format!("local --agent {agent} {SHORT} --run-dir {agent}"))
-            .expect_code(0);
+        system.run_ok(&format!("local --agent {agent} {SHORT} --run-dir {agent}"));
         let run = system.run_folder(agent);
         let summary = run.check_finished();
         assert_eq!((summary.frames, summary.updates), (1280, 540));
         // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
         assert_eq!(summary.k_histogram.len(), served + 1);
         assert!(summary.k_histogram.iter().all(|&count| count > 0));
-        let (header, rows) = run.metrics();
-        let loss = header.iter().position(|it| it == loss).unwrap();
-        let last = rows.last().unwrap()[loss].parse::<f64>().unwrap();
+        let last = run.column(loss).pop().unwrap().parse::<f64>().unwrap();
         assert!(last > 0.0, "{agent}: {last}");
-        let ended = system
-            .run(&format!("evaluate --run {agent} --episodes 3"))
-            .expect_code(0);
-        assert!(ended.stdout.contains(agent), "{}", ended.stdout);
+        system
+            .run_ok(&format!("evaluate --run {agent} --episodes 3"))
+            .expect_printed(agent);
     }
 }
 
@@ -196,50 +157,23 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
         let system = system();
         let longer = SHORT.replace("replay_ratio=8", "replay_ratio=32");
         assert_ne!(longer, SHORT);
-        system
-            .run(&format!(
-                "local --agent {agent} {longer} --set learner.batch_size=64 --run-dir run"
-            ))
-            .expect_code(0);
+        system.run_ok(&format!(
+            "local --agent {agent} {longer} --set learner.batch_size=64 --run-dir run"
+        ));
         let run = system.run_folder("run");
         assert_eq!(run.check_finished().updates, 540);
-        let (header, rows) = run.metrics();
-        let loss = header.iter().position(|it| it == loss).unwrap();
-        let last: f64 = rows.last().unwrap()[loss].parse().unwrap();
+        let last: f64 = run.column(loss).pop().unwrap().parse().unwrap();
         assert!(last > 0.0 && last < 0.75 * 64f64.ln(), "{agent}: {last}");
     }
-}
-
-#[test]
-fn the_settings_that_a_run_leaves_repeat_it() {
-    let system = system();
-    system
-        .run(&format!(
-            "local --agent driml-randk {SHORT} --seed 5 --run-dir a"
-        ))
-        .expect_code(0);
-    system
-        .run("local --config a/config.toml --run-dir b")
-        .expect_code(0);
-    let (a, b) = (system.run_folder("a"), system.run_folder("b"));
-    assert_eq!(a.config(), b.config());
-    // Processes race, so the weights differ; the counts do not.
-    let (a, b) = (a.check_finished(), b.check_finished());
-    assert_eq!(
-        (a.frames, a.updates, a.rows_sampled),
-        (b.frames, b.updates, b.rows_sampled)
-    );
 }
 
 /// Two actors, one replay server each, and one learner: the counts are those of one replay.
 #[test]
 fn two_replay_shards_are_one_replay() {
     let system = system();
-    system
-        .run(&format!(
-            "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
-        ))
-        .expect_code(0);
+    system.run_ok(&format!(
+        "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
+    ));
     assert_eq!(system.survivors(), []);
     let summary = system.run_folder("run").check("finished");
     // Each of the two limiters admits chunks until it learns of the other's.
@@ -248,14 +182,12 @@ fn two_replay_shards_are_one_replay() {
     let owed = (summary.frames - 200) * 8 / 16;
     assert!(owed - summary.updates <= 1, "{summary:#?}");
 
-    system
-        .run(&format!("local {SHORT} --replay-shards 2 --actors 1"))
-        .expect_code(64)
-        .expect_said("2 replay shards for 1 actors");
-    system
-        .run(&format!(
-            "local {SHORT} --replay-shards 2 --actors 2 --lockstep"
-        ))
-        .expect_code(64)
-        .expect_said("leave --replay-shards out");
+    system.refuses(
+        &format!("local {SHORT} --replay-shards 2 --actors 1"),
+        "2 replay shards for 1 actors",
+    );
+    system.refuses(
+        &format!("local {SHORT} --replay-shards 2 --actors 2 --lockstep"),
+        "leave --replay-shards out",
+    );
 }

@@ -3,46 +3,46 @@
 
 use driml_envs::{CorridorConfig, optimal_return};
 use driml_settings::presets::AGENTS;
-use driml_tests::{Summary, TestSystem, skipped_offline, wait_for};
+use driml_tests::{Summary, TestSystem, skipped_offline};
 use nix::sys::signal::Signal;
 
-use crate::{SHORT, system};
+use crate::{PRIORITISED, SHORT, system};
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
-    system
-        .run(&format!("local --lockstep {flags} --run-dir {name}"))
-        .expect_code(0);
+    system.run_ok(&format!("local --lockstep {flags} --run-dir {name}"));
     system.run_folder(name).check_finished()
 }
 
+/// Each row: the flags of two runs that are the same, what makes both so, and what makes a third one another.
 #[test]
-fn the_seed_decides_the_weights() {
-    let system = system();
-    let flags = format!("{SHORT} --agent driml-ada --actors 2 --envs 3");
-    let first = run(&system, &format!("{flags} --seed 3"), "first");
-    let same = run(&system, &format!("{flags} --seed 3"), "same");
-    let other = run(&system, &format!("{flags} --seed 4"), "other");
-    assert_eq!(first.weights_sha256, same.weights_sha256);
-    assert_eq!(
-        (first.k_histogram, first.episodes),
-        (same.k_histogram, same.episodes)
-    );
-    assert_ne!(first.weights_sha256, other.weights_sha256);
-    // And so do the settings that the first run left.
-    let again = run(&system, "--config first/config.toml", "again");
-    assert_eq!(first.weights_sha256, again.weights_sha256);
-}
-
-#[test]
-fn the_seed_decides_the_weights_in_bf16_too() {
-    let system = system();
-    let flags = format!("{SHORT} --agent driml-ada --seed 3");
-    let bf16 = format!("{flags} --set learner.precision=bf16 --set actor.precision=bf16");
-    let first = run(&system, &bf16, "first");
-    let same = run(&system, &bf16, "same");
-    let f32 = run(&system, &flags, "f32");
-    assert_eq!(first.weights_sha256, same.weights_sha256);
-    assert_ne!(first.weights_sha256, f32.weights_sha256);
+fn seed_and_settings_decide_the_weights() {
+    let ada = format!("{SHORT} --agent driml-ada");
+    let of_two = format!("{ada} --actors 2 --envs 3");
+    let curl = "--env mspacman --agent curl --preset smoke --frames 320 --seed 3";
+    let bf16 = "--seed 3 --set learner.precision=bf16 --set actor.precision=bf16";
+    for (flags, own, other) in [
+        (&*of_two, "--seed 3", "--seed 4"),
+        (&*ada, bf16, "--seed 3"),
+        (&*of_two, PRIORITISED, ""),
+        // The augmentation draws from the learner's generator, which the seed decides.
+        (curl, "", "--set learner.augment.hue=0.3"),
+    ] {
+        let system = system();
+        let runs = [("first", own), ("same", own), ("other", other)];
+        let [first, same, other] =
+            runs.map(|(name, more)| run(&system, &format!("{flags} {more}"), name));
+        assert_eq!(first.weights_sha256, same.weights_sha256, "{flags} {own}");
+        assert_eq!(
+            (first.k_histogram, first.episodes),
+            (same.k_histogram, same.episodes)
+        );
+        assert_ne!(first.weights_sha256, other.weights_sha256, "{flags}");
+        // And so do the settings that the first run left.
+        let again = run(&system, "--config first/config.toml", "again");
+        assert_eq!(first.weights_sha256, again.weights_sha256, "{flags} {own}");
+        let configs = ["first", "again"].map(|name| system.run_folder(name).config());
+        assert_eq!(configs[0], configs[1]);
+    }
 }
 
 /// Starts a run, ends it with `signal` some time after a save, and resumes it to its end.
@@ -51,9 +51,7 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
     let process = system.start(&format!("local --lockstep {flags} --run-dir run"));
     let run = system.run_folder("run");
     // The first checkpoint is after 200.
-    wait_for("updates after a checkpoint", || {
-        run.updates_recorded().filter(|&updates| updates > 300)
-    });
+    run.wait_for_updates(300);
     process.signal(signal);
     system.let_go();
     let ended = process.wait();
@@ -62,12 +60,9 @@ fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
             .expect_code(130)
             .expect_said("`driml train --resume run` resumes it");
     }
-    let ended = system.run("local --resume run").expect_code(0);
-    assert!(
-        ended.stdout.contains("with everything in lockstep"),
-        "{}",
-        ended.stdout
-    );
+    system
+        .run_ok("local --resume run")
+        .expect_printed("with everything in lockstep");
     let summary = run.check_finished();
     assert!((200..6_300).contains(&summary.resumed_after_updates));
     summary
@@ -102,7 +97,7 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
 #[test]
 fn a_run_that_is_prolonged_is_a_longer_one() {
     let mut runs = vec![("mspacman", "driml-ada"), ("mspacman", "rainbow")];
-    if !skipped_offline("lockstep::a_run_that_is_prolonged_is_a_longer_one (Procgen)") {
+    if !skipped_offline() {
         runs.extend([
             ("procgen:coinrun", "driml-ada"),
             ("procgen:maze", "driml-ada"),
@@ -118,32 +113,14 @@ fn a_run_that_is_prolonged_is_a_longer_one() {
         let whole = run(&system, &format!("{flags} --frames 1216"), "whole");
         let half = run(&system, &format!("{flags} --frames 608"), "half");
         assert_ne!(half.weights_sha256, whole.weights_sha256);
-        let ended = system.run("local --resume half").expect_code(0);
-        assert!(
-            ended.stdout.contains("nothing is left to do"),
-            "{}",
-            ended.stdout
-        );
         system
-            .run("local --resume half --frames 1216")
-            .expect_code(0);
+            .run_ok("local --resume half")
+            .expect_printed("nothing is left to do");
+        system.run_ok("local --resume half --frames 1216");
         let resumed = system.run_folder("half").check_finished();
         assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{world}");
         assert_eq!(resumed.mean_return, whole.mean_return, "{world}");
     }
-}
-
-/// The augmentation draws from the learner's generator, which the seed decides.
-#[test]
-fn the_seed_decides_the_augmentation_too() {
-    let system = system();
-    let flags = "--env mspacman --agent curl --preset smoke --frames 320";
-    let first = run(&system, &format!("{flags} --seed 3"), "first");
-    let same = run(&system, &format!("{flags} --seed 3"), "same");
-    assert_eq!(first.weights_sha256, same.weights_sha256);
-    let weaker = "--set learner.augment.hue=0.3";
-    let other = run(&system, &format!("{flags} --seed 3 {weaker}"), "other");
-    assert_ne!(first.weights_sha256, other.weights_sha256);
 }
 
 #[test]
@@ -185,9 +162,7 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
         "the last 100 episodes, with exploration: {while_training} of {wanted}"
     );
 
-    let ended = system
-        .run("evaluate --run run --episodes 40")
-        .expect_code(0);
+    let ended = system.run_ok("evaluate --run run --episodes 40");
     let mean = |policy: &str| -> f64 {
         let line = ended
             .stdout

@@ -2,6 +2,7 @@
 //! The replay server is played by the test, around the real replay; the learner's side is the real one.
 
 use std::{
+    ops::Range,
     sync::{
         Arc, Mutex,
         atomic::{AtomicU32, Ordering},
@@ -12,10 +13,10 @@ use std::{
 use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
 use driml_protocol::{
     BatchReply, BatchRequest, Buffer, Horizon, InsertReply, Keys, ReplayStatus, RunClient, RunSpec,
-    Shutdown, codec,
-    session::{self, Endpoints},
+    Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
+use driml_tests::{connect, listen};
 use zenoh::{
     Session, Wait,
     query::{Query, Queryable},
@@ -44,15 +45,18 @@ fn config(shards: u32) -> Config {
 
 /// A shard that holds its share of the run.
 fn full(shard: u32, shards: u32) -> Replay {
-    let spec = spec();
-    let mut replay = Replay::shard(&spec, &config(shards), ROWS, shard).unwrap();
+    let mut replay = Replay::shard(&spec(), &config(shards), ROWS, shard).unwrap();
     tiny_replay::join(&mut replay, 0);
-    for sequence in 0..TRANSITIONS / 8 / u64::from(shards) {
-        let chunk = tiny_replay::chunk(&spec, 0, sequence, 8);
-        let stored = replay.insert(&chunk);
+    fill(&mut replay, 0..TRANSITIONS / 8 / u64::from(shards));
+    replay
+}
+
+/// Stores chunks of 8 transitions with these numbers.
+fn fill(replay: &mut Replay, sequences: Range<u64>) {
+    for sequence in sequences {
+        let stored = replay.insert(&tiny_replay::chunk(&spec(), 0, sequence, 8));
         assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
     }
-    replay
 }
 
 /// Answers as a replay server does, but for some batches, which it draws and does not send.
@@ -106,8 +110,7 @@ fn serve(shards: Vec<Replay>) -> Shards {
     let (mut replays, mut declared, mut clients) = (vec![], vec![], vec![]);
     for (shard, replay) in shards.into_iter().enumerate() {
         let endpoint = format!("unixsock-stream/{}/{shard}.sock", folder.path().display());
-        let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
-        let server = open(vec![endpoint.clone()], vec![]);
+        let server = listen(&endpoint);
         let replay = Arc::new(Mutex::new(replay));
         let (asked, count) = (replay.clone(), drawn.clone());
         let batches = declare(&server, keys.of::<BatchRequest>(), move |query| {
@@ -119,8 +122,7 @@ fn serve(shards: Vec<Replay>) -> Shards {
             let bytes = codec::encode(hash, &status, &[]).unwrap();
             session::answer(query, bytes.into());
         });
-        let session = open(vec![], vec![endpoint]);
-        clients.push(RunClient::new(session, keys.clone(), hash));
+        clients.push(RunClient::new(connect(&endpoint), keys.clone(), hash));
         replays.push(replay);
         declared.push((server, [batches, status]));
     }
@@ -204,20 +206,13 @@ fn lost_parts_of_batches_do_not_count() {
 /// never make the learner wait.
 #[test]
 fn a_shard_that_fills_late_is_asked() {
-    let spec = spec();
     let config = Config {
         transitions_max: None,
         ..config(2)
     };
     let mut shards: Vec<_> = (0..2)
-        .map(|shard| Replay::shard(&spec, &config, ROWS, shard).unwrap())
+        .map(|shard| Replay::shard(&spec(), &config, ROWS, shard).unwrap())
         .collect();
-    let fill = |replay: &mut Replay, sequences: std::ops::Range<u64>| {
-        for sequence in sequences {
-            let stored = replay.insert(&tiny_replay::chunk(&spec, 0, sequence, 8));
-            assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
-        }
-    };
     shards
         .iter_mut()
         .for_each(|replay| tiny_replay::join(replay, 0));

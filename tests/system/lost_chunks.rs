@@ -2,7 +2,7 @@
 //! The replay server is played by the test, around the real replay; the actors' side is the real one.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     sync::{
         Arc, Mutex,
         atomic::{AtomicU32, Ordering},
@@ -10,19 +10,19 @@ use std::{
     time::Duration,
 };
 
-use driml_actor::{Delivery, DeliveryLimits};
+use driml_actor::DeliveryLimits;
 use driml_protocol::{
-    BufferPool, Chunk, ChunkHeader, Claim, Done, End, Goodbye, Horizon, InsertReply, Keys,
-    RequestId, RunClient, RunSpec, Shutdown, codec,
-    session::{self, Endpoints},
+    Chunk, ChunkHeader, Claim, Done, Goodbye, Horizon, InsertReply, Keys, RunClient, RunSpec,
+    Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
+use driml_tests::{check_nothing_lost, connect, listen};
 use zenoh::{
     Session, Wait,
     query::{Query, Queryable},
 };
 
-use crate::tiny_replay;
+use crate::{synthetic_actor::SyntheticActor, tiny_replay};
 
 /// Actors, and chunks of each.
 const ACTORS: u32 = 3;
@@ -150,35 +150,11 @@ impl Server {
         replay.check_valid();
         let status = replay.status();
         assert_eq!(status.transitions_inserted, TRANSITIONS, "{status:#?}");
-        assert_eq!(
-            (status.transitions_lost, status.transitions_duplicated),
-            (0, 0)
-        );
-        let mut numbers = BTreeSet::new();
-        let mut request = RequestId::first(1);
-        for _ in 0..TRANSITIONS * SAMPLED / u64::from(ROWS) {
-            let draft = replay.draw_for(request, ROWS, driml_protocol::Buffer::zeroed);
-            let batch = draft.unwrap().unpack();
-            numbers.extend(batch.n_step_returns().into_iter().map(|it| it as u64));
-            request = request.next();
-        }
+        check_nothing_lost(&status);
+        let batches = TRANSITIONS * SAMPLED / u64::from(ROWS);
+        let numbers = tiny_replay::numbers(&mut replay, batches, ROWS);
         // As many are stored as there are numbers: if each number is there, none is there twice.
         assert_eq!(numbers, (0..TRANSITIONS).collect());
-    }
-}
-
-/// Sends one actor's chunks, whose rewards number the transitions of all actors.
-fn deliver(actor: u32, delivery: &Delivery) {
-    for sequence in 0..CHUNKS {
-        let first_transition = sequence * u64::from(STEPS);
-        let mut chunk = tiny_replay::chunk(&spec(), actor, sequence, STEPS);
-        for row in 0..STEPS as usize {
-            let number =
-                u64::from(actor) * CHUNKS * u64::from(STEPS) + first_transition + row as u64;
-            // Each is one episode, so that its return is its number.
-            chunk.set(row, 0, number as f32, End::Terminal);
-        }
-        assert!(delivery.send(chunk));
     }
 }
 
@@ -186,34 +162,27 @@ fn deliver(actor: u32, delivery: &Delivery) {
 fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
     let folder = tempfile::tempdir().unwrap();
     let endpoint = format!("unixsock-stream/{}/server.sock", folder.path().display());
-    let open = |listen, connect| session::open(&Endpoints { listen, connect }).unwrap();
-    let listening = open(vec![endpoint.clone()], vec![]);
+    let listening = listen(&endpoint);
     let keys = Keys::new("lossy").unwrap();
     let declared = server.declare(&listening, &keys);
+    let limits = DeliveryLimits {
+        chunks_in_flight_max: CHUNKS as usize,
+        ack_timeout,
+        unreachable_max: Duration::from_secs(60),
+    };
     std::thread::scope(|scope| {
         for actor in 0..ACTORS {
-            let (session, keys) = (open(vec![], vec![endpoint.clone()]), keys.clone());
+            let run = RunClient::new(connect(&endpoint), keys.clone(), spec().hash());
             scope.spawn(move || {
                 let stop = Shutdown::default();
-                let limits = DeliveryLimits {
-                    chunks_in_flight_max: CHUNKS as usize,
-                    ack_timeout,
-                    unreachable_max: Duration::from_secs(60),
-                };
-                let pool = BufferPool::new(4);
-                let delivery = Delivery::start(
-                    RunClient::new(session, keys, spec().hash()),
-                    0,
-                    limits,
-                    pool,
-                    stop.clone(),
-                )
-                .unwrap();
+                let first = tiny_replay::chunk(&spec(), actor, 0, STEPS).header;
+                let mut synthetic = SyntheticActor::start(run, first, limits, &stop);
                 if leaving {
                     stop.set();
                 }
-                deliver(actor, &delivery);
-                assert_eq!(delivery.finish().unwrap(), 0);
+                let number = u64::from(actor) * CHUNKS * u64::from(STEPS);
+                (0..CHUNKS).for_each(|_| synthetic.send(number));
+                synthetic.finish();
             });
         }
     });

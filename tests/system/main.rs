@@ -38,6 +38,7 @@ mod small_shared_memory;
 mod soak;
 mod status;
 mod successors;
+mod synthetic_actor;
 mod tensorboard;
 mod tiny_replay;
 mod tls;
@@ -58,17 +59,24 @@ const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.repla
 /// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
 
+/// The processes of a run.
+const PARTS: [&str; 3] = ["replay-server", "learner", "actor"];
+
 /// Rows drawn by priority, with Rainbow's numbers.
 const PRIORITISED: &str =
     "--set replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
 
 /// A launched run of `driml-ada` that has learned more than so many `updates`.
 fn launched(system: &TestSystem, updates: u64) -> Process {
+    launched_with(system, "--agent driml-ada", updates)
+}
+
+/// A launched run with these flags that has learned more than so many `updates`.
+fn launched_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
     let process = system.start(&format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
+        "local {LONG} {flags} --listen {} --run-dir run",
         system.endpoint()
     ));
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > updates);
+    system.connect().wait_for_updates(updates);
     process
 }

@@ -3,17 +3,15 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use driml_actor::{Delivery, DeliveryLimits};
+use driml_actor::DeliveryLimits;
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, Buffer, BufferPool, Chunk, ChunkHeader, End, Keys, Learned,
-    RequestId, RunClient, RunSpec, Shutdown,
-    config::Settings,
-    session::{self, Endpoints},
+    Batch, BatchReply, BatchRequest, BufferPool, ChunkHeader, Keys, Learned, RequestId, RunClient,
+    RunSpec, Shutdown, config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, TestSystem};
+use driml_tests::{Process, TestSystem, check_nothing_lost, connect};
 
-use crate::system;
+use crate::{synthetic_actor::SyntheticActor, system, tiny_replay};
 
 /// Actors that number their transitions, chunks of each, and transitions of a chunk.
 const ACTORS: u32 = 3;
@@ -32,14 +30,6 @@ const DRAWN: u64 = 64;
 /// How often the server is killed.
 pub(crate) const KILLS: u64 = 6;
 
-fn session_with(system: &TestSystem) -> zenoh::Session {
-    session::open(&Endpoints {
-        listen: Vec::new(),
-        connect: vec![system.endpoint()],
-    })
-    .unwrap()
-}
-
 /// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
 fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
     let limits = DeliveryLimits {
@@ -47,9 +37,7 @@ fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
         ack_timeout: Duration::from_secs(2),
         unreachable_max: Duration::from_secs(60),
     };
-    let stop = Shutdown::default();
-    let delivery = Delivery::start(run, 0, limits, BufferPool::new(8), stop).unwrap();
-    let mut header = ChunkHeader {
+    let first = ChunkHeader {
         actor,
         incarnation: 1,
         streams: STREAMS,
@@ -57,17 +45,9 @@ fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
         frame_bytes,
         ..ChunkHeader::default()
     };
-    while header.sequence < CHUNKS {
-        let mut chunk = Chunk::zeroed(header);
-        for row in 0..header.transitions() {
-            let number = u64::from(actor) * OF_AN_ACTOR + header.first_transition + row as u64;
-            chunk.set(row, 0, number as f32, End::Terminal);
-        }
-        header.sequence += 1;
-        header.first_transition += header.transitions() as u64;
-        assert!(delivery.send(chunk));
-    }
-    assert_eq!(delivery.finish().unwrap(), 0);
+    let mut synthetic = SyntheticActor::start(run, first, limits, &Shutdown::default());
+    (0..CHUNKS).for_each(|_| synthetic.send(u64::from(actor) * OF_AN_ACTOR));
+    synthetic.finish();
 }
 
 /// Asks for all batches there are, as a learner that asks again; gives their number.
@@ -132,18 +112,8 @@ fn numbers_in(system: &TestSystem, spec: &RunSpec, config_toml: &str) -> BTreeSe
         "{recovery:?}"
     );
     replay.check_valid();
-    let mut numbers = BTreeSet::new();
-    for number in 0..TRANSITIONS * DRAWN / u64::from(ROWS) {
-        let id = RequestId {
-            client_id: 1,
-            number,
-            attempt: 0,
-        };
-        let batch = replay.draw_for(id, ROWS, Buffer::zeroed).unwrap().unpack();
-        let returns = batch.n_step_returns();
-        numbers.extend(returns.into_iter().map(|it| it as u64));
-    }
-    numbers
+    let batches = TRANSITIONS * DRAWN / u64::from(ROWS);
+    tiny_replay::numbers(&mut replay, batches, ROWS)
 }
 
 /// Rows that are sampled of all transitions.
@@ -164,11 +134,8 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
     client.join_as_learner(7);
     let (spec_hash, frame_bytes) = (client.spec.hash(), client.spec.frame_bytes() as u32);
     let run = || {
-        RunClient::new(
-            session_with(&system),
-            Keys::new("driml").unwrap(),
-            spec_hash,
-        )
+        let session = connect(&system.endpoint());
+        RunClient::new(session, Keys::new("driml").unwrap(), spec_hash)
     };
     let batches = std::thread::scope(|scope| {
         for actor in 0..ACTORS {
@@ -187,21 +154,15 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
     assert_eq!(batches, SAMPLED / u64::from(ROWS));
     // A server that has just started is not reached at once.
     let replay = client.wait_for_replay("the counts in the end", |_| true);
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     // As many are stored as there are numbers: if each number is there, none is there twice.
     assert_eq!(replay.transitions_inserted, TRANSITIONS);
     let (spec, config_toml) = (client.spec.clone(), client.config_toml.clone());
     drop(client);
     server.into_iter().for_each(Process::kill);
     let numbers = numbers_in(&system, &spec, &config_toml);
-    let missing: Vec<_> = (0..TRANSITIONS)
-        .filter(|it| !numbers.contains(it))
-        .collect();
-    assert_eq!(missing, [0; 0]);
-    assert_eq!(numbers.len() as u64, TRANSITIONS);
+    let missing = (0..TRANSITIONS).find(|it| !numbers.contains(it));
+    assert_eq!((missing, numbers.len() as u64), (None, TRANSITIONS));
 }
 
 #[test]

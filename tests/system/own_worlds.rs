@@ -67,7 +67,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     };
     let first = lockstep(&flags, "first");
     assert_eq!(first, lockstep("--config first/config.toml", "again"));
-    let ended = system.run("evaluate --run run --episodes 8").expect_code(0);
+    let ended = system.run_ok("evaluate --run run --episodes 8");
     // Each episode ends with 1000, and what comes before is 2 a step at most.
     let agent = ended.stdout.lines().nth(1).unwrap();
     assert!(agent.contains("mean return 10"), "{agent}");
@@ -100,9 +100,7 @@ fn lockstep_continues(env: &str, flags: &str, frames: u64) {
 
     let half = run(frames / 2, "half");
     assert_ne!(half.weights_sha256, whole.0);
-    system
-        .run(&format!("local --resume half --frames {frames}"))
-        .expect_code(0);
+    system.run_ok(&format!("local --resume half --frames {frames}"));
     let prolonged = system.run_folder("half").check_finished();
     assert_eq!(result(prolonged), whole, "prolonged");
 
@@ -113,15 +111,11 @@ fn lockstep_continues(env: &str, flags: &str, frames: u64) {
         let process = start(&system, &args, env);
         let run = system.run_folder(signal.as_str());
         // After a checkpoint and before the next: what follows it is done again.
-        wait_for("updates after a checkpoint", || {
-            run.updates_recorded().filter(|&updates| updates > 110)
-        });
+        run.wait_for_updates(110);
         process.signal(signal);
         system.let_go();
         process.wait();
-        system
-            .run(&format!("local --resume {signal}"))
-            .expect_code(0);
+        system.run_ok(&format!("local --resume {signal}"));
         let resumed = run.check_finished();
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(result(resumed), whole, "{signal}");
@@ -273,14 +267,12 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     drop(client);
     learner.stop().expect_code(0);
     server.stop().expect_code(0);
-    wait_for("the end of all", || {
-        system.survivors().is_empty().then_some(())
-    });
+    system.wait_until_all_have_ended();
 }
 
 /// A Python with Gymnasium and ALE, installed once into cargo's folder for tests; `None`, and a line that says so, where pip cannot.
-fn gymnasium(test: &str) -> Option<String> {
-    if skipped_offline(test) {
+fn gymnasium() -> Option<String> {
+    if skipped_offline() {
         return None;
     }
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("gymnasium");
@@ -301,7 +293,7 @@ fn gymnasium(test: &str) -> Option<String> {
             .unwrap();
         if !output.status.success() {
             let said = String::from_utf8_lossy(&output.stderr);
-            skip(test, said.lines().last().unwrap_or("no pip"));
+            skip(said.lines().last().unwrap_or("no pip"));
             return None;
         }
         fs::write(&ready, "").unwrap();
@@ -311,9 +303,7 @@ fn gymnasium(test: &str) -> Option<String> {
 
 #[test]
 fn atari_by_gymnasium_trains() {
-    let Some(python) = gymnasium("own_worlds::atari_by_gymnasium_trains") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let system = system();
     let env = format!(
         "exec:{python} {} ALE/Pong-v5 --atari",
@@ -341,9 +331,7 @@ fn atari_by_gymnasium_trains() {
 /// ALE's emulator, wrappers and generators come back as they were.
 #[test]
 fn atari_continues_exactly_in_lockstep() {
-    let Some(python) = gymnasium("own_worlds::atari_continues_exactly_in_lockstep") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let env = format!(
         "exec:{python} {} ALE/Breakout-v5 --atari --clip --size 20",
         file("deploy/python/driml_env.py")
@@ -357,9 +345,7 @@ fn atari_continues_exactly_in_lockstep() {
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
-    let Some(python) = gymnasium("own_worlds::the_adapter_keeps_gymnasium_s_episodes") else {
-        return;
-    };
+    let Some(python) = gymnasium() else { return };
     let output = std::process::Command::new(python)
         .arg(file("tests/worlds/check_adapter.py"))
         .output()

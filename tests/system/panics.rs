@@ -65,16 +65,16 @@ fn ends_the_run((part, point, flags): (&str, &str, &str)) {
 }
 
 /// Only debug builds can be asked to panic; a line says that a test is skipped in others.
-fn skipped(test: &str) -> bool {
+fn skipped() -> bool {
     if !cfg!(debug_assertions) {
-        driml_tests::skip(test, "a release build");
+        driml_tests::skip("a release build");
     }
     !cfg!(debug_assertions)
 }
 
 #[test]
 fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
-    if skipped("a_panic_in_a_part_ends_it_and_the_launcher_names_it") {
+    if skipped() {
         return;
     }
     // These runs wait for each other's ends more than they compute.
@@ -90,7 +90,7 @@ fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
 /// More than one part has these threads, so any may be the first.
 #[test]
 fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
-    if skipped("a_panic_in_a_thread_of_several_parts_ends_the_run") {
+    if skipped() {
         return;
     }
     for point in ["signals", "reporter", "connecting"] {
@@ -106,7 +106,7 @@ fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
 /// The launcher itself, after whose death the other processes exit.
 #[test]
 fn a_panic_in_the_launcher_ends_the_run() {
-    if skipped("a_panic_in_the_launcher_ends_the_run") {
+    if skipped() {
         return;
     }
     for point in ["interrupts", "connect", "log of learner"] {
@@ -120,8 +120,6 @@ fn a_panic_in_the_launcher_ends_the_run() {
         );
         let said = format!("error: the thread {point} panicked");
         assert!(ended.stderr.contains(&said), "{point}: {ended:#?}");
-        driml_tests::wait_for("the end of all processes", || {
-            system.survivors().is_empty().then_some(())
-        });
+        system.wait_until_all_have_ended();
     }
 }

@@ -8,19 +8,16 @@ use crate::system;
 
 #[test]
 fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
-    if skipped_offline("procgen::bigfish_trains_and_is_evaluated_on_unseen_levels") {
+    if skipped_offline() {
         return;
     }
     let system = system();
     system
-        .run("local --env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2 --run-dir run")
-        .expect_code(0);
+        .run_ok("local --env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2 --run-dir run");
     let summary = system.run_folder("run").check_finished();
     assert_eq!((summary.frames, summary.updates), (608, 25));
     assert!(summary.mean_k.is_some());
-    let ended = system
-        .run("evaluate --run run --episodes 2 --levels unseen")
-        .expect_code(0);
+    let ended = system.run_ok("evaluate --run run --episodes 2 --levels unseen");
     assert!(
         ended
             .stdout
@@ -33,7 +30,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
 /// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
-    if skipped_offline("procgen::a_border_that_no_convolution_reads_changes_no_bit") {
+    if skipped_offline() {
         return;
     }
     let system = system();
@@ -46,11 +43,9 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
         ),
     ] {
         let flags = "--env procgen:coinrun --agent driml-ada --preset smoke --frames 416";
-        system
-            .run(&format!(
-                "local --lockstep {flags} {sets} --run-dir cut-{name}"
-            ))
-            .expect_code(0);
+        system.run_ok(&format!(
+            "local --lockstep {flags} {sets} --run-dir cut-{name}"
+        ));
         let folder = system.run_folder(&format!("cut-{name}"));
         let text = std::fs::read_to_string(system.path(&format!("cut-{name}")).join("config.toml"));
         let config = RunConfig::parse("config.toml", &text.unwrap()).unwrap();
@@ -58,17 +53,13 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
         let whole = config.with_whole_frames().unwrap();
         assert_eq!([whole.run.frame_height, whole.run.frame_width], [64, 64]);
         std::fs::write(system.path(&format!("{name}.toml")), whole.to_toml()).unwrap();
-        system
-            .run(&format!(
-                "local --lockstep --config {name}.toml --run-dir whole-{name}"
-            ))
-            .expect_code(0);
+        system.run_ok(&format!(
+            "local --lockstep --config {name}.toml --run-dir whole-{name}"
+        ));
         let whole = system.run_folder(&format!("whole-{name}")).check_finished();
         assert_eq!(folder.check_finished().weights_sha256, whole.weights_sha256);
         let played = ["cut", "whole"].map(|run| {
-            let ended = system
-                .run(&format!("evaluate --run {run}-{name} --episodes 2"))
-                .expect_code(0);
+            let ended = system.run_ok(&format!("evaluate --run {run}-{name} --episodes 2"));
             ended.stdout
         });
         assert_eq!(played[0], played[1]);
@@ -77,33 +68,28 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
-    if skipped_offline("procgen::an_agent_chooses_among_the_actions_that_differ") {
+    if skipped_offline() {
         return;
     }
     let system = system();
-    system
-        .run(
-            "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
+    system.run_ok(
+        "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
              --set actor.actions=visible --set learner.affinity.alphabet=visible --run-dir run",
-        )
-        .expect_code(0);
+    );
     system.run_folder("run").check_finished();
     let config = system.run_folder("run").config();
     assert_eq!(config["model"]["num_actions"].as_integer(), Some(4));
-    system
-        .run("evaluate --run run --episodes 2 --levels unseen")
-        .expect_code(0);
+    system.run_ok("evaluate --run run --episodes 2 --levels unseen");
 }
 
 #[test]
 fn an_experiment_of_three_seeds_has_scores_over_games() {
-    if skipped_offline("procgen::an_experiment_of_three_seeds_has_scores_over_games") {
+    if skipped_offline() {
         return;
     }
     let system = system();
     system
-        .run("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table")
-        .expect_code(0);
+        .run_ok("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table");
     let folder = system.path("table");
     let page = std::fs::read_to_string(folder.join("README.md")).unwrap();
     for part in [

@@ -63,9 +63,7 @@ const RUNS: [&str; 5] = [
 /// A run, what its network is, and random states in a file beside it.
 fn trained(system: &TestSystem, flags: &str) -> (Agent, Vec<u8>) {
     let _ = fs::remove_dir_all(system.path("run"));
-    system
-        .run(&format!("local --lockstep {flags} --run-dir run"))
-        .expect_code(0);
+    system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
     let text = fs::read_to_string(system.path("run/config.toml")).unwrap();
     let config = RunConfig::parse("config.toml", &text).unwrap();
     let folder = system.path("run/checkpoints");
@@ -88,7 +86,7 @@ fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
 
 #[test]
 fn pytorch_computes_what_driml_does() {
-    let Some(python) = python_with("python::pytorch_computes_what_driml_does", &["torch"]) else {
+    let Some(python) = python_with(&["torch"]) else {
         return;
     };
     let system = system();
@@ -128,8 +126,7 @@ fn pytorch_computes_what_driml_does() {
 #[test]
 fn onnx_runtime_computes_what_driml_does() {
     let modules = ["torch", "onnx", "onnxscript", "onnxruntime"];
-    let Some(python) = python_with("python::onnx_runtime_computes_what_driml_does", &modules)
-    else {
+    let Some(python) = python_with(&modules) else {
         return;
     };
     let system = system();
@@ -175,7 +172,7 @@ fn the_page_has_the_actions_in_their_order() {
 
 #[test]
 fn optuna_searches() {
-    let Some(python) = python_with("optuna_searches", &["optuna"]) else {
+    let Some(python) = python_with(&["optuna"]) else {
         return;
     };
     let system = system();
@@ -206,7 +203,7 @@ fn optuna_searches() {
 
 #[test]
 fn a_helper_without_its_package_says_which() {
-    let Some(python) = python_with("python::a_helper_without_its_package_says_which", &[]) else {
+    let Some(python) = python_with(&[]) else {
         return;
     };
     for (script, args, package) in [

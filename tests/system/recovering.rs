@@ -5,12 +5,13 @@ use std::{borrow::Cow, fs, path::Path, time::Duration};
 
 use driml_protocol::{
     ActorJoin, BatchRequest, Chunk, ChunkHeader, End, Hello, InsertReply, Keys, Learned,
-    ReplayStatus, RequestId, RunClient, RunSpec, WeightsHeader, WeightsUpload,
-    config::Settings,
-    session::{self, Endpoints, SessionError},
+    ReplayStatus, RequestId, RunClient, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
+    session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, SlowMachine, TestSystem, new_learner, wait_for};
+use driml_tests::{
+    Process, SlowMachine, TestSystem, check_nothing_lost, connect, new_learner, wait_for,
+};
 use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
@@ -119,11 +120,7 @@ fn recovering(system: &TestSystem) -> Option<Value> {
 
 /// Whatever is asked is put off.
 fn check_put_off(system: &TestSystem, spec: &RunSpec) {
-    let endpoints = Endpoints {
-        listen: Vec::new(),
-        connect: vec![system.endpoint()],
-    };
-    let session = session::open(&endpoints).unwrap();
+    let session = connect(&system.endpoint());
     let run = RunClient::new(session, Keys::new("driml").unwrap(), spec.hash());
     let answer_max = Duration::from_secs(10);
     let chunk = Chunk::zeroed(header_of(5, spec.frame_bytes()));
@@ -179,7 +176,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
     let client = system.connect();
-    client.wait_for_learner("some updates", |it| it.updates > 50);
+    client.wait_for_updates(50);
     drop(client);
     server.kill();
 
@@ -189,7 +186,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     check_put_off(&system, &spec);
     let endpoint = system.endpoint();
     let status = format!("status --connect {endpoint}");
-    let said = system.run(&status).expect_code(0).stdout;
+    let said = system.run_ok(&status).stdout;
     for words in [
         "chain, c51: frames ?/",
         "replay-server  reads its replay back",
@@ -228,10 +225,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
         (UPDATES, 16 * UPDATES)
     );
     assert_eq!(replay.transitions_inserted, FRAMES);
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait().expect_code(0);
     assert_eq!(system.run_folder("seen").summary().updates, UPDATES);
@@ -284,7 +278,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
         system.endpoint()
     ));
     let client = system.connect();
-    client.wait_for_learner("some updates", |it| it.updates > 10);
+    client.wait_for_updates(10);
     drop(client);
     process.stop().expect_code(130);
     let run = system.run_folder("run");
@@ -301,19 +295,13 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let summary = run.check_finished();
     let updates = (frames - WARMUP) / 1024;
     assert_eq!((summary.frames, summary.updates), (frames, updates));
-    assert_eq!(
-        (summary.transitions_lost, summary.transitions_duplicated),
-        (0, 0)
-    );
     assert_eq!(system.survivors(), []);
 }
 
 /// Each role receives it in place of the answer.
 #[test]
 fn roles_are_told_too() {
-    let Some(tls) = TlsSystem::new("roles_are_told_too") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     keep_for(&tls.system, "replay");
     let mut server = tls.start_server(&format!("{} --replay-dir replay", flags()));
     let slow = slow_down(&mut server);
@@ -325,7 +313,7 @@ fn roles_are_told_too() {
         part.wait_for_stderr(WAITING);
     }
     let status = format!("status --connect {} --tls-dir tls", tls.endpoint);
-    let said = tls.system.run(&status).expect_code(0).stdout;
+    let said = tls.system.run_ok(&status).stdout;
     assert!(said.contains("reads its replay back"), "{said}");
     drop(slow);
     let [actor, learner] = parts;

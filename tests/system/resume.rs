@@ -3,17 +3,10 @@
 use std::fs;
 
 use driml_settings::config::RunConfig;
-use driml_tests::{RunFolder, Summary, TestSystem};
+use driml_tests::{Summary, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::{SHORT, launched, system};
-
-/// Updates of the newest checkpoint.
-fn saved(run: &RunFolder) -> u64 {
-    let newest = run.checkpoints().pop().unwrap();
-    let name = newest.file_name().unwrap().to_str().unwrap().to_owned();
-    name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
-}
+use crate::{PARTS, SHORT, launched, system};
 
 /// Updates that a resumed run makes: more than are left for the 256 transitions of slack, a chunk that is on its way and one that
 /// fills the memory again.
@@ -22,14 +15,12 @@ const MORE: u64 = 200;
 /// Resumes `run` for so many updates more than it has, and checks what it leaves.
 fn resumes(system: &TestSystem) -> Summary {
     let run = system.run_folder("run");
-    let updates = saved(&run);
+    let updates = run.saved_updates();
     // The warm-up, and 2 for each update of 16 rows at replay ratio 8.
     let frames = 200 + 2 * (updates + MORE);
-    let ended = system
-        .run(&format!("local --resume run --frames {frames}"))
-        .expect_code(0);
+    let ended = system.run_ok(&format!("local --resume run --frames {frames}"));
     let from = format!("from its checkpoint after {updates} updates");
-    assert!(ended.stdout.contains(&from), "{}", ended.stdout);
+    ended.expect_printed(&from);
     let summary = run.check_finished();
     assert_eq!(summary.resumed_after_updates, updates);
     // The last chunk is stored whole, which are up to 16 updates.
@@ -39,11 +30,10 @@ fn resumes(system: &TestSystem) -> Summary {
     );
     assert!(summary.episodes > 0);
 
-    let (header, rows) = run.metrics();
     for name in ["seconds", "frames", "updates", "episodes"] {
-        let at = header.iter().position(|it| it == name).unwrap();
-        let column: Vec<f64> = rows.iter().map(|row| row[at].parse().unwrap()).collect();
-        assert!(column.is_sorted(), "{name}: {column:?}");
+        let numbers = run.column(name).into_iter().map(|it| it.parse().unwrap());
+        let numbers: Vec<f64> = numbers.collect();
+        assert!(numbers.is_sorted(), "{name}: {numbers:?}");
     }
     let log = run.log("learner");
     assert!(
@@ -59,13 +49,9 @@ fn an_interrupted_run_continues() {
     let system = system();
     // 1,000 updates are 2,200 frames, in which more than 100 episodes end.
     let process = launched(&system, 1_000);
-    system
-        .run("local --resume run")
-        .expect_code(64)
-        .expect_said("is still running");
-    process.signal(Signal::SIGINT);
+    system.refuses("local --resume run", "is still running");
     process
-        .wait()
+        .interrupt()
         .expect_code(130)
         .expect_said("`driml train --resume run` resumes it");
     let before = system.run_folder("run").summary();
@@ -76,12 +62,9 @@ fn an_interrupted_run_continues() {
     assert_eq!((before.mean_return_of, summary.mean_return_of), (100, 100));
     // And once more, with more frames, now that it is finished.
     assert_eq!(resumes(&system).mean_return_of, 100);
-    let ended = system.run("local --resume run").expect_code(0);
-    assert!(
-        ended.stdout.contains("nothing is left to do"),
-        "{}",
-        ended.stdout
-    );
+    system
+        .run_ok("local --resume run")
+        .expect_printed("nothing is left to do");
 }
 
 /// Runs of earlier versions recorded whole frames where a border of them is cut today.
@@ -90,24 +73,18 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
     let system = system();
     let border =
         "--set world.height=15 --set world.width=17 --set input.height=15 --set input.width=17";
-    system
-        .run(&format!("local --lockstep {SHORT} {border} --run-dir cut"))
-        .expect_code(0);
+    system.run_ok(&format!("local --lockstep {SHORT} {border} --run-dir cut"));
     let text = fs::read_to_string(system.path("cut").join("config.toml")).unwrap();
     let cut = RunConfig::parse("config.toml", &text).unwrap();
     assert_eq!((cut.run.frame_height, cut.run.frame_width), (14, 16));
     let old = cut.with_whole_frames().unwrap();
     fs::write(system.path("old.toml"), old.to_toml()).unwrap();
-    system
-        .run("local --config old.toml --run-dir run")
-        .expect_code(0);
+    system.run_ok("local --config old.toml --run-dir run");
     resumes(&system);
     let config = system.run_folder("run").config();
     assert_eq!(config["run"]["frame_height"].as_integer(), Some(15));
     for run in ["run", "cut"] {
-        system
-            .run(&format!("evaluate --run {run} --episodes 3"))
-            .expect_code(0);
+        system.run_ok(&format!("evaluate --run {run} --episodes 3"));
     }
 }
 
@@ -115,7 +92,7 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
 fn a_run_whose_processes_were_all_killed_continues() {
     let system = system();
     let process = launched(&system, 200);
-    let parts = ["replay-server", "learner", "actor"].map(|part| system.find_part(part));
+    let parts = PARTS.map(|part| system.find_part(part));
     process.signal(Signal::SIGKILL);
     parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
     process.wait();
@@ -133,7 +110,7 @@ fn a_run_whose_processes_were_all_killed_continues() {
 fn what_cannot_be_resumed() {
     let system = system();
     let refused = |args: &str, words: &str| {
-        system.run(args).expect_code(64).expect_said(words);
+        system.refuses(args, words);
     };
     refused(
         "local --resume nowhere",
@@ -141,7 +118,7 @@ fn what_cannot_be_resumed() {
     );
     refused("local --resume run --agent c51", "cannot be used with");
     let run = format!("local --agent c51 {SHORT} --run-dir run");
-    system.run(&run).expect_code(0);
+    system.run_ok(&run);
     for less in ["", "--frames 700"] {
         let ended = system.run(&format!("local --resume run {less}"));
         let said = &ended.expect_code(0).stdout;
@@ -161,13 +138,13 @@ fn a_run_cut_off_at_its_end_is_finished() {
         let run = format!(
             "--agent c51 {SHORT} --actors {shards} --replay-shards {shards} --run-dir {dir}"
         );
-        system.run(&format!("local {run}")).expect_code(0);
+        system.run_ok(&format!("local {run}"));
         let path = system.path(&dir).join("summary.json");
         let summary = fs::read_to_string(&path).unwrap();
         fs::write(&path, summary.replace("\"finished\"", "\"failed\"")).unwrap();
         let run = system.run_folder(&dir);
         let before = run.summary().updates;
-        system.run(&format!("local --resume {dir}")).expect_code(0);
+        system.run_ok(&format!("local --resume {dir}"));
         let summary = run.summary();
         assert_eq!(summary.outcome, "finished");
         // The last chunk of 32 is stored whole, which are 16 updates.
@@ -181,10 +158,8 @@ fn a_run_cut_off_at_its_end_is_finished() {
 #[test]
 fn a_damaged_checkpoint_is_reported_once() {
     let system = system();
-    system
-        .run(&format!("local --agent c51 {SHORT} --run-dir run"))
-        .expect_code(0);
-    let newest = system.run_folder("run").checkpoints().pop().unwrap();
+    system.run_ok(&format!("local --agent c51 {SHORT} --run-dir run"));
+    let newest = system.run_folder("run").newest_checkpoint();
     fs::write(newest.join("online.safetensors"), "").unwrap();
     let ended = system
         .run("local --resume run --frames 2000")

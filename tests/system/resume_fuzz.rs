@@ -135,10 +135,7 @@ fn resume_once(seed: u64) {
     );
     let Some(before) = saved(&run) else {
         // Nothing was saved yet.
-        system
-            .run("local --resume run")
-            .expect_code(64)
-            .expect_said("there is no checkpoint");
+        system.refuses("local --resume run", "there is no checkpoint");
         return;
     };
     let delivered_before = delivered(&run);
@@ -159,7 +156,7 @@ fn resume_once(seed: u64) {
     if change.actors != 2 {
         write!(flags, " --set local.actors={}", change.actors).unwrap();
     }
-    let ended = system.run(&flags).expect_code(0);
+    let ended = system.run_ok(&flags);
     let has_other_pace = change.rows != ROWS || change.ratio != RATIO;
     // Where nothing was learned, nothing is behind it.
     let is_fresh = before.updates == 0;
@@ -209,7 +206,7 @@ fn resume_once(seed: u64) {
 
 fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, moment: Duration) {
     if stop == Stop::End {
-        system.run(flags).expect_code(0);
+        system.run_ok(flags);
         return;
     }
     let process = system.start(flags);
@@ -220,8 +217,7 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
     match stop {
         Stop::End => {}
         Stop::Interrupt => {
-            process.signal(Signal::SIGINT);
-            let ended = process.wait();
+            let ended = process.interrupt();
             assert!(matches!(ended.code, Some(0 | 130)), "{ended:?}");
         }
         Stop::KillLauncher => {
@@ -258,7 +254,7 @@ fn the_last_checkpoint_counts_frames_that_came_after_its_last_update() {
         let flags = "--agent c51 --env chain --preset smoke --frames 1280 --set replay.replay_ratio=0.25 \
              --set replay.slack_transitions=64 --set learner.checkpoint_period_updates=1";
         let call = format!("local {flags} {store} --run-dir {dir}");
-        system.run(&call).expect_code(0);
+        system.run_ok(&call);
         let last = saved(&system.run_folder(&dir)).unwrap();
         assert_eq!((last.updates, last.frames), (16, 1_280), "{store}");
     }

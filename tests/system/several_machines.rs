@@ -32,8 +32,8 @@ const MACHINES: [&str; 5] = ["server", "learner", "actor0", "actor1", "actor2"];
 
 impl Run {
     /// None, and the test is skipped, where there can be no such network.
-    fn start(test: &str, actors: usize, frames: u64, ratio: u64) -> Option<Self> {
-        let network = Network::new(test, &MACHINES[..2 + actors])?;
+    fn start(actors: usize, frames: u64, ratio: u64) -> Option<Self> {
+        let network = Network::new(&MACHINES[..2 + actors])?;
         let flags = format!(
             "--env chain --preset smoke --agent driml-ada --frames {frames} --set replay.replay_ratio={ratio}"
         );
@@ -142,8 +142,7 @@ impl Run {
 /// they can.
 #[test]
 fn cut_cables_heal_by_themselves() {
-    let name = "cut_cables_heal_by_themselves";
-    let Some(run) = Run::start(name, 2, 60_000, 8) else {
+    let Some(run) = Run::start(2, 60_000, 8) else {
         return;
     };
     run.wait_for_frames(2_000);
@@ -165,12 +164,11 @@ fn cut_cables_heal_by_themselves() {
 /// One actor behind 256 kbit/s: the others are as fast as they were, and it takes part.
 #[test]
 fn a_narrow_link_slows_no_other_process() {
-    let name = "a_narrow_link_slows_no_other_process";
-    let Some(run) = Run::start(name, 2, 30_000, 8) else {
+    let Some(run) = Run::start(2, 30_000, 8) else {
         return;
     };
     if !run.network.narrow("actor0", 256) {
-        return skip(name, "tc knows no tbf");
+        return skip("tc knows no tbf");
     }
     run.wait_for_frames(20_000);
     let status = wait_for("an answer", || run.status());
@@ -185,8 +183,7 @@ fn a_narrow_link_slows_no_other_process() {
 #[test]
 #[ignore = "seven minutes: cargo nextest run --workspace --run-ignored only -E 'test(cut_off_for_long)'"]
 fn each_part_is_cut_off_for_long() {
-    let name = "each_part_is_cut_off_for_long";
-    let Some(run) = Run::start(name, 2, 400_000, 8) else {
+    let Some(run) = Run::start(2, 400_000, 8) else {
         return;
     };
     run.wait_for_frames(2_000);
@@ -206,14 +203,13 @@ fn each_part_is_cut_off_for_long() {
 #[test]
 #[ignore = "a quarter of an hour: cargo nextest run --workspace --run-ignored only -E 'test(random_faults)'"]
 fn random_faults_lose_nothing() {
-    let name = "random_faults_lose_nothing";
     let number = |name: &str, usual: u64| {
         let text = std::env::var(name);
         text.map_or(usual, |text| text.parse().expect("a number"))
     };
     let (seed, faults) = (number("DRIML_FAULTS_SEED", 1), number("DRIML_FAULTS", 200));
     // The replay ratio makes the learner the slower side, so that the run lasts as long as the faults.
-    let Some(mut run) = Run::start(name, 3, 600 * faults, 64) else {
+    let Some(mut run) = Run::start(3, 600 * faults, 64) else {
         return;
     };
     run.wait_for_frames(500);

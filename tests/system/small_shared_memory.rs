@@ -12,9 +12,9 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
 
-/// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that `test` is skipped, if
+/// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that the test is skipped, if
 /// that is not permitted.
-fn with_shared_memory(test: &str, size: &str) -> Option<Vec<String>> {
+fn with_shared_memory(size: &str) -> Option<Vec<String>> {
     let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm && exec \"$0\" \"$@\"");
     let words: Vec<String> = ["unshare", "-m", "sh", "-c", &mount]
         .map(String::from)
@@ -26,11 +26,11 @@ fn with_shared_memory(test: &str, size: &str) -> Option<Vec<String>> {
     match tried {
         Ok(output) if output.status.success() => Some(words),
         Ok(output) => {
-            skip(test, String::from_utf8_lossy(&output.stderr).trim());
+            skip(String::from_utf8_lossy(&output.stderr).trim());
             None
         }
         Err(e) => {
-            skip(test, &format!("unshare: {e}"));
+            skip(&format!("unshare: {e}"));
             None
         }
     }
@@ -44,7 +44,6 @@ fn warnings(ended: &Ended) -> usize {
 
 #[test]
 fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
-    let test = "too_little_for_all_processes_is_said_once_and_sockets_serve";
     // zenoh alone takes 1.3 MB of each process.
     for (size, actors, enough) in [
         ("512k", 2, false),
@@ -54,7 +53,7 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
         ("9m", 8, false),
         ("64m", 2, true),
     ] {
-        let Some(words) = with_shared_memory(test, size) else {
+        let Some(words) = with_shared_memory(size) else {
             return;
         };
         let system = system();
@@ -74,7 +73,7 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
 
 #[test]
 fn a_run_continues_when_others_fill_it_up() {
-    let Some(words) = with_shared_memory("a_run_continues_when_others_fill_it_up", "64m") else {
+    let Some(words) = with_shared_memory("64m") else {
         return;
     };
     let system = system();
@@ -84,21 +83,20 @@ fn a_run_continues_when_others_fill_it_up() {
     );
     let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
     let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 100);
+    client.wait_for_updates(100);
     let mut filler = File::create(format!("/proc/{}/root/dev/shm/filler", process.pid())).unwrap();
     while filler.write_all(&[0; 4096]).is_ok() {}
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("more updates", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     // A process that starts now finds no room.
     system.find_part("actor").signal(Signal::SIGKILL);
     process.wait_for_stderr("is started again (1 of 16 times in a run)");
     process.wait_for_stderr("no shared memory, so messages go through sockets");
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     let then = client.learner().unwrap().updates;
-    client.wait_for_learner("updates after that", |learner| learner.updates > then + 200);
+    client.wait_for_updates(then + 200);
     drop(client);
-    process.signal(Signal::SIGINT);
-    let ended = process.wait().expect_code(130);
+    let ended = process.interrupt().expect_code(130);
     assert_eq!(warnings(&ended), 1, "{ended:#?}");
     let log = fs::read_to_string(system.path("run/logs/replay-server.log")).unwrap();
     assert!(!log.contains("panicked"), "{log}");

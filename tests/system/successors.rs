@@ -45,13 +45,22 @@ fn killed_learners_cost_no_update_of_the_plan() {
     }
     system.let_go();
     let learned = client.wait_for_learner("the last update", |it| it.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     let planned = (replay.transitions_inserted - 200) * 8 / 16;
     assert_eq!(learned.updates, planned, "{replay:#?}");
     assert_eq!(replay.rows_sampled, 16 * planned);
     actor.wait().expect_code(0);
-    learner.stop().expect_code(0);
+    learner.stop().expect_code(0).expect_said("resumed after ");
     drop(client);
+    server.stop().expect_code(0);
+
+    // What is in the folder is another run's to a run with other settings.
+    let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+    let learner = system.start_learner("run");
+    learner
+        .wait()
+        .expect_code(1)
+        .expect_said("resume with the settings it was made with");
     server.stop().expect_code(0);
 }
 
@@ -63,15 +72,9 @@ fn between_checkpoints(system: &TestSystem, flags: &str) -> (Process, Process, C
     let learner = system.start_learner("run");
     let client = system.connect();
     let actor = system.start_actor(0);
-    client.wait_for_learner("updates", |it| it.updates > 75);
+    client.wait_for_updates(75);
     actor.stop();
     (server, learner, client)
-}
-
-fn newest_checkpoint(system: &TestSystem) -> u64 {
-    let newest = system.run_folder("run").checkpoints().pop().unwrap();
-    let name = newest.file_name().unwrap().to_str().unwrap().to_owned();
-    name.strip_prefix("checkpoint-").unwrap().parse().unwrap()
 }
 
 #[test]
@@ -85,7 +88,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
         .wait()
         .expect_code(1)
         .expect_said("no batch and no answer for 1s");
-    assert!(newest_checkpoint(&system) > 75);
+    assert!(system.run_folder("run").saved_updates() > 75);
 }
 
 /// A new replay server at the same endpoint knows nothing of the run: actors and learner of before exit, and a learner with the run's
@@ -108,7 +111,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
         .wait()
         .expect_code(1)
         .expect_said("this replay server does not know the learner: it was started again");
-    let saved = newest_checkpoint(&system);
+    let saved = system.run_folder("run").saved_updates();
     assert!(saved > 75);
     actor
         .wait()
@@ -118,7 +121,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
-    client.wait_for_learner("more updates", |it| it.updates > saved);
+    client.wait_for_updates(saved);
     let replay = client.replay().unwrap();
     assert_eq!(replay.transitions_refilled, 200, "the warm-up: {replay:#?}");
     assert!(replay.transitions_inserted > 200 + 2 * saved, "{replay:#?}");

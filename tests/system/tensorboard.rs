@@ -74,13 +74,12 @@ fn check_points(read: &Value, columns: &BTreeMap<String, Vec<(u64, f64)>>) {
 
 #[test]
 fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
-    let test = "tensorboard::tensorboard_reads_what_a_run_recorded_and_continues_recording";
-    let Some(python) = python_with(test, &["tensorboard"]) else {
+    let Some(python) = python_with(&["tensorboard"]) else {
         return;
     };
     let system = system();
     let flags = "local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --tensorboard --run-dir run";
-    system.run(flags).expect_code(0);
+    system.run_ok(flags);
     let summary = system.run_folder("run").check_finished();
     let first = read(&python, &system);
     check_points(&first, &columns(&system));
@@ -98,7 +97,7 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
     assert_eq!(picture[3], "89504e47", "a PNG");
     assert!(picture[1].as_u64().unwrap() >= 5 * 24);
 
-    system.run("local --resume run --frames 480").expect_code(0);
+    system.run_ok("local --resume run --frames 480");
     let second = read(&python, &system);
     let columns = columns(&system);
     check_points(&second, &columns);
@@ -117,9 +116,9 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
 #[test]
 fn without_the_flag_there_are_no_events() {
     let system = system();
-    system
-        .run("local --lockstep --env chain --agent c51 --preset smoke --frames 256 --run-dir run")
-        .expect_code(0);
+    system.run_ok(
+        "local --lockstep --env chain --agent c51 --preset smoke --frames 256 --run-dir run",
+    );
     let mut files = fs::read_dir(system.path("run")).unwrap();
     assert!(!files.any(|it| {
         it.unwrap()

@@ -1,6 +1,10 @@
 //! A real replay of tiny frames, for tests that play the replay server themselves.
 
-use driml_protocol::{ActorJoin, Chunk, ChunkHeader, Horizon, RunSpec, Sampling, TimeoutRule};
+use std::collections::BTreeSet;
+
+use driml_protocol::{
+    ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, Sampling, TimeoutRule,
+};
 use driml_replay_server::{Compression, Config, Replay};
 
 /// Frames of 4 x 4 bytes that are not stacked.
@@ -64,4 +68,17 @@ pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Ch
         steps,
         frame_bytes: spec.frame_bytes() as u32,
     })
+}
+
+/// The returns of the rows of so many batches, as numbers: of transitions that are episodes of their own, their rewards.
+pub(crate) fn numbers(replay: &mut Replay, batches: u64, rows: u32) -> BTreeSet<u64> {
+    let mut numbers = BTreeSet::new();
+    let mut request = RequestId::first(1);
+    for _ in 0..batches {
+        let batch = replay.draw_for(request, rows, Buffer::zeroed).unwrap();
+        let returns = batch.unpack().n_step_returns();
+        numbers.extend(returns.into_iter().map(|it| it as u64));
+        request = request.next();
+    }
+    numbers
 }

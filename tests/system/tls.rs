@@ -12,7 +12,8 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 use driml_tests::{
-    Certificates, Client, Process, TestSystem, Valid, skipped_without_openssl, wait_for,
+    Certificates, Client, Process, TestSystem, Valid, check_nothing_lost, skipped_without_openssl,
+    wait_for,
 };
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
@@ -30,9 +31,9 @@ pub(crate) struct TlsSystem {
 }
 
 impl TlsSystem {
-    /// With certificates for some actors; none where there is no openssl, and then `test` is skipped by name.
-    pub(crate) fn new(test: &str) -> Option<Self> {
-        if skipped_without_openssl(test) {
+    /// With certificates for some actors; none where there is no openssl, and then the test is skipped by name.
+    pub(crate) fn new() -> Option<Self> {
+        if skipped_without_openssl() {
             return None;
         }
         let system = system();
@@ -134,9 +135,7 @@ fn raw_tls(side: &str, certificates: &Certificates, role: Option<&str>) -> Strin
 
 #[test]
 fn a_run_over_tls() {
-    let Some(tls) = TlsSystem::new("a_run_over_tls") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let server = tls.start_server(&format!("--agent driml-ada {SHORT}"));
     let observer = tls.client(Role::Observer);
     let learner = tls.start("learner --stay --run-dir run", "tls");
@@ -153,10 +152,7 @@ fn a_run_over_tls() {
         (replay.transitions_inserted, replay.rows_sampled),
         (1280, 8640)
     );
-    assert_eq!(
-        (replay.transitions_lost, replay.transitions_duplicated),
-        (0, 0)
-    );
+    check_nothing_lost(&replay);
     // No process asked for more than its role allows.
     assert_eq!(replay.messages_refused, 0);
     assert!(
@@ -174,9 +170,7 @@ fn a_run_over_tls() {
 /// Its processes meet at a unix socket, and one more comes from outside.
 #[test]
 fn a_launched_run_with_an_actor_from_outside() {
-    let Some(tls) = TlsSystem::new("a_launched_run_with_an_actor_from_outside") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let run = tls.system.start(&format!(
         "local --agent c51 {LONG} --listen {} --tls-dir tls --run-dir run",
         tls.endpoint
@@ -208,9 +202,7 @@ fn a_launched_run_with_an_actor_from_outside() {
 /// Files that are wrong are named before anything is sent.
 #[test]
 fn own_files_that_cannot_be_used() {
-    let Some(tls) = TlsSystem::new("own_files_that_cannot_be_used") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
     spoiled("role").pass_off("learner", "actor-0");
     spoiled("number").pass_off("actor-1", "actor-0");
@@ -274,23 +266,15 @@ fn own_files_that_cannot_be_used() {
         .expect_code(64)
         .expect_said("old/replay-server.pem is not there");
     let server = server.replace("quic/127.0.0.1", "tcp/127.0.0.1");
-    tls.system
-        .run(&server)
-        .expect_code(64)
-        .expect_said("it is quic/127.0.0.1:1");
+    tls.system.refuses(&server, "it is quic/127.0.0.1:1");
     let without = "actor --connect quic/127.0.0.1:1";
-    tls.system
-        .run(without)
-        .expect_code(64)
-        .expect_said("add --tls-dir DIR");
+    tls.system.refuses(without, "add --tls-dir DIR");
 }
 
 /// A replay server rejects each certificate that is not good, and logs why; accepted connections stay.
 #[test]
 fn strangers_at_a_replay_server() {
-    let Some(tls) = TlsSystem::new("strangers_at_a_replay_server") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let mut server = tls.start_server(&format!("--agent c51 {LONG}"));
     let observer = tls.client(Role::Observer);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
@@ -325,7 +309,7 @@ fn strangers_at_a_replay_server() {
     // Who is let in is not disturbed.
     let learner = tls.start("learner --stay --run-dir run", "tls");
     let actor = tls.start("actor --id 1", "tls");
-    observer.wait_for_learner("some updates", |learner| learner.updates > 10);
+    observer.wait_for_updates(10);
     actor.stop().expect_code(0);
     learner.stop().expect_code(0);
 }
@@ -333,9 +317,7 @@ fn strangers_at_a_replay_server() {
 /// A process does not follow a stranger in the place of its replay server, and names the endpoint.
 #[test]
 fn strangers_in_the_place_of_a_replay_server() {
-    let Some(tls) = TlsSystem::new("strangers_in_the_place_of_a_replay_server") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
     let old = spoiled("old");
     old.sign_again("replay-server", Valid::UntilYesterday);
@@ -382,9 +364,7 @@ fn strangers_in_the_place_of_a_replay_server() {
 /// For every role that has a file in the folder, the report says whether it can be used, and what to do if not.
 #[test]
 fn the_doctor_looks_at_certificates() {
-    let Some(tls) = TlsSystem::new("the_doctor_looks_at_certificates") else {
-        return;
-    };
+    let Some(tls) = TlsSystem::new() else { return };
     let doctor = |dir: &str| tls.system.run(&format!("doctor --tls-dir {dir}"));
     let well = doctor("tls");
     let said = |ended: &driml_tests::Ended, state: &str, what: &str, words: &str| {

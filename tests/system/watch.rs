@@ -48,14 +48,10 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
         &system,
         &format!("learner --connect {endpoint} --run-dir run"),
     );
-    let ended = watch.wait().expect_code(0);
-    assert!(
-        ended
-            .stdout
-            .contains("finished: 1280 frames and 540 updates"),
-        "{}",
-        ended.stdout
-    );
+    watch
+        .wait()
+        .expect_code(0)
+        .expect_printed("finished: 1280 frames and 540 updates");
     drop(client);
     for part in actors.into_iter().chain([learner, server]) {
         part.wait().expect_code(0);
@@ -73,16 +69,11 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
     assert!(episodes.iter().all(|it| it.seconds.is_some()));
 
     // The columns are those of a launched run with these settings.
-    system
-        .run(&format!("local {flags} {SHORT} --run-dir launched"))
-        .expect_code(0);
-    let (header, rows) = watched.metrics();
+    system.run_ok(&format!("local {flags} {SHORT} --run-dir launched"));
+    let header = watched.metrics().0;
     assert_eq!(header, system.run_folder("launched").metrics().0);
-    let memory = header.iter().position(|it| it == "rss_mib_learner");
-    assert_eq!(rows.last().unwrap()[memory.unwrap()], "");
-    system
-        .run("plot run launched --out plot.svg")
-        .expect_code(0);
+    assert_eq!(watched.column("rss_mib_learner").pop().unwrap(), "");
+    system.run_ok("plot run launched --out plot.svg");
     let files = fs::read_dir(system.path("run")).unwrap();
     let names = files.map(|it| it.unwrap().file_name().into_string().unwrap());
     assert!(names.into_iter().any(|name| name.contains("tfevents")));
@@ -103,25 +94,21 @@ fn a_launched_run_is_watched_and_continues_without() {
     assert!(!system.path("seen/summary.json").exists());
 
     // Where its launcher writes, no other process does.
-    system
-        .run("watch --run run --run-dir run")
-        .expect_code(64)
-        .expect_said("run is written by `driml train` or by another `driml watch`");
+    system.refuses(
+        "watch --run run --run-dir run",
+        "run is written by `driml train` or by another `driml watch`",
+    );
     // Another run's folder is not this one's.
-    system
-        .run(&format!("local --agent c51 {SHORT} --run-dir other"))
-        .expect_code(0);
-    system
-        .run("watch --run run --run-dir other")
-        .expect_code(64)
-        .expect_said("other holds another run (chain with c51, seed 1)");
+    system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
+    system.refuses(
+        "watch --run run --run-dir other",
+        "other holds another run (chain with c51, seed 1)",
+    );
 
     let watched = system.start("watch --run run --run-dir seen");
     wait_for("further rows", || (rows() > before + 1).then_some(()));
-    launcher.signal(Signal::SIGINT);
-    launcher.wait().expect_code(130);
-    watched.signal(Signal::SIGINT);
-    watched.wait().expect_code(130);
+    launcher.interrupt().expect_code(130);
+    watched.interrupt().expect_code(130);
     let text = fs::read_to_string(system.path("seen/metrics.csv")).unwrap();
     let frames = text.lines().skip(1).map(|row| {
         let frames = row.split(',').nth(1).unwrap();
@@ -142,7 +129,7 @@ fn a_silent_part_is_named_and_a_restarted_server_found_again() {
     watched.wait_for_stderr("no learner has joined yet; no actor has joined yet");
     let learner = system.start_learner("run");
     let _actor = system.start_actor(0);
-    client.wait_for_learner("some updates", |it| it.updates > 0);
+    client.wait_for_updates(0);
     learner.signal(Signal::SIGSTOP);
     watched.wait_for_stderr("learner: no answer for ");
     learner.signal(Signal::SIGCONT);
@@ -160,8 +147,7 @@ fn a_silent_part_is_named_and_a_restarted_server_found_again() {
     wait_for("rows after the restart", || {
         (frames()? > before).then_some(())
     });
-    watched.signal(Signal::SIGINT);
-    watched.wait().expect_code(130);
+    watched.interrupt().expect_code(130);
 }
 
 /// The fields of `--once --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
@@ -197,9 +183,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let _parts = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_learner("the end", |it| it.finished);
 
-    let ended = system
-        .run(&format!("{look} --json --prometheus run.prom"))
-        .expect_code(0);
+    let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
     let said: Value = serde_json::from_str(&ended.stdout).unwrap();
     let names: BTreeSet<_> = said
         .as_object()
@@ -220,7 +204,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     );
     assert_eq!(said["losses"].as_object().unwrap().len(), 1);
     // The page for persons is that of `driml status`.
-    let page = system.run(&look).expect_code(0).stdout;
+    let page = system.run_ok(&look).stdout;
     assert!(
         page.contains("the run is over: everything is learned and saved"),
         "{page}"
@@ -299,8 +283,7 @@ fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> 
 
 #[test]
 fn prometheus_reads_the_file_of_a_run_that_is_watched() {
-    let test = "watch::prometheus_reads_the_file_of_a_run_that_is_watched";
-    let Some(python) = python_with(test, &["prometheus_client"]) else {
+    let Some(python) = python_with(&["prometheus_client"]) else {
         return;
     };
     let system = system();
@@ -320,8 +303,6 @@ print(next(it for it in parse(open(sys.argv[1]).read()) if it.name == 'driml_upd
     };
     let first = wait_for("the file", updates);
     wait_for("more updates", || (updates()? > first).then_some(()));
-    watched.signal(Signal::SIGINT);
-    watched.wait().expect_code(130);
-    launcher.signal(Signal::SIGINT);
-    launcher.wait().expect_code(130);
+    watched.interrupt().expect_code(130);
+    launcher.interrupt().expect_code(130);
 }

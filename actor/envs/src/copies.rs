@@ -1,11 +1,91 @@
-//! What every world of many copies shares: a generator for each copy, and the check of a caller's step buffers.
+//! What every world of many copies shares: a generator for each copy, the check of a caller's step buffers, and how copies that are
+//! stepped one by one are a world.
 //! It holds no game rules and no state.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::{Serialize, de::DeserializeOwned};
 
-use crate::environment::StepEnd;
+use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
+use crate::saved;
+
+/// A world whose copies are stepped one by one, each by itself.
+pub(crate) trait Copies: Send {
+    /// All of a copy that does not follow from the settings.
+    type Saved: Serialize + DeserializeOwned;
+
+    fn shape(&self) -> FrameShape;
+
+    fn actions(&self) -> usize;
+
+    fn count(&self) -> usize;
+
+    /// Writes the current frame [H, W, C] of a copy.
+    fn draw(&self, copy: usize, frame: &mut [u8]);
+
+    /// Takes an action, which the world has, and starts anew what it ended.
+    fn act(&mut self, copy: usize, action: u8) -> (f32, StepEnd);
+
+    fn saved(&self, copy: usize) -> Self::Saved;
+
+    fn restore(&mut self, copy: usize, saved: Self::Saved) -> Result<(), EnvError>;
+}
+
+impl<W: Copies> Environment for W {
+    fn frame_shape(&self) -> FrameShape {
+        self.shape()
+    }
+
+    fn num_actions(&self) -> usize {
+        self.actions()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.count()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        check_frames(frames, self.count(), self.shape());
+        let bytes = self.shape().bytes();
+        for (copy, frame) in frames.chunks_exact_mut(bytes).enumerate() {
+            self.draw(copy, frame);
+        }
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        check_step(self.count(), self.actions(), actions, rewards, ends)?;
+        for (copy, &action) in actions.iter().enumerate() {
+            (rewards[copy], ends[copy]) = self.act(copy, action);
+        }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let copies: Vec<_> = (0..self.count()).map(|copy| self.saved(copy)).collect();
+        saved::encode(&copies)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let copies = saved::decode(state, self.count())?;
+        let mut copies = copies.into_iter().enumerate();
+        copies.try_for_each(|(copy, saved)| self.restore(copy, saved))
+    }
+}
+
+/// The argument of `Environment::observe` is as long as the frames of all copies.
+pub(crate) fn check_frames(frames: &[u8], num_envs: usize, shape: FrameShape) {
+    assert_eq!(
+        frames.len(),
+        num_envs * shape.bytes(),
+        "observe needs room for every copy's frame"
+    );
+}
 
 /// What a copy's generator is used for; each use has its own stream, so adding one leaves the others as they were.
 #[derive(Clone, Copy)]
@@ -23,7 +103,6 @@ pub(crate) fn copy_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
     rng
 }
 
-/// Rejects a world without copies.
 pub(crate) fn check_num_envs(num_envs: usize) -> Result<(), EnvError> {
     if num_envs == 0 {
         return Err(EnvError::Config(

@@ -16,6 +16,8 @@
 //! [`WorldConfig`] holds the settings of any of them (`kind` says which) and builds it, and [`WorldName`] reads the names
 //! above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
 //!
+//! [`PartOfWorld`] is one with fewer actions and smaller frames.
+//!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`], and the world itself,
 //! which implements [`Environment`]; then give it a line in `registry.rs`.
@@ -46,24 +48,22 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
-mod action_set;
 mod copies;
-mod cut_frames;
 mod environment;
 mod error;
 mod frame_stack;
 mod own;
+mod part;
 mod registry;
 mod saved;
 mod settings;
 mod worlds;
 
-pub use action_set::{ActionSet, FewerActions};
-pub use cut_frames::CutFrames;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use own::{OwnWorld, preset as own_preset, register};
+pub use part::{ActionSet, PartOfWorld};
 pub use procgen_sys::{
     DistributionMode, Engine as ProcgenEngine, Game, InstallError, ProcgenError,
 };

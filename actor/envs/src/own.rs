@@ -83,7 +83,7 @@ impl OwnWorld {
         self.kind
     }
 
-    pub(crate) fn settings(&self) -> &dyn WorldSettings {
+    pub(crate) fn settings(&self) -> &(dyn WorldSettings + 'static) {
         self.settings.as_ref()
     }
 }

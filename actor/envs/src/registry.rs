@@ -4,16 +4,16 @@
 
 use std::collections::BTreeSet;
 use std::fmt;
+use std::ops::Deref;
 use std::str::FromStr;
 use std::sync::{Mutex, PoisonError};
 
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::action_set::ActionSet;
-use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
 use crate::own::{self, OwnWorld};
+use crate::part::ActionSet;
 use crate::settings::{Levels, Variants, WorldSettings, no_levels};
 use crate::worlds::corridor::CorridorConfig;
 use crate::worlds::exec::ExecConfig;
@@ -53,7 +53,7 @@ macro_rules! worlds {
         const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
 
         impl WorldConfig {
-            fn settings(&self) -> (&'static str, &dyn WorldSettings) {
+            fn settings(&self) -> (&'static str, &(dyn WorldSettings + 'static)) {
                 match self {
                     $(Self::$World(settings) => ($kind, settings),)+
                     Self::Own(own) => (own.kind(), own.settings()),
@@ -122,38 +122,12 @@ impl WorldConfig {
         }
     }
 
-    /// # Errors
-    /// Says which setting cannot work.
-    pub fn validate(&self) -> Result<(), EnvError> {
-        self.settings().1.validate()
-    }
-
-    /// The shape of one frame of the world that these settings make.
-    pub fn frame_shape(&self) -> FrameShape {
-        self.settings().1.frame_shape()
-    }
-
-    /// The names of the world's actions; an action is a place in this list.
-    pub fn action_names(&self) -> Vec<&str> {
-        self.settings().1.action_names()
-    }
-
-    /// Steps a second at which a person plays the game, or can follow it.
-    pub fn steps_per_second(&self) -> f64 {
-        self.settings().1.steps_per_second()
-    }
-
     /// Number of the world's actions; valid ones are below it.
     pub fn num_actions(&self) -> usize {
         self.action_names().len()
     }
 
-    /// For each action, the one that it amounts to in this world; an action that stands for itself maps to itself.
-    pub fn visible_actions(&self) -> Vec<u8> {
-        self.settings().1.visible_actions()
-    }
-
-    /// The actions of `set`, in their order: each is a place in [`action_names`](Self::action_names).
+    /// The actions of `set`, in their order: each is a place in [`action_names`](WorldSettings::action_names).
     pub fn actions(&self, set: ActionSet) -> Vec<u8> {
         let mut actions = match set {
             ActionSet::All => (0..self.num_actions()).map(|action| action as u8).collect(),
@@ -189,34 +163,14 @@ impl WorldConfig {
             )))
         }
     }
+}
 
-    /// Whether a run in this world can be resumed: no episode depends on how many were played before.
-    pub fn is_resumable(&self) -> bool {
-        self.settings().1.is_resumable()
-    }
+/// What a run must know of the world, and how it is built, are those of its settings.
+impl Deref for WorldConfig {
+    type Target = dyn WorldSettings;
 
-    /// Puts what the world needs onto this machine; `progress` is told what is being done, a line at a time.
-    ///
-    /// # Errors
-    /// What is missing, and how to get it.
-    pub fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
-        self.settings().1.install(progress)
-    }
-
-    /// Builds `num_envs` copies of the world. Copy i depends on (`seed`, i) and its actions only.
-    ///
-    /// `threads` is how many threads Procgen's engine may start, 0 for none; the other worlds are stepped in microseconds
-    /// and use none. The chain has nothing to seed.
-    ///
-    /// # Errors
-    /// Settings that cannot work, or an engine that cannot be had.
-    pub fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
-        self.settings().1.build(num_envs, seed, threads)
+    fn deref(&self) -> &Self::Target {
+        self.settings().1
     }
 }
 

@@ -14,7 +14,6 @@ pub(crate) fn encode<T: Serialize>(state: &T) -> Result<Vec<u8>, EnvError> {
         .map_err(|e| EnvError::State(e.to_string()))
 }
 
-/// The state that [`encode`] wrote.
 pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvError> {
     let config = bincode::config::standard().with_limit::<STATE_BYTES_MAX>();
     let (state, used) = bincode::serde::decode_from_slice(bytes, config)
@@ -60,10 +59,8 @@ pub(crate) mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::{
-        Boundary, CorridorConfig, CutFrames, Environment, FewerActions, IsingConfig, StepEnd,
-        WorldConfig,
-    };
+    use crate::worlds::{corridor, ising};
+    use crate::{Environment, IsingConfig, PartOfWorld, StepEnd, WorldConfig};
 
     /// Copies of each world here.
     const COPIES: usize = 3;
@@ -117,15 +114,8 @@ pub(crate) mod tests {
         ended
     }
 
-    fn chain(cells: usize) -> WorldConfig {
-        WorldConfig::Chain(CorridorConfig {
-            cells,
-            height: 12,
-            width: 12,
-            step_limit: 30,
-            reward_left: 0.1,
-            reward_right: 1.0,
-        })
+    fn chain() -> WorldConfig {
+        WorldConfig::Chain(corridor::tests::config())
     }
 
     fn ising(lattice_size: usize) -> WorldConfig {
@@ -133,20 +123,18 @@ pub(crate) mod tests {
             lattice_size,
             patch_size: 5,
             temperature: 2.0,
-            boundary: Boundary::Free,
-            sweeps_per_step: 1,
-            episode_steps: 16,
+            ..ising::tests::paper()
         })
     }
 
     #[test]
     fn worlds_go_on_where_they_were_saved() {
-        for (name, config) in [("chain", chain(8)), ("ising", ising(9))] {
+        for (name, config) in [("chain", chain()), ("ising", ising(9))] {
             assert!(continues(name, 60, || config.build(COPIES, 3, 0).unwrap()) > 3);
         }
         let part = || {
-            let cut = CutFrames::of(chain(8).build(COPIES, 3, 0).unwrap(), (6, 11)).unwrap();
-            FewerActions::of(cut, vec![1, 2]).unwrap()
+            let whole = chain().build(COPIES, 3, 0).unwrap();
+            PartOfWorld::of(whole, vec![1, 2], (6, 11)).unwrap()
         };
         assert!(continues("a part of the chain", 60, part) > 3);
     }
@@ -155,10 +143,10 @@ pub(crate) mod tests {
     fn a_state_of_another_world_is_refused() {
         let state = |config: WorldConfig, copies| config.build(copies, 3, 0).unwrap().save();
         for (config, state) in [
-            (chain(8), state(chain(8), 2)),
-            (chain(8), state(ising(9), COPIES)),
+            (chain(), state(chain(), 2)),
+            (chain(), state(ising(9), COPIES)),
             (ising(9), state(ising(10), COPIES)),
-            (ising(9), state(chain(8), COPIES)),
+            (ising(9), state(chain(), COPIES)),
         ] {
             let mut world = config.build(COPIES, 3, 0).unwrap();
             let said = world.load(&state.unwrap()).unwrap_err().to_string();

@@ -31,11 +31,9 @@ pub enum Game {
     Starpilot,
 }
 
-/// What is known of a game.
 struct Row {
     game: Game,
     name: &'static str,
-    /// See [`Game::time_limit_steps`].
     limit: u32,
     /// Its modes beside easy and hard.
     modes: &'static [DistributionMode],
@@ -55,7 +53,6 @@ const fn row(
     }
 }
 
-/// In the order of [`Game`].
 const TABLE: [Row; 16] = [
     row(Game::Bigfish, "bigfish", 6000, &[]),
     row(Game::Bossfight, "bossfight", 4000, &[]),

@@ -77,12 +77,10 @@ fn fetch_with(python: &str, to: &Path) -> Result<PathBuf, InstallError> {
     )))
 }
 
-/// Checks that pip is there.
 pub(crate) fn check_pip() -> Result<(), InstallError> {
     pip("python3", &["--version"]).map(drop)
 }
 
-/// Runs `python -m pip` with these arguments.
 fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
     let mut command = Command::new(python);
     command.args(["-m", "pip"]).args(arguments);
@@ -104,7 +102,6 @@ fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
     }
 }
 
-/// Checks the SHA-256 of a file.
 pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), InstallError> {
     let mut hasher = Sha256::new();
     let mut file = File::open(path).map_err(InstallError::io("opening", path))?;
@@ -177,7 +174,6 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// A zip file with these entries.
     pub(crate) fn archive(path: &Path, entries: &[(&str, &[u8])]) {
         let mut writer = zip::ZipWriter::new(File::create(path).unwrap());
         for (name, bytes) in entries {
@@ -237,7 +233,6 @@ pub(crate) mod tests {
         assert!(error.to_string().contains(&text), "{error}");
     }
 
-    /// A script stands for Python.
     #[test]
     fn each_way_pip_can_fail_has_its_message() {
         let folder = tempfile::tempdir().unwrap();

@@ -120,6 +120,7 @@ impl Delivery {
     /// A chunk that could not be delivered.
     pub fn finish(self) -> Result<u64, DeliveryError> {
         drop(self.queue);
-        self.thread.join().map_err(|_| DeliveryError::Panicked)?
+        let panicked = |_| DeliveryError::Failed("the delivery thread panicked".into());
+        self.thread.join().map_err(panicked)?
     }
 }

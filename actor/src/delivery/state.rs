@@ -66,20 +66,6 @@ impl DeliveryState {
 /// Why chunks could not be delivered.
 #[derive(Debug, thiserror::Error)]
 pub enum DeliveryError {
-    /// The actor was told to stop, and the replay server did not store what it had left.
-    #[error("chunk {sequence} was not stored within {within:?} of the end")]
-    NotDrained {
-        /// The first chunk that was not stored.
-        sequence: u64,
-        /// How long it was tried.
-        within: Duration,
-    },
-    /// The replay server rejects it permanently.
-    #[error("the replay server refused a chunk: {why}")]
-    Refused {
-        /// The replay server's reason, a sentence.
-        why: String,
-    },
     /// No answer for too long.
     #[error("the replay server was out of reach for {within:?}")]
     OutOfReach {
@@ -88,7 +74,7 @@ pub enum DeliveryError {
         /// The last try's error.
         source: SessionError,
     },
-    /// A broken invariant of our own.
-    #[error("the delivery thread panicked")]
-    Panicked,
+    /// Anything else: a chunk was refused, or not stored in the time that an actor has which was told to stop.
+    #[error("{0}")]
+    Failed(String),
 }

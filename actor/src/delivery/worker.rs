@@ -29,7 +29,6 @@ const GOODBYE_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its answer: several must fit, as a message may be lost.
 const GOODBYE_TRY_MAX: Duration = Duration::from_secs(1);
 
-/// A chunk that is not settled yet.
 struct Outgoing {
     header: ChunkHeader,
     payload: ZBytes,
@@ -71,7 +70,6 @@ pub(super) struct DeliveryWorker {
     outgoing: VecDeque<Outgoing>,
     /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
     window: usize,
-    /// When the replay server last answered.
     answered: Instant,
     /// When the chunk that waits at the rate limiter began to wait.
     held_since: Option<Instant>,
@@ -177,10 +175,9 @@ impl DeliveryWorker {
         if self.shutdown.is_set() {
             let since = *self.draining_since.get_or_insert_with(Instant::now);
             if since.elapsed() > DRAIN_MAX {
-                return Err(DeliveryError::NotDrained {
-                    sequence,
-                    within: DRAIN_MAX,
-                });
+                return Err(DeliveryError::Failed(format!(
+                    "chunk {sequence} was not stored within {DRAIN_MAX:?} of the end"
+                )));
             }
         }
         let reply = match self.send_window().and_then(|()| self.wait_for_first()) {
@@ -226,7 +223,9 @@ impl DeliveryWorker {
             }
             // Judged while one before it waited; all of those are stored now.
             Ok(InsertReply::OutOfOrder { .. }) => Ok(self.again()),
-            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Refused { why }),
+            Ok(InsertReply::Refused { why }) => Err(DeliveryError::Failed(format!(
+                "the replay server refused a chunk: {why}"
+            ))),
             Err(SessionError::Recovering(recovering)) => {
                 self.answered = Instant::now();
                 if let Some(more) = self.retries_said.due() {

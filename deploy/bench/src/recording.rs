@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_envs::{CutFrames, StepEnd};
+use driml_envs::{ActionSet, PartOfWorld, StepEnd};
 use driml_launch::console;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
@@ -63,7 +63,8 @@ impl Recording {
             config.run.frame_height as usize,
             config.run.frame_width as usize,
         );
-        let mut world = CutFrames::of(config.world.build(STREAMS, 1, 0)?, sent)?;
+        let whole = config.world.build(STREAMS, 1, 0)?;
+        let mut world = PartOfWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
         let mut steps = Vec::with_capacity(STEPS * STREAMS);

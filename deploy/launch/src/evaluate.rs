@@ -6,7 +6,7 @@ use std::{ops::ControlFlow, path::Path};
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, Watch, episode_returns};
-use driml_envs::{CutFrames, FewerActions, WorldConfig};
+use driml_envs::{PartOfWorld, WorldConfig};
 use driml_learner::{
     Compute, UpdateError, checkpoint,
     insight::{Insight, Seen},
@@ -229,8 +229,8 @@ fn play_with(
 ) -> anyhow::Result<Vec<f64>> {
     let copies = Player::copies(evaluation.episodes);
     let actions = world.actions(config.actor.actions);
-    let fewer = FewerActions::of(world.build(copies, seed, 0)?, actions)?;
-    let (world, rng) = (CutFrames::of(fewer, sent(config))?, policy_rng(seed));
+    let world = PartOfWorld::of(world.build(copies, seed, 0)?, actions, sent(config))?;
+    let rng = policy_rng(seed);
     episode_returns(world, policy, evaluation, rng, watch)
         .with_context(|| format!("playing {}", config.run.world))
 }

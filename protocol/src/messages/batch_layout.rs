@@ -63,7 +63,6 @@ impl Column {
         matches!(self, Self::Transition | Self::Probability)
     }
 
-    /// Whether its values are states.
     pub(super) const fn is_of_states(self) -> bool {
         matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
     }
@@ -191,7 +190,6 @@ impl BatchLayout {
         }
     }
 
-    /// Bytes of a column.
     pub(super) const fn column_bytes(&self, column: Column) -> usize {
         match column {
             Column::Frames => match self.stacked {
@@ -209,7 +207,6 @@ impl BatchLayout {
         }
     }
 
-    /// Where a column lies in the payload.
     pub(super) fn range(&self, column: Column) -> Range<usize> {
         let before = Column::ALL[..column as usize].iter();
         let start = before.map(|&column| self.column_bytes(column)).sum();
@@ -275,60 +272,30 @@ mod tests {
         // Five frames of two bytes, and four numbers of four for each of eight states.
         let of_states = 5 * 2 + 8 * 16;
         assert_eq!(stacks.bytes(), Some(of_states + 2 * (10 + 2 * 2)));
-        let of = |stacked| BatchLayout {
-            stacked: Some(stacked),
-            ..stacks
-        };
-        for wrong in [
-            of(StackedFrames {
-                frames: 8 * 4 + 1,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_stack: 0,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_stack: 1,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_stack: 3,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_stack: u32::MAX,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_channels: 0,
-                ..FRAMES
-            }),
-            of(StackedFrames {
-                frame_channels: 3,
-                ..FRAMES
-            }),
-            BatchLayout {
-                state_bytes: usize::MAX / 4 * 4,
-                ..stacks
-            },
-            BatchLayout {
-                rows: usize::MAX,
-                ..small
-            },
-            BatchLayout {
-                states_k: 5,
-                ..small
-            },
-            BatchLayout {
-                states_n: 3,
-                ..small
-            },
-            BatchLayout {
-                state_bytes: usize::MAX / 4,
-                ..small
-            },
-        ] {
+        let frames: [fn(&mut StackedFrames); 7] = [
+            |it| it.frames = 8 * 4 + 1,
+            |it| it.frame_stack = 0,
+            |it| it.frame_stack = 1,
+            |it| it.frame_stack = 3,
+            |it| it.frame_stack = u32::MAX,
+            |it| it.frame_channels = 0,
+            |it| it.frame_channels = 3,
+        ];
+        for change in frames {
+            let mut wrong = stacks;
+            wrong.stacked.as_mut().map(change);
+            assert_eq!(wrong.bytes(), None, "{wrong:?}");
+        }
+        type Change = fn(&mut BatchLayout);
+        let layouts: [(BatchLayout, Change); 5] = [
+            (stacks, |it| it.state_bytes = usize::MAX / 4 * 4),
+            (small, |it| it.rows = usize::MAX),
+            (small, |it| it.states_k = 5),
+            (small, |it| it.states_n = 3),
+            (small, |it| it.state_bytes = usize::MAX / 4),
+        ];
+        for (mut wrong, change) in layouts {
+            change(&mut wrong);
             assert_eq!(wrong.bytes(), None, "{wrong:?}");
         }
     }

@@ -29,7 +29,6 @@ impl RowScalars {
         self.bootstrap_discount != 0.0
     }
 
-    /// Writes them as those of `row`.
     pub(super) fn write(&self, layout: &BatchLayout, payload: &mut [u8], row: usize) {
         assert!(self.positives as usize <= layout.positives, "at most P");
         let mut put = |column, at: usize, bytes: &[u8]| {

@@ -97,15 +97,20 @@ pub fn open_unless(
     message_bytes_max: usize,
 ) -> Result<Option<Session>, SessionError> {
     let (keys, credentials) = (keys.clone(), credentials.cloned());
-    let Endpoints { listen, connect } = endpoints.clone();
+    let failed = endpoints.clone();
     let open = move || open_as(&endpoints, &keys, credentials.as_deref(), message_bytes_max);
     match shutdown.unless_set("connecting", open) {
         Ok(opened) => opened.transpose(),
-        Err(e) => Err(SessionError::Open {
-            listen,
-            connect,
-            why: format!("starting a thread: {e}"),
-        }),
+        Err(e) => Err(failed.not_opened(&format!("starting a thread: {e}"))),
+    }
+}
+
+impl Endpoints {
+    fn not_opened(&self, why: &str) -> SessionError {
+        let Self { listen, connect } = self;
+        SessionError::Failed(format!(
+            "opening a zenoh session (listen {listen:?}, connect {connect:?}): {why}"
+        ))
     }
 }
 
@@ -119,28 +124,15 @@ fn open_with(
     message_bytes_max: usize,
     more: &[(&str, String)],
 ) -> Result<Session, SessionError> {
-    let fail = |why: String| SessionError::Open {
-        listen: endpoints.listen.clone(),
-        connect: endpoints.connect.clone(),
-        // zenoh adds where in its own sources it failed.
-        why: why.split(" at /").next().unwrap_or_default().to_owned(),
-    };
-    let list = |list: &[String]| -> String {
-        format!(
-            "[{}]",
-            list.iter()
-                .map(|e| format!("{e:?}"))
-                .collect::<Vec<_>>()
-                .join(", ")
-        )
-    };
+    // zenoh adds where in its own sources it failed.
+    let fail = |why: String| endpoints.not_opened(why.split(" at /").next().unwrap_or_default());
     let router = !endpoints.listen.is_empty();
     let max = message_bytes_max.to_string();
     let stalled_us = STALLED_MAX.as_micros().to_string();
     let settings: &[(&str, &str)] = &[
         ("mode", if router { "\"router\"" } else { "\"client\"" }),
-        ("listen/endpoints", &list(&endpoints.listen)),
-        ("connect/endpoints", &list(&endpoints.connect)),
+        ("listen/endpoints", &format!("{:?}", endpoints.listen)),
+        ("connect/endpoints", &format!("{:?}", endpoints.connect)),
         (
             "connect/exit_on_failure",
             if router { "false" } else { "true" },
@@ -198,13 +190,20 @@ fn open_with(
         return open("-1").map_err(fail);
     }
     reach::wait_for_any(&endpoints.connect, CONNECT_MAX)?;
-    let connect = || endpoints.connect.clone();
-    let not_driml = |what: String| match endpoints.connect.iter().any(|it| is_quic(it)) {
-        true => SessionError::NotLetIn { connect: connect() },
-        false => SessionError::NotDriml {
-            connect: connect(),
-            what,
-        },
+    let not_driml = |what: &str| {
+        let connect = endpoints.connect.join(", ");
+        SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {
+            // Whether none listens or one side rejects the other's certificate is known to zenoh alone, whose log has it on the side
+            // that rejects.
+            true => format!(
+                "no replay server lets this process in on {connect}: is it running, with --tls-dir, and is the endpoint right (its port is \
+                 one of UDP)? If so, one side rejects the other's certificate: `driml doctor --tls-dir` on both machines and the replay \
+                 server's log say why"
+            ),
+            false => format!(
+                "something listens on {connect} that is not driml ({what}): is the endpoint right? If it is, its process may be suspended"
+            ),
+        })
     };
     let milliseconds = |it: Duration| it.as_millis().to_string();
     let why = match open(&milliseconds(UNDERSTOOD_MAX)) {
@@ -214,12 +213,12 @@ fn open_with(
     // A process of the run may be slow on a busy machine, and then sends nothing; a foreign server may introduce itself.
     let mut listening = endpoints.connect.iter();
     if let Some(words) = listening.find_map(|it| reach::what_listens(it)) {
-        return Err(not_driml(format!("it says {words:?}")));
+        return Err(not_driml(&format!("it says {words:?}")));
     }
     tracing::debug!("trying again: {why}");
     open(&milliseconds(CONNECT_MAX.saturating_sub(UNDERSTOOD_MAX))).map_err(|why| {
         match why.contains(NOTHING_LISTENS) {
-            true => not_driml("it says nothing that could be understood".into()),
+            true => not_driml("it says nothing that could be understood"),
             false => fail(why),
         }
     })

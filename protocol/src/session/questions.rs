@@ -47,10 +47,7 @@ pub fn send(
         .priority(priority)
         .timeout(timeout)
         .wait()
-        .map_err(|e| SessionError::Zenoh {
-            key: key.into(),
-            why: e.to_string(),
-        })?;
+        .map_err(|e| SessionError::Failed(format!("{key}: {e}")))?;
     Ok(PendingBytes {
         key: key.into(),
         timeout,
@@ -126,7 +123,7 @@ impl PendingBytes {
                         key: key(),
                         within_ms: self.timeout.as_millis(),
                     },
-                    _ => SessionError::Zenoh { key: key(), why },
+                    _ => SessionError::Failed(format!("{}: {why}", self.key)),
                 }
             }
         };

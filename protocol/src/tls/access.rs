@@ -24,13 +24,9 @@ use crate::{
 /// What a role may do; everything else it may not.
 struct Grant {
     role: Role,
-    /// Keys at which it asks.
     asks: Vec<String>,
-    /// Keys at which it answers.
     answers: Vec<String>,
-    /// Keys to which it subscribes.
     subscribes: Vec<String>,
-    /// Keys of its liveliness tokens.
     lives: Vec<String>,
 }
 

@@ -19,10 +19,12 @@ use rustls::{
 };
 use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
 
-use super::{
-    role::{ACTORS_MAX, Role},
-    sentences::TlsError,
-};
+use super::role::{ACTORS_MAX, Role};
+
+/// Why a process cannot use its certificate or its key, and what to do.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct TlsError(String);
 
 /// A certificate that expires sooner is warned of at the start.
 const EXPIRES_SOON: Duration = Duration::from_secs(14 * 24 * 3600);
@@ -68,20 +70,20 @@ impl Credentials {
     /// # Errors
     /// As [`Credentials::read`].
     pub fn examine(folder: &Path, role: Role) -> Result<Self, TlsError> {
-        match role {
-            Role::Actor(number) if number >= ACTORS_MAX => {
-                return Err(TlsError::Number { number });
-            }
-            _ => {}
+        if let Role::Actor(number) = role
+            && number >= ACTORS_MAX
+        {
+            return Err(TlsError(format!(
+                "actor {number} has no certificate: with --tls-dir actors have the numbers 0 to {}, see --id",
+                ACTORS_MAX - 1
+            )));
         }
         let file = |ending| folder.join(format!("{role}.{ending}"));
         let (authority, certificate, key) = (authority_path(folder), file("pem"), file("key"));
         let authorities = certificates(&authority, role)?;
         let chain = certificates(&certificate, role)?;
-        let secret = PrivateKeyDer::from_pem_slice(&read(&key, role)?).map_err(|_| {
-            let (path, what) = (key.clone(), "private key");
-            TlsError::NotPem { path, what }
-        })?;
+        let secret = PrivateKeyDer::from_pem_slice(&read(&key, role)?);
+        let secret = secret.map_err(|_| not_pem(&key))?;
         let own = parsed(&chain[0], &certificate)?;
         let names: Vec<_> = own
             .subject()
@@ -89,11 +91,13 @@ impl Credentials {
             .map(|name| name.as_str().unwrap_or_default().to_owned())
             .collect();
         if names != [role.to_string()] {
-            return Err(TlsError::OtherRole {
-                path: certificate,
-                have: names.join(", "),
-                role,
-            });
+            return Err(TlsError(format!(
+                "{} is the certificate of {:?}, not of {:?}: each part has its own; `deploy/certs.sh {}` makes it",
+                certificate.display(),
+                names.join(", "),
+                role.to_string(),
+                how_to_make(&certificate, role)
+            )));
         }
         check_dates(&own, &certificate, role)?;
         let expires = own.validity().not_after.timestamp();
@@ -103,20 +107,24 @@ impl Credentials {
             check_dates(&parsed(&one, &authority)?, &authority, role)?;
             roots.add(one).map_err(|_| not_pem(&authority))?;
         }
-        check_signed(&roots, &chain, role).map_err(|why| TlsError::OtherAuthority {
-            path: certificate.clone(),
-            authority: authority.clone(),
-            why,
+        check_signed(&roots, &chain, role).map_err(|why| {
+            TlsError(format!(
+                "{} was not signed by the authority of {} ({why}): take both from the same run of `deploy/certs.sh`",
+                certificate.display(),
+                authority.display()
+            ))
         })?;
-        let other_key = || TlsError::OtherKey {
-            key: key.clone(),
-            certificate: certificate.clone(),
-            role,
-        };
         let signer = provider().key_provider.load_private_key(secret);
         let signer = signer.map_err(|_| not_pem(&key))?;
         let pair = CertifiedKey::new(chain, signer);
-        pair.keys_match().map_err(|_| other_key())?;
+        pair.keys_match().map_err(|_| {
+            TlsError(format!(
+                "{} is not the key of {}: they were made at different times; remove both and `deploy/certs.sh {}` makes them anew",
+                key.display(),
+                certificate.display(),
+                how_to_make(&certificate, role)
+            ))
+        })?;
         Ok(Self {
             role,
             authority,
@@ -173,7 +181,6 @@ impl Credentials {
         }
     }
 
-    /// zenoh's settings for TLS, JSON5.
     pub(crate) fn zenoh_settings(&self) -> String {
         let paths = [
             ("root_ca_certificate", &self.authority),
@@ -201,17 +208,26 @@ fn now() -> Duration {
 }
 
 fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
-    let path_of = || path.to_owned();
-    fs::read(path).map_err(|why| match why.kind() {
-        io::ErrorKind::NotFound => TlsError::Missing {
-            path: path_of(),
-            role,
-        },
-        _ => TlsError::Unreadable {
-            path: path_of(),
-            why,
-        },
+    fs::read(path).map_err(|why| {
+        TlsError(match why.kind() {
+            io::ErrorKind::NotFound => format!(
+                "{} is not there: the role {role} needs ca.pem, {role}.pem and {role}.key; `deploy/certs.sh {}` makes them, \
+                 beside the authority's key, and you copy them here",
+                path.display(),
+                how_to_make(path, role)
+            ),
+            _ => format!(
+                "{} cannot be read: {why}; it belongs to the user who starts this part",
+                path.display()
+            ),
+        })
     })
+}
+
+/// The arguments of `deploy/certs.sh` that make the files of `role` beside `path`.
+fn how_to_make(path: &Path, role: Role) -> String {
+    let folder = path.parent().unwrap_or(path).display();
+    format!("{folder} {}", role.how_to_make()).trim_end().into()
 }
 
 fn not_pem(path: &Path) -> TlsError {
@@ -219,8 +235,10 @@ fn not_pem(path: &Path) -> TlsError {
         Some(ending) if ending == "key" => "private key",
         _ => "certificate",
     };
-    let path = path.to_owned();
-    TlsError::NotPem { path, what }
+    TlsError(format!(
+        "{} holds no {what} in PEM: `deploy/certs.sh` makes such files; copy it again, or remove it and make it anew",
+        path.display()
+    ))
 }
 
 /// The certificates in a file, at least one.
@@ -240,14 +258,20 @@ fn parsed<'a>(der: &'a CertificateDer<'_>, path: &Path) -> Result<X509Certificat
 
 fn check_dates(certificate: &X509Certificate<'_>, path: &Path, role: Role) -> Result<(), TlsError> {
     let (validity, now) = (certificate.validity(), now().as_secs() as i64);
-    let path = path.to_owned();
+    let shown = path.display();
     if now > validity.not_after.timestamp() {
-        let when = validity.not_after.to_string();
-        return Err(TlsError::Expired { path, when, role });
+        return Err(TlsError(format!(
+            "{shown} expired at {}: remove it and its key, and `deploy/certs.sh {}` makes new ones; if it did not, this machine's clock is \
+             wrong",
+            validity.not_after,
+            how_to_make(path, role)
+        )));
     }
     if now < validity.not_before.timestamp() {
-        let when = validity.not_before.to_string();
-        return Err(TlsError::NotYet { path, when });
+        return Err(TlsError(format!(
+            "{shown} is valid only from {} on: this machine's clock is wrong, or that of the machine on which it was made",
+            validity.not_before
+        )));
     }
     Ok(())
 }

@@ -11,9 +11,7 @@
 mod access;
 mod credentials;
 mod role;
-mod sentences;
 
 pub(crate) use access::rules;
-pub use credentials::{Credentials, authority_path};
+pub use credentials::{Credentials, TlsError, authority_path};
 pub use role::{ACTORS_MAX, Role};
-pub use sentences::TlsError;

@@ -43,7 +43,6 @@ pub trait Request: Keyed {
     type Reply: Message;
 }
 
-/// Checks that no payload follows the header.
 pub(crate) fn no_payload(payload: &[u8]) -> Result<(), CodecError> {
     match payload.len() {
         0 => Ok(()),

@@ -4,7 +4,6 @@
 /// Defines the prefix, and its bytes as they follow from the fields: little-endian, one after the other, without gaps.
 macro_rules! prefix {
     ($($(#[$doc:meta])* $field:ident: $type:ty,)*) => {
-        /// The prefix of a message.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub(super) struct Prefix {
             $($(#[$doc])* pub(super) $field: $type,)*
@@ -14,7 +13,6 @@ macro_rules! prefix {
             /// Its length: the widths of all fields.
             pub(super) const BYTES: usize = 0 $(+ size_of::<$type>())*;
 
-            /// The bytes as they travel.
             pub(super) fn to_bytes(self) -> [u8; Self::BYTES] {
                 let mut bytes = [0; Self::BYTES];
                 let mut at = 0;
@@ -62,7 +60,6 @@ prefix! {
 const _: () = assert!(Prefix::BYTES == 32);
 
 impl Prefix {
-    /// What the magic is.
     pub(super) const MAGIC: u32 = u32::from_le_bytes(*b"DRML");
 
     /// A checksum over the fields before it, to which header and payload are to be added.

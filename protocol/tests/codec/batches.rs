@@ -149,48 +149,21 @@ fn stacks_that_cannot_be_are_refused() {
         );
     }
     let (header, payload) = stacked_batch(None).into_payload();
-    for wrong in [
-        StackedFrames {
-            frames: 0,
-            ..STACKED
-        },
-        StackedFrames {
-            frames: 4,
-            ..STACKED
-        },
-        StackedFrames {
-            frames: u32::MAX,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_stack: 0,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_stack: 1,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_stack: 17,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_stack: u32::MAX,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_channels: 0,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_channels: 3,
-            ..STACKED
-        },
-        StackedFrames {
-            frame_channels: u32::MAX,
-            ..STACKED
-        },
-    ] {
+    let changes: [fn(&mut StackedFrames); 10] = [
+        |it| it.frames = 0,
+        |it| it.frames = 4,
+        |it| it.frames = u32::MAX,
+        |it| it.frame_stack = 0,
+        |it| it.frame_stack = 1,
+        |it| it.frame_stack = 17,
+        |it| it.frame_stack = u32::MAX,
+        |it| it.frame_channels = 0,
+        |it| it.frame_channels = 3,
+        |it| it.frame_channels = u32::MAX,
+    ];
+    for change in changes {
+        let mut wrong = STACKED;
+        change(&mut wrong);
         let header = BatchHeader {
             stacked: Some(wrong),
             ..header

@@ -80,7 +80,6 @@ impl Statistics {
         self.differences.is_power_of_two()
     }
 
-    /// Counts rows served with these `ks`.
     pub(crate) fn served(&mut self, ks: &[u32]) {
         for &k in ks {
             self.counted.k_histogram[k as usize] += 1;

@@ -11,7 +11,6 @@ use driml_protocol::{lock_file, whole_file};
 use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
-use crate::config::ConfigError;
 
 /// Form of the log; one of another form is refused.
 pub(super) const FORMAT: u32 = 4;
@@ -48,7 +47,7 @@ pub enum PersistError {
     Stopped,
     /// Settings that cannot work.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(#[from] driml_protocol::config::ConfigError),
 }
 
 /// Makes an error of the file system one that says what was done with which file.
@@ -68,13 +67,11 @@ pub(super) fn io_error(
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Mark(pub(super) u64);
 
-/// Which log it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct LogId {
     pub(super) format: u32,
     /// A random number, drawn when the log was begun.
     pub(super) identity: u64,
-    /// Hash of the run spec.
     pub(super) spec_hash: u64,
     /// Which of the replay's shards it is, and how many there are.
     pub(super) shard: (u32, u32),
@@ -84,7 +81,6 @@ pub(super) struct LogId {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct SegmentHeader {
     pub(super) log: LogId,
-    /// Number of the segment, from 0.
     pub(super) number: u64,
     /// The state before its first record.
     pub(super) snapshot: Snapshot,
@@ -110,7 +106,6 @@ impl LogFolder {
         })
     }
 
-    /// Path of segment `number`.
     pub(super) fn segment(&self, number: u64) -> PathBuf {
         self.path.join(format!("segment-{number:012}.log"))
     }
@@ -132,7 +127,6 @@ impl LogFolder {
         Ok(numbers)
     }
 
-    /// All of a segment.
     pub(super) fn read(&self, number: u64) -> Result<Vec<u8>, PersistError> {
         let path = self.segment(number);
         fs::read(&path).map_err(io_error("reading", &path))

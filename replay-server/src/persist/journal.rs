@@ -38,9 +38,7 @@ pub(super) struct Segment {
 pub(super) struct Place {
     /// The segments that are of use.
     pub(super) segments: VecDeque<Segment>,
-    /// Number of the next segment.
     pub(super) number: u64,
-    /// Number of the next record.
     pub(super) ordinal: u64,
     /// The mark to which the log went back, and the oldest transition that was held then.
     pub(super) mark: Option<(Mark, u64)>,
@@ -71,7 +69,6 @@ pub(crate) struct Journal {
     /// All in the folder, the oldest first; the last one is written.
     segments: VecDeque<Segment>,
     file: Arc<File>,
-    /// Number of the next record.
     ordinal: u64,
     limits: Limits,
     /// Bytes of the largest record so far, by which a segment may become larger than it should.
@@ -138,7 +135,6 @@ impl Journal {
         }
     }
 
-    /// Bytes on disk.
     pub(crate) fn bytes(&self) -> u64 {
         self.segments.iter().map(|it| it.bytes).sum()
     }
@@ -229,7 +225,6 @@ impl Journal {
         }
     }
 
-    /// Whether the newest segment is full.
     pub(super) fn is_full(&self) -> bool {
         let newest = self.segments.back();
         self.pending.is_empty() && newest.is_some_and(|it| it.bytes >= self.limits.segment_bytes)

@@ -90,7 +90,6 @@ impl KeptReplay {
         })
     }
 
-    /// The folder that holds its segments.
     pub(crate) fn dir(&self) -> &Path {
         &self.folder.path
     }

@@ -6,7 +6,6 @@
 //! The checksum covers the head before it too. Of a chunk, whose body is the message as it came, it covers the message's head; the
 //! message has another checksum over all of it.
 
-/// Bytes before the body.
 const HEAD_BYTES: usize = 32;
 const MAGIC: [u8; 4] = *b"DRL1";
 /// Longest body: a message's, and some.
@@ -51,7 +50,6 @@ pub(super) fn head(kind: RecordKind, ordinal: u64, checked: &[u8], rest: usize) 
     head
 }
 
-/// A record that was read.
 #[derive(Debug)]
 pub(super) struct Record<'a> {
     pub(super) kind: RecordKind,
@@ -60,13 +58,11 @@ pub(super) struct Record<'a> {
 }
 
 impl Record<'_> {
-    /// Bytes with its head.
     pub(super) const fn bytes(&self) -> usize {
         HEAD_BYTES + self.body.len()
     }
 }
 
-/// Why no record follows.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Broken {
     /// The last record was not written whole.

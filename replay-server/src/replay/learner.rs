@@ -135,7 +135,6 @@ impl Replay {
         Ok(())
     }
 
-    /// The learner has done so many updates.
     pub(crate) fn note_updates(&mut self, updates: u64) {
         let done = &mut self.state.learned.updates;
         *done = updates.min(LEARNED_MAX).max(*done);

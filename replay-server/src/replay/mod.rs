@@ -5,10 +5,13 @@
 mod actors;
 mod learner;
 
-use driml_protocol::{BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, Tally, Waiting};
+use driml_protocol::{
+    BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, Tally, Waiting,
+    config::{ConfigError, check},
+};
 
 use crate::{
-    config::{Config, ConfigError},
+    config::Config,
     ledger::requests::Requests,
     persist::{journal::Journal, snapshot::State},
     rate_limiter::RateLimiter,
@@ -82,20 +85,19 @@ impl Replay {
         shard: u32,
     ) -> Result<Self, ConfigError> {
         config.validate(spec, batch_size)?;
-        if shard >= config.shards {
-            return Err(ConfigError::Key {
-                key: "replay.shards",
-                value: config.shards.to_string(),
-                why: format!("there is no shard {shard}; the first is shard 0"),
-            });
-        }
+        let shards = config.shards;
+        check(shard < shards, "replay.shards", shards, || {
+            format!("there is no shard {shard}; the first is shard 0")
+        })?;
         let shards = u64::from(config.shards);
         let capacity = config.capacity_transitions / shards;
         let bytes_max = config.compressed_bytes_max.map(|bytes| bytes / shards);
-        let not_granted = |bytes: u64| ConfigError::Key {
-            key: "replay.capacity_transitions",
-            value: config.capacity_transitions.to_string(),
-            why: format!("the system does not grant the {bytes} bytes that this takes; hold fewer"),
+        let not_granted = |bytes: u64| {
+            let why = format_args!(
+                "the system does not grant the {bytes} bytes that this takes; hold fewer"
+            );
+            let key = "replay.capacity_transitions";
+            ConfigError::of(key, config.capacity_transitions, why)
         };
         let frames = Frames::new(config.compression, capacity, spec.frame_bytes(), bytes_max)
             .map_err(not_granted)?;

@@ -18,7 +18,6 @@ pub(crate) struct RowStates {
     n: Option<u64>,
     /// k of the first positive; the others follow it step by step.
     k_first: u32,
-    /// Positives that the row has.
     positives: usize,
     /// s_{t+k} of each.
     s_tpk: [u64; POSITIVES_MAX],

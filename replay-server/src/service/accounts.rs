@@ -85,7 +85,6 @@ impl Accounts {
         parts.map(|(_, account)| account)
     }
 
-    /// How often actors have joined, all together.
     pub(super) fn actor_lives(&self) -> u32 {
         self.all(false).map(|account| account.lives).sum()
     }
@@ -95,7 +94,6 @@ impl Accounts {
         self.connected.contains(&who)
     }
 
-    /// A process is connected, or no longer.
     pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
         let has_changed = match is_connected {
             true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
@@ -106,13 +104,11 @@ impl Accounts {
         }
     }
 
-    /// Actors that are connected and have joined.
     pub(super) fn actors_connected(&self) -> u32 {
         let connected = self.all(false).filter(|it| self.is_connected(it.alive));
         connected.count() as u32
     }
 
-    /// Processes that are connected and have joined.
     pub(super) fn connected(&self) -> usize {
         let parts = self.parts.values();
         parts.filter(|it| self.is_connected(it.alive)).count()
@@ -138,7 +134,6 @@ impl Accounts {
         true
     }
 
-    /// Who waits at the limiter now.
     pub(super) fn note_waiting(&mut self, waiting: Waiting, now: Instant) {
         if discriminant(&self.waiting.0) != discriminant(&waiting) {
             self.waiting.1 = now;

@@ -20,14 +20,12 @@ pub(super) const SHARED_LIVES_MAX: u32 = 128;
 /// Sessions of others at each replay server, which make no messages in shared memory: learner, launcher, and some that look.
 const OTHER_SESSIONS: usize = 4;
 
-/// Bytes of a row's number and priority.
 const PRIORITY_BYTES_MAX: usize = 9 + 4;
 
 /// Bytes of the longest message of each kind.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
     pub(super) chunk: usize,
-    /// An upload of weights.
     pub(super) weights: usize,
     /// An affinity matrix, which is its header.
     pub(super) affinity: usize,

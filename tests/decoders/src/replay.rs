@@ -51,14 +51,15 @@ impl Numbers<'_> {
     }
 }
 
-fn spec() -> RunSpec {
+/// A run whose frames are of so many bytes.
+pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     RunSpec {
         world: "counter".into(),
         agent: "driml-ada".into(),
         seed: 1,
         frame_height: 1,
         frame_width: 1,
-        frame_channels: 2,
+        frame_channels: frame_bytes,
         frame_stack: 2,
         num_actions: 3,
         n_step: 2,
@@ -68,7 +69,7 @@ fn spec() -> RunSpec {
     }
 }
 
-fn config(shards: u32, sampling: Sampling) -> Config {
+pub(crate) fn config(shards: u32, sampling: Sampling) -> Config {
     Config {
         capacity_transitions: 64 * u64::from(shards),
         shards,
@@ -96,7 +97,7 @@ pub(crate) fn replay(bytes: &[u8]) {
         0 => Sampling::Uniform,
         _ => PRIORITISED,
     };
-    let mut replay = Replay::new(&spec(), &config(shards, sampling), 4).unwrap();
+    let mut replay = Replay::new(&spec(2), &config(shards, sampling), 4).unwrap();
     for _ in 0..MESSAGES_MAX {
         if message(&mut replay, &mut numbers).is_none() {
             break;

@@ -9,10 +9,12 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, Goodbye, Horizon, InsertReply,
-    LearnerJoin, RequestId, RunSpec, Sampling, Tally, TimeoutRule, codec,
+    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, Goodbye, InsertReply, LearnerJoin,
+    RequestId, RunSpec, Sampling, Tally, codec,
 };
-use driml_replay_server::{Compression, Config, PersistArgs, Replay};
+use driml_replay_server::{Config, PersistArgs, Replay};
+
+use crate::replay;
 
 /// Bytes of a frame: its number, which is never 0.
 const FRAME_BYTES: usize = 4;
@@ -46,37 +48,19 @@ const MESSAGE_SUM: Range<usize> = 28..32;
 type Step = ([u8; FRAME_BYTES], u8);
 
 fn spec() -> RunSpec {
-    RunSpec {
-        world: "counter".into(),
-        agent: "driml-ada".into(),
-        seed: 1,
-        frame_height: 1,
-        frame_width: 1,
-        frame_channels: FRAME_BYTES as u32,
-        frame_stack: 2,
-        num_actions: ACTIONS,
-        n_step: 2,
-        gamma: 0.99,
-        horizon: Horizon::Nhg { k_max: 3 },
-        timeout: TimeoutRule::Bootstrap,
-    }
+    replay::spec(FRAME_BYTES as u32)
 }
 
 fn config() -> Config {
     Config {
         capacity_transitions: CAPACITY,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
-        disk_bytes_max: None,
         // Without a thread.
         fsync_ms: Some(0),
         replay_ratio: 1e6,
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
         transitions_max: None,
-        since: None,
+        ..replay::config(1, Sampling::Uniform)
     }
 }
 

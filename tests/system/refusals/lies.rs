@@ -10,15 +10,17 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Learned,
-    LearnerJoin, Origin, PriorityPart, PriorityUpdate, ReplayStatus, RequestId, Tally,
-    WeightsHeader, WeightsRequest, WeightsUpload, WeightsVersion, codec, session,
+    ActorJoin, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Origin, PriorityPart,
+    PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsRequest, WeightsUpload, WeightsVersion,
+    session,
 };
-use driml_tests::{Client, Process, TestSystem, new_learner, wait_for};
+use driml_tests::{Client, Process, TestSystem, check_nothing_lost, new_learner, wait_for};
 use zenoh::{Wait, query::Query};
 
-use super::{Row, SILENCE, sealed, send};
-use crate::{LONG, PRIORITISED, launched, system};
+use super::{
+    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, goodbye, sealed, send, upload,
+};
+use crate::{PRIORITISED, launched_with, system};
 
 const LIFE: u64 = 77;
 const LEARNER: u64 = 78;
@@ -33,17 +35,20 @@ struct Lied {
 }
 
 fn lied() -> Lied {
-    let system = system();
-    let run = launched(&system, 20);
-    let client = system.connect();
-    Lied {
-        client,
-        run,
-        system,
-    }
+    Lied::of("--agent driml-ada")
 }
 
 impl Lied {
+    fn of(flags: &str) -> Self {
+        let system = system();
+        let run = launched_with(&system, flags, 20);
+        Self {
+            client: system.connect(),
+            run,
+            system,
+        }
+    }
+
     fn status(&self) -> ReplayStatus {
         self.client.replay().unwrap()
     }
@@ -68,15 +73,11 @@ impl Lied {
     fn continues(self) {
         let updates = self.client.learner().unwrap().updates;
         let before = self.status();
-        self.client
-            .wait_for_learner("more updates", |learner| learner.updates > updates + 20);
+        self.client.wait_for_updates(updates + 20);
         let status = self.client.wait_for_replay("more transitions", |replay| {
             replay.transitions_inserted > before.transitions_inserted + 100
         });
-        assert_eq!(
-            (status.transitions_lost, status.transitions_duplicated),
-            (0, 0)
-        );
+        check_nothing_lost(&status);
         assert_eq!((status.actors, status.finished), (1, false));
         assert!(status.affinity_version < 1 << 20, "{status:#?}");
         let learner = self.client.learner().unwrap();
@@ -94,65 +95,37 @@ fn of_each_kind_of_message() {
     let lied = lied();
     let (client, keys) = (&lied.client, &lied.client.keys);
     let joins = [0, 1 << 60, u64::MAX].map(|rows_sampled| {
-        let tally = Tally {
-            inserted: 0,
-            rows_sampled,
-        };
-        let join = LearnerJoin {
-            tally,
-            ..new_learner(LEARNER)
-        };
-        Row::of(client, keys.of::<LearnerJoin>(), &join, "Taken {")
+        let mut join = new_learner(LEARNER);
+        join.tally.rows_sampled = rows_sampled;
+        Row::of(client, &join, "Taken {")
     });
     lied.sends(joins, 0);
-    let actor = ActorJoin {
-        actor: 0,
-        incarnation: LIFE,
-    };
-    let join =
-        |number, expected| Row::of(client, keys.of_actor::<ActorJoin>(number), &actor, expected);
-    lied.sends([join(0, "Taken {")], 0);
+    let join = actor_join(0, LIFE);
+    lied.sends([Row::of(client, &join, "Taken {")], 0);
     // As another number than its key's.
-    lied.sends((0..4).map(|_| join(STRANGER, SILENCE)), 4);
+    let key = keys.of_actor::<ActorJoin>(STRANGER);
+    let bytes = sealed(client, &join);
+    lied.sends((0..4).map(|_| Row::new(&key, &*bytes, SILENCE)), 4);
 
     client.join_as_actor(STRANGER, LIFE);
-    let goodbye = |(actor, incarnation, produced)| {
-        let goodbye = Goodbye {
-            actor,
-            incarnation,
-            produced,
-        };
-        Row::of(client, keys.of_actor::<Goodbye>(actor), &goodbye, "Done")
-    };
+    let row = |goodbye| Row::of(client, &goodbye, "Done");
     let goodbyes = [
-        (0, LIFE, 0),
-        (0, LIFE, u64::MAX),
-        (0, u64::MAX, 1000),
-        (STRANGER, LIFE + 1, 1000),
-        (STRANGER, LIFE, 1 << 60),
-        (STRANGER + 1, LIFE, 1 << 60),
+        goodbye(0, LIFE, 0),
+        goodbye(0, LIFE, u64::MAX),
+        goodbye(0, u64::MAX, 1000),
+        goodbye(STRANGER, LIFE + 1, 1000),
+        goodbye(STRANGER, LIFE, 1 << 60),
+        goodbye(STRANGER + 1, LIFE, 1 << 60),
     ];
-    lied.sends(goodbyes.map(goodbye), 6);
-    lied.sends((0..1000).map(|_| goodbye((0, LIFE, 1))), 1000);
+    lied.sends(goodbyes.map(row), 6);
+    lied.sends((0..1000).map(|_| row(goodbye(0, LIFE, 1))), 1000);
 
-    let honest = ChunkHeader {
-        actor: STRANGER,
-        incarnation: LIFE,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 1,
-        leaving: true,
-        streams: 1,
-        steps: 2,
-        frame_bytes: client.spec.frame_bytes() as u32,
-    };
     let chunk = |change: &dyn Fn(&mut ChunkHeader), expected| {
-        let mut header = honest;
+        let mut header = chunk_header(client, STRANGER, LIFE);
+        header.leaving = true;
         change(&mut header);
-        let chunk = Chunk::zeroed(header);
-        let (head, payload) = chunk.seal(client.spec.hash()).unwrap();
         let key = keys.of_actor::<ChunkHeader>(header.actor);
-        Row::new(key, [&head, payload].concat(), expected)
+        Row::new(key, client.seal(&Chunk::zeroed(header)), expected)
     };
     let (no_run, newest) = ("counts that no run reaches", "acted, and the newest are");
     let claim = Claim {
@@ -169,7 +142,7 @@ fn of_each_kind_of_message() {
             chunk(&|it| it.first_transition = u64::MAX - 1, no_run),
             chunk(&|it| it.weights_version = 1 << 60, newest),
             chunk(&|it| it.weights_version = u64::MAX, newest),
-            Row::of(client, keys.of_actor::<Claim>(0), &claim, "Refused {"),
+            Row::of(client, &claim, "Refused {"),
         ],
         7,
     );
@@ -181,48 +154,27 @@ fn of_each_kind_of_message() {
     let batches = [(16, None), (u32::MAX, None), (16, Some(tally)), (0, None)];
     let batches = batches.map(|(rows, other_shards)| {
         let request = BatchRequest {
-            learner: LEARNER,
             id: RequestId::first(u64::MAX),
-            rows,
             shared_memory: true,
-            learned: Learned::default(),
             other_shards,
+            ..batch_request(LEARNER, rows)
         };
-        Row::of(client, keys.of::<BatchRequest>(), &request, "Refused {")
+        Row::of(client, &request, "Refused {")
     });
     lied.sends(batches, 4);
-    let num_actions = client.spec.num_actions;
-    let affinities = [1, 1 << 60, u64::MAX].map(|version| {
-        let affinity = AffinityUpdate {
-            learner: LEARNER,
-            version,
-            num_actions,
-            matrix: vec![1.0; (num_actions * num_actions) as usize],
-        };
-        Row::of(client, keys.of::<AffinityUpdate>(), &affinity, SILENCE)
-    });
+    let affinities = [1, 1 << 60, u64::MAX]
+        .map(|version| affinity(LEARNER, version, client.spec.num_actions))
+        .map(|affinity| Row::of(client, &affinity, SILENCE));
     lied.sends(affinities, 3);
     // This run does not draw by priorities, and has no place for them.
-    let update = priority(LEARNER, 1, 1.0);
-    lied.sends(
-        [Row::of(
-            client,
-            keys.of::<PriorityUpdate>(),
-            &update,
-            SILENCE,
-        )],
-        0,
-    );
+    lied.sends([Row::of(client, &priority(1, 1.0), SILENCE)], 0);
 
     let uploads = [0, 1, 1 << 60, u64::MAX].map(|version| {
         let announced = sealed(client, &WeightsVersion { version });
         let announced = client.session.put(keys.of::<WeightsVersion>(), announced);
         announced.wait().unwrap();
-        Row::new(
-            keys.of::<WeightsUpload>(),
-            upload(client, LEARNER, version),
-            SILENCE,
-        )
+        let bytes = upload(client.spec.hash(), LEARNER, version, b"w");
+        Row::new(keys.of::<WeightsUpload>(), bytes, SILENCE)
     });
     lied.sends(uploads, 4);
     let piece = |version, offset| WeightsRequest::Piece { version, offset };
@@ -231,21 +183,14 @@ fn of_each_kind_of_message() {
         (piece(1 << 60, 0), "Gone"),
         (piece(1, u64::MAX), "Gone"),
     ];
-    let key = keys.of::<WeightsRequest>();
-    let requests = requests.map(|(it, expected)| Row::of(client, key.clone(), &it, expected));
-    lied.sends(requests, 0);
+    lied.sends(requests.map(|(it, said)| Row::of(client, &it, said)), 0);
     lied.continues();
 }
 
-fn upload(client: &Client, learner: u64, version: u64) -> Vec<u8> {
-    let weights = WeightsHeader::new(version, version, b"w");
-    let upload = WeightsUpload { learner, weights };
-    codec::encode(client.spec.hash(), &upload, b"w").unwrap()
-}
-
-fn priority(learner: u64, transition: u64, priority: f32) -> PriorityUpdate {
+/// The priority of a transition, by a learner that is not the run's.
+fn priority(transition: u64, priority: f32) -> PriorityUpdate {
     PriorityUpdate {
-        learner,
+        learner: LEARNER,
         number: u64::MAX,
         parts: vec![PriorityPart {
             origin: Origin::default(),
@@ -287,15 +232,8 @@ fn of_4096_strangers() {
     let tokens: Vec<_> = (0..300)
         .map(|mark| client.run().declare_alive(Alive::Learner { mark }).unwrap())
         .collect();
-    let joins = (0..2 * 4096).map(|number| {
-        let join = ActorJoin {
-            actor: STRANGER + number,
-            incarnation: LIFE,
-        };
-        let key = client.keys.of_actor::<ActorJoin>(join.actor);
-        Row::of(client, key, &join, "Welcome {")
-    });
-    send(client, joins);
+    let joins = (0..2 * 4096).map(|number| actor_join(STRANGER + number, LIFE));
+    send(client, joins.map(|it| Row::of(client, &it, "Welcome {")));
     drop(tokens);
     assert_eq!(lied.status().actors, 1);
     let mut actor = lied.system.start_actor(7);
@@ -304,48 +242,27 @@ fn of_4096_strangers() {
     actor.stop().expect_code(0).expect_said("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
     // Those who were forgotten, and who say what they will.
-    let goodbye = Goodbye {
-        actor: STRANGER,
-        incarnation: LIFE,
-        produced: 1 << 60,
-    };
-    let key = client.keys.of_actor::<Goodbye>(STRANGER);
-    lied.sends([Row::of(client, key, &goodbye, "Done")], 1);
+    let goodbye = goodbye(STRANGER, LIFE, 1 << 60);
+    lied.sends([Row::of(client, &goodbye, "Done")], 1);
     lied.continues();
 }
 
 /// Of a run that draws by them.
 #[test]
 fn of_priorities() {
-    let system = system();
-    let run = system.start(&format!(
-        "local --agent driml-ada {LONG} {PRIORITISED} --listen {} --run-dir run",
-        system.endpoint()
-    ));
-    let client = system.connect();
-    client.wait_for_learner("some updates", |learner| learner.updates > 20);
-    let lied = Lied {
-        client,
-        run,
-        system,
-    };
+    let lied = Lied::of(&format!("--agent driml-ada {PRIORITISED}"));
     let client = &lied.client;
-    let row =
-        |lie: &PriorityUpdate| Row::of(client, client.keys.of::<PriorityUpdate>(), lie, SILENCE);
+    let row = |lie: &PriorityUpdate| Row::of(client, lie, SILENCE);
     let no_numbers = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0];
-    lied.sends(no_numbers.map(|it| row(&priority(LEARNER, 1, it))), 4);
+    lied.sends(no_numbers.map(|it| row(&priority(1, it))), 4);
     wait_for("what the server says of them", || {
         let log = fs::read_to_string(lied.system.path("run/logs/replay-server.log")).unwrap();
         log.contains("is not a number from 0 on").then_some(())
     });
-    let mut long = priority(LEARNER, 1, 1.0);
+    let mut long = priority(1, 1.0);
     long.parts[0].transitions.resize(100_000, 1);
     long.parts[0].priorities.resize(100_000, 1.0);
-    let others = [
-        priority(LEARNER, u64::MAX, 1.0),
-        priority(LEARNER, 1, f32::MAX),
-        long,
-    ];
+    let others = [priority(u64::MAX, 1.0), priority(1, f32::MAX), long];
     lied.sends(others.map(|it| row(&it)), 3);
     lied.continues();
 }
@@ -358,16 +275,9 @@ fn of_half_a_gigabyte() {
     let server = lied.system.find_part("replay-server").pid;
     let peak_mib = || {
         let status = fs::read_to_string(format!("/proc/{server}/status")).unwrap();
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("VmHWM:"))
-            .unwrap();
-        line.split_whitespace()
-            .next()
-            .unwrap()
-            .parse::<u64>()
-            .unwrap()
-            / 1024
+        let mut lines = status.lines();
+        let peak = lines.find_map(|line| line.strip_prefix("VmHWM:")?.strip_suffix(" kB"));
+        peak.unwrap().trim().parse::<u64>().unwrap() / 1024
     };
     let (keys, peak_before) = (&client.keys, peak_mib());
     let long: [String; 4] = [
@@ -404,22 +314,10 @@ fn of_processes_whose_number_can_be_read() {
         let shown = client.keys.alive(token.key_expr().as_str()).unwrap();
         // The mark is of no use in the place of the number.
         rows.push(match shown {
-            Alive::Actor { actor, mark } => {
-                let goodbye = Goodbye {
-                    actor,
-                    incarnation: mark,
-                    produced: 0,
-                };
-                Row::of(
-                    client,
-                    client.keys.of_actor::<Goodbye>(actor),
-                    &goodbye,
-                    "Done",
-                )
-            }
+            Alive::Actor { actor, mark } => Row::of(client, &goodbye(actor, mark, 0), "Done"),
             Alive::Learner { mark } => {
-                let key = client.keys.of::<WeightsUpload>();
-                Row::new(key, upload(client, mark, 1 << 19), SILENCE)
+                let bytes = upload(client.spec.hash(), mark, 1 << 19, b"w");
+                Row::new(client.keys.of::<WeightsUpload>(), bytes, SILENCE)
             }
         });
     }

@@ -11,8 +11,9 @@ mod wrong_place;
 use std::time::Duration;
 
 use driml_protocol::{
-    BatchReply, Done, InsertReply, JoinReply, Message, PROTOCOL_VERSION, WeightsReply, codec,
-    session,
+    ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, Done, Goodbye, InsertReply,
+    JoinReply, Keyed, Learned, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply,
+    WeightsUpload, codec, session,
 };
 use driml_tests::Client;
 use zenoh::qos::Priority;
@@ -40,14 +41,64 @@ impl Row {
         }
     }
 
-    /// A well-formed message of the client's run.
-    fn of(
-        client: &Client,
-        key: impl Into<String>,
-        message: &impl Message,
-        expected: &'static str,
-    ) -> Self {
+    /// A well-formed message of the client's run, at the key where such messages go.
+    fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
+        let actor = message.actor().unwrap_or_default();
+        let key = client.keys.of_actor::<M>(actor);
         Self::new(key, sealed(client, message), expected)
+    }
+}
+
+const fn goodbye(actor: u32, incarnation: u64, produced: u64) -> Goodbye {
+    Goodbye {
+        actor,
+        incarnation,
+        produced,
+    }
+}
+
+const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
+    ActorJoin { actor, incarnation }
+}
+
+fn batch_request(learner: u64, rows: u32) -> BatchRequest {
+    BatchRequest {
+        learner,
+        id: RequestId::first(7),
+        rows,
+        shared_memory: false,
+        learned: Learned::default(),
+        other_shards: None,
+    }
+}
+
+/// Affinities of all pairs of actions, each 0.5.
+fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
+    AffinityUpdate {
+        learner,
+        version,
+        num_actions,
+        matrix: vec![0.5; (num_actions * num_actions) as usize],
+    }
+}
+
+/// A learner's weights of this version, as it hands them over.
+fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec<u8> {
+    let weights = WeightsHeader::new(version, 0, safetensors);
+    let upload = WeightsUpload { learner, weights };
+    codec::encode(spec_hash, &upload, safetensors).unwrap()
+}
+
+/// The first chunk of an actor: one stream of two steps.
+fn chunk_header(client: &Client, actor: u32, incarnation: u64) -> ChunkHeader {
+    ChunkHeader {
+        actor,
+        incarnation,
+        weights_version: 1,
+        streams: 1,
+        steps: 2,
+        frame_bytes: client.spec.frame_bytes() as u32,
+        ..ChunkHeader::default()
     }
 }
 

@@ -7,14 +7,15 @@ use std::sync::{
 };
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Hello,
-    Learned, LearnerJoin, LearnerStatus, ReplayStatus, RequestId, WeightsHeader, WeightsRequest,
-    WeightsUpload, WeightsVersion, codec, session, tls::Role,
+    ActorJoin, Alive, Chunk, ChunkHeader, Claim, Goodbye, Hello, LearnerStatus, ReplayStatus,
+    WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
 use driml_tests::{Client, Process, new_learner};
 use zenoh::{Wait, query::Query, sample::Locality};
 
-use super::{Row, SILENCE, send};
+use super::{
+    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, goodbye, sealed, send, upload,
+};
 use crate::{LONG, tls::TlsSystem};
 
 /// A run over TLS, and who watches it.
@@ -26,15 +27,15 @@ struct Guarded {
 }
 
 impl Guarded {
-    fn new(test: &str) -> Option<Self> {
-        let tls = TlsSystem::new(test)?;
+    fn new() -> Option<Self> {
+        let tls = TlsSystem::new()?;
         let server = tls.start_server(&format!("--agent driml-ada {LONG}"));
         let parts = [
             tls.start("learner --stay --run-dir run", "tls"),
             tls.start("actor --id 0", "tls"),
         ];
         let observer = tls.client(Role::Observer);
-        observer.wait_for_learner("some updates", |learner| learner.updates > 10);
+        observer.wait_for_updates(10);
         Some(Self {
             tls,
             observer,
@@ -50,72 +51,39 @@ impl Guarded {
     /// The run continues unaffected.
     fn continues(&self) {
         let updates = self.observer.learner().unwrap().updates;
-        let later = |learner: &LearnerStatus| learner.updates > updates + 10;
-        self.observer.wait_for_learner("more updates", later);
-        let replay = self.observer.replay().unwrap();
-        assert_eq!(
-            (replay.transitions_lost, replay.transitions_duplicated),
-            (0, 0)
-        );
+        self.observer.wait_for_updates(updates + 10);
+        let replay = self.observer.check_nothing_lost();
         assert_eq!(replay.actors, 1);
     }
 }
 
 #[test]
 fn an_actor_asks_for_nothing_but_its_own() {
-    let Some(run) = Guarded::new("an_actor_asks_for_nothing_but_its_own") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let one = &run.tls.client(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
-    let goodbye = Goodbye {
-        actor: other,
-        incarnation,
-        produced: 0,
-    };
-    let join = ActorJoin {
-        actor: other,
-        incarnation,
-    };
+    let goodbye = goodbye(other, incarnation, 0);
+    let join = actor_join(other, incarnation);
     let claim = Claim {
         actor: other,
         incarnation,
         sequence: 0,
         leaving: false,
     };
-    let batch = BatchRequest {
-        learner: 1,
-        id: RequestId::first(1),
-        rows: 16,
-        shared_memory: false,
-        learned: Learned::default(),
-        other_shards: None,
-    };
-    let affinity = AffinityUpdate {
-        learner: 1,
-        version: 1,
-        num_actions: 3,
-        matrix: vec![1.0; 9],
-    };
-    let upload = WeightsUpload {
-        learner: 1,
-        weights: WeightsHeader::new(1 << 19, 0, b"w"),
-    };
-    let upload = codec::encode(hash, &upload, b"w").unwrap();
-    let learner = new_learner(1);
+    let weights = upload(hash, 1, 1 << 19, b"w");
     send(
         one,
         [
-            Row::of(one, keys.of::<BatchRequest>(), &batch, SILENCE),
-            Row::of(one, keys.of::<AffinityUpdate>(), &affinity, SILENCE),
-            Row::of(one, keys.of::<LearnerJoin>(), &learner, SILENCE),
-            Row::new(keys.of::<WeightsUpload>(), upload, SILENCE),
-            Row::of(one, keys.of_actor::<ActorJoin>(other), &join, SILENCE),
-            Row::of(one, keys.of_actor::<Goodbye>(other), &goodbye, SILENCE),
-            Row::of(one, keys.of_actor::<Claim>(other), &claim, SILENCE),
+            Row::of(one, &batch_request(1, 16), SILENCE),
+            Row::of(one, &affinity(1, 1, 3), SILENCE),
+            Row::of(one, &new_learner(1), SILENCE),
+            Row::new(keys.of::<WeightsUpload>(), weights, SILENCE),
+            Row::of(one, &join, SILENCE),
+            Row::of(one, &goodbye, SILENCE),
+            Row::of(one, &claim, SILENCE),
             Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], SILENCE),
-            Row::of(one, keys.of::<Goodbye>(), &goodbye, SILENCE),
+            Row::new(keys.of::<Goodbye>(), sealed(one, &goodbye), SILENCE),
             Row::new(keys.of::<ReplayStatus>(), [], SILENCE),
             Row::new(keys.of::<LearnerStatus>(), [], SILENCE),
             Row::new("driml/**", [], SILENCE),
@@ -124,29 +92,18 @@ fn an_actor_asks_for_nothing_but_its_own() {
 
     // At its own keys, messages that speak for another.
     let before = run.refused();
-    let mut chunk = Chunk::zeroed(ChunkHeader {
-        actor: other,
-        incarnation,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 1,
-        leaving: false,
-        streams: 1,
-        steps: 1,
-        frame_bytes: one.spec.frame_bytes() as u32,
-    });
-    chunk.set(0, 0, 1.0, driml_protocol::End::Running);
-    let (head, payload) = chunk.seal(hash).unwrap();
-    let chunk = [&head, payload].concat();
-    let speaks_for = "speaks for actor 0 at the key";
+    let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
+    let rows = [
+        (keys.of_actor::<ChunkHeader>(1), one.seal(&chunk)),
+        (keys.of_actor::<Goodbye>(1), sealed(one, &goodbye)),
+        (keys.of_actor::<ActorJoin>(1), sealed(one, &join)),
+        (keys.of_actor::<Claim>(1), sealed(one, &claim)),
+    ];
+    let expected = ["speaks for actor 0 at the key", SILENCE, SILENCE, SILENCE];
+    let rows = rows.into_iter().zip(expected);
     send(
         one,
-        [
-            Row::new(keys.of_actor::<ChunkHeader>(1), chunk, speaks_for),
-            Row::of(one, keys.of_actor::<Goodbye>(1), &goodbye, SILENCE),
-            Row::of(one, keys.of_actor::<ActorJoin>(1), &join, SILENCE),
-            Row::of(one, keys.of_actor::<Claim>(1), &claim, SILENCE),
-        ],
+        rows.map(|((key, bytes), expected)| Row::new(key, bytes, expected)),
     );
     assert_eq!(run.refused(), before + 4);
     run.continues();
@@ -155,9 +112,7 @@ fn an_actor_asks_for_nothing_but_its_own() {
 /// It can neither answer in the place of others, nor publish or receive what is not for it, nor count as another process.
 #[test]
 fn an_actor_declares_nothing_but_its_own() {
-    let Some(run) = Guarded::new("an_actor_declares_nothing_but_its_own") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let one = run.tls.client(Role::Actor(1));
     let keys = &one.keys;
     let asked = Arc::<AtomicUsize>::default();
@@ -199,9 +154,8 @@ fn an_actor_declares_nothing_but_its_own() {
         .wait()
         .unwrap();
     let lie = WeightsVersion { version: 1 << 60 };
-    let bytes = codec::encode(one.spec.hash(), &lie, &[]).unwrap();
     one.session
-        .put(keys.of::<WeightsVersion>(), bytes)
+        .put(keys.of::<WeightsVersion>(), sealed(&one, &lie))
         .wait()
         .unwrap();
 
@@ -225,23 +179,16 @@ fn an_actor_declares_nothing_but_its_own() {
 
 #[test]
 fn an_observer_only_looks() {
-    let Some(run) = Guarded::new("an_observer_only_looks") else {
-        return;
-    };
+    let Some(run) = Guarded::new() else { return };
     let observer = &run.tls.client(Role::Observer);
     assert!(observer.replay().is_some() && observer.learner().is_some());
     let keys = &observer.keys;
-    let join = ActorJoin {
-        actor: 1,
-        incarnation: 1,
-    };
-    let (newer, learner) = (WeightsRequest::NewerThan(0), new_learner(1));
     send(
         observer,
         [
-            Row::of(observer, keys.of::<WeightsRequest>(), &newer, SILENCE),
-            Row::of(observer, keys.of::<LearnerJoin>(), &learner, SILENCE),
-            Row::of(observer, keys.of_actor::<ActorJoin>(1), &join, SILENCE),
+            Row::of(observer, &WeightsRequest::NewerThan(0), SILENCE),
+            Row::of(observer, &new_learner(1), SILENCE),
+            Row::of(observer, &actor_join(1, 1), SILENCE),
             Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], SILENCE),
         ],
     );

@@ -2,56 +2,24 @@
 //! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
-use driml_protocol::{
-    Hello, Keys, WeightsHeader, WeightsUpload, WeightsVersion, codec,
-    session::{self, Endpoints},
-};
-use driml_tests::Client;
+use driml_protocol::{Hello, Keys, WeightsUpload, WeightsVersion, codec, session};
+use driml_tests::{Client, listen};
 use zenoh::Wait;
 
-use super::{Row, SILENCE, newer, send};
+use super::{Row, SILENCE, newer, send, upload};
 use crate::system;
 
 /// The learner that this test plays.
 const LEARNER: u64 = 5;
 
-/// A learner of the run, and another sender of weights.
-struct FakeLearner<'a> {
-    client: &'a Client,
-}
-
-impl FakeLearner<'_> {
-    fn upload(version: u64, safetensors: &[u8], spec_hash: u64, learner: u64) -> Vec<u8> {
-        let weights = WeightsHeader::new(version, 0, safetensors);
-        let upload = WeightsUpload { learner, weights };
-        codec::encode(spec_hash, &upload, safetensors).unwrap()
-    }
-
-    /// Sends weights that the replay server takes.
-    fn send(&self, version: u64, safetensors: &[u8]) {
-        let bytes = Self::upload(version, safetensors, self.client.spec.hash(), LEARNER);
-        self.client
-            .ask(&self.client.keys.of::<WeightsUpload>(), bytes)
-            .unwrap();
-    }
-
-    /// Sends what the replay server refuses, and counts as refused.
-    fn refused(&self, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
-        let counted = || self.client.replay().unwrap().messages_refused;
-        for (name, bytes) in rows {
-            let before = counted();
-            let key = self.client.keys.of::<WeightsUpload>();
-            send(self.client, [Row::new(key, bytes, SILENCE)]);
-            assert_eq!(counted(), before + 1, "{name}");
-        }
-    }
-
-    /// Says that there are newer weights, as a stranger could.
-    fn announce(&self, version: u64, spec_hash: u64) {
-        let announced = WeightsVersion { version };
-        let bytes = codec::encode(spec_hash, &announced, &[]).unwrap();
-        let key = self.client.keys.of::<WeightsVersion>();
-        self.client.session.put(key, bytes).wait().unwrap();
+/// Sends what the replay server refuses, and counts as refused.
+fn refused(client: &Client, rows: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
+    let counted = || client.replay().unwrap().messages_refused;
+    for (name, bytes) in rows {
+        let before = counted();
+        let key = client.keys.of::<WeightsUpload>();
+        send(client, [Row::new(key, bytes, SILENCE)]);
+        assert_eq!(counted(), before + 1, "{name}");
     }
 }
 
@@ -70,24 +38,38 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
         .next_weights()
         .unwrap()
         .safetensors;
-    let learner = FakeLearner { client: &client };
-    let upload = FakeLearner::upload;
+    let of = |version, weights: &[u8], learner| upload(hash, learner, version, weights);
+    // What the replay server takes.
+    let send = |version, weights: &[u8]| {
+        let key = client.keys.of::<WeightsUpload>();
+        client.ask(&key, of(version, weights, LEARNER)).unwrap();
+    };
+    // Says that there are newer weights, as a stranger could.
+    let announce = |version, spec_hash| {
+        let bytes = codec::encode(spec_hash, &WeightsVersion { version }, &[]).unwrap();
+        let put = client
+            .session
+            .put(client.keys.of::<WeightsVersion>(), bytes);
+        put.wait().unwrap();
+    };
 
     // Until there are weights that it may use, an actor asks again and steps nothing.
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr("waiting for the learner's first weights");
-    learner.refused([("it has not joined", upload(1, &good, hash, LEARNER))]);
+    refused(&client, [("it has not joined", of(1, &good, LEARNER))]);
     client.join_as_learner(LEARNER);
-    learner.refused([("of another run", upload(1, &good, hash ^ 1, LEARNER))]);
+    refused(
+        &client,
+        [("of another run", upload(hash ^ 1, LEARNER, 1, &good))],
+    );
     assert_eq!(client.replay().unwrap().transitions_inserted, 0);
-    learner.send(1, &good);
+    send(1, &good);
     client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
 
     // Then it keeps them, whatever comes.
-    let of = |version, weights: &[u8], from| upload(version, weights, hash, from);
     let mut damaged = of(2, &good, LEARNER);
     *damaged.last_mut().unwrap() ^= 1;
-    learner.refused([
+    let rows = [
         ("of another protocol", newer(of(2, &good, LEARNER))),
         ("damaged", damaged),
         ("not a message", b"not weights".to_vec()),
@@ -101,16 +83,17 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
             of(1 << 60, &good, LEARNER),
         ),
         ("older", of(0, &good, LEARNER)),
-    ]);
-    learner.announce(4, hash ^ 1);
+    ];
+    refused(&client, rows);
+    announce(4, hash ^ 1);
     actor
         .wait_for_stderr("an announcement of weights was dropped: the message belongs to run spec");
     // Nothing newer is there, so nothing comes of it.
-    learner.announce(1 << 60, hash);
+    announce(1 << 60, hash);
     // Of the right learner, but no network of this shape: seen only when they are to be used.
-    learner.send(6, &good[..good.len() / 2]);
+    send(6, &good[..good.len() / 2]);
     actor.wait_for_stderr("weights 6 were refused, the old ones stay");
-    learner.send(7, &good);
+    send(7, &good);
 
     let before = client.replay().unwrap().transitions_inserted;
     client.wait_for_replay("more transitions", |replay| {
@@ -124,11 +107,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
 #[test]
 fn parts_of_another_protocol_version_do_not_join() {
     let system = system();
-    let endpoints = Endpoints {
-        listen: vec![system.endpoint()],
-        connect: Vec::new(),
-    };
-    let server = session::open(&endpoints).unwrap();
+    let server = listen(&system.endpoint());
     let hello = Hello {
         config_toml: String::new(),
         inserted_total: 0,

@@ -8,7 +8,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::session::{self, Endpoints};
 use driml_tests::{Ended, TestSystem};
 use nix::sys::signal::Signal;
 
@@ -64,6 +63,7 @@ fn a_closed_port_differs_from_an_unknown_host() {
     let socket = system.endpoint();
     refused(&system, &format!("watch --connect {socket}"), 0)
         .expect_said("there is no such socket. Start the replay server first");
+    system.run("status").expect_code(64);
     assert!(started.elapsed() < Duration::from_secs(10));
 }
 
@@ -98,11 +98,7 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let system = system();
     let (endpoint, listener) = listener();
     drop(listener);
-    let _router = session::open(&Endpoints {
-        listen: vec![endpoint.clone()],
-        connect: Vec::new(),
-    })
-    .unwrap();
+    let _router = driml_tests::listen(&endpoint);
     let words = "a process listens there, but does not answer at driml/hello";
     for command in [COMMANDS[0], COMMANDS[1]] {
         let started = Instant::now();
@@ -112,9 +108,8 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     }
     for command in [COMMANDS[2], COMMANDS[3]] {
         system
-            .run(&format!("{command} {endpoint}"))
-            .expect_code(64)
-            .expect_said("it is not a replay server with the namespace \"driml\"");
+            .refuses(&format!("{command} {endpoint}"), "a program listens on")
+            .expect_said("but it is not a replay server with the namespace \"driml\"");
     }
 }
 
@@ -146,11 +141,10 @@ fn an_endpoint_that_is_taken_is_named_before_anything_is_made() {
     let (endpoint, _listener) = listener();
     for command in ["local --run-dir run", "replay-server"] {
         let ended = system
-            .run(&format!("{command} {SHORT} --listen {endpoint}"))
-            .expect_code(64)
-            .expect_said(&format!(
-                "error: cannot listen on {endpoint}: another process listens there"
-            ))
+            .refuses(
+                &format!("{command} {SHORT} --listen {endpoint}"),
+                &format!("error: cannot listen on {endpoint}: another process listens there"),
+            )
             .expect_said("with --listen for this command");
         assert_eq!(ended.stderr.lines().count(), 1, "{}", ended.stderr);
     }

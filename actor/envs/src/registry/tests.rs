@@ -1,7 +1,8 @@
 //! Names, reading settings, and what each world says of itself before it is built.
 
 use super::*;
-use crate::worlds::ising::Boundary;
+use crate::environment::{Environment, FrameShape};
+use crate::worlds::{corridor, exec, ising, pacman, procgen};
 
 #[test]
 fn names_go_there_and_back() {
@@ -141,8 +142,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     assert_eq!(config.name(), "flat".parse().unwrap());
     assert_eq!(config.frame_shape().height, 3);
     assert!(config.validate().is_ok() && config.build(1, 1, 0).is_err());
-    let again = toml::to_string(&config).unwrap();
-    assert_eq!(toml::from_str::<WorldConfig>(&again).unwrap(), config);
+    check_round_trip(&config);
     assert!(config.with_levels(Levels::Train).is_ok());
     assert!(config.with_levels(Levels::Unseen).is_err());
     assert_eq!(own::preset("flat"), Some("# preset"));
@@ -150,10 +150,13 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     assert!(error.unwrap_err().to_string().contains("colour"));
     assert!(WorldName::all().any(|name| name.to_string() == "flat"));
     let [_, chain, ..] = configs();
-    assert_eq!(
-        toml::from_str::<WorldConfig>(&toml::to_string(&chain).unwrap()).unwrap(),
-        chain
-    );
+    check_round_trip(&chain);
+}
+
+/// Settings that are written are read back as they were.
+fn check_round_trip(config: &WorldConfig) {
+    let text = toml::to_string(config).unwrap();
+    assert_eq!(&toml::from_str::<WorldConfig>(&text).unwrap(), config);
 }
 
 #[test]
@@ -161,10 +164,7 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
     let chain = "kind = 'chain'\ncells = 8\nheight = 12\nwidth = 12\nstep_limit = 30\nreward_left = 0.1\nreward_right = 1\n";
     let config: WorldConfig = toml::from_str(chain).unwrap();
     assert_eq!(config.name(), "chain".parse().unwrap());
-    assert_eq!(
-        toml::from_str::<WorldConfig>(&toml::to_string(&config).unwrap()).unwrap(),
-        config
-    );
+    check_round_trip(&config);
 
     let pacman = "kind = 'mspacman'\nepsilon = 0\nswitch_probability = 0.5\nlethal = [true, false, false, false]\n\
         boost_steps = 10\nstep_limit = 500\nreward_pellet = 1\nreward_boost = 0\nreward_ghost = 5\n\
@@ -172,10 +172,7 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
         ising = { temperature = 0.4, sweeps_per_step = 1 }\n";
     let config: WorldConfig = toml::from_str(pacman).unwrap();
     assert_eq!(config.name(), "mspacman".parse().unwrap());
-    assert_eq!(
-        toml::from_str::<WorldConfig>(&toml::to_string(&config).unwrap()).unwrap(),
-        config
-    );
+    check_round_trip(&config);
 
     for (wrong, word) in [
         (format!("{chain}colour = 1"), "colour"),
@@ -192,49 +189,12 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
 
 /// One set of settings for each world that needs no engine.
 fn configs() -> [WorldConfig; 4] {
+    let numbered = exec::tests::numbered("");
     [
-        WorldConfig::Exec(ExecConfig {
-            command: format!(
-                "exec python3 {}/../../tests/worlds/numbered.py",
-                env!("CARGO_MANIFEST_DIR")
-            ),
-            height: 12,
-            width: 12,
-            channels: 1,
-            actions: ["no-op", "left", "right"].map(str::to_owned).to_vec(),
-            start_timeout_ms: 60_000,
-            step_timeout_ms: 60_000,
-        }),
-        WorldConfig::Chain(CorridorConfig {
-            cells: 8,
-            height: 9,
-            width: 12,
-            step_limit: 30,
-            reward_left: 0.1,
-            reward_right: 1.0,
-        }),
-        WorldConfig::Ising(IsingConfig {
-            lattice_size: 84,
-            patch_size: 42,
-            temperature: 0.4,
-            boundary: Boundary::Free,
-            sweeps_per_step: 1,
-            episode_steps: 32,
-        }),
-        WorldConfig::MsPacman(PacmanConfig {
-            epsilon: 0.0,
-            switch_probability: 0.5,
-            lethal: [true; 4],
-            lethal_schedule: None,
-            boost_steps: 10,
-            step_limit: 100,
-            reward_pellet: 1.0,
-            reward_boost: 1.0,
-            reward_ghost: 1.0,
-            reward_death: -1.0,
-            reward_cleared: 1.0,
-            ising: None,
-        }),
+        WorldConfig::Exec(exec::tests::config(numbered)),
+        WorldConfig::Chain(corridor::tests::config()),
+        WorldConfig::Ising(ising::tests::paper()),
+        WorldConfig::MsPacman(pacman::tests::config()),
     ]
 }
 
@@ -270,18 +230,9 @@ fn no_copies_and_wrong_buffers_are_errors() {
 
 fn procgen(start_level: u32, num_levels: u32) -> WorldConfig {
     WorldConfig::Procgen(ProcgenConfig {
-        game: "coinrun".parse().unwrap(),
-        distribution_mode: procgen_sys::DistributionMode::Easy,
         num_levels,
         start_level,
-        use_sequential_levels: true,
-        paint_vel_info: true,
-        use_backgrounds: true,
-        center_agent: true,
-        restrict_themes: false,
-        frame_side: 64,
-        grey: false,
-        library: None,
+        ..procgen::tests::config(procgen_sys::Game::Coinrun)
     })
 }
 

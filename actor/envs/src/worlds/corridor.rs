@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::copies::{check_num_envs, check_step};
+use crate::copies::{Copies, check_num_envs};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::saved;
@@ -29,44 +29,6 @@ pub struct CorridorConfig {
     pub reward_left: f32,
     /// Reward of reaching the right end (the last cell), which ends the episode.
     pub reward_right: f32,
-}
-
-impl CorridorConfig {
-    /// # Errors
-    /// Says which setting cannot work.
-    pub fn validate(&self) -> Result<(), EnvError> {
-        if self.cells < 3
-            || self.width < self.cells
-            || self.height == 0
-            || self.width.max(self.height) > 1024
-        {
-            return Err(EnvError::Config(format!(
-                "the chain needs cells >= 3, cells <= width <= 1024 and 1 <= height <= 1024, got cells = {}, width = {}, height = {}",
-                self.cells, self.width, self.height
-            )));
-        }
-        if self.step_limit == 0 {
-            return Err(EnvError::Config(
-                "the chain's step_limit must be at least 1, got 0".into(),
-            ));
-        }
-        if !self.reward_left.is_finite() || !self.reward_right.is_finite() {
-            return Err(EnvError::Config(format!(
-                "the chain's rewards must be finite, got reward_left = {} and reward_right = {}",
-                self.reward_left, self.reward_right
-            )));
-        }
-        Ok(())
-    }
-
-    /// `height` x `width` x 1.
-    pub fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.height,
-            width: self.width,
-            channels: 1,
-        }
-    }
 }
 
 /// The best undiscounted return of one episode: `optimal_discounted_return` with gamma = 1.
@@ -120,11 +82,37 @@ impl CorridorWorld {
 
 impl WorldSettings for CorridorConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        CorridorConfig::validate(self)
+        if self.cells < 3
+            || self.width < self.cells
+            || self.height == 0
+            || self.width.max(self.height) > 1024
+        {
+            return Err(EnvError::Config(format!(
+                "the chain needs cells >= 3, cells <= width <= 1024 and 1 <= height <= 1024, got cells = {}, width = {}, height = {}",
+                self.cells, self.width, self.height
+            )));
+        }
+        if self.step_limit == 0 {
+            return Err(EnvError::Config(
+                "the chain's step_limit must be at least 1, got 0".into(),
+            ));
+        }
+        if !self.reward_left.is_finite() || !self.reward_right.is_finite() {
+            return Err(EnvError::Config(format!(
+                "the chain's rewards must be finite, got reward_left = {} and reward_right = {}",
+                self.reward_left, self.reward_right
+            )));
+        }
+        Ok(())
     }
 
+    /// `height` x `width` x 1.
     fn frame_shape(&self) -> FrameShape {
-        CorridorConfig::frame_shape(self)
+        FrameShape {
+            height: self.height,
+            width: self.width,
+            channels: 1,
+        }
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -141,87 +129,68 @@ impl WorldSettings for CorridorConfig {
     }
 }
 
-impl Environment for CorridorWorld {
-    fn frame_shape(&self) -> FrameShape {
+impl Copies for CorridorWorld {
+    /// Cell, and steps of the episode.
+    type Saved = (usize, u32);
+
+    fn shape(&self) -> FrameShape {
         self.config.frame_shape()
     }
 
-    fn num_actions(&self) -> usize {
+    fn actions(&self) -> usize {
         Self::ACTION_NAMES.len()
     }
 
-    fn num_envs(&self) -> usize {
+    fn count(&self) -> usize {
         self.cells.len()
     }
 
-    fn observe(&mut self, frames: &mut [u8]) {
-        let (width, bytes) = (self.config.width, self.config.frame_shape().bytes());
-        assert_eq!(
-            frames.len(),
-            bytes * self.cells.len(),
-            "observe needs room for every copy's frame"
-        );
-        frames.fill(0);
-        for (&cell, frame) in self.cells.iter().zip(frames.chunks_exact_mut(bytes)) {
-            let band = cell * width / self.config.cells..(cell + 1) * width / self.config.cells;
-            for row in frame.chunks_exact_mut(width) {
-                row[band.clone()].fill(255);
-            }
+    fn draw(&self, copy: usize, frame: &mut [u8]) {
+        let (cell, cells, width) = (self.cells[copy], self.config.cells, self.config.width);
+        frame.fill(0);
+        for row in frame.chunks_exact_mut(width) {
+            row[cell * width / cells..(cell + 1) * width / cells].fill(255);
         }
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
-        check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
-        for (env, &action) in actions.iter().enumerate() {
-            match action {
-                1 => self.cells[env] -= 1,
-                2 => self.cells[env] += 1,
-                _ => {}
-            }
-            self.episode_steps[env] += 1;
-            let timed_out = self.episode_steps[env] >= self.config.step_limit;
-            (rewards[env], ends[env]) = match self.cells[env] {
-                0 => (self.config.reward_left, StepEnd::Terminal),
-                cell if cell == self.config.cells - 1 => {
-                    (self.config.reward_right, StepEnd::Terminal)
-                }
-                _ if timed_out => (0.0, StepEnd::TimedOut),
-                _ => (0.0, StepEnd::Running),
-            };
-            if ends[env] != StepEnd::Running {
-                (self.cells[env], self.episode_steps[env]) = (START_CELL, 0);
-            }
+    fn act(&mut self, copy: usize, action: u8) -> (f32, StepEnd) {
+        let (cell, steps) = (&mut self.cells[copy], &mut self.episode_steps[copy]);
+        match action {
+            1 => *cell -= 1,
+            2 => *cell += 1,
+            _ => {}
         }
-        Ok(())
+        *steps += 1;
+        let (reward, end) = match *cell {
+            0 => (self.config.reward_left, StepEnd::Terminal),
+            it if it == self.config.cells - 1 => (self.config.reward_right, StepEnd::Terminal),
+            _ if *steps >= self.config.step_limit => (0.0, StepEnd::TimedOut),
+            _ => (0.0, StepEnd::Running),
+        };
+        if end != StepEnd::Running {
+            (*cell, *steps) = (START_CELL, 0);
+        }
+        (reward, end)
     }
 
-    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        let copies = self.cells.iter().zip(&self.episode_steps);
-        saved::encode(&copies.collect::<Vec<_>>())
+    fn saved(&self, copy: usize) -> Self::Saved {
+        (self.cells[copy], self.episode_steps[copy])
     }
 
-    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let copies: Vec<(usize, u32)> = saved::decode(state, self.num_envs())?;
+    fn restore(&mut self, copy: usize, saved: Self::Saved) -> Result<(), EnvError> {
         let inner = 1..self.config.cells - 1;
-        saved::check(
-            copies.iter().all(|(cell, _)| inner.contains(cell)),
-            "a cell",
-        )?;
-        (self.cells, self.episode_steps) = copies.into_iter().unzip();
+        saved::check(inner.contains(&saved.0), "a cell")?;
+        (self.cells[copy], self.episode_steps[copy]) = saved;
         Ok(())
     }
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
-    fn config() -> CorridorConfig {
+    /// A corridor in which 0.1 is near and 1 is far.
+    pub(crate) fn config() -> CorridorConfig {
         CorridorConfig {
             cells: 8,
             height: 12,
@@ -280,35 +249,16 @@ mod tests {
     #[test]
     fn ends_are_terminal_at_the_ends_and_timed_out_between() {
         assert_eq!(play(&config(), 0, 1.0), (0.0, StepEnd::TimedOut));
-        assert_eq!(
-            play(&config(), 1, 1.0),
-            (f64::from(0.1f32), StepEnd::Terminal)
-        );
+        let near = f64::from(0.1f32);
+        assert_eq!(play(&config(), 1, 1.0), (near, StepEnd::Terminal));
         assert_eq!(play(&config(), 2, 1.0), (1.0, StepEnd::Terminal));
-        assert_eq!(
-            play(
-                &CorridorConfig {
-                    step_limit: 6,
-                    ..config()
-                },
-                2,
-                1.0
-            )
-            .1,
-            StepEnd::Terminal
-        );
-        assert_eq!(
-            play(
-                &CorridorConfig {
-                    step_limit: 5,
-                    ..config()
-                },
-                2,
-                1.0
-            )
-            .1,
-            StepEnd::TimedOut
-        );
+        for (step_limit, end) in [(6, StepEnd::Terminal), (5, StepEnd::TimedOut)] {
+            let config = CorridorConfig {
+                step_limit,
+                ..config()
+            };
+            assert_eq!(play(&config, 2, 1.0).1, end);
+        }
     }
 
     #[test]
@@ -335,38 +285,20 @@ mod tests {
     #[test]
     fn bad_actions_and_settings_are_errors() {
         let mut world = CorridorWorld::new(&config(), 1).unwrap();
-        assert!(
-            world
-                .step(&[3], &mut [0.0], &mut [StepEnd::Running])
-                .is_err()
-        );
-        assert!(
-            world
-                .step(&[0, 0], &mut [0.0], &mut [StepEnd::Running])
-                .is_err()
-        );
-        for bad in [
-            CorridorConfig {
-                cells: 2,
-                ..config()
-            },
-            CorridorConfig {
-                width: 7,
-                ..config()
-            },
-            CorridorConfig {
-                height: 0,
-                ..config()
-            },
-            CorridorConfig {
-                step_limit: 0,
-                ..config()
-            },
-            CorridorConfig {
-                reward_right: f32::NAN,
-                ..config()
-            },
-        ] {
+        for wrong in [&[3][..], &[0, 0]] {
+            let step = world.step(wrong, &mut [0.0], &mut [StepEnd::Running]);
+            assert!(step.is_err(), "{wrong:?}");
+        }
+        let changes: [fn(&mut CorridorConfig); 5] = [
+            |it| it.cells = 2,
+            |it| it.width = 7,
+            |it| it.height = 0,
+            |it| it.step_limit = 0,
+            |it| it.reward_right = f32::NAN,
+        ];
+        for change in changes {
+            let mut bad = config();
+            change(&mut bad);
             assert!(CorridorWorld::new(&bad, 1).is_err(), "{bad:?}");
         }
     }

@@ -29,12 +29,10 @@ impl SumTree {
         Ok(Self { leaves, nodes })
     }
 
-    /// The sum of all numbers.
     pub(super) fn total(&self) -> f64 {
         self.nodes[1]
     }
 
-    /// The number at `place`.
     pub(super) fn get(&self, place: usize) -> f64 {
         self.nodes[self.leaves + place]
     }

@@ -100,13 +100,9 @@ impl ExecConfig {
             setting: "world.step_timeout_ms",
         }
     }
-
-    /// What a declaration must be for this world, in words.
-    pub(super) fn in_words(&self) -> String {
-        in_words(self.frame_shape(), &self.actions)
-    }
 }
 
+/// What a process declares, in words.
 pub(super) fn in_words(shape: FrameShape, actions: &[String]) -> String {
     format!(
         "frames of {} x {} x {} and the {} actions {}",

@@ -148,7 +148,6 @@ impl WorldProcess {
         self.say(&line, doing)
     }
 
-    /// Its next line.
     pub(super) fn line(
         &mut self,
         patience: Patience,
@@ -166,7 +165,6 @@ impl WorldProcess {
         }
     }
 
-    /// Its next byte.
     pub(super) fn byte(
         &mut self,
         patience: Patience,
@@ -295,7 +293,6 @@ fn in_words(status: ExitStatus) -> String {
     }
 }
 
-/// Where the process's stderr goes.
 struct Log {
     stderr: ChildStderr,
     words: Arc<Mutex<VecDeque<String>>>,

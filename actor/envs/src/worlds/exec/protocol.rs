@@ -55,7 +55,6 @@ pub(super) const VERSION: u64 = 1;
 /// Most characters of a line that a message repeats.
 const SHOWN_MAX: usize = 200;
 
-/// What an actor asks for.
 #[derive(Debug, Serialize)]
 pub(super) struct Request {
     driml_env: u64,
@@ -87,7 +86,6 @@ pub(super) struct Declaration {
 }
 
 impl Declaration {
-    /// Reads the first line of a process.
     pub(super) fn parse(line: &[u8]) -> Result<Self, Fault> {
         let no_world = |why: String| {
             let line = String::from_utf8_lossy(line);
@@ -266,7 +264,6 @@ pub(super) struct SavedExec {
     actions: Vec<String>,
     /// Those in which the next actions are taken [N, H, W, C].
     pub(super) frames: Vec<u8>,
-    /// The process's own bytes.
     pub(super) state: Vec<u8>,
 }
 

@@ -4,23 +4,23 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use super::declaration::seeds;
 use super::protocol::SavedExec;
+use super::world::seeds;
 use super::*;
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{Environment, StepEnd};
 use crate::error::EnvError;
 use crate::saved::tests::continues;
 use crate::settings::WorldSettings;
 
 /// The command of the world that numbers its frames.
-fn numbered(arguments: &str) -> String {
+pub(crate) fn numbered(arguments: &str) -> String {
     format!(
         "exec python3 {}/../../tests/worlds/numbered.py {arguments}",
         env!("CARGO_MANIFEST_DIR")
     )
 }
 
-fn config(command: String) -> ExecConfig {
+pub(crate) fn config(command: String) -> ExecConfig {
     ExecConfig {
         command,
         height: 12,
@@ -60,18 +60,8 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
     const COPIES: usize = 3;
     let config = config(numbered(""));
     let mut world = ExecWorld::new(&config, COPIES, 7).unwrap();
-    assert_eq!(
-        (world.num_envs(), world.num_actions(), world.frame_shape()),
-        (
-            COPIES,
-            3,
-            FrameShape {
-                height: 12,
-                width: 12,
-                channels: 1
-            }
-        )
-    );
+    assert_eq!((world.num_envs(), world.num_actions()), (COPIES, 3));
+    assert_eq!(world.frame_shape(), config.frame_shape());
     let seeds: Vec<u16> = seeds(7, COPIES)
         .into_iter()
         .map(|seed| (seed % 65_536) as u16)

@@ -1,13 +1,15 @@
 //! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
-//! What passes between them is for `protocol`.
+//! What passes between them is for `protocol`. A command is asked here what world it is.
 
+use rand::Rng;
 use tracing::Level;
 
-use super::config::{ExecConfig, in_words};
-use super::declaration::{introduce, seeds};
+use super::config::{ExecConfig, in_words, start_patience};
 use super::process::{Patience, WorldProcess};
-use super::protocol::{Block, Opening, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX};
-use crate::copies::{check_num_envs, check_step};
+use super::protocol::{
+    Block, Declaration, Opening, Request, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
+};
+use crate::copies::{RngUse, check_frames, check_num_envs, check_step, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::{EnvError, ExecError, Fault};
 use crate::settings::{Variants, WorldSettings};
@@ -58,7 +60,8 @@ impl ExecWorld {
             channels: declared.channels,
         };
         if shape != config.frame_shape() || declared.actions != config.actions {
-            let (found, promised) = (in_words(shape, &declared.actions), config.in_words());
+            let found = in_words(shape, &declared.actions);
+            let promised = in_words(config.frame_shape(), &config.actions);
             let other = format!(
                 "declares {found}, but the run's settings say {promised}: start the run anew, or the command as it was"
             );
@@ -162,6 +165,57 @@ impl ExecWorld {
     }
 }
 
+/// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
+pub(super) fn introduce(
+    command: &str,
+    patience: Patience,
+    seeds: Vec<u32>,
+    level: Level,
+) -> Result<(WorldProcess, Declaration), ExecError> {
+    let mut process = WorldProcess::start(command, level)?;
+    let doing = "before it declared itself";
+    process.say_line(b"", &Request::new(seeds), doing)?;
+    let line = process.line(patience, doing)?;
+    let declaration = Declaration::parse(&line).map_err(|fault| process.fail(fault))?;
+    Ok((process, declaration))
+}
+
+/// Asks a command what world it is: starts it with one copy, reads its declaration, ends it.
+///
+/// # Errors
+/// A command that cannot be started, does not declare a world in time, or one that no run can be made of.
+pub fn declaration(
+    command: &str,
+    start_timeout_ms: u64,
+    step_timeout_ms: u64,
+) -> Result<ExecConfig, EnvError> {
+    let (process, declared) = introduce(
+        command,
+        start_patience(start_timeout_ms),
+        vec![0],
+        Level::DEBUG,
+    )?;
+    drop(process);
+    let config = ExecConfig {
+        command: command.into(),
+        height: declared.height,
+        width: declared.width,
+        channels: declared.channels,
+        actions: declared.actions,
+        start_timeout_ms,
+        step_timeout_ms,
+    };
+    config.validate()?;
+    Ok(config)
+}
+
+/// The seed of each copy, below 2^31 so that every language and engine has room for it.
+pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
+    (0..copies)
+        .map(|copy| copy_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
+        .collect()
+}
+
 impl WorldSettings for ExecConfig {
     fn validate(&self) -> Result<(), EnvError> {
         ExecConfig::validate(self)
@@ -211,11 +265,7 @@ impl Environment for ExecWorld {
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
-        assert_eq!(
-            frames.len(),
-            self.num_envs * self.config.frame_shape().bytes(),
-            "observe needs room for every copy's frame"
-        );
+        check_frames(frames, self.num_envs, self.config.frame_shape());
         self.block
             .read_frames(frames)
             .expect("it is memory of this process, whose size is sealed");

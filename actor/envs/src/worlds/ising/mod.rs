@@ -8,4 +8,6 @@ mod world;
 
 pub(crate) use lattice::check_temperature;
 pub use lattice::{Boundary, IsingLattice};
+#[cfg(test)]
+pub(crate) use world::tests;
 pub use world::{IsingConfig, IsingWorld};

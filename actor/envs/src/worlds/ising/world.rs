@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
-use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
+use crate::copies::{Copies, RngUse, check_num_envs, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::saved;
@@ -30,40 +30,6 @@ pub struct IsingConfig {
     pub episode_steps: u32,
 }
 
-impl IsingConfig {
-    /// # Errors
-    /// Says which setting cannot work.
-    pub fn validate(&self) -> Result<(), EnvError> {
-        check_temperature(self.temperature)?;
-        if self.patch_size < 3 || self.patch_size > self.lattice_size || self.lattice_size > 1024 {
-            return Err(EnvError::Config(format!(
-                "the Ising world needs 3 <= patch_size <= lattice_size <= 1024, got patch_size = {} and lattice_size = {}",
-                self.patch_size, self.lattice_size
-            )));
-        }
-        for (name, value) in [
-            ("sweeps_per_step", self.sweeps_per_step),
-            ("episode_steps", self.episode_steps),
-        ] {
-            if value == 0 {
-                return Err(EnvError::Config(format!(
-                    "the Ising world's {name} must be at least 1, got 0"
-                )));
-            }
-        }
-        Ok(())
-    }
-
-    /// `lattice_size` x `lattice_size` x 1.
-    pub fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.lattice_size,
-            width: self.lattice_size,
-            channels: 1,
-        }
-    }
-}
-
 /// N fields of spins drawn afresh at each step (0 is -1, 255 is +1, even odds), each with a patch that obeys the Ising
 /// model. One action, no reward; an episode ends `TimedOut`.
 ///
@@ -85,7 +51,7 @@ struct Field {
 
 /// All of a [`Field`] that does not follow from the settings.
 #[derive(Serialize, Deserialize)]
-struct SavedField {
+pub(crate) struct SavedField {
     rng: ChaCha8Rng,
     origin: (usize, usize),
     spins: Vec<i8>,
@@ -135,11 +101,33 @@ impl IsingWorld {
 
 impl WorldSettings for IsingConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        IsingConfig::validate(self)
+        check_temperature(self.temperature)?;
+        if self.patch_size < 3 || self.patch_size > self.lattice_size || self.lattice_size > 1024 {
+            return Err(EnvError::Config(format!(
+                "the Ising world needs 3 <= patch_size <= lattice_size <= 1024, got patch_size = {} and lattice_size = {}",
+                self.patch_size, self.lattice_size
+            )));
+        }
+        for (name, value) in [
+            ("sweeps_per_step", self.sweeps_per_step),
+            ("episode_steps", self.episode_steps),
+        ] {
+            if value == 0 {
+                return Err(EnvError::Config(format!(
+                    "the Ising world's {name} must be at least 1, got 0"
+                )));
+            }
+        }
+        Ok(())
     }
 
+    /// `lattice_size` x `lattice_size` x 1.
     fn frame_shape(&self) -> FrameShape {
-        IsingConfig::frame_shape(self)
+        FrameShape {
+            height: self.lattice_size,
+            width: self.lattice_size,
+            channels: 1,
+        }
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -156,54 +144,35 @@ impl WorldSettings for IsingConfig {
     }
 }
 
-impl Environment for IsingWorld {
-    fn frame_shape(&self) -> FrameShape {
+impl Copies for IsingWorld {
+    type Saved = SavedField;
+
+    fn shape(&self) -> FrameShape {
         self.config.frame_shape()
     }
 
-    fn num_actions(&self) -> usize {
+    fn actions(&self) -> usize {
         Self::ACTION_NAMES.len()
     }
 
-    fn num_envs(&self) -> usize {
+    fn count(&self) -> usize {
         self.copies.len()
     }
 
-    fn observe(&mut self, frames: &mut [u8]) {
-        let bytes = self.config.frame_shape().bytes();
-        assert_eq!(
-            frames.len(),
-            bytes * self.copies.len(),
-            "observe needs room for every copy's frame"
-        );
-        for (field, out) in self.copies.iter().zip(frames.chunks_exact_mut(bytes)) {
-            out.copy_from_slice(&field.frame);
-        }
+    fn draw(&self, copy: usize, frame: &mut [u8]) {
+        frame.copy_from_slice(&self.copies[copy].frame);
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
-        check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
-        rewards.fill(0.0);
-        for (field, end) in self.copies.iter_mut().zip(ends) {
-            *end = field.step(&self.config);
-        }
-        Ok(())
+    fn act(&mut self, copy: usize, _: u8) -> (f32, StepEnd) {
+        (0.0, self.copies[copy].step(&self.config))
     }
 
-    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        let copies: Vec<SavedField> = self.copies.iter().map(Field::saved).collect();
-        saved::encode(&copies)
+    fn saved(&self, copy: usize) -> SavedField {
+        self.copies[copy].saved()
     }
 
-    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let copies: Vec<SavedField> = saved::decode(state, self.num_envs())?;
-        let mut both = self.copies.iter_mut().zip(copies);
-        both.try_for_each(|(field, saved)| field.load(saved, &self.config))
+    fn restore(&mut self, copy: usize, saved: SavedField) -> Result<(), EnvError> {
+        self.copies[copy].load(saved, &self.config)
     }
 }
 
@@ -281,10 +250,10 @@ impl Field {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
-    fn paper() -> IsingConfig {
+    pub(crate) fn paper() -> IsingConfig {
         IsingConfig {
             lattice_size: 84,
             patch_size: 42,
@@ -370,28 +339,16 @@ mod tests {
 
     #[test]
     fn unusable_settings_are_errors() {
-        for bad in [
-            IsingConfig {
-                patch_size: 85,
-                ..paper()
-            },
-            IsingConfig {
-                patch_size: 2,
-                ..paper()
-            },
-            IsingConfig {
-                temperature: 0.0,
-                ..paper()
-            },
-            IsingConfig {
-                sweeps_per_step: 0,
-                ..paper()
-            },
-            IsingConfig {
-                episode_steps: 0,
-                ..paper()
-            },
-        ] {
+        let changes: [fn(&mut IsingConfig); 5] = [
+            |it| it.patch_size = 85,
+            |it| it.patch_size = 2,
+            |it| it.temperature = 0.0,
+            |it| it.sweeps_per_step = 0,
+            |it| it.episode_steps = 0,
+        ];
+        for change in changes {
+            let mut bad = paper();
+            change(&mut bad);
             assert!(IsingWorld::new(&bad, 1, 0).is_err(), "{bad:?}");
         }
         assert!(IsingWorld::new(&paper(), 0, 0).is_err());

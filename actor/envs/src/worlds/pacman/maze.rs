@@ -43,7 +43,6 @@ pub(crate) type Direction = u8;
 /// An open cell, by its number in row order: 0..places.
 pub(crate) type Place = u16;
 
-/// What lies in an open cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Item {
     Nothing,

@@ -18,15 +18,16 @@ mod saved;
 #[cfg(test)]
 mod state_tests;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use rand_chacha::ChaCha8Rng;
 
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use ghost::{Chance, Ghost};
 use maze::{GHOSTS, Item, Maze, Place};
+use saved::SavedGame;
 
-use crate::copies::{RngUse, check_num_envs, check_step, copy_rng};
+use crate::copies::{Copies, RngUse, check_num_envs, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::settings::WorldSettings;
@@ -126,76 +127,50 @@ impl WorldSettings for PacmanConfig {
     }
 }
 
-impl Environment for PacmanWorld {
-    fn frame_shape(&self) -> FrameShape {
+impl Copies for PacmanWorld {
+    type Saved = SavedGame;
+
+    fn shape(&self) -> FrameShape {
         self.config.frame_shape()
     }
 
-    fn num_actions(&self) -> usize {
+    fn actions(&self) -> usize {
         Self::ACTION_NAMES.len()
     }
 
-    fn num_envs(&self) -> usize {
+    fn count(&self) -> usize {
         self.copies.len()
     }
 
-    fn observe(&mut self, frames: &mut [u8]) {
-        let wanted = render::FRAME_BYTES * self.copies.len();
-        assert_eq!(
-            frames.len(),
-            wanted,
-            "observe needs room for every copy's frame"
-        );
-        for (game, frame) in self
-            .copies
-            .iter()
-            .zip(frames.chunks_exact_mut(render::FRAME_BYTES))
+    fn draw(&self, copy: usize, frame: &mut [u8]) {
+        let game = &self.copies[copy];
+        frame.copy_from_slice(&game.background);
+        if let Some((lattice, _)) = &game.walls {
+            render::overlay(lattice.spins(), frame);
+        }
+        let ghosts = game.ghosts.map(|ghost| ghost.place);
+        render::actors(&self.maze, ghosts, game.agent, game.boost_left > 0, frame);
+    }
+
+    fn act(&mut self, copy: usize, action: u8) -> (f32, StepEnd) {
+        let game = &mut self.copies[copy];
+        let (reward, end) = game.step(&self.config, &self.maze, self.chance, action);
+        if end != StepEnd::Running {
+            game.episodes += 1;
+            game.reset(&self.config, &self.maze, &self.fresh);
+        } else if let (Some((lattice, rng)), Some(overlay)) = (&mut game.walls, &self.config.ising)
         {
-            frame.copy_from_slice(&game.background);
-            if let Some((lattice, _)) = &game.walls {
-                render::overlay(lattice.spins(), frame);
-            }
-            render::actors(
-                &self.maze,
-                game.ghosts.map(|g| g.place),
-                game.agent,
-                game.boost_left > 0,
-                frame,
-            );
+            (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng));
         }
+        (reward, end)
     }
 
-    fn step(
-        &mut self,
-        actions: &[u8],
-        rewards: &mut [f32],
-        ends: &mut [StepEnd],
-    ) -> Result<(), EnvError> {
-        check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
-        for (env, game) in self.copies.iter_mut().enumerate() {
-            (rewards[env], ends[env]) =
-                game.step(&self.config, &self.maze, self.chance, actions[env]);
-            if ends[env] != StepEnd::Running {
-                game.episodes += 1;
-                game.reset(&self.config, &self.maze, &self.fresh);
-            } else if let (Some((lattice, rng)), Some(overlay)) =
-                (&mut game.walls, &self.config.ising)
-            {
-                (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng));
-            }
-        }
-        Ok(())
+    fn saved(&self, copy: usize) -> SavedGame {
+        self.copies[copy].saved()
     }
 
-    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        let copies: Vec<_> = self.copies.iter().map(Game::saved).collect();
-        crate::saved::encode(&copies)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let copies = crate::saved::decode(state, self.num_envs())?;
-        let mut both = self.copies.iter_mut().zip(copies);
-        both.try_for_each(|(game, saved)| game.load(saved, &self.maze))
+    fn restore(&mut self, copy: usize, saved: SavedGame) -> Result<(), EnvError> {
+        self.copies[copy].load(saved, &self.maze)
     }
 }
 
@@ -279,24 +254,17 @@ impl Game {
             }
             if boosted {
                 self.ghosts[index] = Ghost::at(maze.ghost_starts()[index]);
-                reward += if self.lethal[index] {
-                    config.reward_ghost
-                } else {
-                    0.0
-                };
+                if self.lethal[index] {
+                    reward += config.reward_ghost;
+                }
             } else if self.lethal[index] {
                 return (reward + config.reward_death, StepEnd::Terminal);
             }
         }
-        let timed_out = self.episode_step >= config.step_limit;
-        (
-            reward,
-            if timed_out {
-                StepEnd::TimedOut
-            } else {
-                StepEnd::Running
-            },
-        )
+        match self.episode_step >= config.step_limit {
+            true => (reward, StepEnd::TimedOut),
+            false => (reward, StepEnd::Running),
+        }
     }
 
     fn eat(&mut self, config: &PacmanConfig, maze: &Maze, item: Item) -> f32 {

@@ -5,10 +5,8 @@ use super::maze::{GHOSTS, HEIGHT, Item, Maze, Place, WIDTH};
 
 /// Bytes a pixel.
 pub(crate) const CHANNELS: usize = 3;
-/// Bytes a frame.
 pub(crate) const FRAME_BYTES: usize = HEIGHT * WIDTH * CHANNELS;
 
-/// An RGB colour.
 pub(crate) type Colour = [u8; CHANNELS];
 
 pub(crate) const WALL: Colour = [33, 33, 160];
@@ -38,7 +36,6 @@ pub(crate) fn background(maze: &Maze, frame: &mut [u8]) {
     }
 }
 
-/// Paints the floor where food was eaten.
 pub(crate) fn erase(maze: &Maze, place: Place, frame: &mut [u8]) {
     paint(frame, maze.pixel(place), FLOOR);
 }

@@ -11,9 +11,8 @@ use super::{
 };
 use crate::{error::EnvError, saved::check};
 
-/// All of a [`Game`].
 #[derive(Serialize, Deserialize)]
-pub(super) struct SavedGame {
+pub(crate) struct SavedGame {
     rng: ChaCha8Rng,
     agent: Place,
     ghosts: [Ghost; GHOSTS],

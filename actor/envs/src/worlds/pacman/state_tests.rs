@@ -4,62 +4,37 @@
 use super::tests::config;
 use super::*;
 
+fn schedule(episodes_per_task: u64, order: &[u8]) -> Option<LethalSchedule> {
+    Some(LethalSchedule {
+        episodes_per_task,
+        order: order.to_vec(),
+    })
+}
+
+fn overlay(temperature: f64, sweeps_per_step: u32) -> Option<IsingOverlay> {
+    Some(IsingOverlay {
+        temperature,
+        sweeps_per_step,
+    })
+}
+
 #[test]
 fn unusable_settings_and_actions_are_errors() {
-    let schedule = |episodes_per_task, order: &[u8]| {
-        Some(LethalSchedule {
-            episodes_per_task,
-            order: order.to_vec(),
-        })
-    };
-    let overlay = |temperature, sweeps_per_step| {
-        Some(IsingOverlay {
-            temperature,
-            sweeps_per_step,
-        })
-    };
-    for bad in [
-        PacmanConfig {
-            epsilon: 1.1,
-            ..config()
-        },
-        PacmanConfig {
-            epsilon: f64::NAN,
-            ..config()
-        },
-        PacmanConfig {
-            switch_probability: -0.1,
-            ..config()
-        },
-        PacmanConfig {
-            step_limit: 0,
-            ..config()
-        },
-        PacmanConfig {
-            reward_ghost: f32::INFINITY,
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(0, &[0]),
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(1, &[]),
-            ..config()
-        },
-        PacmanConfig {
-            lethal_schedule: schedule(1, &[4]),
-            ..config()
-        },
-        PacmanConfig {
-            ising: overlay(0.0, 1),
-            ..config()
-        },
-        PacmanConfig {
-            ising: overlay(0.4, 0),
-            ..config()
-        },
-    ] {
+    let changes: [fn(&mut PacmanConfig); 10] = [
+        |it| it.epsilon = 1.1,
+        |it| it.epsilon = f64::NAN,
+        |it| it.switch_probability = -0.1,
+        |it| it.step_limit = 0,
+        |it| it.reward_ghost = f32::INFINITY,
+        |it| it.lethal_schedule = schedule(0, &[0]),
+        |it| it.lethal_schedule = schedule(1, &[]),
+        |it| it.lethal_schedule = schedule(1, &[4]),
+        |it| it.ising = overlay(0.0, 1),
+        |it| it.ising = overlay(0.4, 0),
+    ];
+    for change in changes {
+        let mut bad = config();
+        change(&mut bad);
         let error = PacmanWorld::new(&bad, 1, 0)
             .err()
             .expect("rejected")
@@ -84,15 +59,8 @@ fn unusable_settings_and_actions_are_errors() {
 fn a_game_continues_where_it_was_saved() {
     use crate::saved::tests::continues;
 
-    let overlay = IsingOverlay {
-        temperature: 2.0,
-        sweeps_per_step: 1,
-    };
-    let schedule = LethalSchedule {
-        episodes_per_task: 1,
-        order: vec![0, 1, 2, 3],
-    };
-    for (ising, lethal_schedule) in [(None, None), (Some(overlay), Some(schedule))] {
+    let schedule = schedule(1, &[0, 1, 2, 3]);
+    for (ising, lethal_schedule) in [(None, None), (overlay(2.0, 1), schedule)] {
         let config = PacmanConfig {
             ising,
             lethal_schedule,

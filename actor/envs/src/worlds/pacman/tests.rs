@@ -6,7 +6,7 @@ use super::ghost::Mode;
 use super::maze::WIDTH;
 use super::*;
 
-pub(super) fn config() -> PacmanConfig {
+pub(crate) fn config() -> PacmanConfig {
     PacmanConfig {
         epsilon: 0.1,
         switch_probability: 0.5,
@@ -20,6 +20,13 @@ pub(super) fn config() -> PacmanConfig {
         reward_death: -100.0,
         reward_cleared: 1000.0,
         ising: None,
+    }
+}
+
+fn harmless() -> PacmanConfig {
+    PacmanConfig {
+        lethal: [false; 4],
+        ..config()
     }
 }
 
@@ -124,13 +131,7 @@ fn the_first_frame_shows_everything() {
 
 #[test]
 fn a_wall_stops_the_agent_and_a_no_op_keeps_it() {
-    let mut world = duel(
-        &PacmanConfig {
-            lethal: [false; 4],
-            ..config()
-        },
-        3,
-    );
+    let mut world = duel(&harmless(), 3);
     let before = world.copies[0].agent;
     for action in [0, 2] {
         step(&mut world, action);
@@ -142,13 +143,7 @@ fn a_wall_stops_the_agent_and_a_no_op_keeps_it() {
 
 #[test]
 fn food_is_eaten_once() {
-    let mut world = duel(
-        &PacmanConfig {
-            lethal: [false; 4],
-            ..config()
-        },
-        3,
-    );
+    let mut world = duel(&harmless(), 3);
     assert_eq!(step(&mut world, 3).0, 1.0);
     assert_eq!(world.copies[0].pellets_left, 186);
     assert_eq!(
@@ -163,21 +158,17 @@ fn food_is_eaten_once() {
 
 #[test]
 fn contact_with_a_lethal_ghost_ends_the_episode() {
-    // Ghost 1 apart, agent waits: the ghost steps onto it.
-    assert_eq!(
-        step(&mut duel(&config(), 1), 0),
-        (1.0 - 100.0, StepEnd::Terminal)
-    );
-    // 1 apart, agent walks at it: they change places, which counts.
-    assert_eq!(
-        step(&mut duel(&config(), 1), 4),
-        (1.0 - 100.0, StepEnd::Terminal)
-    );
-    // 2 apart, both go to the middle.
-    assert_eq!(
-        step(&mut duel(&config(), 2), 4),
-        (1.0 - 100.0, StepEnd::Terminal)
-    );
+    for (apart, action) in [
+        // The agent waits: the ghost steps onto it.
+        (1, 0),
+        // It walks at it: they change places, which counts.
+        (1, 4),
+        // Both go to the middle.
+        (2, 4),
+    ] {
+        let seen = step(&mut duel(&config(), apart), action);
+        assert_eq!(seen, (1.0 - 100.0, StepEnd::Terminal), "{apart} {action}");
+    }
     // 1 apart, agent flees: the ghost is where the agent was, and no contact.
     assert_eq!(step(&mut duel(&config(), 1), 3), (1.0, StepEnd::Running));
 }
@@ -278,9 +269,8 @@ fn the_last_pellet_ends_the_episode_before_any_contact() {
 #[test]
 fn a_whole_game_can_be_cleared() {
     let config = PacmanConfig {
-        lethal: [false; 4],
         step_limit: 5_000,
-        ..config()
+        ..harmless()
     };
     let mut world = PacmanWorld::new(&config, 1, 5).unwrap();
     let mut total = 0.0;
@@ -312,8 +302,7 @@ fn a_whole_game_can_be_cleared() {
 fn episodes_are_cut_off_at_the_step_limit() {
     let config = PacmanConfig {
         step_limit: 7,
-        lethal: [false; 4],
-        ..config()
+        ..harmless()
     };
     let (_, _, ends) = play(&mut PacmanWorld::new(&config, 1, 6).unwrap(), 21, 1);
     let cut: Vec<usize> = (0..21).filter(|&i| ends[i] == StepEnd::TimedOut).collect();

@@ -10,9 +10,7 @@ use super::*;
 
 #[test]
 fn completed_levels_are_followed_by_levels_of_the_set() {
-    let Some(engine) = engine("completed_levels_are_followed_by_levels_of_the_set") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     for (game, start_level, num_levels) in [
         (Game::Leaper, 0, 500),
         (Game::Maze, 30, 7),
@@ -50,9 +48,7 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
 /// Levels have no order: the next one is drawn.
 #[test]
 fn the_same_level_is_followed_by_different_ones() {
-    let Some(engine) = engine("the_same_level_is_followed_by_different_ones") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let config = ProcgenConfig {
         start_level: 30,
         num_levels: 3,
@@ -89,9 +85,7 @@ fn the_same_level_is_followed_by_different_ones() {
 /// A redrawn copy equals a fresh one of that level, also in the steps that follow, in every game.
 #[test]
 fn a_redrawn_level_is_the_level_itself() {
-    let Some(engine) = engine("a_redrawn_level_is_the_level_itself") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let config = config(game);
         let mut world = ProcgenWorld::with_engine(engine, &config, 3, 11, 0).unwrap();
@@ -151,9 +145,7 @@ fn a_redrawn_level_is_the_level_itself() {
 
 #[test]
 fn redrawn_levels_are_uniform_over_the_set() {
-    let Some(engine) = engine("redrawn_levels_are_uniform_over_the_set") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let config = ProcgenConfig {
         num_levels: 10,
         ..config(Game::Maze)

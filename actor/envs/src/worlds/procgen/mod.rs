@@ -32,12 +32,12 @@ mod config;
 mod level_tests;
 mod shrink;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod visible_actions;
 
 use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
-use crate::copies::check_step;
+use crate::copies::{check_frames, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::saved;
@@ -133,10 +133,9 @@ impl ProcgenWorld {
                 num_threads: 0,
                 ..options
             };
-            let end = if options.num_levels == 0 {
-                i32::MAX
-            } else {
-                options.start_level + options.num_levels
+            let end = match options.num_levels {
+                0 => i32::MAX,
+                levels => options.start_level + levels,
             };
             Some(LevelSet {
                 levels: options.start_level..end,
@@ -277,11 +276,7 @@ impl Environment for ProcgenWorld {
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
-        assert_eq!(
-            frames.len(),
-            self.num_envs() * self.shape.bytes(),
-            "the buffer holds one frame for each copy"
-        );
+        check_frames(frames, self.num_envs(), self.shape);
         match &self.shrink {
             None => frames.copy_from_slice(self.game.frames()),
             Some(shrink) => shrink.apply(self.game.frames(), frames),

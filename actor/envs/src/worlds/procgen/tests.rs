@@ -11,16 +11,17 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 
 /// The installed engine, or a line that says the test was skipped.
-pub(super) fn engine(test: &str) -> Option<&'static Engine> {
+pub(super) fn engine() -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|value| value == "1") {
-        println!("skipped: {test} (DRIML_OFFLINE=1)");
+        let test = std::thread::current();
+        println!("skipped: {} (DRIML_OFFLINE=1)", test.name().unwrap_or("?"));
         return None;
     }
     Some(ENGINE.get_or_init(|| Engine::install(&mut |line| println!("{line}")).unwrap()))
 }
 
-pub(super) fn config(game: Game) -> ProcgenConfig {
+pub(crate) fn config(game: Game) -> ProcgenConfig {
     ProcgenConfig {
         game,
         distribution_mode: DistributionMode::Easy,
@@ -71,9 +72,7 @@ pub(super) fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_mo
 
 #[test]
 fn another_build_of_the_library_is_played_by_its_path() {
-    let Some(engine) = engine("another_build_of_the_library_is_played_by_its_path") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let folder = tempfile::tempdir().unwrap();
     // As in Procgen's own tree: the pictures are beside the library's folder.
     let library = folder.path().join("prebuilt/libenv.so");
@@ -110,9 +109,7 @@ fn another_build_of_the_library_is_played_by_its_path() {
 
 #[test]
 fn smaller_and_grey_frames_are_the_engines_own_made_so() {
-    let Some(engine) = engine("smaller_and_grey_frames_are_the_engines_own_made_so") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let world = |frame_side, grey| {
         let config = ProcgenConfig {
             frame_side,
@@ -149,47 +146,26 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
 
 #[test]
 fn wrong_settings_are_refused_without_an_engine() {
-    let refused = |config: ProcgenConfig, text: &str| {
-        let error = config.validate().unwrap_err().to_string();
-        assert!(error.contains(text), "{error}");
-    };
     let maze = || config(Game::Maze);
     maze().validate().unwrap();
-    refused(
-        ProcgenConfig {
-            distribution_mode: DistributionMode::Extreme,
-            ..maze()
-        },
-        "maze has no distribution",
-    );
-    refused(
-        ProcgenConfig {
-            num_levels: u32::MAX,
-            ..maze()
-        },
-        "num_levels = 4294967295",
-    );
-    refused(
-        ProcgenConfig {
-            start_level: i32::MAX as u32,
-            ..maze()
-        },
-        "past the last level",
-    );
-    refused(
-        ProcgenConfig {
-            num_levels: 0,
-            start_level: 3,
-            ..maze()
-        },
-        "no effect",
-    );
-    for frame_side in [0, 7, 65] {
-        let config = ProcgenConfig {
-            frame_side,
-            ..maze()
-        };
-        refused(config, &format!("frame_side = {frame_side}"));
+    type Change = fn(&mut ProcgenConfig);
+    let refused: [(Change, &str); 7] = [
+        (
+            |it| it.distribution_mode = DistributionMode::Extreme,
+            "maze has no distribution",
+        ),
+        (|it| it.num_levels = u32::MAX, "num_levels = 4294967295"),
+        (|it| it.start_level = i32::MAX as u32, "past the last level"),
+        (|it| (it.num_levels, it.start_level) = (0, 3), "no effect"),
+        (|it| it.frame_side = 0, "frame_side = 0"),
+        (|it| it.frame_side = 7, "frame_side = 7"),
+        (|it| it.frame_side = 65, "frame_side = 65"),
+    ];
+    for (change, text) in refused {
+        let mut config = maze();
+        change(&mut config);
+        let error = config.validate().unwrap_err().to_string();
+        assert!(error.contains(text), "{error}");
     }
     for (num_envs, threads, text) in [(0, 0, "0 copies"), (1, 1000, "1000 threads")] {
         let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
@@ -236,11 +212,7 @@ fn seeds_are_mixed_and_not_negative() {
 
 #[test]
 fn the_same_seed_gives_the_same_frames_and_copies_do_not_depend_on_their_number() {
-    let Some(engine) =
-        engine("the_same_seed_gives_the_same_frames_and_copies_do_not_depend_on_their_number")
-    else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     // Maze is won by chance within a few steps, so this crosses redrawn levels too.
     let run = |num_envs: usize, seed: u64, threads: usize| {
         let config = config(Game::Maze);
@@ -270,9 +242,7 @@ fn the_same_seed_gives_the_same_frames_and_copies_do_not_depend_on_their_number(
 
 #[test]
 fn ends_are_told_apart() {
-    let Some(engine) = engine("ends_are_told_apart") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     for use_sequential_levels in [false, true] {
         // Standing still in a maze: nothing happens until the limit.
         let config = ProcgenConfig {
@@ -317,9 +287,7 @@ fn ends_are_told_apart() {
 
 #[test]
 fn wrong_steps_are_refused() {
-    let Some(engine) = engine("wrong_steps_are_refused") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let mut world = ProcgenWorld::with_engine(engine, &config(Game::Coinrun), 2, 1, 0).unwrap();
     let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
     let error = world.step(&[0, 15], &mut rewards, &mut ends).unwrap_err();
@@ -341,9 +309,7 @@ fn wrong_steps_are_refused() {
 /// Does every action in the same saved states and compares all that follows for six steps; see `visible_actions`.
 #[test]
 fn visible_actions_are_what_the_engine_does() {
-    let Some(engine) = engine("visible_actions_are_what_the_engine_does") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let mut envs = VecGame::new(engine, &config(game).options(1, 1, 0).unwrap()).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -397,9 +363,7 @@ fn visible_actions_are_what_the_engine_does() {
 fn every_game_continues_where_it_was_saved() {
     use crate::saved::tests::continues;
 
-    let Some(engine) = engine("every_game_continues_where_it_was_saved") else {
-        return;
-    };
+    let Some(engine) = engine() else { return };
     let mut ended = 0;
     for game in Game::ALL {
         let config = config(game);

@@ -3,7 +3,7 @@
 
 use anyhow::Context;
 use candle_core::{Device, Tensor};
-use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
+use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd, WorldSettings};
 use driml_learner::{LearnerSettings, auxiliary::dim::Dim};
 use driml_model::{Features, ModelConfig};
 use rand::{Rng, SeedableRng};
@@ -110,7 +110,7 @@ impl Episodes {
             ..config.clone()
         };
         let mut world = IsingWorld::new(&config, copies, seed)?;
-        let bytes = config.frame_shape().bytes();
+        let bytes = world.frame_shape().bytes();
         let (mut rewards, mut ends) = (vec![0.0; copies], vec![StepEnd::Running; copies]);
         let mut frames = Vec::new();
         for step in 0..=steps {

@@ -4,7 +4,7 @@
 
 use anyhow::Context;
 use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
-use driml_envs::{CutFrames, FewerActions, StepEnd};
+use driml_envs::{PartOfWorld, StepEnd};
 use driml_learner::Batch;
 use driml_protocol::NO_ACTION;
 use driml_settings::config::RunConfig;
@@ -134,9 +134,10 @@ fn history(
     let sent = (run.frame_height as usize, run.frame_width as usize);
     let world = config.world.build(COPIES, SEED, 0);
     let world = world.context("building the world")?;
-    let fewer = FewerActions::of(world, config.world.actions(config.actor.actions))?;
+    let actions = config.world.actions(config.actor.actions);
+    let world = PartOfWorld::of(world, actions, sent)?;
     let rng = ChaCha8Rng::seed_from_u64(SEED);
-    let mut acting = Acting::new(CutFrames::of(fewer, sent)?, run.frame_stack as usize, rng)?;
+    let mut acting = Acting::new(world, run.frame_stack as usize, rng)?;
     let enlarge = || config.input.enlarge(sent, model);
     let enlarged = enlarge()?;
     let precision = config.actor.precision;
