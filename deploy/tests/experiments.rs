@@ -52,16 +52,35 @@ fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
 }
 
 fn names(files: &BTreeMap<String, Vec<u8>>) -> String {
-    files
-        .keys()
-        .map(String::as_str)
-        .collect::<Vec<_>>()
-        .join(" ")
+    let names: Vec<_> = files.keys().map(String::as_str).collect();
+    names.join(" ")
 }
 
 /// Lines of a CSV file without its header.
 fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
     String::from_utf8_lossy(&files[name]).lines().count() - 1
+}
+
+/// The parts of a page, and the files beside it.
+fn check_page(folder: &Path, parts: &[&str], files: &str) -> String {
+    let page = fs::read_to_string(folder.join("README.md")).unwrap();
+    let of_all = [
+        "smoke length",
+        "**Claim.**",
+        "**Command.** `driml experiment",
+        "**Got.**",
+        "**Differences from the paper.**",
+    ];
+    for part in of_all.iter().chain(parts) {
+        assert!(page.contains(part), "{part}\n{page}");
+    }
+    let found = data(folder);
+    assert_eq!(names(&found), files);
+    for (file, bytes) in &found {
+        let text = String::from_utf8_lossy(bytes);
+        assert!(bytes.len() > 50 && !text.contains("NaN"), "{file}: {text}");
+    }
+    page
 }
 
 fn check(name: &str, files: &str) {
@@ -70,24 +89,8 @@ fn check(name: &str, files: &str) {
     let printed = run(root.path(), &call);
     let folder = root.path().join("experiments").join(name);
     assert!(printed.ends_with("README.md\n"), "{printed}");
-    let page = fs::read_to_string(folder.join("README.md")).unwrap();
-    for part in [
-        "smoke length",
-        "**Claim.**",
-        "**Command.** `driml experiment",
-        "**Time.**",
-        "**Expected.**",
-        "**Got.**",
-        "**Differences from the paper.**",
-    ] {
-        assert!(page.contains(part), "{part}\n{page}");
-    }
+    check_page(&folder, &["**Time.**", "**Expected.**"], files);
     let first = data(&folder);
-    assert_eq!(names(&first), files, "{name}");
-    for (file, bytes) in &first {
-        assert!(bytes.len() > 50, "{file} is all but empty");
-        assert!(!String::from_utf8_lossy(bytes).contains("NaN"), "{file}");
-    }
 
     // Elsewhere: the same bytes. Again, with one piece lost: that one is made anew, to the same bytes.
     run(root.path(), &format!("{call} --out other"));
@@ -130,28 +133,6 @@ fn stability() {
     check("stability", "promises.csv worst.png worst.svg");
 }
 
-/// The parts of a page, and the files beside it.
-fn check_page(folder: &Path, files: &str) -> String {
-    let page = fs::read_to_string(folder.join("README.md")).unwrap();
-    for part in [
-        "smoke length",
-        "**Claim.**",
-        "**Command.** `driml experiment",
-        "**Got.**\n\n* ",
-        "| --- |",
-        "**Differences from the paper.**",
-    ] {
-        assert!(page.contains(part), "{part}\n{page}");
-    }
-    let found = data(folder);
-    assert_eq!(names(&found), files);
-    for (file, bytes) in &found {
-        let text = String::from_utf8_lossy(bytes);
-        assert!(bytes.len() > 20 && !text.contains("NaN"), "{file}");
-    }
-    page
-}
-
 /// Through real processes, so no two runs are alike; but what is finished stays as it was.
 #[test]
 fn procgen_without_the_engine() {
@@ -160,7 +141,7 @@ fn procgen_without_the_engine() {
     run(root.path(), call);
     let folder = root.path().join("experiments/procgen");
     let files = "curves.png curves.svg table.csv";
-    let page = check_page(&folder, files);
+    let page = check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data(&folder);
@@ -240,7 +221,7 @@ fn pacman() {
     run(root.path(), "experiment pacman --smoke");
     let folder = root.path().join("experiments/pacman");
     let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
-    check_page(&folder, files);
+    check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
     let config = |name: &str| {
         let path = folder.join("runs").join(name).join("config.toml");
         fs::read_to_string(path).unwrap()
@@ -366,21 +347,8 @@ fn killed_and_resumed() {
 }
 
 #[test]
-fn an_experiment_that_is_not_there() {
+fn a_file_where_the_folder_should_be_is_an_error() {
     let root = tempfile::tempdir().unwrap();
-    for call in [
-        "experiment",
-        "experiment walk",
-        "experiment ising --seeds 0",
-        "experiment procgen --games pong",
-        "experiment procgen --agents dqn",
-        "experiment procgen --smoke --games chain --set run.gamma=2",
-        "experiment procgen --smoke --report --out none",
-        "experiment pacman --episodes-per-task 33",
-    ] {
-        said(root.path(), call, 64);
-    }
-    // A file where the folder should be.
     fs::write(root.path().join("file"), "").unwrap();
     let said = said(root.path(), "experiment random-walk --smoke --out file", 1);
     assert!(said.contains("making file/pieces"), "{said}");
@@ -419,29 +387,16 @@ fn a_grid_makes_every_combination_once() {
         ["driml-ada", "1e-3", "1"],
     ];
     assert_eq!(cells, expected);
-    assert!(
-        folder
-            .join("runs/1-c51-lr=1e-4-seed1/summary.json")
-            .is_file()
-    );
+    let summary = folder.join("runs/1-c51-lr=1e-4-seed1/summary.json");
+    assert!(summary.is_file());
     // One seed more makes what is missing alone.
-    let made = |name: &str| {
-        fs::metadata(folder.join("runs").join(name))
-            .unwrap()
-            .modified()
-            .unwrap()
-    };
-    let before = made("1-c51-lr=1e-4-seed1/summary.json");
+    let made = || fs::metadata(&summary).unwrap().modified().unwrap();
+    let before = made();
     run(root.path(), &format!("{call} --seeds 2 --jobs 2"));
-    assert_eq!(made("1-c51-lr=1e-4-seed1/summary.json"), before);
+    assert_eq!(made(), before);
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
-    assert!(
-        table
-            .lines()
-            .skip(1)
-            .all(|row| row.split(',').nth(3) == Some("2")),
-        "{table}"
-    );
+    let mut seeds = table.lines().skip(1).map(|row| row.split(',').nth(3));
+    assert!(seeds.all(|seeds| seeds == Some("2")), "{table}");
     // Another grid does not mix with it.
     refused(&format!("{fixed} --frames 352"), &["other settings"]);
 }

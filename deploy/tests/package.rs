@@ -8,8 +8,29 @@ use std::{
     process::{Command, Output},
 };
 
+/// Each recipe, and the commands that it calls in their order.
+const RECIPES: [(&str, &str); 6] = [
+    ("compose.yaml", "replay-server learner actor actor status"),
+    ("kubernetes.yaml", "replay-server learner actor"),
+    ("driml.sbatch", "replay-server learner actor"),
+    ("systemd/driml-replay-server.service", "replay-server"),
+    ("systemd/driml-learner.service", "learner"),
+    ("systemd/driml-actor@.service", "actor"),
+];
+
+/// What a recipe's place holders become.
+const VALUES: [(&str, &str); 7] = [
+    ("${DRIML_ENV:-procgen:coinrun}", "procgen:coinrun"),
+    ("${DRIML_AGENT:-driml-ada}", "driml-ada"),
+    ("${DRIML_FRAMES:-120000}", "120000"),
+    ("$actors", "4"),
+    ("$DRIML_SETTINGS", ""),
+    ("\"$@\"", ""),
+    ("%i", "7"),
+];
+
 fn recipe(name: &str) -> String {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("package")
         .join(name);
     std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
@@ -26,133 +47,67 @@ fn help(words: &[String]) -> Output {
         .unwrap()
 }
 
-fn check(name: &str, calls: &[Vec<String>], expected: &[&str]) {
-    let commands: Vec<_> = calls.iter().map(|words| words[0].as_str()).collect();
-    assert_eq!(commands, expected, "{name}");
-    for words in calls {
-        let output = help(words);
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(
-            output.status.success(),
-            "{name}: driml {}: {said}",
-            words.join(" ")
-        );
-    }
-}
-
 fn words(text: &str) -> Vec<String> {
     let plain = |word: &str| word.trim_matches(['"', ',', '\'', '[', ']']).to_owned();
-    text.split_whitespace()
-        .map(plain)
-        .filter(|word| !word.is_empty())
-        .collect()
+    let words = text.split_whitespace().map(plain);
+    words.filter(|word| !word.is_empty()).collect()
 }
 
-/// The lists under `key`, in a line or an item a line.
-fn lists(yaml: &str, key: &str) -> Vec<Vec<String>> {
-    let mut lines = yaml
-        .lines()
-        .map(str::trim)
-        .filter(|line| !line.starts_with('#'))
-        .peekable();
+/// The calls of the program in a recipe: of a shell's line, of systemd's, or the list under a key of YAML, in a line or an item a line.
+fn calls(text: &str) -> Vec<Vec<String>> {
+    let mut lines = text.lines().map(str::trim).peekable();
     let mut found = Vec::new();
     while let Some(line) = lines.next() {
-        let Some(rest) = line.strip_prefix(key) else {
+        let of_yaml = line
+            .strip_prefix("command:")
+            .or_else(|| line.strip_prefix("args:"));
+        let of_slurm = || Some(line.strip_prefix("part ")?.split_once("\"$program\" ")?.1);
+        let of_systemd = || line.strip_prefix("ExecStart=/usr/local/bin/driml ");
+        let Some(call) = of_yaml.or_else(of_slurm).or_else(of_systemd) else {
             continue;
         };
-        let mut list = words(rest);
-        while rest.is_empty() && lines.peek().is_some_and(|line| line.starts_with("- ")) {
-            list.extend(words(lines.next().unwrap().trim_start_matches("- ")));
+        let mut call = call.to_owned();
+        while let Some(item) = lines.next_if(|line| of_yaml == Some("") && line.starts_with("- ")) {
+            call += &item[1..];
         }
-        found.push(list);
+        for (holder, value) in VALUES {
+            call = call.replace(holder, value);
+        }
+        found.push(words(&call));
     }
     found
 }
 
-/// `${NAME:-default}` as its default.
-fn with_defaults(word: &str) -> String {
-    match word.split_once("${") {
-        Some((before, rest)) => {
-            let (_, default) = rest.trim_end_matches('}').split_once(":-").unwrap();
-            format!("{before}{default}")
+#[test]
+fn every_call_in_a_recipe_has_flags_that_the_program_knows() {
+    for (name, expected) in RECIPES {
+        let calls = calls(&recipe(name));
+        let commands: Vec<_> = calls.iter().map(|words| words[0].as_str()).collect();
+        assert_eq!(commands.join(" "), expected, "{name}");
+        for words in calls {
+            let output = help(&words);
+            let said = String::from_utf8(output.stderr).unwrap();
+            let call = words.join(" ");
+            assert!(output.status.success(), "{name}: driml {call}: {said}");
         }
-        None => word.to_owned(),
     }
-}
-
-#[test]
-fn compose() {
-    let calls = lists(&recipe("compose.yaml"), "command:");
-    let calls: Vec<Vec<_>> = calls
-        .iter()
-        .map(|words| words.iter().map(|word| with_defaults(word)).collect())
-        .collect();
-    check(
-        "compose.yaml",
-        &calls,
-        &["replay-server", "learner", "actor", "actor", "status"],
-    );
-}
-
-#[test]
-fn kubernetes() {
-    let calls = lists(&recipe("kubernetes.yaml"), "args:");
-    check(
-        "kubernetes.yaml",
-        &calls,
-        &["replay-server", "learner", "actor"],
-    );
-}
-
-#[test]
-fn slurm() {
-    let script = recipe("driml.sbatch");
-    let calls: Vec<_> = script
-        .lines()
-        .filter_map(|line| line.strip_prefix("part ")?.split_once("\"$program\" "))
-        .map(|(_, call)| words(&call.replace("\"$@\"", "").replace("$actors", "4")))
-        .collect();
-    check(
-        "driml.sbatch",
-        &calls,
-        &["replay-server", "learner", "actor"],
-    );
-    let checked = Command::new("bash")
-        .args(["-n", "-c", &script])
-        .output()
-        .unwrap();
-    assert!(checked.status.success(), "{checked:?}");
-}
-
-#[test]
-fn systemd() {
-    for (unit, command) in [
-        ("driml-replay-server.service", "replay-server"),
-        ("driml-learner.service", "learner"),
-        ("driml-actor@.service", "actor"),
-    ] {
-        let unit = recipe(&format!("systemd/{unit}"));
-        let start = "ExecStart=/usr/local/bin/driml ";
-        let calls: Vec<_> = unit
-            .lines()
-            .filter_map(|line| line.strip_prefix(start))
-            .map(|call| words(&call.replace("$DRIML_SETTINGS", "").replace("%i", "7")))
-            .collect();
-        check(command, &calls, &[command]);
-    }
-}
-
-#[test]
-fn a_flag_that_is_not_there_is_found() {
     let output = help(&words("actor --conect tcp/127.0.0.1:1"));
-    assert_eq!(output.status.code(), Some(64));
+    assert_eq!(output.status.code(), Some(64), "a flag that is not there");
+}
+
+#[test]
+fn the_batch_script_is_a_shell_s() {
+    let script = recipe("driml.sbatch");
+    let checked = Command::new("bash").args(["-n", "-c", &script]).output();
+    let checked = checked.unwrap();
+    assert!(checked.status.success(), "{checked:?}");
 }
 
 /// What the image installs and copies is where it says.
 #[test]
 fn the_image_is_made_of_what_is_there() {
     let file = recipe("Dockerfile");
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..");
     for copied in file.lines().filter_map(|line| line.strip_prefix("COPY ")) {
         let from = copied.split_whitespace().next().unwrap();
         if from != "--from=build" {
@@ -161,12 +116,8 @@ fn the_image_is_made_of_what_is_there() {
     }
     let manifest = std::fs::read_to_string(root.join("Cargo.toml")).unwrap();
     assert!(file.contains("--profile dist") && manifest.contains("[profile.dist]"));
-    let rust = manifest
-        .lines()
-        .find_map(|line| line.strip_prefix("rust-version = "))
-        .unwrap();
-    assert!(
-        file.contains(&format!("rust:{}-", rust.trim_matches('"'))),
-        "{rust}"
-    );
+    let mut lines = manifest.lines();
+    let rust = lines.find_map(|line| line.strip_prefix("rust-version = "));
+    let rust = rust.unwrap().trim_matches('"');
+    assert!(file.contains(&format!("rust:{rust}-")), "{rust}");
 }

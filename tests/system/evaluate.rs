@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use driml_launch::keep::SELECTION_SEED;
+use driml_launch::evaluator::SELECTION_SEED;
 use driml_tests::{TestSystem, updates_of};
 
 use crate::{SHORT, system};

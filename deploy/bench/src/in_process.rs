@@ -4,9 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{anyhow, ensure};
-use driml_protocol::{
-    ActorJoin, Batch, BufferPool, Chunk, ChunkHeader, End, InsertReply, Sampling,
-};
+use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply, Sampling};
 use driml_replay_server::Replay;
 use driml_settings::config::RunConfig;
 use rand::{Rng, SeedableRng};
@@ -23,11 +21,7 @@ use crate::{
 pub(super) const ASSEMBLED: &str = "batch of 3 states, without a wire";
 pub(super) const COPIED: &str = "plain copy of a batch's bytes";
 
-/// Streams and steps of a chunk that holds no world's frames.
-const BLANK_CHUNK: (u32, u32) = (8, 128);
-/// Steps of its episodes.
-const EPISODE: u64 = 500;
-/// Side of its frames: so small that the draw is measured and not the copying of states.
+/// Side of black frames: so small that the draw is measured and not the copying of states.
 const SIDE: u32 = 8;
 /// Rainbow's alpha; beta is the learner's.
 const PRIORITISED: Sampling = Sampling::Prioritised {
@@ -44,8 +38,7 @@ pub(super) fn assembling(
 ) -> anyhow::Result<[Measurement; 2]> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
     let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes());
-    let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
-    let mut filled = Filled::new(&config, CAPACITY, || chunks.next_chunk())?;
+    let mut filled = Filled::new(&config, CAPACITY, recording)?;
     let sampling = effort.rate_by_median(|| {
         black_box(filled.draw()?);
         Ok(())
@@ -72,17 +65,14 @@ pub(super) fn assembling(
 /// Batches a second of a replay that holds `held` transitions: drawn uniformly, by priority, and by priorities that are then set,
 /// in turn.
 pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+    let blank = Recording::blank((SIDE * SIDE) as usize);
     let filled = |sampling| {
         let mut config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
         (config.run.frame_height, config.run.frame_width) = (SIDE, SIDE);
         config.run.frame_channels = 1;
         config.replay.capacity_transitions = held;
         config.replay.sampling = sampling;
-        let mut sequence = 0;
-        Filled::new(&config, held, || {
-            sequence += 1;
-            blank_chunk(sequence - 1)
-        })
+        Filled::new(&config, held, &blank)
     };
     let mut uniform = filled(Sampling::Uniform)?;
     let mut prioritised = filled(PRIORITISED)?;
@@ -110,29 +100,6 @@ pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measure
         .collect())
 }
 
-/// A chunk of black frames whose episodes have [`EPISODE`] steps.
-fn blank_chunk(sequence: u64) -> Chunk {
-    let (streams, steps) = BLANK_CHUNK;
-    let mut chunk = Chunk::zeroed(ChunkHeader {
-        actor: 0,
-        incarnation: INCARNATION,
-        sequence,
-        first_transition: sequence * u64::from(streams * steps),
-        weights_version: 0,
-        leaving: false,
-        streams,
-        steps,
-        frame_bytes: SIDE * SIDE,
-    });
-    for row in 0..streams * steps {
-        let step = sequence * u64::from(steps) + u64::from(row % steps);
-        let ends = (step + 1).is_multiple_of(EPISODE);
-        let end = if ends { End::Terminal } else { End::Running };
-        chunk.set(row as usize, 0, 0.0, end);
-    }
-    chunk
-}
-
 /// A replay that is full, and what its learner finds.
 struct Filled {
     replay: Replay,
@@ -143,11 +110,8 @@ struct Filled {
 
 impl Filled {
     /// A replay with the chunks of one actor, until it has stored more than `held` transitions.
-    fn new(
-        config: &RunConfig,
-        held: u64,
-        mut next_chunk: impl FnMut() -> Chunk,
-    ) -> anyhow::Result<Self> {
+    fn new(config: &RunConfig, held: u64, recording: &Recording) -> anyhow::Result<Self> {
+        let mut chunks = recording.chunks(0, CHUNKS[3], BufferPool::new(1));
         let rows = config.learner.batch_size;
         let mut replay = Replay::new(&config.run, &config.replay, rows)?;
         let join = ActorJoin {
@@ -156,7 +120,7 @@ impl Filled {
         };
         replay.join_actor(join).map_err(anyhow::Error::msg)?;
         while replay.inserted_total() <= held {
-            let reply = replay.insert(&next_chunk());
+            let reply = replay.insert(&chunks.next_chunk());
             ensure!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
         }
         Ok(Self {

@@ -1,4 +1,4 @@
-//! Real frames of Procgen, recorded once, from which benches make transitions.
+//! Frames of Procgen, recorded once, or black ones, from which benches make transitions.
 //! It keeps no time: recording is not measured.
 
 use std::path::Path;
@@ -85,6 +85,20 @@ impl Recording {
             frames,
             steps,
         })
+    }
+
+    /// Black frames of so many bytes; an episode is as long as the recording.
+    pub(super) fn blank(frame_bytes: usize) -> Self {
+        let end = |step| match step + 1 == STEPS {
+            true => End::Terminal,
+            false => End::Running,
+        };
+        let steps = (0..STEPS).flat_map(|step| [(0, 0.0, end(step)); STREAMS]);
+        Self {
+            frame_bytes,
+            frames: vec![0; STEPS * STREAMS * frame_bytes],
+            steps: steps.collect(),
+        }
     }
 
     /// Writes the frames, raw, for a process that is not ours.

@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_launch::managed_process::ManagedProcess;
 
 use crate::{
     effort::Effort,
@@ -68,7 +69,7 @@ pub(super) fn measure(args: &BenchReplayArgs, effort: &Effort) -> anyhow::Result
             samples.add(rates(&mut server, &recording, effort)?);
             match on_disk {
                 Some(dir) => samples.add(restart(server, folder.path(), dir)?),
-                None => server.end(),
+                None => drop(server.end(ManagedProcess::ask_to_stop)),
             }
             on_disk.map_or(Ok(()), empty)?;
         }
@@ -110,14 +111,14 @@ fn restart(server: Server, logs: &Path, dir: &Path) -> anyhow::Result<[Measureme
         bytes += entry?.metadata()?.len();
     }
     let megabytes = bytes as f64 / 1e6;
-    let wire = server.kill();
+    let wire = server.end(ManagedProcess::kill);
     let started = Instant::now();
     let server = Server::start(&wire, logs)?;
     let seconds = started
         .elapsed()
         .max(Duration::from_millis(1))
         .as_secs_f64();
-    server.kill();
+    server.end(ManagedProcess::kill);
     Ok([
         Measurement::found("log", megabytes, "MB"),
         Measurement::found("restart", seconds, "s"),

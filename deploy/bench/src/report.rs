@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 use anyhow::Context;
-use driml_launch::console::{self, print};
+use driml_launch::console::{self, aligned, print};
 use driml_learner::Precision;
 use driml_machine::{resources::MachineNote, units::number};
 use serde::{Deserialize, Serialize};
@@ -111,28 +111,6 @@ pub(super) fn publish(
         }
         None => print(table),
     }
-}
-
-/// Rows as lines whose columns are aligned: to the left, or to the right for the columns in `right`.
-pub(super) fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width_of = |column: usize| {
-        let cells = rows.iter().filter_map(|row| row.get(column));
-        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
-    };
-    let widths: Vec<_> = (0..columns).map(width_of).collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().enumerate().map(|(column, cell)| {
-            let width = widths[column];
-            match right.contains(&column) {
-                true => format!("{cell:>width$}"),
-                false => format!("{cell:<width$}"),
-            }
-        });
-        let line = cells.collect::<Vec<_>>().join("  ");
-        format!("{}\n", line.trim_end())
-    };
-    rows.iter().map(line).collect()
 }
 
 #[cfg(test)]

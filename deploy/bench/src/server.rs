@@ -180,29 +180,17 @@ impl Server {
         Ok(RunClient::new(session, self.keys.clone(), spec_hash))
     }
 
-    /// Asks the server to end, and waits for it.
-    pub(super) fn end(mut self) {
-        self.close();
-        self.process.ask_to_stop();
-        self.process
-            .wait_until(Instant::now() + ANSWER_MAX, || false);
-    }
-
-    /// Ends the server at once, as when its process dies; another one can take its place.
-    pub(super) fn kill(mut self) -> Wire {
-        self.close();
-        self.process.kill();
-        self.process
-            .wait_until(Instant::now() + ANSWER_MAX, || false);
-        self.wire
-    }
-
-    fn close(&self) {
+    /// Ends the server as its process is told to, and waits for it; another one can take its place.
+    pub(super) fn end(mut self, tell: fn(&mut ManagedProcess)) -> Wire {
         for session in &self.sessions {
             if let Err(e) = session.close().wait() {
                 tracing::debug!("closing a session: {e}");
             }
         }
+        tell(&mut self.process);
+        let deadline = Instant::now() + ANSWER_MAX;
+        self.process.wait_until(deadline, || false);
+        self.wire
     }
 }
 

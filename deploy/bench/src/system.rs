@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{bail, ensure};
 use driml_launch::{
-    console,
+    console::{self, aligned},
     endpoint::NAMESPACE,
     managed_process::ManagedProcess,
     run_folder::{RunFolder, Summary},
@@ -20,7 +20,7 @@ use tempfile::TempDir;
 
 use crate::{
     flags::BenchFlags,
-    report::{Measurement, aligned},
+    report::Measurement,
     settings::{self, AGENT, WORLD},
     subprocess::{connect, reach, start},
 };

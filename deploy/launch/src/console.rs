@@ -25,6 +25,8 @@ use tracing_subscriber::{
 
 /// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
+/// How often a line says how far something is where there is no progress bar.
+const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 
 /// Writes a line to stderr. What cannot be written is dropped: the pipe is closed or the disk is full, and a run continues.
 pub fn line(text: &str) {
@@ -38,6 +40,15 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(e) if !is_gone(&e) => Err(e).context("writing to stdout"),
         _ => Ok(()),
+    }
+}
+
+/// [`print`] of a page that takes the place of the one before, on a terminal; elsewhere pages follow each other.
+pub(crate) fn print_page(text: &str) -> anyhow::Result<()> {
+    let on_terminal = io::stdout().is_terminal().then(Term::stdout);
+    match on_terminal.map(|it| it.clear_screen()) {
+        Some(Err(e)) if !is_gone(&e) => Err(e.into()),
+        _ => print(text),
     }
 }
 
@@ -77,6 +88,26 @@ fn wrapped_to(text: &str, separator: &str, indent: usize, width: usize) -> Strin
         }
     }
     lines
+}
+
+/// Rows as lines whose columns are aligned: to the left, or to the right for the columns in `right`.
+pub fn aligned(rows: &[Vec<String>], right: &[usize]) -> String {
+    let width_of = |column: usize| {
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
+    };
+    let cell = |(column, cell): (usize, &String)| {
+        let width = width_of(column);
+        match right.contains(&column) {
+            true => format!("{cell:>width$}"),
+            false => format!("{cell:<width$}"),
+        }
+    };
+    let line = |row: &Vec<String>| {
+        let line: Vec<_> = row.iter().enumerate().map(cell).collect();
+        format!("{}\n", line.join("  ").trim_end())
+    };
+    rows.iter().map(line).collect()
 }
 
 /// Whether writing failed because the pipe's reader has ended or the terminal was closed.
@@ -199,6 +230,8 @@ const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
 pub struct Screen {
     bar: Option<ProgressBar>,
     full_disk: Arc<Mutex<FullDisk>>,
+    /// When the next line says how far something is.
+    plain_next: Option<Instant>,
 }
 
 /// When a full disk was last reported, and how many lines about it were left out since.
@@ -238,6 +271,7 @@ impl Screen {
         });
         Self {
             bar,
+            plain_next: Some(Instant::now() + PLAIN_PERIOD),
             ..Self::default()
         }
     }
@@ -268,6 +302,18 @@ impl Screen {
         }
     }
 
+    /// Says how far something is: beside the bar, or now and then in a line; `text` is told whether it is beside the bar.
+    pub fn show(&mut self, position: u64, text: impl FnOnce(bool) -> String) {
+        let now = Instant::now();
+        if let Some(bar) = &self.bar {
+            bar.set_position(position);
+            bar.set_message(text(true));
+        } else if self.plain_next.is_none_or(|next| now >= next) {
+            self.plain_next = Some(now + PLAIN_PERIOD);
+            self.line(&text(false));
+        }
+    }
+
     /// Takes the progress bar away.
     pub fn clear(&self) {
         if let Some(bar) = &self.bar {
@@ -276,24 +322,6 @@ impl Screen {
         let more = std::mem::take(&mut self.full_disk().left_out);
         if more > 0 {
             line(&format!("and {more} more about the full disk"));
-        }
-    }
-}
-
-/// Pages on stdout that each take the place of the one before, on a terminal; elsewhere they follow each other.
-pub struct Pages(Option<Term>);
-
-impl Pages {
-    /// None shown yet.
-    pub fn on_stdout() -> Self {
-        Self(io::stdout().is_terminal().then(Term::stdout))
-    }
-
-    /// Shows one.
-    pub fn show(&self, text: &str) -> anyhow::Result<()> {
-        match self.0.as_ref().map(Term::clear_screen) {
-            Some(Err(e)) if !is_gone(&e) => Err(e.into()),
-            _ => print(text),
         }
     }
 }

@@ -67,12 +67,6 @@ pub struct Player {
 }
 
 impl Player {
-    /// Reads what a user wants to play of a run's folder: the averaged weights of the newest checkpoint if there are some, else its
-    /// online ones.
-    pub fn load(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::load_at(folder, Which::default(), Weights::default())
-    }
-
     /// Reads one of the checkpoints in a run's folder.
     pub fn load_at(folder: &RunFolder, which: Which, weights: Weights) -> anyhow::Result<Self> {
         Self::read(config_of(folder)?, &checkpoint_at(folder, which)?, weights)
@@ -125,27 +119,19 @@ impl Player {
         episodes: u32,
         seed: u64,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        match levels(&self.config.world, which) {
-            Ok(world) => self.play(who, &world, episodes as usize, seed).map(Some),
-            Err(_) => Ok(None),
-        }
+        let Ok(world) = levels(&self.config.world, which) else {
+            return Ok(None);
+        };
+        let (count, watch) = (episodes as usize, &mut play_on);
+        let played = self.play_watched(who, &world, count, seed, watch);
+        played.map(Some)
     }
 
-    /// Returns of whole episodes in `world`, which is the run's, with other levels.
+    /// Returns of whole episodes in `world`, which is the run's, with other levels. Every step is shown to `watch`, which may end it
+    /// before all episodes are over.
     ///
     /// # Errors
     /// The policy or the world failed, or episodes do not end.
-    pub fn play(
-        &self,
-        who: Who,
-        world: &WorldConfig,
-        episodes: usize,
-        seed: u64,
-    ) -> anyhow::Result<Vec<f64>> {
-        self.play_watched(who, world, episodes, seed, &mut play_on)
-    }
-
-    /// [`Player::play`], with every step shown to `watch`, which may end it before all episodes are over.
     pub fn play_watched(
         &self,
         who: Who,
@@ -163,8 +149,8 @@ impl Player {
             }
             Who::Random => Box::new(random_policy(config)?),
         };
-        let evaluation = evaluation(config, episodes, self.epsilon);
-        play_with(config, policy.as_mut(), world, evaluation, seed, watch)
+        let (policy, epsilon) = (policy.as_mut(), self.epsilon);
+        play_with(config, policy, world, episodes, epsilon, seed, watch)
     }
 
     /// Copies of the world that play so many episodes.
@@ -197,11 +183,12 @@ impl Player {
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
     let mut policy = random_policy(config)?;
-    let evaluation = evaluation(config, episodes, EPSILON);
-    play_with(config, &mut policy, &world, evaluation, seed, &mut play_on)
+    let (policy, watch) = (&mut policy, &mut play_on);
+    play_with(config, policy, &world, episodes, EPSILON, seed, watch)
 }
 
-fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
+/// Watches without ending anything.
+pub(crate) fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
@@ -209,25 +196,22 @@ fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {
     Ok(RandomPolicy::new(u8::try_from(config.run.num_actions)?))
 }
 
-fn evaluation(config: &RunConfig, episodes: usize, epsilon: f64) -> Evaluation {
-    let rounds = episodes.div_ceil(Player::copies(episodes)) as u64;
-    Evaluation {
-        frame_stack: config.run.frame_stack as usize,
-        epsilon,
-        episodes,
-        steps_max: rounds * STEPS_A_ROUND_MAX,
-    }
-}
-
 fn play_with(
     config: &RunConfig,
     policy: &mut dyn Policy,
     world: &WorldConfig,
-    evaluation: Evaluation,
+    episodes: usize,
+    epsilon: f64,
     seed: u64,
     watch: Watch<'_>,
 ) -> anyhow::Result<Vec<f64>> {
-    let copies = Player::copies(evaluation.episodes);
+    let copies = Player::copies(episodes);
+    let evaluation = Evaluation {
+        frame_stack: config.run.frame_stack as usize,
+        epsilon,
+        episodes,
+        steps_max: episodes.div_ceil(copies) as u64 * STEPS_A_ROUND_MAX,
+    };
     let actions = world.actions(config.actor.actions);
     let world = PartOfWorld::of(world.build(copies, seed, 0)?, actions, sent(config))?;
     let rng = policy_rng(seed);

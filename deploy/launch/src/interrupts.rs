@@ -3,71 +3,56 @@
 
 use std::{
     ops::ControlFlow,
-    sync::{Arc, Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
-use driml_protocol::end_signs::{self, EndSign};
+use driml_protocol::{
+    TwoSteps,
+    end_signs::{self, EndSign},
+};
 
 /// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
 const ONE_WISH: Duration = Duration::from_millis(300);
 
-/// A shared count of interrupts.
+/// A shared count of interrupts, up to two.
 #[derive(Clone, Debug, Default)]
-pub struct Interrupts {
-    state: Arc<(Mutex<u32>, Condvar)>,
-}
+pub struct Interrupts(TwoSteps);
 
 impl Interrupts {
     /// Starts to listen for signs that this process should end, for the rest of its life; the death of the process `parent` is
     /// one.
     pub fn listen(parent: Option<u32>) -> std::io::Result<Self> {
         let this = Self::default();
-        let counted = this.clone();
-        let mut last = None;
+        let (counted, mut first) = (this.clone(), None);
         end_signs::listen("interrupts", parent, move |sign| {
-            counted.note(sign, &mut last, Instant::now());
+            counted.note(sign, &mut first, Instant::now());
             ControlFlow::Continue(())
         })?;
         Ok(this)
     }
 
-    /// Counts a signal received at `now`. `last` is when the last request began.
-    fn note(&self, sign: EndSign, last: &mut Option<Instant>, now: Instant) {
-        let is_new = match sign {
-            // Counted from the first signal of a request, so that repeated Ctrl-C always counts.
-            EndSign::Asked => last.is_none_or(|last| now - last > ONE_WISH),
+    /// Counts a sign received at `now`. `first` is when the first request began.
+    fn note(&self, sign: EndSign, first: &mut Option<Instant>, now: Instant) {
+        match *first {
+            None => {
+                *first = Some(now);
+                self.0.ending.set();
+            }
             // A closed terminal sends SIGHUP, and the other signs follow: no user is there who wants it faster.
-            EndSign::Abandoned => last.is_none(),
-        };
-        if is_new {
-            self.add();
-            *last = Some(now);
+            Some(first) if sign == EndSign::Asked && now - first > ONE_WISH => self.0.now.set(),
+            Some(_) => {}
         }
-    }
-
-    fn lock(&self) -> MutexGuard<'_, u32> {
-        let count = self.state.0.lock();
-        count.expect("no thread panics while holding the count")
-    }
-
-    fn add(&self) {
-        *self.lock() += 1;
-        self.state.1.notify_all();
     }
 
     /// How many there were.
     pub fn count(&self) -> u32 {
-        *self.lock()
+        u32::from(self.0.ending.is_set()) + u32::from(self.0.now.is_set())
     }
 
-    /// Sleeps for `timeout`, or until there is one more; returns how many there were.
+    /// Sleeps for `timeout`, or until there is one; returns how many there were.
     pub fn wait_timeout(&self, timeout: Duration) -> u32 {
-        let count = self.lock();
-        let before = *count;
-        let (_, changed) = &*self.state;
-        let waited = changed.wait_timeout_while(count, timeout, |count| *count == before);
-        *waited.expect("no thread panics while holding the count").0
+        self.0.ending.wait_timeout(timeout);
+        self.count()
     }
 }
 
@@ -76,30 +61,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_interrupt_counts_and_wakes() {
-        let interrupts = Interrupts::default();
-        assert_eq!(interrupts.wait_timeout(Duration::from_millis(1)), 0);
-        let other = interrupts.clone();
-        let waiter = std::thread::spawn(move || other.wait_timeout(Duration::from_secs(60)));
-        while !waiter.is_finished() {
-            interrupts.add();
-            std::thread::yield_now();
-        }
-        assert!(waiter.join().unwrap() >= 1);
-    }
-
-    #[test]
     fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
         let interrupts = Interrupts::default();
-        let (start, mut last) = (Instant::now(), None);
+        assert_eq!(interrupts.wait_timeout(Duration::from_millis(1)), 0);
+        let (start, mut first) = (Instant::now(), None);
         let mut note = |sign, seconds| {
-            interrupts.note(sign, &mut last, start + Duration::from_secs(seconds));
-            interrupts.count()
+            interrupts.note(sign, &mut first, start + Duration::from_secs(seconds));
+            interrupts.wait_timeout(Duration::from_secs(60))
         };
         assert_eq!(note(EndSign::Abandoned, 0), 1);
         assert_eq!(note(EndSign::Abandoned, 5), 1);
-        assert_eq!(note(EndSign::Asked, 10), 2, "a second request");
-        assert_eq!(note(EndSign::Asked, 10), 2, "the same request");
+        assert_eq!(note(EndSign::Asked, 5), 2, "a second request");
         assert_eq!(note(EndSign::Abandoned, 20), 2);
+
+        let (interrupts, mut first) = (Interrupts::default(), None);
+        let mut note = |ms| {
+            let now = start + Duration::from_millis(ms);
+            interrupts.note(EndSign::Asked, &mut first, now);
+            interrupts.count()
+        };
+        assert_eq!(
+            [0, 299, 310].map(&mut note),
+            [1, 1, 2],
+            "from the first signal on"
+        );
     }
 }

@@ -11,6 +11,7 @@ use driml_actor::Step;
 use driml_settings::config::RunConfig;
 
 use crate::{
+    chosen::{Weights, Which},
     console,
     evaluate::{Levels, Player, Who, levels},
     run_folder::{Earned, LastPlay, RunFolder, Summary},
@@ -53,7 +54,7 @@ pub(crate) fn play(
 /// What the weights in `folder` earn; none if it was stopped before there was anything to say.
 fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<Option<LastPlay>> {
     let started = Instant::now();
-    let player = Player::load(folder)?;
+    let player = Player::load_at(folder, Which::default(), Weights::default())?;
     let world = levels(&player.config.world, Levels::Train)?;
     let watch =
         &mut |_: &Step<'_>, _: &[f64]| match is_stopped() || started.elapsed() > FIRST_BATCH_MAX {
@@ -92,9 +93,8 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
 mod tests {
     use super::*;
     use crate::{
-        moment::Episodes,
         run_folder::Outcome,
-        run_view::{Plan, RunView},
+        run_view::{Episodes, Plan, RunView},
         testing::config,
     };
 

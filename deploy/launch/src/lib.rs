@@ -21,27 +21,25 @@
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
 pub mod chosen;
-mod connect;
 pub mod console;
 pub mod endpoint;
 pub mod evaluate;
-mod evaluator;
+pub mod evaluator;
 pub mod inspect;
 pub mod interrupts;
-pub mod keep;
 mod last_play;
 pub mod launcher;
 pub mod lockstep;
 pub mod managed_process;
 pub mod meeting;
 pub mod metrics;
-pub mod moment;
 pub mod open_files;
 pub mod panics;
 pub mod plan;
 pub mod pretrained;
-pub mod process_log;
+mod process_log;
 mod processes;
+mod rates;
 pub mod resume;
 pub mod run_folder;
 pub mod run_view;

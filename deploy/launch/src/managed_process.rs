@@ -46,11 +46,6 @@ pub struct Surroundings<'a> {
 /// The variable that says how many threads a process has for arithmetic.
 pub const THREADS: &str = "RAYON_NUM_THREADS";
 
-/// Gives a process `threads` threads for arithmetic. Everything else that it needs of its environment it has from this one.
-pub fn set_thread_env(command: &mut Command, threads: u32) {
-    command.env(THREADS, threads.to_string());
-}
-
 /// Flags for a child that is to end when this process does. They name this process, as it may have died before the child looks
 /// who its parent is.
 pub fn exit_with_this_process() -> [String; 2] {
@@ -72,8 +67,9 @@ impl ManagedProcess {
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);
-        set_thread_env(&mut command, threads);
+        // Everything else that it needs of its environment it has from this one.
         command
+            .env(THREADS, threads.to_string())
             .args(args)
             .args(exit_with_this_process())
             .stdin(stdin);

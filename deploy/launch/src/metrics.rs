@@ -4,52 +4,49 @@
 
 use std::collections::BTreeMap;
 
-use crate::moment::{Moment, rounded};
+use driml_protocol::LearnerStatus;
+
+use crate::run_view::RunView;
 
 /// A metric: its column in `metrics.csv`, or its columns where it is one of several things.
 #[derive(Clone, Copy, Debug)]
 pub struct Column {
     /// Its name in `metrics.csv` and in JSON. Prometheus' is `driml_NAME`, of a counter `driml_NAME_total`.
     pub name: &'static str,
-    /// What it measures, in a sentence.
-    pub help: &'static str,
+    pub(crate) help: &'static str,
     /// What its numbers count.
     pub unit: &'static str,
     /// The title of its chart.
     pub plot_label: &'static str,
     /// TensorBoard shows the curves of a group beside each other.
-    pub group: &'static str,
-    /// How it is taken from a moment of a run.
-    pub value: Value,
+    pub(crate) group: &'static str,
+    pub(crate) value: Value,
 }
 
-/// How a metric is taken from a moment of a run; none where it is not known yet.
+/// How a metric is taken from a view of a run; none where it is not known yet.
 #[derive(Clone, Copy, Debug)]
-pub enum Value {
+pub(crate) enum Value {
     /// A number that rises until the run is started anew.
-    Counter(fn(&Moment<'_>) -> Option<f64>),
+    Counter(fn(&RunView) -> Option<f64>),
     /// A number that may fall.
-    Gauge(fn(&Moment<'_>) -> Option<f64>),
+    Gauge(fn(&RunView) -> Option<f64>),
     /// A gauge for each of several things, such as each auxiliary loss: a column each.
     Each {
         /// What tells them apart, as Prometheus' label.
         label: &'static str,
-        /// All of them.
-        members: fn(&Moment<'_>) -> Vec<Member>,
+        members: fn(&RunView) -> Vec<Member>,
     },
     /// Words, which are in `metrics.csv` and JSON alone.
-    Words(fn(&Moment<'_>) -> String),
+    Words(fn(&RunView) -> String),
 }
 
 /// One of several things that a metric is known of.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Member {
-    /// The name of its column.
-    pub column: String,
-    /// Its own name.
-    pub name: String,
+pub(crate) struct Member {
+    pub(crate) column: String,
+    pub(crate) name: String,
     /// Its value, in the metric's unit; none where it is not known.
-    pub value: Option<f64>,
+    pub(crate) value: Option<f64>,
 }
 
 /// Makes [`COLUMNS`]: a row has a metric's name, unit, group and title, then what it measures, then how it is taken.
@@ -70,7 +67,7 @@ macro_rules! columns {
 columns! {
     "seconds", "seconds", "run", "Time":
         "Time since the run began, without interruptions.",
-        Value::Counter(|it| it.seconds);
+        Value::Counter(|it| it.seconds());
     "frames", "frames", "run", "Frames":
         "Transitions that the replay has stored.",
         Value::Counter(|it| Some(it.replay.transitions_inserted as f64));
@@ -88,40 +85,40 @@ columns! {
         Value::Gauge(|it| it.replay.replay_ratio());
     "episodes", "episodes", "return", "Episodes":
         "Training episodes that ended.",
-        Value::Counter(|it| Some(it.episodes.count as f64));
+        Value::Counter(|it| Some(it.episodes().count as f64));
     "mean_return", "mean of the last 100 episodes", "return", "Return":
         "Mean undiscounted return of the newest training episodes.",
-        Value::Gauge(|it| it.episodes.mean_return);
+        Value::Gauge(|it| it.episodes().mean_return);
     "mean_return_of", "episodes", "return", "Episodes in the mean return":
         "Episodes in the mean return: 100, or as many as there were.",
-        Value::Gauge(|it| Some(it.episodes.mean_return_of as f64));
+        Value::Gauge(|it| Some(it.episodes().mean_return_of as f64));
     "c51_kl", "KL divergence [nats]", "learning", "C51 loss":
         "C51's loss of the last update.",
-        Value::Gauge(|it| it.learned(|it| it.c51_kl.into()));
+        Value::Gauge(|it| learned(it, |it| it.c51_kl.into()));
     "losses", "auxiliary loss [nats]", "learning", "Auxiliary loss":
         "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
         Value::Each { label: "loss", members: losses };
     "total_loss", "loss [nats]", "learning", "Total loss":
         "The total loss of the last update.",
-        Value::Gauge(|it| it.learned(|it| it.total.into()));
+        Value::Gauge(|it| learned(it, |it| it.total.into()));
     "grad_norm", "global 2-norm", "learning", "Gradient before clipping":
         "Norm of the last update's gradient before clipping.",
-        Value::Gauge(|it| it.learned(|it| it.grad_norm));
+        Value::Gauge(|it| learned(it, |it| it.grad_norm));
     "q_mean", "discounted return", "learning", "Mean Q value":
         "Mean Q value of the last update's states.",
-        Value::Gauge(|it| it.learned(|it| it.q_mean.into()));
+        Value::Gauge(|it| learned(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
         "Mean k of the rows served; of several positives the furthest.",
-        Value::Gauge(|it| it.k.map(|it| it.mean));
+        Value::Gauge(|it| it.k().map(|it| it.mean));
     "sd_k", "environment steps", "k", "Standard deviation of k":
         "Standard deviation of k over the same rows.",
-        Value::Gauge(|it| it.k.map(|it| it.sd));
+        Value::Gauge(|it| it.k().map(|it| it.sd));
     "mean_age", "transitions", "run", "Age of sampled rows":
         "Mean age of the rows served last: transitions stored since theirs.",
         Value::Gauge(|it| Some(it.replay.mean_age));
     "weights_version", "version", "run", "Version of the weights":
         "Version of the newest weights.",
-        Value::Gauge(|it| it.learner.map(|it| it.weights_version as f64));
+        Value::Gauge(|it| it.learner_shown().map(|it| it.weights_version as f64));
     "affinity_version", "version", "run", "Version of the affinity":
         "Version of the affinity in use; 0 is the uniform one.",
         Value::Gauge(|it| Some(it.replay.affinity_version as f64));
@@ -133,7 +130,7 @@ columns! {
         Value::Words(|it| it.replay.waiting.to_string());
     "epsilon", "probability of a random action", "run", "Epsilon":
         "Probability of a random action; empty where actors differ in it.",
-        Value::Gauge(|it| it.epsilon);
+        Value::Gauge(|it| it.epsilon());
     "transitions_lost", "transitions", "faults", "Lost transitions":
         "Transitions that actors produced and that never arrived.",
         Value::Counter(|it| Some(it.replay.transitions_lost as f64));
@@ -154,22 +151,29 @@ columns! {
         Value::Each { label: "process", members: memory };
 }
 
-fn updates(it: &Moment<'_>) -> Option<f64> {
+fn updates(it: &RunView) -> Option<f64> {
     let last_known = it.replay.learner_finished.then_some(it.replay.updates);
-    let updates = it.learner.map(|it| it.updates).or(last_known);
+    let updates = it.learner_shown().map(|it| it.updates).or(last_known);
     updates.map(|it| it as f64)
 }
 
-fn losses(it: &Moment<'_>) -> Vec<Member> {
-    let loss = |name: &str| it.learner?.loss(name).map(f64::from);
-    let member = |name: &&str| Member::new(name, name, loss(name));
-    it.losses.iter().map(member).collect()
+/// What the last update computed; none before the first, as a 0 would look like a loss.
+fn learned(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
+    let learner = it.learner_shown().filter(|it| it.updates > 0);
+    learner.map(value)
 }
 
-fn memory(it: &Moment<'_>) -> Vec<Member> {
+fn losses(it: &RunView) -> Vec<Member> {
+    let loss = |name: &str| it.learner_shown()?.loss(name).map(f64::from);
+    let member = |name: &&str| Member::new(name, name, loss(name));
+    it.plan.losses.iter().map(member).collect()
+}
+
+fn memory(it: &RunView) -> Vec<Member> {
     let column = |name: &str| format!("rss_mib_{}", name.replace('-', "_"));
-    let member = |(name, mib): &(&str, _)| Member::new(&column(name), name, *mib);
-    it.rss_mib.iter().map(member).collect()
+    let member = |(name, mib): &(String, _)| Member::new(&column(name), name, *mib);
+    let memory = it.recorded.iter().flat_map(|it| &it.rss_mib);
+    memory.map(member).collect()
 }
 
 impl Member {
@@ -184,24 +188,24 @@ impl Member {
 
 impl Column {
     /// Its numbers: one, or one for each of several things; none of words.
-    pub(crate) fn members(&self, moment: &Moment<'_>) -> Vec<Member> {
+    pub(crate) fn members(&self, view: &RunView) -> Vec<Member> {
         match self.value {
             Value::Counter(value) | Value::Gauge(value) => {
-                vec![Member::new(self.name, self.name, value(moment))]
+                vec![Member::new(self.name, self.name, value(view))]
             }
-            Value::Each { members, .. } => members(moment),
+            Value::Each { members, .. } => members(view),
             Value::Words(_) => Vec::new(),
         }
     }
 }
 
 /// The name and the cell of each column of `metrics.csv`, in order. What is not known is empty.
-pub fn cells(moment: &Moment<'_>) -> Vec<(String, String)> {
+pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
     let text = |value: Option<f64>| value.map_or(String::new(), |it| rounded(it).to_string());
     let cells = COLUMNS.iter().flat_map(|column| match column.value {
-        Value::Words(words) => vec![(column.name.to_owned(), words(moment))],
+        Value::Words(words) => vec![(column.name.to_owned(), words(view))],
         _ => {
-            let members = column.members(moment).into_iter();
+            let members = column.members(view).into_iter();
             members.map(|it| (it.column, text(it.value))).collect()
         }
     });
@@ -209,25 +213,25 @@ pub fn cells(moment: &Moment<'_>) -> Vec<(String, String)> {
 }
 
 /// The curves of TensorBoard, `GROUP/COLUMN`, and their points. Frames are what they are drawn over.
-pub fn points(moment: &Moment<'_>) -> Vec<(String, f64)> {
+pub(crate) fn points(view: &RunView) -> Vec<(String, f64)> {
     let drawn = COLUMNS.iter().filter(|it| it.name != "frames");
     let points = drawn.flat_map(|column| {
         let curve = |it: &Member| format!("{}/{}", column.group, it.column);
-        let members = column.members(moment).into_iter();
+        let members = column.members(view).into_iter();
         members.filter_map(move |it| Some((curve(&it), rounded(it.value?))))
     });
     points.collect()
 }
 
 /// The metrics as JSON by name, whole numbers as such; what is not known is null. Metrics of several things are objects.
-pub fn json(moment: &Moment<'_>) -> BTreeMap<&'static str, serde_json::Value> {
+pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> {
     let value = |column: &Column| match column.value {
         Value::Counter(value) | Value::Gauge(value) => {
-            value(moment).map_or(serde_json::Value::Null, json_number)
+            value(view).map_or(serde_json::Value::Null, json_number)
         }
-        Value::Words(words) => words(moment).into(),
+        Value::Words(words) => words(view).into(),
         Value::Each { members, .. } => {
-            let members = members(moment).into_iter();
+            let members = members(view).into_iter();
             let known = members.filter_map(|it| Some((it.name, json_number(it.value?))));
             serde_json::Value::Object(known.collect())
         }
@@ -255,54 +259,45 @@ pub fn column(name: &str) -> Option<&'static Column> {
     })
 }
 
-/// All metrics as a table of Markdown.
-pub fn markdown() -> String {
-    let mut table =
-        "| column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
-    for column in COLUMNS {
-        let prometheus = match column.value {
-            Value::Counter(_) => format!("`driml_{}_total`", column.name),
-            Value::Gauge(_) => format!("`driml_{}`", column.name),
-            Value::Each { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
-            Value::Words(_) => "-".into(),
-        };
-        let Column {
-            name, unit, help, ..
-        } = column;
-        table += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
-    }
-    table
+/// Six decimals, without the digits that a conversion from f32 added: -0.6, not -0.5999999940395355. Small numbers keep seven digits.
+pub fn rounded(value: f64) -> f64 {
+    let text = match value.abs() < 1e-3 {
+        true => format!("{value:.6e}"),
+        false => format!("{value:.6}"),
+    };
+    text.parse().unwrap_or(value)
 }
 
 #[cfg(test)]
 mod tests {
-    use driml_protocol::{LearnerStatus, ReplayStatus};
+    use driml_protocol::ReplayStatus;
 
     use super::*;
     use crate::{
-        moment::{Episodes, Speed},
+        run_view::{Episodes, Plan, Recorded},
         testing::with,
     };
 
-    fn moment<'a>(replay: &'a ReplayStatus, learner: Option<&'a LearnerStatus>) -> Moment<'a> {
-        Moment {
-            seconds: Some(12.5),
-            speed: Speed::default(),
+    /// A view of a run that is recorded, or not and whose learner does not answer.
+    fn view(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
+        let losses: &[&str] = &["dim_3t3", "dim_4t4"];
+        let mut view = RunView::new(with(|it: &mut Plan| it.losses = losses));
+        view.take_replay(vec![replay]);
+        view.recorded = learner.is_some().then(|| Recorded {
+            seconds: 12.5,
             episodes: Episodes::default(),
             k: None,
-            epsilon: Some(0.25),
-            replay,
-            learner,
-            losses: vec!["dim_3t3", "dim_4t4"],
-            rss_mib: vec![("actor-0", Some(12.34)), ("actor-1", None)],
-        }
+            rss_mib: vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)],
+        });
+        view.take_learner(learner);
+        view
     }
 
     /// Scripts read the file by these names.
     #[test]
     fn the_columns_of_the_file_keep_their_names_and_their_order() {
-        let replay = ReplayStatus::default();
-        let cells = cells(&moment(&replay, None)).into_iter();
+        let view = view(ReplayStatus::default(), Some(LearnerStatus::default()));
+        let cells = cells(&view).into_iter();
         let names: Vec<_> = cells.map(|(name, _)| name).collect();
         let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
                       dim_3t3,dim_4t4,total_loss,grad_norm,q_mean,mean_k,sd_k,mean_age,weights_version,affinity_version,actors,waiting,epsilon";
@@ -317,10 +312,10 @@ mod tests {
             it.losses = vec![("dim_4t4".into(), 2.0)];
             (it.updates, it.c51_kl) = (3, 0.5);
         });
-        let unknown = json(&moment(&replay, None));
+        let unknown = json(&view(replay.clone(), None));
         assert_eq!(unknown["updates"], serde_json::Value::Null);
         assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
-        let known = moment(&replay, Some(&learner));
+        let known = view(replay, Some(learner));
         let text = serde_json::to_string(&json(&known)).unwrap();
         for part in [
             r#""frames":7,"#,
@@ -340,6 +335,27 @@ mod tests {
     }
 
     #[test]
+    fn small_and_large_numbers_keep_their_digits() {
+        let three_f32 = f64::from(-0.2f32) + f64::from(-0.2f32) + f64::from(-0.2f32);
+        for (value, text) in [
+            (three_f32, "-0.6"),
+            (f64::from(0.1f32), "0.1"),
+            (12_345.0, "12345"),
+            (0.0, "0"),
+            (f64::from(1e-7f32), "0.0000001"),
+            (4.007, "4.007"),
+            (-0.0125, "-0.0125"),
+            (123_456.789, "123456.789"),
+            (4.2e-7, "0.00000042"),
+            (-9.87654321e-4, "-0.0009876543"),
+        ] {
+            assert_eq!(rounded(value).to_string(), text);
+        }
+        assert_eq!(rounded(1.5e30), 1.5e30);
+        assert!(rounded(f64::NAN).is_nan() && rounded(f64::INFINITY).is_infinite());
+    }
+
+    #[test]
     fn a_name_is_one_metric_s_and_none_hides_another() {
         for (at, it) in COLUMNS.iter().enumerate() {
             assert_eq!(column(it.name).map(|it| it.name), Some(it.name));
@@ -348,6 +364,25 @@ mod tests {
         }
         assert_eq!(column("rss_mib_actor_7").unwrap().name, "rss_mib");
         assert!(column("dim_4t4").is_none());
+    }
+
+    /// All metrics as a table of Markdown.
+    fn markdown() -> String {
+        let mut table =
+            "| column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
+        for column in COLUMNS {
+            let prometheus = match column.value {
+                Value::Counter(_) => format!("`driml_{}_total`", column.name),
+                Value::Gauge(_) => format!("`driml_{}`", column.name),
+                Value::Each { label, .. } => format!("`driml_{}{{{label}}}`", column.name),
+                Value::Words(_) => "-".into(),
+            };
+            let Column {
+                name, unit, help, ..
+            } = column;
+            table += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
+        }
+        table
     }
 
     /// `UPDATE_DOCS=1` writes the page anew.

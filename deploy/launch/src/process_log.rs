@@ -1,10 +1,9 @@
 //! What a process writes: carried to its log file, its warnings and errors to the screen too, its last lines kept for the end.
-//! A full disk costs lines of the log, never the run.
+//! On a full disk lines wait as rows of a table do.
 
 use std::{
     collections::VecDeque,
-    fs::File,
-    io::{self, BufRead, BufReader, Read, Write},
+    io::{BufRead, BufReader, Read},
     path::{Path, PathBuf},
     sync::{Arc, Mutex, MutexGuard},
     thread::JoinHandle,
@@ -13,10 +12,12 @@ use std::{
 use anyhow::Context;
 use driml_protocol::fault;
 
-use crate::console::Screen;
+use crate::{console::Screen, run_folder::AppendLog};
 
 /// Last lines that are kept to be shown if the process fails.
 const TAIL_LINES_MAX: usize = 8;
+/// Lines that are kept while they cannot be written: with each one all of them are tried again.
+const WAITING_MAX: usize = 1000;
 
 #[derive(Debug)]
 pub(crate) struct ProcessLog {
@@ -28,26 +29,20 @@ pub(crate) struct ProcessLog {
 
 #[derive(Debug)]
 struct Kept {
-    file: File,
+    file: AppendLog,
     tail: VecDeque<String>,
     /// The error with which the process says that it ended, and how many lines followed: its causes may take several.
     error: Option<(String, usize)>,
-    lost: u64,
-    failed: Option<io::Error>,
 }
 
 impl ProcessLog {
     /// Opens the log of the process `name` in the folder `logs`, to append to it.
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
-        let file = File::options().create(true).append(true).open(&path);
-        let file = file.with_context(|| format!("making {}", path.display()))?;
         let kept = Kept {
-            file,
+            file: AppendLog::open(&path, format!("the log of {name}"), "lines", WAITING_MAX)?,
             tail: VecDeque::new(),
             error: None,
-            lost: 0,
-            failed: None,
         };
         Ok(Self {
             name: name.into(),
@@ -72,7 +67,6 @@ impl ProcessLog {
                 let line = String::from_utf8_lossy(&line).into_owned();
                 let shown = is_warning(&line).then(|| format!("{name}: {line}"));
                 let said = lock(&kept).add(line);
-                let said = said.map(|e| format!("the log of {name} cannot be written: {e}"));
                 for line in shown.into_iter().chain(said) {
                     screen.line(&line);
                 }
@@ -106,12 +100,7 @@ impl ProcessLog {
 
     /// How many lines could not be written, and why; none if all were.
     pub(crate) fn missing(&self) -> Option<String> {
-        let kept = lock(&self.kept);
-        let error = kept.failed.as_ref()?;
-        Some(format!(
-            "{} lines of the log of {} are lost: {error}",
-            kept.lost, self.name
-        ))
+        lock(&self.kept).file.missing()
     }
 
     /// Waits until everything that the process wrote is in the log. The process has ended, and no other one holds the pipes'
@@ -128,9 +117,9 @@ fn lock(kept: &Mutex<Kept>) -> MutexGuard<'_, Kept> {
 }
 
 impl Kept {
-    /// Keeps a line. Gives the error the first time that one cannot be written; later ones are tried all the same.
+    /// Keeps a line. A warning is returned the first time that one cannot be written.
     fn add(&mut self, line: String) -> Option<String> {
-        let written = self.file.write_all(format!("{line}\n").as_bytes());
+        let warning = self.file.add(format!("{line}\n").into_bytes());
         if self.tail.len() == TAIL_LINES_MAX {
             self.tail.pop_front();
         }
@@ -140,11 +129,7 @@ impl Kept {
             (None, None) => {}
         }
         self.tail.push_back(line);
-        let error = written.err()?;
-        self.lost += 1;
-        let first = self.failed.is_none().then(|| error.to_string());
-        self.failed.get_or_insert(error);
-        first
+        warning
     }
 }
 
@@ -173,12 +158,13 @@ mod tests {
     }
 
     #[test]
-    fn a_log_keeps_its_last_lines_and_counts_those_that_it_lost() {
+    fn a_log_keeps_its_last_lines() {
         let folder = tempfile::tempdir().unwrap();
         let mut log = ProcessLog::open("actor-0", folder.path()).unwrap();
         let lines: String = (0..10).map(|n| format!("line {n}\n")).collect();
         let screen = Screen::plain();
-        log.follow(io::Cursor::new(lines.clone()), &screen).unwrap();
+        log.follow(std::io::Cursor::new(lines.clone()), &screen)
+            .unwrap();
         log.finish();
         assert_eq!(std::fs::read_to_string(log.path()).unwrap(), lines);
         assert_eq!((log.tail().len(), log.tail()[7].as_str()), (8, "line 9"));
@@ -189,14 +175,5 @@ mod tests {
         }
         let said = "it failed. Its last words:\n  no\n  more";
         assert_eq!(log.error().as_deref(), Some(said));
-
-        lock(&log.kept).file = File::options().append(true).open("/dev/full").unwrap();
-        let add = |line: &str| lock(&log.kept).add(line.into());
-        assert!(add("one").unwrap().starts_with("No space left"));
-        assert_eq!(add("two"), None, "it is logged once");
-        let missing = log.missing().unwrap();
-        let said = "2 lines of the log of actor-0 are lost: No space left";
-        assert!(missing.starts_with(said), "{missing}");
-        assert_eq!(log.tail()[7], "two");
     }
 }

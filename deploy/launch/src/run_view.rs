@@ -8,30 +8,27 @@ use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus,
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
-use crate::moment::{Episodes, Moment, Rates, Spread};
+use crate::rates::{Rates, Speed};
 
 /// What the settings say of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Plan {
-    /// The world, as `--env` names it.
-    pub world: String,
-    /// The agent, as `--agent` names it.
-    pub agent: String,
-    /// The seed of every generator of the run.
-    pub seed: u64,
+    pub(crate) world: String,
+    pub(crate) agent: String,
+    pub(crate) seed: u64,
     /// What all processes of the run agree on, as a hash: the same number is the same run.
-    pub run_spec: String,
-    /// Frames of the whole run.
-    pub frames_planned: u64,
-    /// Updates of the whole run.
-    pub updates_planned: u64,
+    pub(crate) run_spec: String,
+    pub(crate) frames_planned: u64,
+    pub(crate) updates_planned: u64,
     /// Rows an update and a transition.
-    pub replay_ratio_planned: f64,
-    /// Actors that the settings name.
-    pub actors_planned: u32,
+    pub(crate) replay_ratio_planned: f64,
+    pub(crate) actors_planned: u32,
     /// The probability with which all actors act at random; none where they differ in it.
     #[serde(skip)]
-    pub epsilon: Option<Schedule>,
+    pub(crate) epsilon: Option<Schedule>,
+    /// The names of the agent's auxiliary losses.
+    #[serde(skip)]
+    pub(crate) losses: &'static [&'static str],
 }
 
 impl Plan {
@@ -49,55 +46,105 @@ impl Plan {
             actors_planned: config.local.actors,
             // Without a ladder it is every actor's.
             epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
+            losses: config.learner.update.objective.losses(),
         }
     }
 }
 
+/// Mean and standard deviation over the rows served.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Spread {
+    pub(crate) mean: f64,
+    pub(crate) sd: f64,
+}
+
+/// The training's episodes so far, also over a resumption.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Episodes {
+    pub(crate) count: u64,
+    /// Mean return of the newest; none before the first.
+    pub(crate) mean_return: Option<f64>,
+    /// Episodes in the mean: 100, or as many as there were.
+    pub(crate) mean_return_of: usize,
+}
+
+impl Spread {
+    /// Of the k of the rows that were served with a positive.
+    pub(crate) fn of_k(replay: &ReplayStatus) -> Option<Self> {
+        let both = replay.mean_k().zip(replay.sd_k());
+        both.map(|(mean, sd)| Self { mean, sd })
+    }
+}
+
+impl Episodes {
+    /// So many, of whose newest these are the returns.
+    pub(crate) fn of<'a>(count: u64, newest: impl ExactSizeIterator<Item = &'a f64>) -> Self {
+        let of = newest.len();
+        let sum: f64 = newest.sum();
+        Self {
+            count,
+            mean_return: (of > 0).then(|| sum / of as f64),
+            mean_return_of: of,
+        }
+    }
+}
+
+/// What a recorder knows beside its processes: of the whole run, before it was resumed too.
+#[derive(Clone, Debug)]
+pub(crate) struct Recorded {
+    pub(crate) seconds: f64,
+    pub(crate) episodes: Episodes,
+    pub(crate) k: Option<Spread>,
+    /// Resident memory of each process by name, MiB; none for one that ended.
+    pub(crate) rss_mib: Vec<(String, Option<f64>)>,
+}
+
 /// What one replay server answers.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct ServerAnswer {
+pub(crate) struct ServerAnswer {
     /// What it is called in messages.
     #[serde(skip)]
-    pub name: String,
-    /// Where it was asked.
-    pub endpoint: String,
+    pub(crate) name: String,
+    pub(crate) endpoint: String,
     /// Its counts; none if it does not answer, or not yet.
-    pub replay: Option<ReplayStatus>,
+    pub(crate) replay: Option<ReplayStatus>,
     /// Who takes part; none if it does not answer, or not yet.
-    pub parts: Option<PartsStatus>,
+    pub(crate) parts: Option<PartsStatus>,
     /// How far it is with reading its replay back from disk, before which it can answer nothing else.
-    pub recovering: Option<RecoveryProgress>,
-    /// Why there is no answer.
-    pub error: Option<String>,
+    pub(crate) recovering: Option<RecoveryProgress>,
+    pub(crate) error: Option<String>,
     /// Nothing listens there any more: its process has ended.
-    pub is_gone: bool,
+    pub(crate) is_gone: bool,
     /// It answers, and for a run with other settings.
-    pub is_another_run: bool,
+    pub(crate) is_another_run: bool,
 }
 
 /// What is known of a run.
 #[derive(Clone, Debug)]
 pub struct RunView {
-    /// What its settings say.
-    pub plan: Plan,
+    pub(crate) plan: Plan,
     /// Updates after which it was resumed; none before that is known.
-    pub after_updates: Option<u64>,
+    pub(crate) after_updates: Option<u64>,
     /// What each replay server answered last time.
-    pub servers: Vec<ServerAnswer>,
+    pub(crate) servers: Vec<ServerAnswer>,
     /// The replay servers' counts when all of them answered last.
-    pub shards: Vec<ReplayStatus>,
+    pub(crate) shards: Vec<ReplayStatus>,
     /// The same, as of one.
     pub replay: ReplayStatus,
     /// The learner's last status.
     pub learner: LearnerStatus,
     /// Whether the learner answered last time.
-    pub learner_answers: bool,
+    pub(crate) learner_answers: bool,
     /// When all replay servers answered last, and when the learner did; at first, when this was made.
     pub(crate) replay_last_seen: Instant,
     pub(crate) learner_last_seen: Instant,
     /// Whether the learner has answered ever, or the counts at the start are known without it.
     is_learner_known: bool,
+    /// What its recorder knew after the last counts; none where it is not recorded.
+    pub(crate) recorded: Option<Recorded>,
     rates: Rates,
+    /// How fast it is, over the last while.
+    pub(crate) speed: Speed,
 }
 
 impl RunView {
@@ -115,12 +162,14 @@ impl RunView {
             replay_last_seen: now,
             learner_last_seen: now,
             is_learner_known: false,
+            recorded: None,
             rates: Rates::default(),
+            speed: Speed::default(),
         }
     }
 
     /// Of a run that begins now, with these counts.
-    pub fn beginning(plan: Plan, frames: u64, updates: u64) -> Self {
+    pub(crate) fn beginning(plan: Plan, frames: u64, updates: u64) -> Self {
         let mut this = Self::new(plan);
         this.after_updates = Some(updates);
         this.learner.updates = updates;
@@ -130,7 +179,7 @@ impl RunView {
     }
 
     /// Takes the learner's status; none if it does not answer.
-    pub fn take_learner(&mut self, learner: Option<LearnerStatus>) {
+    pub(crate) fn take_learner(&mut self, learner: Option<LearnerStatus>) {
         self.learner_answers = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
@@ -146,13 +195,14 @@ impl RunView {
     }
 
     /// Takes the counts of all replay servers, after the learner's.
-    pub fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
+    pub(crate) fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
         self.replay_last_seen = Instant::now();
-        let frames = self.replay.transitions_inserted;
-        self.rates
-            .add(self.replay_last_seen, frames, self.learner.updates);
+        self.recorded = None;
+        let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
+        self.rates.add(self.replay_last_seen, frames, updates);
+        self.speed = self.rates.speed();
     }
 
     /// Each replay server that reads its replay back from disk, and how far it is.
@@ -162,7 +212,7 @@ impl RunView {
     }
 
     /// Whether all replay servers answered last time.
-    pub fn is_answered(&self) -> bool {
+    pub(crate) fn is_answered(&self) -> bool {
         self.servers.iter().all(|it| it.replay.is_some())
     }
 
@@ -172,14 +222,14 @@ impl RunView {
     }
 
     /// Whether everything is learned and saved.
-    pub fn is_finished(&self) -> bool {
+    pub(crate) fn is_finished(&self) -> bool {
         let learner = self.learner_status();
         self.replay.learner_finished
             || self.replay.finished && learner.is_some_and(|it| it.finished)
     }
 
     /// Whether everything is learned and saved, or the replay servers have ended after everything was sampled.
-    pub fn is_over(&self) -> bool {
+    pub(crate) fn is_over(&self) -> bool {
         self.is_finished() || self.is_gone() && self.replay.waiting == Waiting::Finished
     }
 
@@ -195,20 +245,37 @@ impl RunView {
         is_known.then_some(&self.learner)
     }
 
-    /// What it says of the run at this time.
-    pub fn moment(&self) -> Moment<'_> {
-        let replay = &self.replay;
-        let losses = self.learner.losses.iter();
-        Moment {
-            seconds: self.up_s(),
-            speed: self.rates.speed(),
-            episodes: Episodes::of(replay.episodes, replay.returns.newest.iter()),
-            k: (replay.mean_k().zip(replay.sd_k())).map(|(mean, sd)| Spread { mean, sd }),
-            epsilon: (self.plan.epsilon).map(|it| it.epsilon(replay.transitions_inserted)),
-            replay,
-            learner: self.learner_status(),
-            losses: losses.map(|(name, _)| name.as_str()).collect(),
-            rss_mib: Vec::new(),
+    /// Seconds since the run began: without the time between its interruption and its resumption where it is recorded.
+    pub(crate) fn seconds(&self) -> Option<f64> {
+        let recorded = self.recorded.as_ref();
+        recorded.map_or_else(|| self.up_s(), |it| Some(it.seconds))
+    }
+
+    /// The training's episodes.
+    pub(crate) fn episodes(&self) -> Episodes {
+        let of_replay = || Episodes::of(self.replay.episodes, self.replay.returns.newest.iter());
+        self.recorded
+            .as_ref()
+            .map_or_else(of_replay, |it| it.episodes)
+    }
+
+    /// The k of the rows served with a positive.
+    pub(crate) fn k(&self) -> Option<Spread> {
+        let recorded = self.recorded.as_ref();
+        recorded.map_or_else(|| Spread::of_k(&self.replay), |it| it.k)
+    }
+
+    /// The probability with which all actors act at random; none where they differ in it.
+    pub(crate) fn epsilon(&self) -> Option<f64> {
+        let schedule = self.plan.epsilon?;
+        Some(schedule.epsilon(self.replay.transitions_inserted))
+    }
+
+    /// The learner's status that the metrics are taken from: where they are recorded its last one, until it answers.
+    pub(crate) fn learner_shown(&self) -> Option<&LearnerStatus> {
+        match self.recorded {
+            Some(_) => Some(&self.learner),
+            None => self.learner_status(),
         }
     }
 }
@@ -226,7 +293,7 @@ mod tests {
             view.take_learner(answer);
             view.take_replay(vec![ReplayStatus::default()]);
         }
-        assert_eq!(view.moment().speed.updates, 0.0);
+        assert_eq!(view.speed.updates, 0.0);
 
         let mut resumed = RunView::beginning(Plan::default(), 0, 70);
         resumed.take_learner(None);

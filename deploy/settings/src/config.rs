@@ -147,26 +147,24 @@ impl RunConfig {
 
     /// Reads resolved settings, as in a run folder's `config.toml`.
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
-        let table: Table = text
-            .parse()
-            .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
-        derived::check(&table)
-            .and_then(|()| Self::from_table(&table))
-            .map_err(|e| usage!("{name}: {e}"))
+        let table = derived::read_file(name, text)?;
+        Self::from_table(&table).map_err(|e| usage!("{name}: {e}"))
     }
 
     /// The settings as every part reads them, sorted by name.
     pub fn to_toml(&self) -> String {
-        let text = toml::to_string(self).expect("a struct of plain values is TOML");
+        toml::to_string(&self.to_table()).expect("a table of plain values is TOML")
+    }
+
+    pub(crate) fn to_table(&self) -> Table {
         // As text, a number of 32 bits has the digits that were set; as a value of 64 it would have more.
-        let sorted: Table = text.parse().expect("it was just written");
-        toml::to_string(&sorted).expect("a table of plain values is TOML")
+        let text = toml::to_string(self).expect("a struct of plain values is TOML");
+        text.parse().expect("it was just written")
     }
 
     /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
-        let text = self.to_toml();
-        let mut table: Table = text.parse().map_err(|e| usage!("the settings: {e}"))?;
+        let mut table = self.to_table();
         derived::keep_whole_frames(&mut table);
         derived::derive(&mut table)?;
         Self::from_table(&table)

@@ -233,22 +233,25 @@ fn visible_actions(table: &mut Table, world: &WorldConfig, set: ActionSet) {
     }
 }
 
-/// Checks that what a file says of what follows is what follows.
-pub(crate) fn check(read: &Table) -> Result<(), Usage> {
+/// Reads the text of a file that driml wrote. What it says of what follows must be what follows.
+pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
+    let read: Table = text
+        .parse()
+        .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
     let mut right = read.clone();
-    derive(&mut right)?;
+    derive(&mut right).map_err(|e| usage!("{name}: {e}"))?;
     for (path, how) in FOLLOWS {
-        if let (Some(was), Some(is)) = (find(read, path), find(&right, path))
+        if let (Some(was), Some(is)) = (find(&read, path), find(&right, path))
             && was != is
         {
             return Err(usage!(
-                "{path} = {}, but it {how} and is {}; correct the one or the other",
+                "{name}: {path} = {}, but it {how} and is {}; correct the one or the other",
                 inline(was),
                 inline(is)
             ));
         }
     }
-    Ok(())
+    Ok(read)
 }
 
 pub(crate) fn find<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {

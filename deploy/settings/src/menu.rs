@@ -4,10 +4,7 @@
 use std::collections::BTreeMap;
 
 use driml_envs::WorldName;
-use driml_machine::{
-    error::{Usage, usage},
-    resources::Machine,
-};
+use driml_machine::{error::Usage, resources::Machine};
 use toml::{Table, Value};
 
 use crate::{
@@ -80,11 +77,7 @@ pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Resu
         memory_bytes: u64::MAX,
         ..Machine::this()
     };
-    let config = resolve(&source, &Flags::default(), &machine)?;
-    let table: Table = config
-        .to_toml()
-        .parse()
-        .map_err(|e: toml::de::Error| usage!("the settings as TOML: {}", e.message()))?;
+    let table = resolve(&source, &Flags::default(), &machine)?.to_table();
     let mut sources = BTreeMap::new();
     for layer in stack(preset, world, agent) {
         note_sources(&layer, &world.with_own_library().to_string(), &mut sources);

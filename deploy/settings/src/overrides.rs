@@ -35,16 +35,6 @@ impl Override {
         })
     }
 
-    /// A flag's number for the setting at `path`.
-    pub(crate) fn number(path: &str, number: u64) -> Result<Self, Usage> {
-        let whole = i64::try_from(number)
-            .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
-        Ok(Self {
-            path: path.to_owned(),
-            value: Value::Integer(whole),
-        })
-    }
-
     /// Puts the value into `table`; returns whether the key was not there before.
     ///
     /// A new key is accepted in a table that exists: whether it means anything is for the reader of that table to say.
@@ -188,15 +178,6 @@ mod tests {
         let (table, new) = set("run.horizon={rule=\"uniform\",k_max=3}").unwrap();
         assert_eq!((table["run"]["horizon"].get("k"), new), (None, false));
         assert!(set("run.other=3").unwrap().1);
-    }
-
-    #[test]
-    fn a_flag_s_number_takes_the_place_of_a_setting() {
-        let mut table = settings();
-        let set = |number| Override::number("run.seed", number);
-        set(7).unwrap().apply(&mut table).unwrap();
-        assert_eq!(table["run"]["seed"], Value::Integer(7));
-        assert!(set(u64::MAX).is_err());
     }
 
     #[test]

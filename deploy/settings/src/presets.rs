@@ -344,13 +344,6 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_of_world_has_a_layer() {
-        for world in WorldName::all() {
-            assert!(world_layer(world).name.ends_with(world.kind()));
-        }
-    }
-
-    #[test]
     fn every_only_block_names_worlds_that_exist() {
         let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
         for layer in all_layers().values() {

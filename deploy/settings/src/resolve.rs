@@ -72,13 +72,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
             }
             table
         }
-        Source::File(name, text) => {
-            let read: Table = text
-                .parse()
-                .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
-            derived::check(&read).map_err(|e| usage!("{name}: {e}"))?;
-            read
-        }
+        Source::File(name, text) => derived::read_file(name, text)?,
     };
     let sized_by_machine = matches!(source, Source::Layers(..));
     if sized_by_machine {
@@ -100,7 +94,8 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         ("run.seed", flags.seed),
     ] {
         if let Some(value) = value {
-            Override::number(path, value)?.apply(&mut table)?;
+            // The flags' parsers let no larger number through.
+            derived::put(&mut table, path, Value::Integer(value as i64));
         }
     }
     let by_hand = set(&mut table, &flags.sets)?;

@@ -3,7 +3,7 @@
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
 use driml_machine::error::usage;
-use driml_protocol::tls::Role;
+use driml_protocol::{Shutdown, tls::Role};
 use driml_settings::presets;
 
 use super::join::{JoinFlags, TlsFlags, clean_up_after, join};
@@ -54,7 +54,7 @@ pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
         Some(name) => Some(presets::world(name).map_err(|e| usage!("--env: {e}"))?),
         None => None,
     };
-    let shutdown = join(&args.join)?;
+    let shutdown = join(&args.join, Shutdown::on_signals)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,
         credentials,

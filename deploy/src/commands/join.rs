@@ -1,6 +1,6 @@
 //! What the commands that take part in a run share: how they reach it, and what they leave when they end.
 
-use std::{path::PathBuf, sync::Arc};
+use std::{io, path::PathBuf, sync::Arc};
 
 use anyhow::Context;
 use clap::Args;
@@ -10,7 +10,7 @@ use driml_launch::{
 };
 use driml_machine::error::Usage;
 use driml_protocol::{
-    Keys, Shutdown, TwoSteps, session,
+    Keys, session,
     tls::{Credentials, Role},
 };
 
@@ -74,24 +74,16 @@ impl TlsFlags {
     }
 }
 
-/// Checks how a process reaches the run, and starts to listen for signals.
-pub(super) fn join(flags: &JoinFlags) -> anyhow::Result<Shutdown> {
-    prepare(flags)?;
-    Shutdown::on_signals(flags.exit_with_parent).context("listening for signals")
-}
-
-/// [`join`] of a process that the others need while they end.
-pub(super) fn join_in_two_steps(flags: &JoinFlags) -> anyhow::Result<TwoSteps> {
-    prepare(flags)?;
-    TwoSteps::on_signals(flags.exit_with_parent).context("listening for signals")
-}
-
-fn prepare(flags: &JoinFlags) -> Result<(), Usage> {
+/// Checks how a process reaches the run, and starts to `listen` for signals.
+pub(super) fn join<T>(
+    flags: &JoinFlags,
+    listen: fn(Option<u32>) -> io::Result<T>,
+) -> anyhow::Result<T> {
     Keys::new(&flags.namespace).map_err(Usage)?;
     if flags.exit_with_parent.is_none() {
         session::sweep_shared_memory();
     }
-    Ok(())
+    listen(flags.exit_with_parent).context("listening for signals")
 }
 
 /// What a process does when it has ended, well or not: nothing of it is left outside the run folder.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use driml_launch::endpoint::check_endpoints;
 use driml_machine::device::{DeviceFlag, ready_for};
-use driml_protocol::tls::Role;
+use driml_protocol::{Shutdown, tls::Role};
 
 use super::join::{JoinFlags, StayFlag, TlsFlags, clean_up_after, join};
 
@@ -34,7 +34,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Learner)?;
     ready_for(args.on.device)?;
-    let shutdown = join(&args.join)?;
+    let shutdown = join(&args.join, Shutdown::on_signals)?;
     let run = driml_learner::RunArgs {
         connect: args.connect,
         credentials,

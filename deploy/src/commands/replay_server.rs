@@ -11,7 +11,7 @@ use driml_machine::{error::usage, resources::Machine};
 use driml_protocol::{TwoSteps, tls::Role};
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join_in_two_steps};
+use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
@@ -50,7 +50,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         let checked = config.replay.check_in_memory("--replay-dir DIR");
         checked.map_err(|e| usage!("{e}"))?;
     }
-    let TwoSteps { ending, now } = join_in_two_steps(&args.join)?;
+    let TwoSteps { ending, now } = join(&args.join, TwoSteps::on_signals)?;
     for note in &config.notes {
         tracing::warn!("{note}");
     }

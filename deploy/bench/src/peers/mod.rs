@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::Context;
 use clap::ValueEnum;
-use driml_launch::console;
+use driml_launch::console::{self, aligned};
 use driml_machine::{resources::MachineNote, units::number};
 use serde::Serialize;
 
@@ -23,7 +23,7 @@ use crate::{
         script::Script,
     },
     recording::Recording,
-    report::{self, Measurement, Samples, aligned},
+    report::{self, Measurement, Samples},
 };
 
 /// The load above which something else is running, which slows the two sides unequally.

@@ -116,30 +116,12 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use driml_launch::{
-        run_folder::{Recorded, RunRecorder},
+        run_folder::RunRecorder,
         run_view::{Plan, RunView},
     };
-    use driml_protocol::{Horizon, RunSpec, TimeoutRule};
 
     use super::*;
     use crate::sweep::plan::Call;
-
-    fn spec() -> RunSpec {
-        RunSpec {
-            world: "chain".into(),
-            agent: "driml-ada".into(),
-            seed: 3,
-            frame_height: 12,
-            frame_width: 12,
-            frame_channels: 1,
-            frame_stack: 1,
-            num_actions: 3,
-            n_step: 7,
-            gamma: 0.99,
-            horizon: Horizon::Nhg { k_max: 5 },
-            timeout: TimeoutRule::Terminal,
-        }
-    }
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -154,11 +136,16 @@ mod tests {
             };
             PlannedRun::new("run".into(), call, frames)
         };
-        let view = RunView::new(Plan::default());
         let folder = RunFolder::new(runs.root.join("run"));
-        let mut recorder = RunRecorder::create(&folder, Recorded::default()).unwrap();
-        recorder.record(&view, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &spec(), &view);
+        let call = Call {
+            env: Some("chain".into()),
+            ..Call::default()
+        };
+        let config = call.config().unwrap();
+        let mut view = RunView::new(Plan::of(&config));
+        let mut recorder = RunRecorder::create(&folder, &config, Vec::new()).unwrap();
+        recorder.record(&mut view, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
         summary.write(&folder).unwrap();
         assert!(runs.finished(&plan(10)).is_none(), "it has no call");
         runs.write_call(&plan(10), "abc").unwrap();

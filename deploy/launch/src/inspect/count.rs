@@ -21,13 +21,12 @@ pub(super) const BATCH: &str = "a batch";
 
 /// One row of the table.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Line {
-    /// What is counted.
-    pub what: String,
+pub(crate) struct Line {
+    pub(crate) what: String,
     /// How much of it the configuration has.
-    pub is: u64,
+    pub(crate) is: u64,
     /// How much it would have with everything on.
-    pub everything: u64,
+    pub(crate) everything: u64,
 }
 
 type Counts = Vec<(String, u64)>;

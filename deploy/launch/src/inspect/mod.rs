@@ -7,8 +7,8 @@ use anyhow::Context;
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
-pub use count::Line;
-use count::{Counted, EVERYTHING};
+use crate::console::aligned;
+use count::{Counted, EVERYTHING, Line};
 
 /// Columns of the names; a longer name pushes its row to the right.
 const WHAT_COLUMNS: usize = 26;
@@ -17,20 +17,18 @@ const NUMBER_COLUMNS: usize = 16;
 /// What a world and an agent cost.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Inspection {
-    /// The world's name, as `--env` takes it.
-    pub world: String,
-    /// The agent's name, as `--agent` takes it.
-    pub agent: String,
+    pub(crate) world: String,
+    pub(crate) agent: String,
     /// What [`Line::everything`] stands for.
-    pub everything: &'static str,
+    pub(crate) everything: &'static str,
     /// Scalars of all networks that the learner holds, layer by layer.
-    pub parameters: Vec<Line>,
+    pub(crate) parameters: Vec<Line>,
     /// Multiplications and additions of one update, part by part. Rows of a batch that need less are not known before it is drawn.
-    pub update_flops: Vec<Line>,
+    pub(crate) update_flops: Vec<Line>,
     /// Multiplications and additions of one decision of an actor, layer by layer.
-    pub decision_flops: Vec<Line>,
+    pub(crate) decision_flops: Vec<Line>,
     /// Bytes of what travels and of what is kept, without headers of some 60 bytes. They do not add up.
-    pub bytes: Vec<Line>,
+    pub(crate) bytes: Vec<Line>,
 }
 
 impl Inspection {
@@ -84,29 +82,23 @@ impl Inspection {
 
 /// A table of one line a world: the sums of an agent's tables, and in brackets those with everything on.
 pub fn describe_worlds(inspections: &[Inspection]) -> String {
-    let headings = [
-        "parameters",
-        "FLOPs an update",
-        "FLOPs a decision",
-        "bytes a batch",
-    ];
-    let line = |world: &str, cells: [String; 4]| {
-        let cells = cells.map(|cell| format!("{cell:>36}"));
-        format!("{world:WHAT_COLUMNS$}{}\n", cells.concat())
-    };
-    let mut text = line("world", headings.map(str::to_owned));
-    for inspection in inspections {
-        let batch = inspection.bytes.iter().find(|it| it.what == count::BATCH);
-        let sums = [
-            sum("", &inspection.parameters),
-            sum("", &inspection.update_flops),
-            sum("", &inspection.decision_flops),
-            sum("", batch.map_or(&[], std::slice::from_ref)),
+    let headings = "world,parameters,FLOPs an update,FLOPs a decision,bytes a batch";
+    let mut rows = vec![headings.split(',').map(String::from).collect()];
+    for it in inspections {
+        let batch = it.bytes.iter().find(|it| it.what == count::BATCH);
+        let batch = batch.map_or(&[][..], std::slice::from_ref);
+        let counts = [
+            &it.parameters[..],
+            &it.update_flops,
+            &it.decision_flops,
+            batch,
         ];
+        let sums = counts.map(|lines| sum("", lines));
         let cells = sums.map(|it| format!("{} ({})", thousands(it.is), thousands(it.everything)));
-        text += &line(&inspection.world, cells);
+        rows.push([vec![it.world.clone()], cells.into()].concat());
     }
-    format!("{text}\nin brackets: {EVERYTHING}\n")
+    let table = aligned(&rows, &[1, 2, 3, 4]);
+    format!("{table}\nin brackets: {EVERYTHING}\n")
 }
 
 fn sum(what: &str, lines: &[Line]) -> Line {

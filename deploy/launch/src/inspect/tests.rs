@@ -150,9 +150,3 @@ fn no_agent_has_more_than_everything() {
         }
     }
 }
-
-#[test]
-fn numbers_are_readable() {
-    let texts = [0, 999, 1000, 1_234_567, 10_000_000_000].map(thousands);
-    assert_eq!(texts, ["0", "999", "1,000", "1,234,567", "10,000,000,000"]);
-}

@@ -16,7 +16,6 @@ use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
-    connect::connect,
     console::{self, Screen, print_wrapped},
     endpoint::NAMESPACE,
     evaluator::Evaluator,
@@ -24,7 +23,7 @@ use crate::{
     last_play,
     meeting::Meeting,
     open_files,
-    processes::{Processes, Revived, stop},
+    processes::{Processes, Revived, connect, stop},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView},
@@ -88,8 +87,7 @@ pub fn run(
     let place = meeting.path().as_os_str().as_encoded_bytes();
     write_whole(&run_dir.meeting(), place)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
-    let plan = Plan::of(config);
-    let display = Display::new(screen.clone(), plan, Instant::now(), resume_point.updates);
+    let display = Display::new(screen.clone(), Instant::now(), resume_point.updates);
     // What killed processes left is room again.
     session::sweep_shared_memory();
     let shared_memory = config.transport.shared_memory && {
@@ -260,10 +258,13 @@ impl Launch<'_> {
             let rss = self.processes.rss_mib();
             if view.is_answered() {
                 let ask = |shard, since| poller.episodes(shard, since);
-                let warnings = recorder.record_all(view, &rss, ask);
+                let mut warnings = recorder.record_episodes(view, ask);
+                warnings.extend(recorder.record(&mut poller.view, &rss));
                 warnings.iter().for_each(|line| self.screen.line(line));
             }
-            self.display.show(&recorder.moment(view), &notes(view));
+            recorder.complete(&mut poller.view);
+            let view = &poller.view;
+            self.display.show(view, &notes(view));
             self.evaluator.look(&self.screen);
             if view.replay.finished && view.learner.finished {
                 self.display
@@ -394,11 +395,14 @@ impl Launch<'_> {
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
-        let nothing = RunView::new(Plan::default());
-        let view = self.poller.as_ref().map_or(&nothing, |it| &it.view);
-        if self.poller.is_some() {
-            recorder.record(view, &[]);
-        }
+        let nothing = &mut RunView::new(Plan::default());
+        let view = match &mut self.poller {
+            None => nothing,
+            Some(poller) => {
+                recorder.record(&mut poller.view, &[]);
+                &mut poller.view
+            }
+        };
         let logs = self.processes.missing_log_lines();
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));

@@ -19,8 +19,7 @@ use driml_settings::config::RunConfig;
 use crate::{
     chosen::Which,
     console::{self, Screen, print_wrapped},
-    evaluator::Due,
-    keep::keep,
+    evaluator::{Due, keep},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
@@ -53,8 +52,7 @@ pub fn run(
         frames, updates, ..
     } = resumed.unwrap_or_default();
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
-    let plan = view.plan.clone();
-    let mut display = Display::new(screen.clone(), plan, Instant::now(), updates);
+    let mut display = Display::new(screen.clone(), Instant::now(), updates);
     let mut due = Due::new(config, run_dir)?;
     let mut play = |updates, is_last| -> anyhow::Result<()> {
         if let Some(episodes) = due.take(updates, is_last) {
@@ -95,7 +93,7 @@ pub fn run(
             warnings.iter().for_each(|line| screen.line(line));
             if show {
                 shown = Instant::now();
-                display.show(&recorder.moment(&view), &[]);
+                display.show(&view, &[]);
             }
         }
         if shutdown.is_set() {
@@ -132,7 +130,8 @@ fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockste
     view.take_learner(Some(lockstep.turn.status.clone()));
     view.take_replay(vec![status]);
     let ask = |_, since| Ok::<_, Infallible>(lockstep.replay.episodes_since(since));
-    let warnings = recorder.record_all(view, &[], ask);
+    let mut warnings = recorder.record_episodes(view, ask);
+    warnings.extend(recorder.record(view, &[]));
     lockstep.replay.note_recorded(ended);
     warnings
 }

@@ -15,7 +15,7 @@ use super::{
     folder::RunFolder,
     table::{AppendLog, Table, csv_row},
 };
-use crate::moment::{Episodes, rounded};
+use crate::{metrics::rounded, run_view::Episodes};
 
 /// Answers that are asked of one shard at a time; what they do not hold comes the next time.
 const ASKS_MAX: usize = 16;

@@ -16,7 +16,7 @@ use super::{
     folder::RunFolder,
     table::{Table, csv_row},
 };
-use crate::moment::rounded;
+use crate::metrics::rounded;
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 

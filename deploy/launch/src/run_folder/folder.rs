@@ -8,10 +8,11 @@ use std::{
 
 use anyhow::Context;
 use driml_machine::error::{Usage, usage};
-use driml_protocol::{lock_file, whole_file};
+use driml_protocol::lock_file;
+use driml_settings::config::RunConfig;
 use nix::unistd::{AccessFlags, access};
 
-use super::table::Table;
+use super::table::{Table, write_whole};
 
 /// What the names of TensorBoard's files begin with.
 pub(super) const EVENTS: &str = "events.out.tfevents.";
@@ -188,15 +189,13 @@ impl RunFolder {
         Ok(())
     }
 
-    pub(super) fn write_config(&self, config_toml: &str) -> anyhow::Result<()> {
+    pub(super) fn write_config(&self, config: &RunConfig) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
-        write_whole(&self.config(), format!("{head}{config_toml}").as_bytes())
+        write_whole(
+            &self.config(),
+            (head.to_owned() + &config.to_toml()).as_bytes(),
+        )
     }
-}
-
-/// Writes a file whole or not at all.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
 #[cfg(test)]
@@ -206,15 +205,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_in_use_is_refused_and_an_empty_one_is_not() {
-        let folder = tempfile::tempdir().unwrap();
-        let check_free = |path: &Path| RunFolder::new(path).check_free();
-        assert!(check_free(folder.path()).is_ok());
-        fs::write(folder.path().join("x"), "").unwrap();
-        let said = check_free(folder.path()).unwrap_err().to_string();
-        let why = "exists and is not empty: choose another --run-dir";
-        assert!(said.contains(why), "{said}");
-        assert!(check_free(&folder.path().join("x")).is_err());
+    fn a_folder_that_cannot_be_had_says_why_and_a_free_one_is_taken() {
+        let root = tempfile::tempdir().unwrap();
+        let path = |name: &str| root.path().join(name);
+        for folder in ["empty", "used", "closed"] {
+            fs::create_dir(path(folder)).unwrap();
+        }
+        fs::write(path("used/x"), "").unwrap();
+        fs::set_permissions(path("closed"), fs::Permissions::from_mode(0o555)).unwrap();
+        let taken = "exists and is not empty: choose another --run-dir";
+        let mut refused = vec![
+            ("used", taken),
+            ("used/x", taken),
+            (
+                "used/x/one",
+                "/used/x is not a folder; choose another --run-dir",
+            ),
+        ];
+        // Root may write everywhere.
+        if !nix::unistd::geteuid().is_root() {
+            refused.push(("closed/one", "cannot be written: Permission denied"));
+        }
+        for (name, why) in refused {
+            let said = RunFolder::new(path(name)).check_free().unwrap_err();
+            assert!(said.0.contains(why), "{said}");
+        }
+        for name in ["empty", "a/b/c"] {
+            assert!(RunFolder::new(path(name)).check_free().is_ok(), "{name}");
+        }
     }
 
     #[test]
@@ -239,34 +257,6 @@ mod tests {
         fs::remove_dir(folder.checkpoints().join("checkpoint-0")).unwrap();
         write(root.path().join("thesis.tex"), "");
         assert!(folder.check_free().is_err(), "it has files of others");
-    }
-
-    #[test]
-    fn a_folder_that_cannot_be_made_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let refused = |path: &Path| {
-            let said = RunFolder::new(path).check_free().unwrap_err();
-            said.to_string()
-        };
-        let file = folder.path().join("file");
-        fs::write(&file, "").unwrap();
-        let said = refused(&file.join("runs/one"));
-        let why = "is not a folder; choose another --run-dir";
-        assert!(
-            said.contains(&format!("{} {why}", file.display())),
-            "{said}"
-        );
-        let closed = folder.path().join("closed");
-        fs::create_dir(&closed).unwrap();
-        fs::set_permissions(&closed, fs::Permissions::from_mode(0o555)).unwrap();
-        // Root may write everywhere.
-        if !nix::unistd::geteuid().is_root() {
-            let said = refused(&closed.join("one"));
-            let why = "cannot be written: Permission denied";
-            assert!(said.contains(why), "{said}");
-        }
-        let new = RunFolder::new(folder.path().join("a/b/c"));
-        assert!(new.check_free().is_ok());
     }
 
     #[test]

@@ -17,11 +17,11 @@ pub struct ResumePoint {
     /// Updates that the checkpoint has learned.
     pub updates: u64,
     /// Rows from which it has learned.
-    pub rows: u64,
+    pub(crate) rows: u64,
     /// Frames of the run by then.
-    pub frames: u64,
+    pub(crate) frames: u64,
     /// The replay was kept, and counts all of the run.
-    pub replay_is_kept: bool,
+    pub(crate) replay_is_kept: bool,
 }
 
 /// Bytes at the end of the file in which its last row lies.

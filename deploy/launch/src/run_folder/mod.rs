@@ -11,14 +11,15 @@ mod table;
 
 pub(crate) use self::{
     evaluations::Candidate,
-    summary::{commands, plot},
+    summary::{Earned, LastPlay, commands, plot},
+    table::AppendLog,
 };
 pub use self::{
     evaluations::{Evaluated, sweep},
-    folder::{RunFolder, write_whole},
+    folder::RunFolder,
     metrics::{Progress, ResumePoint, progress},
-    recorder::{Recorded, RunRecorder},
-    summary::{Earned, LastPlay, Outcome, Summary},
-    table::Table,
+    recorder::RunRecorder,
+    summary::{Outcome, Summary},
+    table::{Table, write_whole},
 };
-pub use crate::moment::rounded;
+pub use crate::metrics::rounded;

@@ -21,49 +21,8 @@ use super::{
 };
 use crate::{
     metrics::{cells, points},
-    moment::{Episodes, Moment, Spread},
-    run_view::{Plan, RunView},
+    run_view::{Episodes, Plan, Recorded, RunView, Spread},
 };
-
-/// What a recorder knows of a run before it begins.
-#[derive(Clone, Debug, Default)]
-pub struct Recorded {
-    /// The settings, as `config.toml` has them.
-    pub config_toml: String,
-    /// The names of the agent's auxiliary losses.
-    pub losses: &'static [&'static str],
-    /// The processes whose memory is recorded.
-    pub processes: Vec<String>,
-}
-
-impl Recorded {
-    pub(crate) fn of(config: &RunConfig, processes: Vec<String>) -> Self {
-        Self {
-            config_toml: config.to_toml(),
-            losses: config.learner.update.objective.losses(),
-            processes,
-        }
-    }
-
-    pub(super) fn header(&self) -> Vec<String> {
-        let nothing = RunView::new(Plan::default());
-        let cells = cells(&self.moment(&nothing, &[]));
-        cells.into_iter().map(|(name, _)| name).collect()
-    }
-
-    /// What a view says, of this run's losses and processes; their memory is in the order of the processes.
-    fn moment<'a>(&'a self, view: &'a RunView, rss_mib: &[Option<f64>]) -> Moment<'a> {
-        let memory = rss_mib.iter().copied().chain(std::iter::repeat(None));
-        let processes = self.processes.iter().map(String::as_str);
-        Moment {
-            // Until it answers it has its last status.
-            learner: Some(&view.learner),
-            losses: self.losses.to_vec(),
-            rss_mib: processes.zip(memory).collect(),
-            ..view.moment()
-        }
-    }
-}
 
 /// Writes a run folder.
 #[derive(Debug)]
@@ -71,9 +30,8 @@ pub struct RunRecorder {
     /// No other launcher writes to the folder while this is held.
     _lock: File,
     resume_point: ResumePoint,
-    /// Seconds, frames and episodes in the last row before the run was resumed.
+    /// Seconds and episodes in the last row before the run was resumed.
     seconds_before: f64,
-    frames_before: u64,
     episodes_before: u64,
     /// The k of all rows up to there.
     k_before: Option<Spread>,
@@ -82,9 +40,8 @@ pub struct RunRecorder {
     episodes: TrainingEpisodes,
     /// The next episodes that arrive had ended before.
     is_late: bool,
-    run: Recorded,
-    /// Resident memory of each process, now and at the most.
-    rss_mib: Vec<Option<f64>>,
+    /// Resident memory of each process by name, now and at the most.
+    rss_mib: Vec<(String, Option<f64>)>,
     rss_max: Vec<Option<f64>>,
     started: Instant,
 }
@@ -97,10 +54,9 @@ impl RunRecorder {
         processes: Vec<String>,
         resumed: Option<ResumePoint>,
     ) -> anyhow::Result<Self> {
-        let recorded = Recorded::of(config, processes);
         let mut this = match resumed {
-            Some(point) => Self::go_on(folder, recorded, point, config.frames())?,
-            None => Self::create(folder, recorded)?,
+            Some(point) => Self::go_on(folder, config, processes, point, config.frames())?,
+            None => Self::create(folder, config, processes)?,
         };
         if config.local.tensorboard {
             this.write_events(folder)?;
@@ -108,42 +64,47 @@ impl RunRecorder {
         Ok(this)
     }
 
-    /// Makes the folder and writes the settings; the clock starts.
-    pub fn create(folder: &RunFolder, run: Recorded) -> anyhow::Result<Self> {
+    /// Makes the folder and writes the settings; the clock starts. The memory of `processes` is recorded.
+    pub fn create(
+        folder: &RunFolder,
+        config: &RunConfig,
+        processes: Vec<String>,
+    ) -> anyhow::Result<Self> {
         folder.check_free()?;
         fs::create_dir_all(folder.path())
             .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
-        folder.write_config(&run.config_toml)?;
-        let (header, rows) = (run.header(), Vec::new());
+        folder.write_config(config)?;
+        let (header, rows) = (header(config, &processes), Vec::new());
         let rows = Table { header, rows };
-        let episodes = TrainingEpisodes::create(folder)?;
-        Self::begin(folder, run, lock, rows, episodes, ResumePoint::default())
+        let (episodes, point) = (TrainingEpisodes::create(folder)?, ResumePoint::default());
+        Self::begin(folder, processes, lock, rows, episodes, point)
     }
 
     /// Continues from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
     /// to there stay.
     pub(crate) fn go_on(
         folder: &RunFolder,
-        run: Recorded,
+        config: &RunConfig,
+        processes: Vec<String>,
         resume_point: ResumePoint,
         frames_max: u64,
     ) -> anyhow::Result<Self> {
         let lock = folder.lock()?;
-        let seconds = seconds_of(folder);
-        let rows = rows_up_to(&folder.metrics(), run.header(), resume_point, frames_max)?;
+        let (seconds, header) = (seconds_of(folder), header(config, &processes));
+        let rows = rows_up_to(&folder.metrics(), header, resume_point, frames_max)?;
         let is_known = resume_point.replay_is_kept;
         let episodes = TrainingEpisodes::go_on(folder, resume_point.frames, is_known)?;
         Summary::remove(folder)?;
-        folder.write_config(&run.config_toml)?;
-        let mut this = Self::begin(folder, run, lock, rows, episodes, resume_point)?;
+        folder.write_config(config)?;
+        let mut this = Self::begin(folder, processes, lock, rows, episodes, resume_point)?;
         this.count_seconds(seconds);
         Ok(this)
     }
 
     fn begin(
         folder: &RunFolder,
-        run: Recorded,
+        processes: Vec<String>,
         lock: File,
         rows: Table,
         episodes: TrainingEpisodes,
@@ -157,22 +118,20 @@ impl RunRecorder {
             _lock: lock,
             resume_point,
             seconds_before: rows.last("seconds").unwrap_or(0.0),
-            frames_before: resume_point.frames,
             episodes_before: if is_kept { 0 } else { rows_of_episodes },
             k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
             events: None,
             episodes,
             is_late: false,
-            rss_mib: Vec::new(),
-            rss_max: vec![None; run.processes.len()],
-            run,
+            rss_max: vec![None; processes.len()],
+            rss_mib: processes.into_iter().map(|name| (name, None)).collect(),
             started: Instant::now(),
         })
     }
 
     pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
-        let kept = (self.resume_point.updates > 0).then_some(self.frames_before);
+        let kept = (self.resume_point.updates > 0).then_some(self.resume_point.frames);
         self.events = Some(Events::create(folder, kept)?);
         Ok(())
     }
@@ -188,7 +147,8 @@ impl RunRecorder {
     }
 
     /// The k of all rows of the run, before it was resumed too.
-    fn k(&self, replay: &ReplayStatus, since: Option<Spread>) -> Option<Spread> {
+    fn k(&self, replay: &ReplayStatus) -> Option<Spread> {
+        let since = Spread::of_k(replay);
         let (Some(before), Some(since)) = (self.k_before, since) else {
             return since.or(self.k_before);
         };
@@ -202,15 +162,14 @@ impl RunRecorder {
         Some(Spread { mean, sd })
     }
 
-    /// What a view says of the whole run, before it was resumed too.
-    pub fn moment<'a>(&'a self, view: &'a RunView) -> Moment<'a> {
-        let moment = self.run.moment(view, &self.rss_mib);
-        Moment {
-            seconds: Some(self.seconds()),
+    /// Lets a view tell of the whole run, before it was resumed too.
+    pub(crate) fn complete(&self, view: &mut RunView) {
+        view.recorded = Some(Recorded {
+            seconds: self.seconds(),
             episodes: self.episodes(&view.replay),
-            k: self.k(&view.replay, moment.k),
-            ..moment
-        }
+            k: self.k(&view.replay),
+            rss_mib: self.rss_mib.clone(),
+        });
     }
 
     fn seconds(&self) -> f64 {
@@ -228,36 +187,25 @@ impl RunRecorder {
         self.episodes.update(&view.shards, ask, seconds)
     }
 
-    /// [`Self::record_episodes`], then [`Self::record`].
-    pub(crate) fn record_all<E: Display>(
-        &mut self,
-        view: &RunView,
-        rss_mib: &[Option<f64>],
-        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
-    ) -> Vec<String> {
-        let mut warnings = self.record_episodes(view, ask);
-        warnings.extend(self.record(view, rss_mib));
-        warnings
-    }
-
     /// Takes the state of the run: adds a row of metrics, in a resumed run once it is further than its last row.
     /// `rss_mib` is in the order of the processes given at the start, none for one that ended.
     ///
     /// A disk that is full does not end the run: a warning is returned the first time, and [`Self::missing`] says
     /// at the end what was lost.
-    pub fn record(&mut self, view: &RunView, rss_mib: &[Option<f64>]) -> Vec<String> {
-        self.rss_mib = rss_mib.to_vec();
-        for (max, now) in self.rss_max.iter_mut().zip(rss_mib) {
-            *max = now.map_or(*max, |now| Some(max.map_or(now, |max: f64| max.max(now))));
+    pub fn record(&mut self, view: &mut RunView, rss_mib: &[Option<f64>]) -> Vec<String> {
+        let known = rss_mib.iter().copied().chain(std::iter::repeat(None));
+        for (((_, rss), max), now) in self.rss_mib.iter_mut().zip(&mut self.rss_max).zip(known) {
+            *rss = now;
+            *max = now.map_or(*max, |now| Some(max.map_or(now, |max| max.max(now))));
         }
+        self.complete(view);
         let (frames, updates) = (view.replay.transitions_inserted, view.learner.updates);
-        let resumed = self.resume_point.updates > 0;
-        if resumed && (updates <= self.resume_point.updates || frames < self.frames_before) {
+        let before = &self.resume_point;
+        if before.updates > 0 && (updates <= before.updates || frames < before.frames) {
             return Vec::new();
         }
-        let moment = self.moment(view);
-        let row = csv_row(cells(&moment).into_iter().map(|(_, cell)| cell));
-        let points = points(&moment);
+        let row = csv_row(cells(view).into_iter().map(|(_, cell)| cell));
+        let points = points(view);
         let events = self.events.as_mut();
         let drawn = events.and_then(|it| it.add(&points, &view.replay, view.learner.finished));
         let written = self.metrics.add(row);
@@ -273,31 +221,42 @@ impl RunRecorder {
     }
 
     /// The whole run's episodes.
-    pub fn episodes(&self, replay: &ReplayStatus) -> Episodes {
+    pub(crate) fn episodes(&self, replay: &ReplayStatus) -> Episodes {
         self.episodes.so_far(self.episodes_before + replay.episodes)
     }
 
     /// What there is to say of the run, which ended so.
     pub fn summarise(&self, outcome: Outcome, run: &RunSpec, view: &RunView) -> Summary {
-        let wall_seconds = self.seconds();
-        let moment = self.moment(view);
-        let of_view = Summary::of(outcome, run, view, moment.episodes, wall_seconds);
+        let (wall_seconds, episodes) = (self.seconds(), self.episodes(&view.replay));
+        let of_view = Summary::of(outcome, run, view, episodes, wall_seconds);
         // A resumed run that did not get anywhere still has what was done before.
         let frames = of_view.frames.max(self.resume_point.frames);
         let updates = of_view.updates.max(self.resume_point.updates);
-        let rss = self.run.processes.iter().zip(&self.rss_max);
-        let rss = rss.map(|(name, mib)| (name.clone(), mib.map(f64::round).into()));
+        let rss = self.rss_mib.iter().zip(&self.rss_max);
+        let rss = rss.map(|((name, _), mib)| (name.clone(), mib.map(f64::round).into()));
         Summary {
             resumed_after_updates: self.resume_point.updates,
             frames,
             updates,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: moment.k.map(|it| it.mean),
+            mean_k: self.k(&view.replay).map(|it| it.mean),
             rss_mib_max: rss.collect(),
             ..of_view
         }
     }
+}
+
+/// The columns of the metrics of a run with these processes.
+fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
+    let mut nothing = RunView::new(Plan::of(config));
+    nothing.recorded = Some(Recorded {
+        seconds: 0.0,
+        episodes: Episodes::default(),
+        k: None,
+        rss_mib: processes.iter().map(|it| (it.clone(), None)).collect(),
+    });
+    cells(&nothing).into_iter().map(|(name, _)| name).collect()
 }
 
 #[cfg(test)]

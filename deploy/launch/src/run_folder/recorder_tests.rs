@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 
 use driml_actor::Schedule;
-use driml_protocol::{EndedEpisode, LearnerStatus, Played, RunSpec, Waiting};
+use driml_protocol::{EndedEpisode, LearnerStatus, Played, Waiting};
 use expect_test::expect;
 
 use super::*;
@@ -12,16 +12,30 @@ use crate::{
     testing::{config, with},
 };
 
-fn spec() -> RunSpec {
-    config("smoke", "chain", "driml-ada", &[]).run
+fn settings() -> RunConfig {
+    config("smoke", "chain", "driml-ada", &[])
+}
+
+fn create(folder: &RunFolder, processes: &[&str]) -> RunRecorder {
+    RunRecorder::create(folder, &settings(), names(processes)).unwrap()
+}
+
+fn go_on(folder: &RunFolder, processes: &[&str]) -> anyhow::Result<RunRecorder> {
+    RunRecorder::go_on(folder, &settings(), names(processes), point(31), 9_999)
+}
+
+fn names(processes: &[&str]) -> Vec<String> {
+    processes.iter().map(ToString::to_string).collect()
+}
+
+fn header_of(processes: &[&str]) -> Vec<String> {
+    header(&settings(), &names(processes))
 }
 
 /// Where a run is resumed, with 16 rows an update.
 fn point(updates: u64) -> ResumePoint {
     with(|it: &mut ResumePoint| (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000))
 }
-
-const LOSSES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
 fn statuses() -> (ReplayStatus, LearnerStatus) {
     let replay = ReplayStatus {
@@ -44,21 +58,16 @@ fn statuses() -> (ReplayStatus, LearnerStatus) {
     (replay, learner)
 }
 
-fn recorded(processes: &[&str]) -> Recorded {
-    Recorded {
-        config_toml: "[run]\n".into(),
-        losses: &LOSSES,
-        processes: processes.iter().map(ToString::to_string).collect(),
-    }
-}
-
 fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
     let epsilon = Schedule::Falling {
         start: 0.5,
         end: 0.1,
         decay_frames: 4_000,
     };
-    let mut view = RunView::new(with(|it: &mut Plan| it.epsilon = Some(epsilon)));
+    let mut view = RunView::new(Plan {
+        epsilon: Some(epsilon),
+        ..Plan::of(&settings())
+    });
     view.take_learner(Some(learner.clone()));
     view.take_replay(vec![replay.clone()]);
     view
@@ -68,11 +77,11 @@ fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let mut recorder = RunRecorder::create(&run, recorded(&["replay-server", "actor-0"])).unwrap();
+    let mut recorder = create(&run, &["replay-server", "actor-0"]);
     let (replay, learner) = statuses();
-    let all = view(&replay, &learner);
-    let nothing = view(&ReplayStatus::default(), &LearnerStatus::default());
-    let said = recorder.record(&nothing, &[]);
+    let mut all = view(&replay, &learner);
+    let mut nothing = view(&ReplayStatus::default(), &LearnerStatus::default());
+    let said = recorder.record(&mut nothing, &[]);
     assert!(said.is_empty(), "{said:?}");
     let episode = EndedEpisode {
         frames: 2_000,
@@ -90,18 +99,18 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     };
     let said = recorder.record_episodes(&all, |_, _| Ok::<_, Infallible>(ended.clone()));
     assert!(said.is_empty(), "{said:?}");
-    let said = recorder.record(&all, &[Some(12.34), None]);
+    let said = recorder.record(&mut all, &[Some(12.34), None]);
     assert!(said.is_empty(), "{said:?}");
     assert!(recorder.missing().is_empty());
-    let summary = recorder.summarise(Outcome::Finished, &spec(), &all);
+    let summary = recorder.summarise(Outcome::Finished, &settings().run, &all);
     summary.write(&run).unwrap();
     assert!(Summary::is_finished(&run));
     let counts = (summary.frames, summary.replay_ratio, summary.mean_k);
     assert_eq!(counts, (2_000, Some(8.0), Some(1.5)));
 
     let csv = fs::read_to_string(run.metrics()).unwrap();
-    let header = recorded(&["replay-server", "actor-0"]).header();
-    assert_eq!(csv.lines().next().unwrap(), header.join(","));
+    let header = header_of(&["replay-server", "actor-0"]).join(",");
+    assert_eq!(csv.lines().next().unwrap(), header);
     let table = Table::parse(csv.as_bytes()).unwrap();
     let epsilons = table.rows.iter().map(|row| table.value(row, "epsilon"));
     assert_eq!(epsilons.collect::<Vec<_>>(), [Some(0.5), Some(0.3)]);
@@ -122,17 +131,21 @@ fn a_resumed_run_continues_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server"];
-    let mut recorder = RunRecorder::create(&run, recorded(&processes)).unwrap();
+    let mut recorder = create(&run, &processes);
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
         (replay.transitions_inserted, replay.episodes) = (frames, episodes);
         learner.updates = updates;
-        recorder.record(&view(&replay, &learner), &[]);
+        recorder.record(&mut view(&replay, &learner), &[]);
     }
-    let said = RunRecorder::go_on(&run, recorded(&processes), point(31), 9_999).unwrap_err();
+    let said = go_on(&run, &processes).unwrap_err();
     assert!(said.to_string().contains("is still running"), "{said}");
-    let summary = recorder.summarise(Outcome::Interrupted, &spec(), &view(&replay, &learner));
+    let summary = recorder.summarise(
+        Outcome::Interrupted,
+        &settings().run,
+        &view(&replay, &learner),
+    );
     summary.write(&run).unwrap();
     drop(recorder);
     // A launcher that was killed while it wrote.
@@ -140,24 +153,24 @@ fn a_resumed_run_continues_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
-    let mut recorder = RunRecorder::go_on(&run, recorded(&processes), point(31), 9_999).unwrap();
+    let mut recorder = go_on(&run, &processes).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (2_000, 1);
     replay.rows_sampled = 31 * 16;
     learner.updates = 31;
-    recorder.record(&view(&replay, &learner), &[]);
+    recorder.record(&mut view(&replay, &learner), &[]);
     (replay.transitions_inserted, replay.episodes) = (2_100, 2);
     replay.k_histogram = vec![0, 0, 5];
     replay.rows_sampled = 62 * 16;
     learner.updates = 62;
-    recorder.record(&view(&replay, &learner), &[]);
-    let summary = recorder.summarise(Outcome::Finished, &spec(), &view(&replay, &learner));
+    recorder.record(&mut view(&replay, &learner), &[]);
+    let summary = recorder.summarise(Outcome::Finished, &settings().run, &view(&replay, &learner));
     let counts = (summary.frames, summary.updates, summary.episodes);
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
-    let header = recorded(&processes).header();
+    let header = header_of(&processes);
     let read = |frames_max| rows_up_to(&path, header.clone(), point(99), frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
@@ -190,7 +203,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         if let Some(text) = metrics {
             fs::write(run.metrics(), text).unwrap();
         }
-        let recorder = RunRecorder::go_on(&run, recorded(&["actor-0"]), point(31), 9_999).unwrap();
+        let recorder = go_on(&run, &["actor-0"]).unwrap();
         let rows = |name: &str| {
             let text = fs::read(run.path().join(name)).unwrap_or_default();
             Table::parse(&text).unwrap().rows.len()
@@ -202,7 +215,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         let nothing = ReplayStatus::default();
         assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
         let view = view(&nothing, &LearnerStatus::default());
-        let summary = recorder.summarise(Outcome::Finished, &spec(), &view);
+        let summary = recorder.summarise(Outcome::Finished, &settings().run, &view);
         let took = summary.wall_seconds;
         assert!(took >= seconds, "{what}: {took}");
         assert_eq!(summary.frames, 2_000, "{what}");
@@ -210,14 +223,20 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
 
         // A run resumed twice from there sets aside beside what was set aside before.
         fs::write(run.episodes(), episodes).unwrap();
-        RunRecorder::go_on(&run, recorded(&["actor-0"]), point(31), 9_999).unwrap();
+        go_on(&run, &["actor-0"]).unwrap();
         assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
     }
 }
 
 fn summary(replay: &ReplayStatus) -> Summary {
     let view = view(replay, &LearnerStatus::default());
-    Summary::of(Outcome::Finished, &spec(), &view, Episodes::default(), 2.0)
+    Summary::of(
+        Outcome::Finished,
+        &settings().run,
+        &view,
+        Episodes::default(),
+        2.0,
+    )
 }
 
 #[test]

@@ -5,13 +5,13 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{Quantiles, RunSpec, whole_file};
+use driml_protocol::{Quantiles, RunSpec};
 use serde::{Deserialize, Serialize};
 
-use super::folder::RunFolder;
+use super::{folder::RunFolder, table::write_whole};
 use crate::{
-    moment::Episodes,
-    run_view::RunView,
+    console::aligned,
+    run_view::{Episodes, RunView},
     stats::{interval, mean_and_deviation},
 };
 
@@ -29,13 +29,10 @@ pub enum Outcome {
 
 /// The mean undiscounted return of whole episodes, and the 95% interval in which it lies.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Earned {
-    /// Mean return of the episodes.
-    pub mean: f64,
-    /// Where the interval begins.
-    pub low: f64,
-    /// Where it ends.
-    pub high: f64,
+pub(crate) struct Earned {
+    pub(crate) mean: f64,
+    pub(crate) low: f64,
+    pub(crate) high: f64,
 }
 
 impl Earned {
@@ -49,16 +46,13 @@ impl Earned {
 
 /// What a finished run's weights earned, and a random policy over as many episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LastPlay {
+pub(crate) struct LastPlay {
     /// Which weights: "averaged" or "online".
-    pub weights: String,
-    /// Episodes of each.
-    pub episodes: u64,
-    /// What the weights earned.
+    pub(crate) weights: String,
+    pub(crate) episodes: u64,
     #[serde(flatten)]
-    pub agent: Earned,
-    /// What the random policy did.
-    pub random: Earned,
+    pub(crate) agent: Earned,
+    pub(crate) random: Earned,
 }
 
 impl LastPlay {
@@ -152,7 +146,7 @@ pub struct Summary {
     /// Highest resident memory of each process, MiB.
     pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
     /// What its weights earn; none where they were not played.
-    pub played: Option<LastPlay>,
+    pub(crate) played: Option<LastPlay>,
 }
 
 impl Summary {
@@ -209,11 +203,9 @@ impl Summary {
 
     /// Writes it into the run folder, whole or not at all.
     pub fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
-        let path = folder.summary();
-        let doing = || format!("writing {}", path.display());
-        let mut text = serde_json::to_vec_pretty(self).with_context(doing)?;
+        let mut text = serde_json::to_vec_pretty(self).context("writing the summary")?;
         text.push(b'\n');
-        whole_file::write(&path, &text).with_context(doing)
+        write_whole(&folder.summary(), &text)
     }
 
     /// Reads that of the run in `folder`.
@@ -241,7 +233,7 @@ impl Summary {
     }
 
     /// What the weights of a finished run earn, and what a person may do with them, a command a line.
-    pub fn next_steps(&self, run_dir: &RunFolder) -> String {
+    pub(crate) fn next_steps(&self, run_dir: &RunFolder) -> String {
         let run = run_dir.display();
         let more = self.frames.saturating_mul(2);
         let film = "films it, and plays a random policy beside it";
@@ -299,8 +291,7 @@ pub(crate) fn plot(run_dir: &RunFolder) -> (String, &'static str) {
 
 /// Commands and what each does, in columns.
 pub(crate) fn commands(commands: &[(String, &str)]) -> String {
-    let widths = commands.iter().map(|(command, _)| command.chars().count());
-    let width = widths.max().unwrap_or(0);
-    let line = |(command, what): &(String, &str)| format!("  driml {command:width$}   {what}\n");
-    commands.iter().map(line).collect()
+    let row =
+        |(command, what): &(String, &str)| vec![format!("  driml {command}"), format!(" {what}")];
+    aligned(&commands.iter().map(row).collect::<Vec<_>>(), &[])
 }

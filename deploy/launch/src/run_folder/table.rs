@@ -20,6 +20,11 @@ use crate::console;
 /// of a world whose episodes take milliseconds.
 const WAITING_MAX: usize = 100_000;
 
+/// Writes a file whole or not at all.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
+}
+
 /// The whole rows of a file that a run writes.
 #[derive(Clone, Debug, Default)]
 pub struct Table {
@@ -90,8 +95,7 @@ impl Table {
         let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
         let free = (1..).map(free).find(|it| !it.exists());
         let beside = free.context("no name is free beside the table")?;
-        let writing = || format!("writing {}", beside.display());
-        whole_file::write(&beside, &aside.text()).with_context(writing)?;
+        write_whole(&beside, &aside.text())?;
         let name = |path: &Path| path.file_name().unwrap_or_default().display().to_string();
         console::line(&format!(
             "{} rows of {} are past the point where the run is resumed; they are now in {}",
@@ -103,49 +107,66 @@ impl Table {
     }
 }
 
+/// A file to which rows or lines are appended.
 #[derive(Debug)]
-pub(super) struct AppendLog {
+pub(crate) struct AppendLog {
     name: String,
+    /// What is appended: rows or lines.
+    unit: &'static str,
     file: File,
     /// Bytes of it that are whole rows.
     length: u64,
     waiting: VecDeque<Vec<u8>>,
+    waiting_max: usize,
     lost: u64,
     failed: Option<io::Error>,
 }
 
 impl AppendLog {
-    /// Makes the file anew, with the bytes that it begins with.
+    /// Makes a table anew, with the bytes that it begins with.
     pub(super) fn create(path: &Path, first: &[u8]) -> anyhow::Result<Self> {
-        let doing = || format!("writing {}", path.display());
-        whole_file::write(path, first).with_context(doing)?;
-        let file = File::options().append(true).open(path);
+        write_whole(path, first)?;
         let name = path.file_name().unwrap_or_default();
+        Self::open(path, name.to_string_lossy().into(), "rows", WAITING_MAX)
+    }
+
+    /// Continues a file, or begins one; messages call it `name`, and what is appended `unit`, of which no more than `waiting_max` wait.
+    pub(crate) fn open(
+        path: &Path,
+        name: String,
+        unit: &'static str,
+        waiting_max: usize,
+    ) -> anyhow::Result<Self> {
+        let doing = || format!("writing {}", path.display());
+        let file = File::options().create(true).append(true).open(path);
+        let file = file.with_context(doing)?;
         Ok(Self {
-            name: name.to_string_lossy().into_owned(),
-            file: file.with_context(doing)?,
-            length: first.len() as u64,
+            name,
+            unit,
+            length: file.metadata().with_context(doing)?.len(),
+            file,
             waiting: VecDeque::new(),
+            waiting_max,
             lost: 0,
             failed: None,
         })
     }
 
     /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
-    pub(super) fn add(&mut self, row: Vec<u8>) -> Option<String> {
+    pub(crate) fn add(&mut self, row: Vec<u8>) -> Option<String> {
         self.add_all([row])
     }
 
     /// [`Self::add`] of several rows, in one write.
     pub(super) fn add_all(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
         self.waiting.extend(rows);
-        let more = self.waiting.len().saturating_sub(WAITING_MAX);
+        let more = self.waiting.len().saturating_sub(self.waiting_max);
         self.waiting.drain(..more);
         self.lost += more as u64;
         let error = self.write().err()?;
-        let name = &self.name;
+        let (name, unit) = (&self.name, self.unit);
         let said = self.failed.is_none().then(|| {
-            format!("{name} cannot be written: {error}; its rows wait in memory until it can be")
+            format!("{name} cannot be written: {error}; its {unit} wait in memory until it can be")
         });
         self.failed.get_or_insert(error);
         said
@@ -165,10 +186,11 @@ impl AppendLog {
     }
 
     /// How many rows are not in the file, and why; none if all are.
-    pub(super) fn missing(&self) -> Option<String> {
+    pub(crate) fn missing(&self) -> Option<String> {
         let rows = self.lost + self.waiting.len() as u64;
         let error = self.failed.as_ref().filter(|_| rows > 0)?;
-        Some(format!("{rows} rows of {} are lost: {error}", self.name))
+        let (name, unit) = (&self.name, self.unit);
+        Some(format!("{rows} {unit} of {name} are lost: {error}"))
     }
 }
 

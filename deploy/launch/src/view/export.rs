@@ -38,7 +38,7 @@ pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
         plan: &view.plan,
         well: to_go_on.is_empty(),
         finished: view.is_finished(),
-        metrics: metrics::json(&view.moment()),
+        metrics: metrics::json(view),
         servers: &view.servers,
         replay: &view.replay,
         learner: view.learner_status(),
@@ -136,12 +136,11 @@ impl Page {
     }
 
     fn columns(&mut self, view: &RunView) {
-        let moment = view.moment();
         for column in COLUMNS {
             let Column {
                 name, help, value, ..
             } = column;
-            let members = column.members(&moment).into_iter();
+            let members = column.members(view).into_iter();
             let known = members.filter_map(|it| Some((it.name, it.value?)));
             let (kind, label, ending) = match value {
                 Value::Counter(_) => ("counter", "", "_total"),

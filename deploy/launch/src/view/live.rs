@@ -8,11 +8,9 @@ use driml_protocol::{ReplayStatus, Waiting};
 
 use crate::{
     console::{self, Screen},
-    moment::Moment,
-    run_view::Plan,
+    run_view::RunView,
 };
 
-const PLAIN_PERIOD: Duration = Duration::from_secs(10);
 /// How long updates run before the rates are steady enough to estimate the time left.
 const STEADY_MIN: Duration = Duration::from_secs(5);
 /// The progress display: how far, then two lines of numbers.
@@ -26,20 +24,21 @@ pub fn loss_title(name: &str) -> String {
     }
 }
 
-/// How far a run is and how fast; its frames are a question mark where they are not known, as are its updates.
-pub(super) fn progress(plan: &Plan, moment: &Moment<'_>, is_known: bool) -> String {
+/// How far a run is and how fast; frames and updates are a question mark where they are not known.
+pub(super) fn progress(view: &RunView, frames: Option<u64>, updates: Option<u64>) -> String {
+    // The last round may exceed what is planned.
     let count = |count: Option<u64>, planned| match count {
-        Some(count) => of_planned(count, planned),
         None => format!("?/{planned}"),
+        Some(count) if count > planned => format!("{planned}/{planned} (+{})", count - planned),
+        Some(count) => format!("{count}/{planned}"),
     };
-    let frames = is_known.then_some(moment.replay.transitions_inserted);
     format!(
         "frames {} ({:.0}/s)  updates {} ({:.1}/s)  replay ratio {}",
-        count(frames, plan.frames_planned),
-        moment.speed.frames,
-        count(moment.learner.map(|it| it.updates), plan.updates_planned),
-        moment.speed.updates,
-        number(moment.replay.replay_ratio()),
+        count(frames, view.plan.frames_planned),
+        view.speed.frames,
+        count(updates, view.plan.updates_planned),
+        view.speed.updates,
+        number(view.replay.replay_ratio()),
     )
 }
 
@@ -47,54 +46,42 @@ fn number(value: Option<f64>) -> String {
     value.map_or("-".into(), |value| format!("{value:.2}"))
 }
 
-/// A count beside what is planned, which the last round may exceed: `8000/8000 (+192)`.
-fn of_planned(count: u64, planned: u64) -> String {
-    match count.saturating_sub(planned) {
-        0 => format!("{count}/{planned}"),
-        more => format!("{planned}/{planned} (+{more})"),
-    }
-}
-
 /// The live lines.
 #[derive(Debug)]
-pub struct Display {
+pub(crate) struct Display {
     screen: Screen,
-    plan: Plan,
     /// Updates with which it began, and when the first beyond them was seen.
     updates_before: u64,
     learns_since: Option<Instant>,
     /// When the run began: a terminal's bar has its own clock.
     began: Instant,
-    plain_next: Instant,
+    /// Frames that the bar shows.
+    position: u64,
 }
 
 impl Display {
-    /// Of a run of this plan that began at `began`, and has done so many updates.
-    pub fn new(screen: Screen, plan: Plan, began: Instant, updates_before: u64) -> Self {
+    /// Of a run that began at `began`, and has done so many updates.
+    pub(crate) fn new(screen: Screen, began: Instant, updates_before: u64) -> Self {
         Self {
             screen,
-            plan,
             updates_before,
             learns_since: None,
             began,
-            plain_next: Instant::now() + PLAIN_PERIOD,
+            position: 0,
         }
     }
 
     /// Shows the state of the run, and `notes` under it, such as who does not answer.
-    pub fn show(&mut self, moment: &Moment<'_>, notes: &[String]) {
-        let updates = moment.learner.map_or(0, |it| it.updates);
-        if updates > self.updates_before {
+    pub(crate) fn show(&mut self, view: &RunView, notes: &[String]) {
+        if view.learner.updates > self.updates_before {
             self.learns_since.get_or_insert_with(Instant::now);
         }
-        let mut texts = self.text(moment).to_vec();
+        let mut texts = self.text(view).to_vec();
         if !notes.is_empty() {
             texts.push(notes.join("; "));
         }
-        if let Some(bar) = self.screen.bar() {
-            let frames = moment.replay.transitions_inserted;
-            bar.set_position(frames.min(self.plan.frames_planned));
-        }
+        let frames = view.replay.transitions_inserted;
+        self.position = frames.min(view.plan.frames_planned);
         self.write(&texts);
     }
 
@@ -104,44 +91,38 @@ impl Display {
     }
 
     fn write(&mut self, texts: &[String]) {
-        let now = Instant::now();
-        match self.screen.bar() {
-            Some(bar) => bar.set_message(console::wrapped(&texts.join("\n"), "  ", 0)),
-            None if now >= self.plain_next => {
-                self.plain_next = now + PLAIN_PERIOD;
-                self.screen.line(&plain(now - self.began, texts));
-            }
-            None => {}
-        }
+        self.screen.show(self.position, |is_bar| match is_bar {
+            true => console::wrapped(&texts.join("\n"), "  ", 0),
+            false => plain(self.began.elapsed(), texts),
+        });
     }
 
-    fn text(&self, moment: &Moment<'_>) -> [String; 2] {
-        let (replay, speed) = (moment.replay, moment.speed);
-        let frames = replay.transitions_inserted;
-        let updates = moment.learner.map_or(0, |it| it.updates);
+    fn text(&self, view: &RunView) -> [String; 2] {
+        let (plan, speed, learner) = (&view.plan, view.speed, &view.learner);
+        let (frames, updates) = (view.replay.transitions_inserted, learner.updates);
         // Before the first update there are none.
-        let learned = moment.learner.filter(|_| self.learns_since.is_some());
-        let losses = learned.map(|it| {
-            let others = it.losses.iter();
+        let losses = self.learns_since.map(|_| {
+            let others = learner.losses.iter();
             let others = others.map(|(name, loss)| format!("  {} {loss:.3}", loss_title(name)));
-            format!("  C51 {:.3}{}", it.c51_kl, others.collect::<String>())
+            format!("  C51 {:.3}{}", learner.c51_kl, others.collect::<String>())
         });
         let losses = losses.unwrap_or_default();
-        let k = moment.k.map(|k| format!("  mean k {:.2}", k.mean));
-        let k = k.unwrap_or_default();
+        let k = view.k().map(|k| format!("  mean k {:.2}", k.mean));
         let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
         let left = self.learns_since.filter(is_steady).and_then(|_| {
-            let frames = self.plan.frames_planned.saturating_sub(frames);
-            let updates = self.plan.updates_planned.saturating_sub(updates);
+            let frames = plan.frames_planned.saturating_sub(frames);
+            let updates = plan.updates_planned.saturating_sub(updates);
             time_left((frames, speed.frames), (updates, speed.updates))
         });
+        let episodes = view.episodes();
         [
-            progress(&self.plan, moment, true),
+            progress(view, Some(frames), Some(updates)),
             format!(
-                "return {} ({} episodes){losses}{k}  {}{}",
-                number(moment.episodes.mean_return),
-                moment.episodes.count,
-                waiting(replay),
+                "return {} ({} episodes){losses}{}  {}{}",
+                number(episodes.mean_return),
+                episodes.count,
+                k.unwrap_or_default(),
+                waiting(&view.replay),
                 left.map_or(String::new(), |left| format!("  {} left", duration(left))),
             ),
         ]
@@ -184,20 +165,18 @@ mod tests {
 
     use super::*;
     use crate::{
-        moment::{Speed, Spread},
-        run_view::RunView,
+        rates::Speed,
+        run_view::{Episodes, Plan, Recorded, Spread},
         testing::with,
     };
 
-    fn display(frames_planned: u64, updates_planned: u64) -> Display {
-        let plan = with(|it: &mut Plan| {
-            (it.frames_planned, it.updates_planned) = (frames_planned, updates_planned);
-        });
-        Display::new(Screen::plain(), plan, Instant::now(), 0)
+    fn display() -> Display {
+        Display::new(Screen::plain(), Instant::now(), 0)
     }
 
-    fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
-        let mut view = RunView::new(Plan::default());
+    fn view(planned: (u64, u64), replay: ReplayStatus, learner: LearnerStatus) -> RunView {
+        let plan = with(|it: &mut Plan| (it.frames_planned, it.updates_planned) = planned);
+        let mut view = RunView::new(plan);
         view.take_learner(Some(learner));
         view.take_replay(vec![replay]);
         view
@@ -205,7 +184,7 @@ mod tests {
 
     #[test]
     fn the_lines_say_what_a_person_wants_to_know() {
-        let mut display = display(200_000, 6_218);
+        let mut display = display();
         let replay = ReplayStatus {
             transitions_inserted: 33_000,
             rows_sampled: 256_000,
@@ -219,28 +198,32 @@ mod tests {
             (it.updates, it.c51_kl) = (1000, 0.1234);
             it.losses = vec![("dim_4t4".into(), 4.0)];
         });
+        let mut view = view((200_000, 6_218), replay, learner);
         let (mean, sd) = (2.25, 1.0);
+        view.recorded = Some(Recorded {
+            seconds: 9.0,
+            episodes: with(|it: &mut Episodes| (it.count, it.mean_return) = (45, Some(1.234))),
+            k: Some(Spread { mean, sd }),
+            rss_mib: Vec::new(),
+        });
         let (frames, updates) = (160.0, 5.0);
-        let view = view(replay, learner);
-        let mut moment = view.moment();
-        (moment.episodes.count, moment.episodes.mean_return) = (45, Some(1.234));
-        moment.k = Some(Spread { mean, sd });
-        moment.speed = Speed { frames, updates };
+        view.speed = Speed { frames, updates };
         display.learns_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
             frames 33000/200000 (160/s)  updates 1000/6218 (5.0/s)  replay ratio 8.00
             return 1.23 (45 episodes)  C51 0.123  DIM 4t4 4.000  mean k 2.25  23 of 24 actors wait for learner  17 min 23 s left"#]]
-        .assert_eq(&display.text(&moment).join("\n"));
+        .assert_eq(&display.text(&view).join("\n"));
     }
 
     #[test]
     fn before_the_first_update_there_is_no_loss_and_no_time_left() {
-        let mut display = display(8_000, 218);
+        let mut display = display();
         let mut shown = |frames, updates| {
             let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = frames);
-            let view = view(replay, with(|it: &mut LearnerStatus| it.updates = updates));
-            display.show(&view.moment(), &[]);
-            display.text(&view.moment()).join("\n")
+            let learner = with(|it: &mut LearnerStatus| it.updates = updates);
+            let view = view((8_000, 218), replay, learner);
+            display.show(&view, &[]);
+            display.text(&view).join("\n")
         };
         expect![[r#"
             frames 0/8000 (0/s)  updates 0/218 (0.0/s)  replay ratio -

@@ -9,9 +9,10 @@ mod poll;
 pub(crate) use self::{
     advice::{needed, notes, recovery},
     export::{PrometheusFile, json},
+    live::Display,
     page::page,
 };
 pub use self::{
-    live::{Display, TEMPLATE, loss_title},
+    live::{TEMPLATE, loss_title},
     poll::{Poller, Reached},
 };

@@ -6,7 +6,10 @@ use super::{
     advice::{needed, seconds, waits},
     live::progress,
 };
-use crate::run_view::{RunView, ServerAnswer};
+use crate::{
+    console::aligned,
+    run_view::{RunView, ServerAnswer},
+};
 
 /// Actors that have their own line; the others are counted.
 const ACTORS_MAX: usize = 64;
@@ -15,13 +18,15 @@ const ACTORS_MAX: usize = 64;
 const REPORT_AGE_MAX: f64 = 10.0;
 
 pub(crate) fn page(view: &RunView) -> String {
-    let (replay, plan, moment) = (&view.replay, &view.plan, view.moment());
+    let (replay, plan) = (&view.replay, &view.plan);
     let is_known = view.is_answered() || view.is_gone();
+    let frames = is_known.then_some(replay.transitions_inserted);
+    let updates = view.learner_status().map(|it| it.updates);
     let mut page = format!(
         "{}, {}: {} of {}\n",
         plan.world,
         plan.agent,
-        progress(plan, &moment, is_known),
+        progress(view, frames, updates),
         plan.replay_ratio_planned
     );
     let counts = [
@@ -57,7 +62,7 @@ pub(crate) fn page(view: &RunView) -> String {
             rows.push(vec![format!("and {more} more actors")]);
         }
     }
-    page += &table(&rows);
+    page += &aligned(&rows, &[]);
     for note in notes {
         page += &format!("\n{note}\n");
     }
@@ -165,19 +170,4 @@ fn part_row(part: &PartStatus) -> Vec<String> {
         part.weights_version.map_or("-".into(), |it| it.to_string()),
         part.lives.to_string(),
     ]
-}
-
-/// Rows with columns as wide as their widest cell.
-fn table(rows: &[Vec<String>]) -> String {
-    let width = |column: usize| {
-        let cells = rows.iter().filter_map(|row| row.get(column));
-        cells.map(|cell| cell.chars().count()).max().unwrap_or(0)
-    };
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().enumerate();
-        let cells = cells.map(|(column, cell)| format!("{cell:0$}", width(column)));
-        let cells: Vec<_> = cells.collect();
-        format!("{}\n", cells.join("  ").trim_end())
-    };
-    rows.iter().map(line).collect()
 }

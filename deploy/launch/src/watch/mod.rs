@@ -1,22 +1,22 @@
 //! `driml watch` and `driml status`: the live lines, metrics and summary of a run that other commands have started, on any machine.
 //! It asks and never tells: the run does not depend on whether it is watched.
 
-mod run_of_folder;
 mod watched;
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::Seldom;
+use driml_protocol::{Seldom, reach};
 
-pub use self::run_of_folder::{Live, endpoints_of};
 pub use self::watched::Outputs;
 use self::watched::Watched;
 use crate::{
+    chosen::config_of,
     console,
     interrupts::Interrupts,
-    run_folder::{Outcome, RunFolder, commands, plot},
+    resume,
+    run_folder::{Outcome, Progress, RunFolder, Summary, commands, plot, progress},
     view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
 
@@ -45,7 +45,6 @@ pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyh
     if interrupts.wait_timeout(POLL) > 0 {
         return Err(Interrupted.into());
     }
-    let pages = console::Pages::on_stdout();
     loop {
         let view = poller.ask();
         if let Some(folder) = folder.filter(|_| view.is_gone() && !look.json)
@@ -55,7 +54,7 @@ pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyh
         }
         match look.json {
             true => console::print(&json(view)?)?,
-            false if look.again => pages.show(&page(view))?,
+            false if look.again => console::print_page(&page(view))?,
             false => console::print(&page(view))?,
         }
         if !look.again || view.is_over() || interrupts.wait_timeout(PAGE_PERIOD) > 0 {
@@ -165,4 +164,53 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         }
         None => console::print(&format!("{}\n", summary.counts())),
     }
+}
+
+/// Whether the run in a folder can be asked.
+pub enum Live {
+    /// The endpoints of its replay servers.
+    At(Vec<String>),
+    /// No process can be asked: how it ended and how to resume it, for a person.
+    Over(String),
+}
+
+/// Looks into the folder of a run.
+///
+/// # Errors
+/// It is not a run's, or one whose processes were started by hand.
+pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
+    let config = config_of(folder)?;
+    let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
+    // A launcher that runs there holds the lock.
+    if folder.lock().is_err()
+        && let Some(endpoints) = endpoints
+    {
+        let endpoints: Vec<_> = endpoints.lines().map(str::to_owned).collect();
+        if endpoints.iter().any(|it| reach::look(it).is_ok()) {
+            return Ok(Live::At(endpoints));
+        }
+        let frames = progress(folder).map_or(0, |it| it.frames);
+        let how = match frames >= config.frames() {
+            true => "is stopping: all frames are stored and its replay server has exited",
+            false => "is starting or stopping: no replay server listens",
+        };
+        let folder = folder.display();
+        return Ok(Live::Over(format!(
+            "the run in {folder} {how}. Its launcher still runs; retry in a moment\n"
+        )));
+    }
+    if Summary::is_finished(folder) {
+        let summary = Summary::read(folder)?.describe(folder);
+        return Ok(Live::Over(format!("the run is over\n{summary}")));
+    }
+    let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
+    let so_far = progress(folder).map_or("nothing".into(), counts);
+    let next = match resume::is_resumable(&config.world, folder) {
+        true => format!("`driml train --resume {}` resumes it", folder.display()),
+        false => "it has no checkpoint to resume from".into(),
+    };
+    Ok(Live::Over(format!(
+        "no process runs in {}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT\n",
+        folder.display()
+    )))
 }

@@ -16,8 +16,7 @@ use crate::{
     chosen::config_of,
     console::{self, Screen},
     launcher::process_names,
-    moment::Moment,
-    run_folder::{Outcome, Recorded, ResumePoint, RunFolder, RunRecorder, Summary, Table},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::RunView,
     view::{Display, Poller, TEMPLATE, notes},
 };
@@ -68,7 +67,7 @@ impl Watched {
         let began = now.checked_sub(up).unwrap_or(now);
         let updates = view.learner.updates;
         Ok(Self {
-            display: Display::new(screen.clone(), view.plan.clone(), began, updates),
+            display: Display::new(screen.clone(), began, updates),
             screen,
             recorder,
             began,
@@ -85,12 +84,12 @@ impl Watched {
         }
         if let Some(recorder) = self.recorder.as_mut().filter(|_| poller.view.is_answered()) {
             let ask = |shard, since| poller.episodes(shard, since);
-            let warnings = recorder.record_all(&poller.view, &[], ask);
+            let mut warnings = recorder.record_episodes(&poller.view, ask);
+            warnings.extend(recorder.record(&mut poller.view, &[]));
             warnings.iter().for_each(|line| self.screen.line(line));
         }
         let view = &poller.view;
-        let moment = moment(self.recorder.as_ref(), view);
-        self.display.show(&moment, &notes(view));
+        self.display.show(view, &notes(view));
         self.is_over(poller)
     }
 
@@ -132,7 +131,7 @@ impl Watched {
         );
         poller.view.learner.updates = updates;
         let recorded = self.recorder.as_mut();
-        let warnings = recorded.map(|it| it.record(&poller.view, &[]));
+        let warnings = recorded.map(|it| it.record(&mut poller.view, &[]));
         warnings
             .iter()
             .flatten()
@@ -150,7 +149,7 @@ impl Watched {
                 recorder.summarise(outcome, run, view)
             }
             None => {
-                let (episodes, seconds) = (view.moment().episodes, self.began.elapsed());
+                let (episodes, seconds) = (view.episodes(), self.began.elapsed());
                 Summary::of(outcome, run, view, episodes, seconds.as_secs_f64())
             }
         };
@@ -161,27 +160,18 @@ impl Watched {
     }
 }
 
-/// What is shown of a run: of all of it where it is recorded.
-fn moment<'a>(recorder: Option<&'a RunRecorder>, view: &'a RunView) -> Moment<'a> {
-    let of_view = || Moment {
-        // Until it answers it has its last status.
-        learner: Some(&view.learner),
-        ..view.moment()
-    };
-    recorder.map_or_else(of_view, |it| it.moment(view))
-}
-
 /// Begins to record the run in `folder`, or continues.
 fn record(folder: &RunFolder, config: &RunConfig, view: &RunView) -> anyhow::Result<RunRecorder> {
-    let recorded = Recorded::of(config, process_names(config));
+    let processes = process_names(config);
     // A learner may have just begun there.
     let is_run_s = folder.config().exists() || folder.checkpoints().is_dir();
     let mut recorder = match is_run_s {
-        false => RunRecorder::create(folder, recorded)?,
+        false => RunRecorder::create(folder, config, processes)?,
         true => {
             check_same(folder, config)?;
             let point = resume_point(folder, view)?;
-            RunRecorder::go_on(folder, recorded, point, u64::MAX).map_err(|e| in_use(folder, e))?
+            let recorder = RunRecorder::go_on(folder, config, processes, point, u64::MAX);
+            recorder.map_err(|e| in_use(folder, e))?
         }
     };
     recorder.count_seconds_from(view.up_s().unwrap_or(0.0));

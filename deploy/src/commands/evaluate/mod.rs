@@ -1,37 +1,34 @@
 //! `driml evaluate`: whole episodes with a run's weights or an exported network's, and a random policy's beside them; a film of them on
 //! request.
 
-mod progress;
 mod recording;
-mod report;
 mod tile;
 
 use std::{
     fs::File,
+    io::{self, Write},
     ops::ControlFlow,
     path::{Path, PathBuf},
 };
 
 use anyhow::Context;
-use clap::Args;
+use clap::{Args, ValueEnum};
 use driml_actor::Step;
 use driml_figure::Film;
 use driml_launch::{
     chosen::{Weights, Which},
-    console::{self, print},
+    console::{self, Screen, print},
     evaluate::{EPSILON, Levels, Player, Who, levels},
-    keep::{Judged, keep},
+    evaluator::{Judged, keep},
     pretrained,
-    run_folder::{RunFolder, sweep, write_whole},
+    run_folder::{RunFolder, rounded, sweep, write_whole},
     stats::mean_and_deviation,
+    view::TEMPLATE,
 };
 use driml_machine::error::{EXIT_INTERRUPTED, usage};
 use driml_protocol::Shutdown;
 
-use self::{
-    progress::Progress,
-    recording::{RecordArgs, Recording},
-};
+use self::recording::{RecordArgs, Recording};
 
 #[derive(Debug, Args)]
 pub(crate) struct EvaluateArgs {
@@ -152,13 +149,15 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     ))?;
     let play = |who, name: &str, see: &mut dyn FnMut(&Step<'_>)| {
         let episodes = args.episodes as usize;
-        let mut progress = Progress::new(name, episodes);
+        let mut screen = Screen::new(episodes as u64, TEMPLATE);
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
-            progress.see(returns);
+            screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
             see(step);
             ControlFlow::Continue(())
         };
-        player.play_watched(who, &world, episodes, args.seed, watch)
+        let played = player.play_watched(who, &world, episodes, args.seed, watch);
+        screen.clear();
+        played
     };
     let see = &mut |step: &Step<'_>| film.iter_mut().for_each(|film| film.see(step));
     let returns = match (play(Who::Agent, &spec.agent, see), film) {
@@ -176,10 +175,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     said(&describe("random", &random))?;
     let played = [(spec.agent.as_str(), returns), ("random", random)];
     if let Some((path, file)) = &table {
-        report::write(file, &played).with_context(|| format!("writing {}", path.display()))?;
+        write_returns(file, &played).with_context(|| format!("writing {}", path.display()))?;
     }
     if args.json {
-        print(&report::json(&player, args.levels, args.seed, &played)?)?;
+        print(&json(&player, args.levels, args.seed, &played)?)?;
     }
     Ok(())
 }
@@ -229,4 +228,71 @@ fn verdict(judged: &Judged) -> String {
 fn describe(name: &str, returns: &[f64]) -> String {
     let (mean, deviation) = mean_and_deviation(returns);
     format!("{name:12} mean return {mean:8.3}, standard deviation {deviation:.3}\n")
+}
+
+/// Who played, and the returns of the episodes.
+type Played<'a> = (&'a str, Vec<f64>);
+
+/// A table of every episode's return.
+fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
+    let mut text = "policy,episode,return\n".to_owned();
+    for (name, returns) in played {
+        for (episode, value) in (1..).zip(returns) {
+            text += &format!("{name},{episode},{}\n", rounded(*value));
+        }
+    }
+    file.write_all(text.as_bytes())
+}
+
+/// An evaluation for programs: one JSON object.
+fn json(
+    player: &Player,
+    levels: Levels,
+    seed: u64,
+    played: &[Played<'_>],
+) -> anyhow::Result<String> {
+    let spec = &player.config.run;
+    let policies: serde_json::Map<_, _> = played
+        .iter()
+        .map(|(name, returns)| {
+            let (mean, deviation) = mean_and_deviation(returns);
+            let of = serde_json::json!({ "mean_return": mean, "standard_deviation": deviation, "episodes": returns.len() });
+            ((*name).to_owned(), of)
+        })
+        .collect();
+    let levels = levels.to_possible_value();
+    let object = serde_json::json!({
+        "world": spec.world,
+        "agent": spec.agent,
+        "updates": player.updates,
+        "weights": player.config.learner.publish_as,
+        "averaged": player.is_averaged,
+        "arithmetic": player.config.actor.precision,
+        "levels": levels.map(|it| it.get_name().to_owned()),
+        "seed": seed,
+        "epsilon": player.epsilon,
+        "policies": policies,
+    });
+    Ok(serde_json::to_string(&object)? + "\n")
+}
+
+/// How far a policy's episodes are.
+fn progress(policy: &str, returns: &[f64], of: usize) -> String {
+    let mean = match returns {
+        [] => String::new(),
+        _ => format!(", mean return {:.3}", mean_and_deviation(returns).0),
+    };
+    format!("{policy}: {} of {of} episodes{mean}", returns.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn progress_is_episodes_and_their_mean() {
+        assert_eq!(progress("c51", &[], 100), "c51: 0 of 100 episodes");
+        let said = progress("c51", &[1.0, 2.0], 100);
+        assert_eq!(said, "c51: 2 of 100 episodes, mean return 1.500");
+    }
 }

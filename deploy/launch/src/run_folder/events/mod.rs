@@ -7,13 +7,13 @@ mod encode;
 
 use std::{
     fs,
-    path::{Path, PathBuf},
+    path::PathBuf,
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
 use anyhow::Context;
 use driml_figure::{Area, Ink, Picture};
-use driml_learner::AffinityEstimator;
+use driml_learner::{AffinityEstimator, checkpoint};
 use driml_protocol::ReplayStatus;
 
 use self::encode::{At, Value};
@@ -92,30 +92,29 @@ impl Events {
 
     /// What was counted since the last histograms.
     fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
-        let mut counted = Vec::new();
-        for (name, now, before) in [
+        let kinds = [
             ("k/served", &replay.k_histogram, &mut self.k),
             (
                 "actions/stored",
                 &replay.action_histogram,
                 &mut self.actions,
             ),
-        ] {
+        ];
+        let counted = kinds.map(|(name, now, before)| {
             let since = since(now, before);
             before.clone_from(now);
-            if since.iter().any(|&n| n > 0) {
-                counted.push((name.to_owned(), since));
-            }
-        }
-        let histograms = counted.iter();
-        let histograms = histograms.map(|(name, counts)| (name.clone(), Value::Counts(counts)));
-        let histograms: Vec<_> = histograms.collect();
+            (name, since)
+        });
+        let some = counted.iter().filter(|it| it.1.iter().any(|&n| n > 0));
+        let histograms: Vec<_> = some
+            .map(|(name, counts)| ((*name).to_owned(), Value::Counts(counts)))
+            .collect();
         (!histograms.is_empty()).then(|| encode::summary(at, &histograms))
     }
 
     /// Draws A of a checkpoint that was not there before. One that cannot be read just now is tried again.
     fn affinity(&mut self, at: At) -> Option<Vec<u8>> {
-        let (updates, path) = newest(&self.checkpoints)?;
+        let (updates, path) = checkpoint::list(&self.checkpoints).ok()?.pop()?;
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
             return None;
         }
@@ -152,17 +151,6 @@ fn since(now: &[u64], before: &[u64]) -> Vec<u64> {
     let both = now.iter().zip(before);
     let difference: Option<Vec<_>> = both.map(|(now, before)| now.checked_sub(before)).collect();
     difference.unwrap_or_else(|| now.to_vec())
-}
-
-/// The newest whole checkpoint in a folder that the learner writes to just now.
-fn newest(checkpoints: &Path) -> Option<(u64, PathBuf)> {
-    let entries = fs::read_dir(checkpoints).ok()?;
-    let whole = entries.filter_map(|entry| {
-        let path = entry.ok()?.path();
-        let updates = path.file_name()?.to_str()?.strip_prefix("checkpoint-")?;
-        Some((updates.parse().ok()?, path))
-    });
-    whole.max()
 }
 
 /// A as cells, each row an action, each column the next one.
