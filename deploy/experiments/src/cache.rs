@@ -19,10 +19,11 @@ use driml_machine::{
     resources,
 };
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::Value;
 
 use crate::{
     flags::ExperimentFlags,
-    page::{self, Page, Table},
+    page::{Table, page, summary},
     progress::Progress,
 };
 
@@ -46,6 +47,7 @@ struct Kept<T> {
 #[derive(Debug)]
 pub(crate) struct Session {
     folder: PathBuf,
+    smoke: bool,
     progress: Progress,
     seconds: f64,
     /// Of how many pieces at once this is the sum.
@@ -80,6 +82,7 @@ impl Session {
         let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
         Ok(Self {
             folder,
+            smoke: flags.smoke,
             progress: Progress::new(units, interrupts),
             seconds: 0.0,
             at_once: 1,
@@ -113,15 +116,12 @@ impl Session {
 
     /// Keeps a piece that took no time.
     pub(crate) fn keep<T: Serialize>(&self, key: &str, result: T) -> anyhow::Result<()> {
-        let (of, seconds) = (String::new(), 0.0);
-        self.write(
-            key,
-            &Kept {
-                of,
-                seconds,
-                result,
-            },
-        )
+        let kept = Kept {
+            of: String::new(),
+            seconds: 0.0,
+            result,
+        };
+        self.write(key, &kept)
     }
 
     fn read<T: DeserializeOwned>(&self, key: &str) -> Option<Kept<T>> {
@@ -195,6 +195,21 @@ impl Session {
         Ok(kept.result)
     }
 
+    /// [`Session::piece_of`] that counts as work when it is whole.
+    pub(crate) fn whole_piece<T: Serialize + DeserializeOwned>(
+        &mut self,
+        of: &str,
+        key: &str,
+        units: u64,
+        make: impl FnOnce() -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        self.piece_of(of, key, units, |progress| {
+            let made = make()?;
+            progress.advance(units)?;
+            Ok(made)
+        })
+    }
+
     /// Writes a table as `name.csv`.
     pub(crate) fn csv(&self, name: &str, table: &Table) -> anyhow::Result<()> {
         let path = self.folder.join(format!("{name}.csv"));
@@ -211,16 +226,13 @@ impl Session {
         Ok(figure.save_both(&self.folder, stem)?)
     }
 
-    /// Writes the page, says where it is, and ends.
-    pub(crate) fn finish(self, page: &Page) -> anyhow::Result<()> {
+    /// Writes the page of this template with these values, says where it is, and ends.
+    pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let text = page.text(self.seconds, self.at_once);
-        write_whole(&self.folder.join("README.md"), text.as_bytes())?;
-        print(&format!(
-            "{}{}\n",
-            page::summary(&text),
-            self.folder.join("README.md").display()
-        ))
+        let text = page(template, values, self.smoke, self.seconds, self.at_once);
+        let path = self.folder.join("README.md");
+        write_whole(&path, text.as_bytes())?;
+        print(&format!("{}{}\n", summary(&text), path.display()))
     }
 }
 

@@ -4,8 +4,8 @@
 //! * `sweep` is the engine for runs: it makes, resumes and keeps those of every combination of settings and seed. `sweeps` are the
 //!   experiments that consist of runs, each a TOML file, a page template and what is special about it.
 //! * `studies` are the experiments that train something of their own; `stability` measures numeric routines.
-//! * `cache` keeps finished pieces of work in an experiment's folder, `stats` has the statistics, `page` fills in templates and renders
-//!   tables, `plot` draws what runs recorded.
+//! * `cache` keeps finished pieces of work in an experiment's folder, `stats` has the statistics, `page` fills in templates, `plot` draws
+//!   what runs recorded.
 //!
 //! A new experiment of runs is three files in `sweeps` and a variant of [`flags::ExperimentCommand`]. Results that are kept are in
 //! `deploy/experiments/results/`.
@@ -41,10 +41,11 @@ mod sweep;
 mod sweeps;
 
 use crate::{
-    flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
+    flags::ExperimentCommand,
     studies::{ising, random_walk},
     sweeps::{pacman, procgen},
 };
+pub use crate::{sweep::command::run as sweep, sweeps::tradeoff::run as tradeoff};
 
 /// Runs the experiment that the command names.
 ///
@@ -58,20 +59,4 @@ pub fn run(command: &ExperimentCommand) -> anyhow::Result<()> {
         ExperimentCommand::Procgen(args) => procgen::run(args),
         ExperimentCommand::Stability(flags) => stability::run(flags),
     }
-}
-
-/// Measures what each dial that buys speed costs.
-///
-/// # Errors
-/// As [`run`].
-pub fn tradeoff(args: &TradeoffArgs) -> anyhow::Result<()> {
-    sweeps::tradeoff::run(args)
-}
-
-/// Makes a run for each combination of settings and each seed.
-///
-/// # Errors
-/// As [`run`].
-pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
-    sweep::command::run(args)
 }

@@ -1,18 +1,19 @@
 //! The page that an experiment leaves: claim, command, time, expected, got, differences.
 //! Its text is a minijinja template beside the experiment; its numbers come from results alone, so that none can be stale.
 
-use std::{collections::BTreeMap, fmt};
-
 use driml_machine::units::rough_duration;
 use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value};
-use serde::{Serialize, Serializer};
+use serde_json::Value as Json;
 
-use crate::stats::{Interval, Spread, difference, interval};
+use crate::{
+    flags::this_command,
+    stats::{Interval, Spread, difference, interval},
+};
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// Numbers in rows and columns: as Markdown with `{}`, in columns of text with [`Table::text`].
+/// Rows of data below the names of their columns.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Table {
     pub(crate) header: Vec<String>,
@@ -20,23 +21,24 @@ pub(crate) struct Table {
 }
 
 impl Table {
-    /// Rows of data below the names of a file's columns, parted by commas.
-    pub(crate) fn of(columns: &str, rows: impl IntoIterator<Item = Vec<String>>) -> Self {
-        Self::new(&columns.split(',').collect::<Vec<_>>(), rows)
-    }
-
-    /// [`Table::of`] lines of data, whose values have no comma.
-    pub(crate) fn of_lines(columns: &str, lines: impl IntoIterator<Item = String>) -> Self {
-        let row = |line: String| line.split(',').map(str::to_owned).collect();
-        Self::of(columns, lines.into_iter().map(row))
-    }
-
     /// A table of these rows.
-    pub(crate) fn new(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Self {
+    pub(crate) fn new(
+        header: impl IntoIterator<Item: AsRef<str>>,
+        rows: impl IntoIterator<Item = Vec<String>>,
+    ) -> Self {
         Self {
-            header: header.iter().map(|&it| it.to_owned()).collect(),
+            header: header
+                .into_iter()
+                .map(|it| it.as_ref().to_owned())
+                .collect(),
             rows: rows.into_iter().collect(),
         }
+    }
+
+    /// Lines of data, whose values have no comma, below the names of a file's columns, parted by commas.
+    pub(crate) fn of_lines(columns: &str, lines: impl IntoIterator<Item = String>) -> Self {
+        let row = |line: String| line.split(',').map(str::to_owned).collect();
+        Self::new(columns.split(','), lines.into_iter().map(row))
     }
 
     /// Columns that stand below each other, for a terminal.
@@ -55,17 +57,6 @@ impl Table {
     }
 }
 
-impl fmt::Display for Table {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let rule = vec!["---".to_owned(); self.header.len()];
-        let lines = [&self.header, &rule].into_iter().chain(&self.rows);
-        let lines: Vec<_> = lines
-            .map(|cells| format!("| {} |", cells.join(" | ")))
-            .collect();
-        f.write_str(&lines.join("\n"))
-    }
-}
-
 /// The cell of a number; empty in data where there is none.
 pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
@@ -78,75 +69,33 @@ pub(crate) fn numbers<const N: usize>(values: [f64; N], decimals: usize) -> Stri
 
 /// Mean, low and high end as a file of data has them; empty where there is none.
 pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
-    let ends = of.and_then(|it| it.ends);
-    let numbers = [
-        of.map(|it| it.mean),
-        ends.map(|it| it.0),
-        ends.map(|it| it.1),
-    ];
-    numbers.map(|it| number(it, 4))
+    let (low, high) = of.and_then(|it| it.ends).unzip();
+    [of.map(|it| it.mean), low, high].map(|it| number(it, 4))
 }
 
-/// A cell of a page; a dash where there is nothing.
-pub(crate) fn cell<T>(value: Option<T>, text: impl Fn(T) -> String) -> String {
-    value.map_or_else(|| "-".into(), text)
-}
-
-impl Serialize for Table {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
+/// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
+/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time.
+pub(crate) fn page(
+    template: &str,
+    mut values: Json,
+    smoke: bool,
+    seconds: f64,
+    at_once: u32,
+) -> String {
+    let at_once = match at_once {
+        1 => String::new(),
+        jobs => format!(" of runs, {jobs} at once,"),
+    };
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let time = rough_duration(seconds);
+    values["time"] = format!("{time}{at_once} on a machine with {cores} cores.").into();
+    values["smoke"] = (if smoke { SMOKE } else { "" }).into();
+    if values["command"].is_null() {
+        values["command"] = this_command().into();
     }
-}
-
-/// What the names in a template stand for.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Values(BTreeMap<&'static str, Value>);
-
-impl Values {
-    /// A number, words, a list, a whole table, or the settings: whatever the template reads.
-    pub(crate) fn set(&mut self, name: &'static str, value: impl Serialize) -> &mut Self {
-        self.0.insert(name, Value::from_serialize(value));
-        self
-    }
-}
-
-/// A page, filled in but for the time that it took.
-#[derive(Debug)]
-pub(crate) struct Page {
-    template: &'static str,
-    values: Values,
-}
-
-impl Page {
-    /// The page of this template; `command` repeats the experiment, which was of the smoke length or not.
-    pub(crate) fn new(
-        template: &'static str,
-        mut values: Values,
-        command: &str,
-        smoke: bool,
-    ) -> Self {
-        values.set("command", command);
-        values.set("smoke", if smoke { SMOKE } else { "" });
-        Self { template, values }
-    }
-
-    /// As Markdown. `seconds` is the time that all pieces took together, made `at_once` at a time.
-    pub(crate) fn text(&self, seconds: f64, at_once: u32) -> String {
-        let at_once = match at_once {
-            1 => String::new(),
-            jobs => format!(" of runs, {jobs} at once,"),
-        };
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let time = rough_duration(seconds);
-        let mut values = self.values.clone();
-        values.set(
-            "time",
-            format!("{time}{at_once} on a machine with {cores} cores."),
-        );
-        fill(self.template, &values).unwrap_or_else(|e| {
-            panic!("the template of the page is built in, and a test fills it: {e:#}")
-        })
-    }
+    fill(template, &values).unwrap_or_else(|e| {
+        panic!("the template of the page is built in, and a test fills it: {e:#}")
+    })
 }
 
 /// What came out, for the terminal: the list below "Got".
@@ -159,7 +108,7 @@ pub(crate) fn summary(page: &str) -> String {
 ///
 /// # Errors
 /// The template is not one, or names a value that its experiment does not give.
-fn fill(template: &str, values: &Values) -> Result<String, Error> {
+fn fill(template: &str, values: &Json) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
@@ -202,13 +151,14 @@ fn fill(template: &str, values: &Values) -> Result<String, Error> {
     });
     environment.add_filter("minus", |to: Value, from: Value| {
         let (to, from) = (list_of(&to)?, list_of(&from)?);
-        Ok::<_, Error>(cell(difference(&from, &to), |it| it.to_string()))
+        let found = difference(&from, &to).map(|it| format!("{:+}", it.interval));
+        Ok::<_, Error>(found.unwrap_or_else(|| "-".into()))
     });
     environment.add_filter("verdict", |to: Value, from: Value| {
         let (to, from) = (list_of(&to)?, list_of(&from)?);
         Ok::<_, Error>(difference(&from, &to).map_or("", |it| it.verdict()))
     });
-    let text = environment.render_str(template, &values.0)?;
+    let text = environment.render_str(template, values)?;
     let blocks = text.split("\n\n").map(str::trim);
     let blocks: Vec<_> = blocks.filter(|block| !block.is_empty()).collect();
     Ok(blocks.join("\n\n") + "\n")
@@ -254,45 +204,39 @@ fn figure(stem: &str, caption: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
     fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
-        let table = Table::new(&["a", "b"], [vec!["1".into(), "2".into()]]);
+        let table = Table::new(["a", "b"], [vec!["1".into(), "2".into()]]);
         assert_eq!(table.text(), "a  b\n1  2\n");
         let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
-                        * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ table }}\n\n{{ figure('fig', 'A ' ~ got) }}\n";
-        let mut values = Values::default();
-        values.set("got", 0.5).set("table", table);
-        values.set("more", ["1", "2"]).set("no", false);
-        let page = |smoke| Page::new(template, values.clone(), "driml experiment t", smoke);
-        let text = page(true).text(130.0, 1);
+                        * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
+        let command = "driml experiment t";
+        let values = json!({ "got": 0.5, "more": ["1", "2"], "no": false, "command": command });
+        let page = |smoke, at_once| page(template, values.clone(), smoke, 130.0, at_once);
+        let text = page(true, 1);
         for part in [
             "# T\n",
             "smoke length",
             "**Command.** `driml experiment t`",
             "**Time.** 2 min on",
-            "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n| a | b |\n| --- | --- |\n| 1 | 2 |\n",
+            "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
             "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
         assert_eq!(summary(&text), "* 0.5\n* 1\n* 2\n");
-        assert!(
-            page(true)
-                .text(130.0, 2)
-                .contains("**Time.** 2 min of runs, 2 at once, on")
-        );
-        assert!(!page(false).text(1.0, 1).contains("smoke length"));
+        let other = page(false, 2);
+        assert!(other.contains("**Time.** 2 min of runs, 2 at once, on"));
+        assert!(!other.contains("smoke length"));
     }
 
     #[test]
     fn lists_of_numbers_become_what_a_page_says_of_them() {
-        let mut values = Values::default();
-        values.set("base", [0.0, 0.01, 0.02, 0.03]);
-        values
-            .set("none", Vec::<f64>::new())
-            .set("nil", None::<f64>);
+        let mut values = json!({ "base": [0.0, 0.01, 0.02, 0.03], "none": [], "nil": null });
         for (list, template, expected) in [
             (vec![1.0, 3.0], "{{ it | mean_and_sd(2) }}", "2.00 ± 1.41\n"),
             (vec![1.0], "{{ it | mean_and_sd(1) }}", "1.0\n"),
@@ -316,7 +260,7 @@ mod tests {
             ),
             (vec![-1.0, 1.0, 0.0], "{{ it | verdict(base) }}.", ".\n"),
         ] {
-            values.set("it", list);
+            values["it"] = list.into();
             assert_eq!(fill(template, &values).unwrap(), expected, "{template}");
         }
     }
@@ -329,7 +273,7 @@ mod tests {
             "{{ a | mean }}",
             "{{ a | minus([]) }}",
         ] {
-            assert!(fill(template, &Values::default()).is_err(), "{template}");
+            assert!(fill(template, &json!({})).is_err(), "{template}");
         }
     }
 }

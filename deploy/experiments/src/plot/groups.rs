@@ -6,13 +6,11 @@ use std::collections::VecDeque;
 use driml_figure::Series;
 
 use super::{
+    flags::{Band, PlotArgs},
     names,
-    runs::{Over, Run, SPREAD_OF_K},
+    runs::{Run, SPREAD_OF_K},
 };
-use crate::{
-    plot::flags::Band,
-    stats::{Spread, interval},
-};
+use crate::stats::{Spread, interval};
 
 /// Points of a curve over several runs.
 const GRID_POINTS: usize = 240;
@@ -81,13 +79,13 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
 
 impl Group<'_> {
     /// The group's mean of a column, and its band.
-    pub(super) fn curve(&self, column: &str, way: Way) -> anyhow::Result<Curve> {
-        let mean = self.over_seeds(column, way)?;
+    pub(super) fn curve(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
+        let mean = self.over_seeds(column, args)?;
         let has_spread = self.runs.iter().all(|run| run.has_values(SPREAD_OF_K));
         if column != "mean_k" || !has_spread {
             return Ok(mean);
         }
-        let spread = self.over_seeds(SPREAD_OF_K, way)?;
+        let spread = self.over_seeds(SPREAD_OF_K, args)?;
         let around = mean.points.iter().map(|&(x, k)| {
             let sd = between(&spread.points, x);
             (x, (k - sd).max(K_MIN), k + sd)
@@ -98,25 +96,19 @@ impl Group<'_> {
         })
     }
 
-    fn over_seeds(&self, column: &str, way: Way) -> anyhow::Result<Curve> {
-        let mut each = Vec::new();
-        for run in &self.runs {
-            let mut values = run.values_over(way.over, column)?;
-            if let Some(window) = way.smooth {
-                values = smoothed(&values, window as f64);
-            }
-            each.push(values);
-        }
-        Ok(one_curve(&each, way.band))
+    fn over_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
+        let each = self.runs.iter().map(|run| {
+            let values = run.values_over(args.x, column)?;
+            Ok(match args.smooth {
+                Some(window) => smoothed(&values, window as f64),
+                None => values,
+            })
+        });
+        Ok(one_curve(
+            &each.collect::<anyhow::Result<Vec<_>>>()?,
+            args.band,
+        ))
     }
-}
-
-/// How runs become curves.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Way {
-    pub(super) over: Over,
-    pub(super) smooth: Option<u64>,
-    pub(super) band: Band,
 }
 
 /// One or several curves as one, with a band of their range if there are several.
@@ -125,7 +117,7 @@ pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
 }
 
 fn one_curve(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
-    let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).cloned().collect();
+    let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
     match &each[..] {
         [] => Curve::default(),
         [only] => Curve {
@@ -161,21 +153,20 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
 }
 
 /// Mean and band of several curves, over the x that all of them have.
-fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
-    let first = |curve: &Vec<(f64, f64)>| curve[0].0;
-    let last = |curve: &Vec<(f64, f64)>| curve[curve.len() - 1].0;
-    let start = curves.iter().map(first).fold(f64::NEG_INFINITY, f64::max);
-    let end = curves.iter().map(last).fold(f64::INFINITY, f64::min);
+fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
+    let starts = curves.iter().map(|curve| curve[0].0);
+    let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
+    let start = starts.fold(f64::NEG_INFINITY, f64::max);
+    let end = ends.fold(f64::INFINITY, f64::min);
     let mut curve = Curve::default();
     if start > end {
         return curve;
     }
-    for i in 0..=GRID_POINTS {
+    let last = if start == end { 0 } else { GRID_POINTS };
+    for i in 0..=last {
         let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
         let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
-        let Some(spread) = Spread::of(values.iter().copied()) else {
-            break;
-        };
+        let spread = Spread::of(values.iter().copied()).expect("there are curves");
         let mean = spread.mean;
         let (low, high) = match band {
             Band::Range => (spread.min, spread.max),
@@ -186,9 +177,6 @@ fn together(curves: &[Vec<(f64, f64)>], band: Band) -> Curve {
         };
         curve.points.push((x, mean));
         curve.band.push((x, low, high));
-        if start == end {
-            break;
-        }
     }
     curve
 }
@@ -218,22 +206,20 @@ mod tests {
     }
 
     #[test]
-    fn a_band_of_standard_deviations() {
-        let curves = [vec![(0.0, 1.0), (10.0, 1.0)], vec![(0.0, 3.0), (10.0, 3.0)]];
-        let curve = together(&curves, Band::Sd);
-        let root = 2f64.sqrt();
-        assert_eq!(curve.points[0], (0.0, 2.0));
-        assert!((curve.band[0].1 - (2.0 - root)).abs() < 1e-12);
+    fn a_band_of_standard_deviations_and_the_interval_of_student() {
+        let curves = [1.0, 2.0, 4.5].map(|y| vec![(0.0, y), (10.0, y)]);
+        // By hand: standard deviation sqrt(3.25) = 1.803, and 4.303 / sqrt(3) = 2.484 of it.
+        for (band, low, high) in [
+            (Band::Range, 1.0, 4.5),
+            (Band::Sd, 0.697, 4.303),
+            (Band::Ci, -1.979, 6.979),
+        ] {
+            let curve = together(&curves.each_ref(), band);
+            assert_eq!(curve.points[0], (0.0, 2.5));
+            let (_, found_low, found_high) = curve.band[0];
+            assert!((found_low - low).abs() < 1e-3 && (found_high - high).abs() < 1e-3);
+        }
         let apart = [vec![(0.0, 1.0)], vec![(5.0, 1.0)]];
-        assert!(together(&apart, Band::Sd).points.is_empty());
-    }
-
-    #[test]
-    fn the_interval_of_three_seeds_is_students() {
-        // By hand: standard deviation 1, and 4.303 / sqrt(3) = 2.484.
-        let three = [1.0, 2.0, 3.0].map(|y| vec![(0.0, y), (9.0, y)]);
-        let (_, low, high) = together(&three, Band::Ci).band[0];
-        assert!((low + 0.484).abs() < 1e-3, "{low}");
-        assert!((high - 4.484).abs() < 1e-3, "{high}");
+        assert!(together(&apart.each_ref(), Band::Sd).points.is_empty());
     }
 }

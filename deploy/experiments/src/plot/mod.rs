@@ -25,7 +25,6 @@ pub(crate) use self::{
     runs::{Over, Run},
 };
 use self::{
-    groups::{Group, Way},
     runs::C51_LOSS,
     words::{EVALUATED, notes, title, words},
 };
@@ -112,25 +111,17 @@ fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
 }
 
 fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
-    let runs = folders(args)?
-        .iter()
-        .map(Run::read)
-        .collect::<anyhow::Result<Vec<_>>>()?;
-    let columns = if args.column.is_empty() {
-        overview(&runs)
-    } else {
-        let named = |column: &String| {
-            let word = WORDS.iter().find(|(word, _)| word == column);
-            word.map_or_else(|| column.clone(), |(_, column)| (*column).to_owned())
-        };
-        args.column.iter().map(named).collect()
+    let runs = folders(args)?.into_iter().map(|it| Run::read(&it));
+    let runs = runs.collect::<anyhow::Result<Vec<_>>>()?;
+    let named = |column: &String| {
+        let word = WORDS.iter().find(|(word, _)| word == column);
+        word.map_or_else(|| column.clone(), |(_, column)| (*column).to_owned())
+    };
+    let columns = match &args.column[..] {
+        [] => overview(&runs),
+        columns => columns.iter().map(named).collect(),
     };
     let groups = groups::of(&runs, !args.separate);
-    let way = Way {
-        over: args.x,
-        smooth: args.smooth,
-        band: args.band,
-    };
     let random = match args.random {
         Some(episodes) if columns.iter().any(|it| it == RETURN || it == EVALUATED) => {
             at_random(&runs, episodes as usize)?
@@ -144,78 +135,60 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     for column in &columns {
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);
-        let drawn = groups
-            .iter()
-            .map(|group| {
-                // Agents differ in their losses: what another one reports is not drawn for this one.
-                if is_loss && !group.runs.iter().any(|run| reports(run)) {
-                    return Ok(Curve::default());
-                }
-                group.curve(column, way)
-            })
-            .collect::<anyhow::Result<Vec<_>>>()?;
-        if !args.column.is_empty() && drawn.iter().all(|curve| curve.points.is_empty()) {
+        let is_return = column == RETURN || column == EVALUATED;
+        let mut series = Vec::new();
+        for (index, group) in groups.iter().enumerate() {
+            // Agents differ in their losses: what another one reports is not drawn for this one.
+            if is_loss && !group.runs.iter().any(|run| reports(run)) {
+                continue;
+            }
+            let curve = group.curve(column, args)?;
+            series.extend((!curve.points.is_empty()).then(|| curve.series(&group.name, index)));
+        }
+        if !args.column.is_empty() && series.is_empty() {
             return Err(usage!("none of these runs has a value of {column:?} yet").into());
         }
         if column == RETURN || !(args.column.is_empty() || is_loss) {
-            absent(column, &runs)
-                .iter()
-                .for_each(|line| console::line(line));
+            absent(column, &runs).for_each(|line| console::line(&line));
         }
-        let mut series = series(&groups, drawn);
-        if column == RETURN || column == EVALUATED {
+        if is_return {
             series.extend(lines(&random, &series, groups.len()));
         }
-        panels.push(Panel::Chart(chart(column, is_loss, args.x, series)));
+        let (title, y) = match is_loss {
+            true => (
+                format!("{} loss", loss_title(column)),
+                "auxiliary loss [nats]".into(),
+            ),
+            false => words(column),
+        };
+        let (x, y) = (Axis::linear(args.x.column()), Axis::linear(&y));
+        panels.push(Panel::Chart(Chart::new(&title, x, y, series)));
     }
-    if panels.is_empty() {
-        return Err(usage!("none of these runs has recorded a value yet").into());
-    }
+    let (grid, panel_size) = match panels.len() {
+        0 => return Err(usage!("none of these runs has recorded a value yet").into()),
+        1 => (1, (860.0, 420.0)),
+        _ => (2, CHART_SIZE),
+    };
     Ok(Figure {
         title: title(&groups),
         notes: notes(args, &groups, &columns),
-        columns: if panels.len() > 1 { 2 } else { 1 },
-        panel_size: if panels.len() > 1 {
-            CHART_SIZE
-        } else {
-            (860.0, 420.0)
-        },
+        columns: grid,
+        panel_size,
         panels,
     })
 }
 
 /// A line about each run that has no value of a column which is drawn.
-fn absent(column: &str, runs: &[Run]) -> Vec<String> {
+fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
     let why = match column {
         RETURN => "no episode has ended in it",
         _ => "it has no value yet",
     };
-    let absent = runs.iter().filter(|run| !run.has_values(column));
-    let line = |run: &Run| {
-        format!(
-            "{} is not in the chart of {column}: {why}",
-            run.folder.display()
-        )
-    };
-    absent.map(line).collect()
-}
-
-/// The curves that have points, each in the colour of its group.
-fn series(groups: &[Group<'_>], curves: Vec<Curve>) -> Vec<Series> {
-    let all = groups.iter().zip(curves).enumerate();
-    all.filter(|(_, (_, curve))| !curve.points.is_empty())
-        .map(|(index, (group, curve))| curve.series(&group.name, index))
-        .collect()
-}
-
-fn chart(column: &str, is_loss: bool, x: Over, series: Vec<Series>) -> Chart {
-    let (title, y) = if is_loss {
-        let title = format!("{} loss", loss_title(column));
-        (title, "auxiliary loss [nats]".into())
-    } else {
-        words(column)
-    };
-    Chart::new(&title, Axis::linear(x.column()), Axis::linear(&y), series)
+    let absent = runs.iter().filter(move |run| !run.has_values(column));
+    absent.map(move |run| {
+        let run = run.folder.display();
+        format!("{run} is not in the chart of {column}: {why}")
+    })
 }
 
 /// What a random policy earns in each of the runs' worlds, by the world's name.

@@ -71,11 +71,6 @@ impl Run {
             )
             .into());
         }
-        let evaluations = match std::fs::read(folder.evaluations()) {
-            Ok(text) => Table::parse(&text)
-                .with_context(|| format!("reading {}", folder.evaluations().display()))?,
-            Err(_) => Table::default(),
-        };
         let (settings, seed) = settings(&folder.config()).unzip();
         let run = settings.as_ref().and_then(|table| table.get("run"));
         let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
@@ -88,7 +83,7 @@ impl Run {
             seed: seed.flatten(),
             folder: folder.clone(),
             columns,
-            evaluations,
+            evaluations: Table::read(&folder.evaluations())?,
         })
     }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use driml_machine::error::Usage;
 
-use super::{flags::Band, *};
+use super::*;
 use crate::sweep::plan::Call;
 
 /// Folders of runs.
@@ -48,11 +48,6 @@ fn read(folder: &PathBuf) -> Run {
     Run::read(&RunFolder::new(folder)).unwrap()
 }
 
-const WAY: Way = Way {
-    over: Over::Frames,
-    smooth: None,
-    band: Band::Range,
-};
 const METRICS: &str =
     "seconds,frames,mean_return,mean_k,waiting\n1,0,,,warm-up\n2,10,1.5,1.0,-\n3,20,2.5,2.0,-\n";
 
@@ -66,7 +61,9 @@ fn runs_that_differ_in_their_seed_are_one_line_with_a_band() {
     let groups = groups::of(&runs, true);
     let names: Vec<_> = groups.iter().map(|group| group.name.as_str()).collect();
     assert_eq!(names, ["chain c51, 2 seeds", "chain driml-ada, seed 1"]);
-    let curve = groups[0].curve("mean_return", WAY).unwrap();
+    let curve = groups[0]
+        .curve("mean_return", &PlotArgs::default())
+        .unwrap();
     assert_eq!(curve.points.last(), Some(&(20.0, 3.5)));
     assert_eq!(curve.band.last(), Some(&(20.0, 2.5, 4.5)));
     assert_eq!(groups::of(&runs, false).len(), 3);
@@ -94,27 +91,25 @@ fn agents_with_different_losses_are_drawn_beside_each_other() {
 }
 
 #[test]
-fn a_row_that_was_cut_off_is_left_out_and_a_folder_given_twice_is_one_run() {
+fn a_row_cut_off_a_folder_given_twice_and_one_that_is_no_runs_are_left_out() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, &format!("{METRICS}4,3"));
     let values = read(&a).values("mean_return").unwrap();
     assert_eq!(values, [(10.0, 1.5), (20.0, 2.5)]);
-    let again = root.0.path().join(".").join("a");
-    let svg = drawn(&root.args(&[&a, &again], &["mean_return"]));
-    assert!(!svg.contains("2 seeds"));
+    let (none, again) = (root.0.path().to_owned(), root.0.path().join("./a"));
+    let svg = drawn(&root.args(&[&none, &a, &again], &["mean_return"]));
+    assert!(svg.contains("seed 1") && !svg.contains("2 seeds"));
 }
 
 #[test]
 fn smoothing_is_a_mean_over_the_frames_before_and_said() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, METRICS);
-    let runs = [read(&a)];
-    let groups = groups::of(&runs, true);
-    let smooth = Some(15);
-    let curve = groups[0].curve("mean_return", Way { smooth, ..WAY });
-    assert_eq!(curve.unwrap().points, [(10.0, 1.5), (20.0, 2.0)]);
     let mut args = root.args(&[&a], &["mean_return"]);
-    args.smooth = smooth;
+    args.smooth = Some(15);
+    let runs = [read(&a)];
+    let curve = groups::of(&runs, true)[0].curve("mean_return", &args);
+    assert_eq!(curve.unwrap().points, [(10.0, 1.5), (20.0, 2.0)]);
     let expected = "Smoothed: each point is the mean over the 15 frames before it.";
     assert!(drawn(&args).contains(expected));
 }
@@ -168,14 +163,6 @@ fn rows_at_the_same_place_are_one_point_whatever_their_order() {
 }
 
 #[test]
-fn a_folder_that_is_no_runs_is_left_out() {
-    let root = Runs::new();
-    let a = root.run("a", "c51", 1, METRICS);
-    let none = root.0.path().to_owned();
-    assert!(drawn(&root.args(&[&none, &a], &[])).contains("seed 1"));
-}
-
-#[test]
 fn a_random_policy_is_a_line() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, METRICS);
@@ -207,12 +194,12 @@ fn a_run_without_an_episode_is_named() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, METRICS);
     let empty = root.run("e", "c51", 1, "frames,mean_return\n9,\n");
-    let said = absent(RETURN, &[&a, &empty].map(read));
+    let runs = [&a, &empty].map(read);
     let expected = format!(
         "{} is not in the chart of mean_return: no episode has ended in it",
         empty.display()
     );
-    assert_eq!(said, [expected]);
+    assert!(absent(RETURN, &runs).eq([expected]));
 }
 
 #[test]

@@ -14,6 +14,7 @@ use driml_machine::resources;
 use driml_model::{Precision, kernels_in_words};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde_json::{Value, json};
 
 use self::{
     property::{Cases, Row},
@@ -22,8 +23,8 @@ use self::{
 };
 use crate::{
     cache::{self, Session},
-    flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values},
+    flags::{self, ExperimentFlags},
+    page::Table,
 };
 
 const NAME: &str = "stability";
@@ -69,7 +70,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     session.csv("promises", &table_of(&rows))?;
     session.figure("worst", &figure::figure(&rows, &thousands(cases(&rows))))?;
     let page = session.folder().join("README.md");
-    session.finish(&page_of(&rows, &settings, args.smoke))?;
+    session.finish(include_str!("page.md"), values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());
     Ok(())
@@ -123,7 +124,7 @@ fn verdict(rows: &[Row]) -> String {
     format!("{kept} of {all} promises are kept, in {cases} cases.")
 }
 
-fn page_of(rows: &[Row], settings: &Settings, smoke: bool) -> Page {
+fn values(rows: &[Row], settings: &Settings) -> Value {
     let broken = rows.iter().filter(|row| !row.is_kept()).map(|row| {
         let (worst, bound) = (number(row.worst), number(row.bound));
         format!(
@@ -145,16 +146,15 @@ fn page_of(rows: &[Row], settings: &Settings, smoke: bool) -> Page {
     let nearest: Vec<_> = nearest
         .map(|row| format!("{} ({:.0}%)", row.routine, share(row)))
         .collect();
-    let mut values = Values::default();
-    values
-        .set("verdict", verdict(rows))
-        .set("broken", broken.collect::<Vec<_>>())
-        .set("nearest", nearest.join(", "))
-        .set("processor", resources::processor())
-        .set("kernels", Precision::ALL.map(kernels_in_words).join("; "))
-        .set("draws", thousands(settings.draws))
-        .set("seeds", settings.seeds);
-    Page::new(include_str!("page.md"), values, &this_command(), smoke)
+    json!({
+        "verdict": verdict(rows),
+        "broken": broken.collect::<Vec<_>>(),
+        "nearest": nearest.join(", "),
+        "processor": resources::processor(),
+        "kernels": Precision::ALL.map(kernels_in_words).join("; "),
+        "draws": thousands(settings.draws),
+        "seeds": settings.seeds,
+    })
 }
 
 #[cfg(test)]
@@ -172,7 +172,10 @@ mod tests {
     #[test]
     fn the_page_and_the_verdict_name_what_is_broken() {
         let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
-        let page = |rows: &[Row]| page_of(rows, &settings, true).text(1.0, 1);
+        let page = |rows: &[Row]| {
+            let values = values(rows, &settings);
+            crate::page::page(include_str!("page.md"), values, true, 1.0, 1)
+        };
         let mut row = Row {
             routine: "halving".into(),
             range: "any".into(),

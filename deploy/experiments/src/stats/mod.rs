@@ -92,17 +92,6 @@ impl Difference {
     }
 }
 
-/// With its sign.
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Interval { mean, ends } = self.interval;
-        match ends {
-            None => write!(f, "{mean:+.2} (one seed)"),
-            Some((low, high)) => write!(f, "{mean:+.2} [{low:+.2}, {high:+.2}]"),
-        }
-    }
-}
-
 /// The mean of `to` minus that of `from`; none where either is empty.
 pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
     let interval = welch(from, to)?;
@@ -193,13 +182,14 @@ fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
 impl fmt::Display for Interval {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let decimals = f.precision().unwrap_or(2);
+        let number = |it: f64| match f.sign_plus() {
+            true => format!("{it:+.decimals$}"),
+            false => format!("{it:.decimals$}"),
+        };
+        let mean = number(self.mean);
         match self.ends {
-            None => write!(f, "{:.decimals$} (one seed)", self.mean),
-            Some((low, high)) => write!(
-                f,
-                "{:.decimals$} [{low:.decimals$}, {high:.decimals$}]",
-                self.mean
-            ),
+            None => write!(f, "{mean} (one seed)"),
+            Some((low, high)) => write!(f, "{mean} [{}, {}]", number(low), number(high)),
         }
     }
 }

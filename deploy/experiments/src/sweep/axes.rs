@@ -2,20 +2,21 @@
 //! What a setting means is for `driml local`, which takes each of them as it stands here.
 
 use driml_machine::error::{Usage, usage};
+use serde::Serialize;
 
 /// Most runs of a grid; more are a slip of the keyboard.
 const RUNS_MAX: usize = 10_000;
 
 /// What is varied, or fixed if it has one value alone.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Axis {
     /// As a column is headed: `env`, `agent`, or a setting's dotted path.
     pub(crate) name: String,
     pub(crate) values: Vec<String>,
 }
 
-/// One combination: a value of each axis, in their order.
-pub(crate) type Cell = Vec<String>;
+/// One combination: each axis' name and its value, in their order.
+pub(crate) type Cell = Vec<(String, String)>;
 
 impl Axis {
     /// Values of a flag of `driml local`.
@@ -87,13 +88,12 @@ pub(crate) fn cells(axes: &[Axis], seeds: u32) -> Result<Vec<Cell>, Usage> {
         ));
     }
     let mut cells = vec![Cell::new()];
-    for axis in axes {
-        let longer = |cell: &Cell| {
-            let cell = cell.clone();
-            let values = axis.values.iter();
-            values.map(move |value| [&cell[..], std::slice::from_ref(value)].concat())
+    for Axis { name, values } in axes {
+        let longer = |cell: Cell| {
+            let values = values.iter().map(|value| (name.clone(), value.clone()));
+            values.map(move |it| [&cell[..], &[it]].concat())
         };
-        cells = cells.iter().flat_map(longer).collect();
+        cells = cells.into_iter().flat_map(longer).collect();
     }
     Ok(cells)
 }
@@ -127,7 +127,8 @@ mod tests {
     fn cells_are_all_combinations() {
         let axes = ["a=1,2", "b=x", "c=3,4"].map(|it| Axis::parse(it).unwrap());
         let found = cells(&axes, 2).unwrap();
-        let found: Vec<String> = found.iter().map(|cell| cell.concat()).collect();
+        let values = |cell: &Cell| cell.iter().map(|it| it.1.as_str()).collect::<String>();
+        let found: Vec<String> = found.iter().map(values).collect();
         assert_eq!(found, ["1x3", "1x4", "2x3", "2x4"]);
         assert_eq!(cells(&[], 1).unwrap(), [Cell::new()]);
         let many: Vec<String> = (0..200).map(|it| it.to_string()).collect();

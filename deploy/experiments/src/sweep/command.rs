@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::{
     axes::{Axis, Cell, cells},
-    plan::{Call, Made, PlannedRun, seed_by_seed},
+    plan::{Call, Made, PlannedRun},
     queue,
 };
 use crate::{
@@ -27,30 +27,33 @@ const NAME_LETTERS: usize = 80;
 const LEGEND: &str = "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% \
                       interval (Student's t)\n";
 
-/// Makes the runs that are not there yet, then the table and the plot.
-pub(crate) fn run(args: &SweepArgs) -> anyhow::Result<()> {
+/// Makes a run for each combination of settings and each seed that is not there yet, then the table and the plot.
+///
+/// # Errors
+/// As [`crate::run`].
+pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let axes = axes_of(args)?;
     let cells = cells(&axes, args.seeds)?;
     let mut points = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
-        let config = call(args, &axes, cell, 1).config();
-        let config = config.map_err(|e| match &described(&axes, cell)[..] {
+        let config = call(args, cell, 1).config();
+        let config = config.map_err(|e| match &described(cell)[..] {
             "" => e,
             cell => usage!("{cell}: {e}"),
         })?;
-        points.push((at, config.frames()));
+        points.push((at, folder_name(&axes, cell, at), config.frames()));
     }
-    let plans = seed_by_seed(&points, args.seeds, |&(at, frames), seed| {
-        let name = format!("{}-seed{seed}", folder_name(&axes, &cells[at], at));
-        PlannedRun::new(name, call(args, &axes, &cells[at], seed), frames)
-    });
+    let mut plans = Vec::new();
+    for seed in 1..=args.seeds {
+        for (at, name, frames) in &points {
+            let name = format!("{name}-seed{seed}");
+            let call = call(args, &cells[*at], seed);
+            plans.push((*at, PlannedRun::new(name, call, *frames)));
+        }
+    }
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     // Other seeds, and more runs at once, are the same sweep.
-    let settings = json!({
-        "axes": axes.iter().map(|axis| json!({ "name": axis.name, "values": axis.values })).collect::<Vec<_>>(),
-        "preset": args.preset,
-        "frames": args.frames,
-    });
+    let settings = json!({ "axes": axes, "preset": args.preset, "frames": args.frames });
     let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
     session.work().1.clear();
@@ -92,23 +95,22 @@ fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
 }
 
 /// The call of a cell's run.
-fn call(args: &SweepArgs, axes: &[Axis], cell: &Cell, seed: u32) -> Call {
-    let value = |name: &str| {
-        let at = axes.iter().position(|axis| axis.name == name)?;
-        Some(cell[at].clone())
-    };
-    let sets = axes.iter().zip(cell);
-    let sets = sets.filter(|(axis, _)| axis.name != "env" && axis.name != "agent");
-    let sets = sets.map(|(axis, value)| format!("{}={value}", axis.name));
-    Call {
-        // A game may be named alone.
-        env: value("env").map(|name| full_name(&name)),
-        agent: value("agent"),
+fn call(args: &SweepArgs, cell: &Cell, seed: u32) -> Call {
+    let mut call = Call {
         preset: args.preset.clone(),
         seed,
         frames: args.frames,
-        sets: sets.collect(),
+        ..Call::default()
+    };
+    for (name, value) in cell {
+        match name.as_str() {
+            // A game may be named alone.
+            "env" => call.env = Some(full_name(value)),
+            "agent" => call.agent = Some(value.clone()),
+            _ => call.sets.push(format!("{name}={value}")),
+        }
     }
+    call
 }
 
 fn full_name(world: &str) -> String {
@@ -120,9 +122,8 @@ fn full_name(world: &str) -> String {
 }
 
 /// Such as `agent=c51, learner.batch_size=64`: the axes along which something changes.
-fn described(axes: &[Axis], cell: &Cell) -> String {
-    let words = axes.iter().zip(cell);
-    let words = words.map(|(axis, value)| format!("{}={value}", axis.name));
+fn described(cell: &Cell) -> String {
+    let words = cell.iter().map(|(name, value)| format!("{name}={value}"));
     words.collect::<Vec<_>>().join(", ")
 }
 
@@ -130,10 +131,10 @@ fn described(axes: &[Axis], cell: &Cell) -> String {
 fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     let mut name = (at + 1).to_string();
     let varied = axes.iter().zip(cell);
-    for (axis, value) in varied.filter(|(axis, _)| axis.values.len() > 1) {
-        let key = axis.name.rsplit('.').next().unwrap_or_default();
+    for (_, (axis, value)) in varied.filter(|(axis, _)| axis.values.len() > 1) {
+        let key = axis.rsplit('.').next().unwrap_or_default();
         let value = value.replace("procgen:", "");
-        name += &match axis.name.as_str() {
+        name += &match axis.as_str() {
             "env" | "agent" => format!("-{value}"),
             _ => format!("-{key}={value}"),
         };
@@ -143,33 +144,34 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     letters.take(NAME_LETTERS).collect()
 }
 
-/// What came out, a row a cell; the point of a run is its cell's number, and its frames.
-fn table(axes: &[Axis], cells: &[Cell], made: &[Made<(usize, u64)>]) -> Table {
+/// What came out, a row a cell; the point of a run is its cell's number.
+fn table(axes: &[Axis], cells: &[Cell], made: &[Made<usize>]) -> Table {
     let measured = "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
     let header = axes.iter().map(|axis| axis.name.as_str());
-    let header: Vec<_> = header.chain(measured.split(',')).collect();
+    let header = header.chain(measured.split(','));
     let row = |(at, cell): (usize, &Cell)| {
-        let here = made.iter().filter(|it| it.point.0 == at);
+        let here = made.iter().filter(|it| it.point == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
         let returns: Vec<f64> = runs.iter().filter_map(|it| it.mean_return).collect();
         let (found, returns) = (interval(&returns), Spread::of(returns));
-        let ends = found.and_then(|it| it.ends);
+        let ends = found.and_then(|it| it.ends).unzip();
         let speed = Spread::of(runs.iter().map(|it| it.updates_per_second));
         let minutes = Spread::of(runs.iter().map(|it| it.wall_seconds / 60.0));
-        let measured = [
-            runs.len().to_string(),
+        let mut row: Vec<_> = cell.iter().map(|it| it.1.clone()).collect();
+        row.push(runs.len().to_string());
+        row.extend([
             number(returns.map(|it| it.mean), 3),
             number(returns.filter(|it| it.count > 1).map(|it| it.sd), 3),
-            number(ends.map(|it| it.0), 3),
-            number(ends.map(|it| it.1), 3),
+            number(ends.0, 3),
+            number(ends.1, 3),
             number(returns.map(|it| it.min), 3),
             number(returns.map(|it| it.max), 3),
             number(speed.map(|it| it.mean), 2),
             number(minutes.map(|it| it.mean), 1),
-        ];
-        cell.iter().cloned().chain(measured).collect()
+        ]);
+        row
     };
-    Table::new(&header, cells.iter().enumerate().map(row))
+    Table::new(header, cells.iter().enumerate().map(row))
 }
 
 #[cfg(test)]

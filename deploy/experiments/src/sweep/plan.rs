@@ -127,21 +127,6 @@ impl<P> Swept<P> {
     }
 }
 
-/// Plans of every point with every seed. Seed by seed, so that a sweep that was stopped has one seed of everything before it has two of
-/// anything.
-pub(crate) fn seed_by_seed<P: Clone>(
-    points: &[P],
-    seeds: u32,
-    plan: impl Fn(&P, u32) -> PlannedRun,
-) -> Vec<Planned<P>> {
-    let plan = &plan;
-    let plans = (1..=seeds).flat_map(|seed| {
-        let of_seed = points.iter();
-        of_seed.map(move |point| (point.clone(), plan(point, seed)))
-    });
-    plans.collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -67,11 +67,10 @@ pub(crate) fn make<P>(
             queue.waiting.push_back((0, plan.clone()));
         }
     }
-    let made = queue.make(progress);
-    if made.is_err() {
+    if let Err(e) = queue.make(progress) {
         queue.stop(progress);
+        return Err(e);
     }
-    made?;
     let mut swept = Swept {
         made: Vec::new(),
         missing: Vec::new(),
@@ -304,20 +303,14 @@ impl Queue {
         if tried > 1 || !self.runs.is_made_by(plan) {
             return Ok(false);
         }
-        let (sentence, is_resumable) =
-            match resume::find(&folder, &Flags::default(), &Machine::this()) {
-                Ok(Found::Nothing(sentence)) => (sentence, false),
-                Ok(Found::Resumed(_)) => (
-                    format!("{} resumes from its checkpoint", folder.display()),
-                    true,
-                ),
-                Err(e) => (
-                    format!("{} cannot be resumed: {e:#}", folder.display()),
-                    false,
-                ),
-            };
-        progress.line(&sentence);
-        Ok(is_resumable)
+        let found = resume::find(&folder, &Flags::default(), &Machine::this());
+        let run = folder.display();
+        progress.line(&match &found {
+            Ok(Found::Nothing(sentence)) => sentence.clone(),
+            Ok(Found::Resumed(_)) => format!("{run} resumes from its checkpoint"),
+            Err(e) => format!("{run} cannot be resumed: {e:#}"),
+        });
+        Ok(matches!(found, Ok(Found::Resumed(_))))
     }
 
     /// The cores shared out among the runs at once, so that their learners do not get in each other's way.

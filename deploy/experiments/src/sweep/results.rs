@@ -2,14 +2,14 @@
 //! Returns of the training are in their summaries.
 
 use driml_launch::{
-    chosen::{Weights, Which},
+    chosen::{Weights, Which, config_of},
     evaluate::{Levels, Player, Who, random_returns},
     run_folder::RunFolder,
 };
 use driml_learner::checkpoint::{self, AVERAGE};
 
 use super::plan::FinishedRun;
-use crate::{cache::Session, plot::Run, progress::Progress};
+use crate::cache::Session;
 
 /// Seed of the played episodes: the same levels for every run.
 const SEED: u64 = 1;
@@ -34,7 +34,7 @@ impl Played {
         run: &FinishedRun,
     ) -> anyhow::Result<Option<Vec<f64>>> {
         let of = format!("{} {}", run.summary.weights_sha256, self.episodes);
-        self.piece(session, &of, key, || self.returns(&run.folder))
+        session.whole_piece(&of, key, self.units, || self.returns(&run.folder))
     }
 
     /// Returns of a random policy in a run's world, on the levels trained on.
@@ -44,23 +44,8 @@ impl Played {
         key: &str,
         run: &FinishedRun,
     ) -> anyhow::Result<Vec<f64>> {
-        self.piece(session, &self.episodes.to_string(), key, || {
-            let config = Run::read(&run.folder)?.config()?;
-            random_returns(&config, self.episodes as usize, SEED)
-        })
-    }
-
-    fn piece<T: serde::Serialize + serde::de::DeserializeOwned>(
-        self,
-        session: &mut Session,
-        of: &str,
-        key: &str,
-        play: impl FnOnce() -> anyhow::Result<T>,
-    ) -> anyhow::Result<T> {
-        session.piece_of(of, key, self.units, |progress: &mut Progress| {
-            let played = play()?;
-            progress.advance(self.units)?;
-            Ok(played)
+        session.whole_piece(&self.episodes.to_string(), key, self.units, || {
+            random_returns(&config_of(&run.folder)?, self.episodes as usize, SEED)
         })
     }
 

@@ -1,25 +1,34 @@
 //! Fig. 3: ghosts that can be predicted more or less, and one lethal ghost of four that changes, with and without noise in
-//! the walls. Runs are made by the engine in `sweep`; the picture is in `figure`, data and page in `report`.
+//! the walls. Runs are made by the engine in `sweep`; what they left is in `results`, the picture in `figure`.
 
 mod figure;
-mod report;
 mod results;
 mod settings;
 
-use self::{results::Results, settings::NAME};
+use driml_protocol::RETURNS_OF;
+use serde_json::{Value, json};
+
+use self::{
+    results::{LOSSES, Results, Trace},
+    settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PARTS},
+};
 use crate::{
     cache::Session,
-    flags::{PacmanArgs, this_command},
-    page::Page,
-    sweep::{plan::seed_by_seed, queue},
+    flags::PacmanArgs,
+    page::{Table, number},
+    sweep::queue,
 };
+
+/// Names of ghosts 0 to 3.
+const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
+/// How the page names (b) and (c).
+const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
 /// Runs the experiment.
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = settings::with_flags(args)?;
-    let plans = seed_by_seed(&settings.points(), settings.seeds, |point, seed| {
-        settings.plan(point, seed)
-    });
+    let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
+    let plans: Vec<_> = plans.collect();
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     let report = args.queue.report;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
@@ -27,9 +36,127 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     swept.check_any()?;
     let results = Results::read(settings, swept)?;
     session.figure("fig3", &figure::figure(&results))?;
-    report::write_data(&session, &results)?;
-    let (template, values) = (include_str!("pacman.md"), report::values(&results));
-    let page = Page::new(template, values, &this_command(), args.flags.smoke);
-    session.finish(&page)?;
+    write_data(&session, &results)?;
+    session.finish(include_str!("pacman.md"), values(&results))?;
     queue::check_made(&results.missing, report)
+}
+
+/// Writes the tables.
+fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let losses = results.losses.iter().map(|it| {
+        let of = format!("{},{},{}", it.epsilon, it.seed, it.column);
+        (of, it)
+    });
+    let points = losses.clone().flat_map(|(of, it)| {
+        let points = it.points.iter();
+        points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+    });
+    let columns = "epsilon,seed,loss,frames,nats";
+    session.csv("loss", &Table::of_lines(columns, points))?;
+    let ends =
+        losses.map(|(of, it)| format!("{of},{},{}", number(it.last, 4), number(it.whole, 4)));
+    let columns = "epsilon,seed,loss,last_fifth_nats,whole_nats";
+    session.csv("final_loss", &Table::of_lines(columns, ends))?;
+    for (name, traces) in PART_NAMES.iter().zip(&results.traces) {
+        let rows = traces.iter().flat_map(|it| {
+            let of = format!("{},{}", it.agent, it.seed);
+            let points = it.points.iter();
+            points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+        });
+        let columns = "agent,seed,episodes,mean_return";
+        session.csv(name, &Table::of_lines(columns, rows))?;
+    }
+    Ok(())
+}
+
+/// Of each epsilon its episodes, and the final losses of its runs.
+fn losses(results: &Results) -> Vec<Value> {
+    let epsilons = results.settings.predictability.epsilons.iter();
+    let row = |&epsilon: &f64| {
+        let of = |(column, _)| results.losses(column, epsilon).collect::<Vec<_>>();
+        let losses = LOSSES.map(of);
+        json!({
+            "epsilon": epsilon.to_string(),
+            "episodes": losses[0].iter().map(|it| it.episodes).collect::<Vec<_>>(),
+            "losses": losses,
+        })
+    };
+    epsilons.map(row).collect()
+}
+
+/// Of each task its lethal ghost, and of each agent the returns at its end and over it.
+fn tasks(part: usize, results: &Results) -> Vec<Value> {
+    let continual = results.settings.tasks(part);
+    let row = |task: usize| {
+        let ghost = continual.order[task % continual.order.len()];
+        let of_agent = |agent: &String| {
+            let both = results.traces(part, agent).filter_map(|it| it.tasks[task]);
+            let (end, over): (Vec<f64>, Vec<f64>) = both.unzip();
+            json!({ "end": end, "over": over })
+        };
+        let agents = results.settings.agents.iter().map(of_agent);
+        json!({
+            "number": task + 1,
+            "ghost": GHOSTS.get(usize::from(ghost)).unwrap_or(&"?"),
+            "agents": agents.collect::<Vec<_>>(),
+        })
+    };
+    (0..continual.tasks as usize).map(row).collect()
+}
+
+/// By seed, of each agent how much more it earns at the end of its last task than of its first, and how much more than the first agent
+/// over all tasks; where a run has both.
+fn differences(part: usize, results: &Results) -> Vec<Value> {
+    let agents = &results.settings.agents;
+    let row = |agent: &String, first: Option<&String>, values: Vec<f64>| {
+        let panel = PANELS[part];
+        let row = json!({ "panel": panel, "agent": agent, "first": first, "values": values });
+        (!values.is_empty()).then_some(row)
+    };
+    let gains = agents.iter().map(|agent| {
+        let gain = |it: &Trace| Some((*it.tasks.last()?)?.0 - (*it.tasks.first()?)?.0);
+        let gains = results.traces(part, agent).filter_map(gain);
+        row(agent, None, gains.collect())
+    });
+    let above_first = agents.iter().skip(1).map(|agent| {
+        let above = results.traces(part, agent).filter_map(|it| {
+            let mut of_first = results.traces(part, &agents[0]);
+            let other = of_first.find(|other| other.seed == it.seed)?;
+            Some(it.over_tasks()? - other.over_tasks()?)
+        });
+        row(agent, Some(&agents[0]), above.collect())
+    });
+    gains.chain(above_first).flatten().collect()
+}
+
+/// What the page says.
+fn values(results: &Results) -> Value {
+    let settings = &results.settings;
+    let (ghosts, noise) = (&settings.continual, &settings.noise);
+    let ranks = LOSSES.iter().filter_map(|(column, what)| {
+        let (rank, runs) = results.order_of_epsilon(column)?;
+        Some(json!({ "what": what, "rank": rank, "runs": runs }))
+    });
+    let differences = (0..PARTS).flat_map(|part| differences(part, results));
+    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
+    let mut sets = ghosts.sets.iter();
+    let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));
+    let order = results.order_of_epsilon(LOSSES[1].0);
+    let is_out_of_order = order.is_some_and(|(rank, _)| rank <= 0.0);
+    json!({
+        "settings": settings,
+        "agents": settings.agents,
+        "seeds": settings.seeds,
+        "ranks": ranks.collect::<Vec<_>>(),
+        "differences": differences.collect::<Vec<_>>(),
+        "losses": losses(results),
+        "ghosts": tasks(0, results),
+        "noise": tasks(1, results),
+        "missing": results.missing,
+        "out_of_order": is_out_of_order,
+        "capacity": capacity,
+        "short_tasks": short,
+        "returns_of": RETURNS_OF,
+        "episode_frames_max": EPISODE_FRAMES_MAX,
+    })
 }

@@ -22,12 +22,12 @@ use driml_machine::{error::usage, units::rough_duration};
 use driml_settings::{config::RunConfig, presets};
 
 use self::{
-    dials::{Dial, LevelOf, Point},
+    dials::Point,
     exactness::Exactness,
     plan::{Cost, Fit},
-    results::{PointResult, Results, SeedResult},
+    results::{PointResult, Results, SeedResult, fields},
     settings::Settings,
-    speed::{Effort, Speed},
+    speed::Speed,
 };
 use crate::{
     cache::{self, Session},
@@ -52,16 +52,6 @@ const OVERHEAD: f64 = 1.3;
 /// Seconds that processes take to start, and to save and end.
 const START_SECONDS: f64 = 4.0;
 
-/// The levels of the world's dials, and what fits into the budget.
-struct Plan {
-    levels: Vec<LevelOf>,
-    /// What each level's base and the level still cost.
-    costs: Vec<[Cost; 2]>,
-    chosen: Vec<bool>,
-    /// Of the chosen ones.
-    seconds: f64,
-}
-
 /// A call under way.
 struct Tradeoff<'a> {
     args: &'a TradeoffArgs,
@@ -71,21 +61,24 @@ struct Tradeoff<'a> {
     speeds: BTreeMap<String, Speed>,
 }
 
-/// Plans, benches, trains, and writes the page.
-pub(crate) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
+/// Measures what each dial that buys speed costs: plans, benches, trains, and writes the page.
+///
+/// # Errors
+/// As [`crate::run`].
+pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let world = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let name = format!("tradeoff-{}", world.to_string().replace("procgen:", ""));
-    let mut settings = settings::of(args, cache::settings_of(&name, &args.flags))?;
+    let found = cache::settings_of(&name, &args.flags);
+    let mut settings = settings::of(args, world, found)?;
     let report_only = args.queue.report;
     if !report_only {
-        let base = settings
-            .common
-            .config(&settings.all_dials[0].base_point())?;
+        let base = settings.common.config(&settings.levels[0].base)?;
         base.world.install(&mut console::line)?;
     }
-    let started = Instant::now();
+    // Machine time for the runs of this call.
+    let (started, budget_seconds) = (Instant::now(), f64::from(args.budget) * 60.0);
     if settings.frames_open {
-        shorten(&mut settings, Effort::of(args.flags.smoke))?;
+        shorten(&mut settings, args.flags.smoke, budget_seconds)?;
     }
     let mut it = Tradeoff {
         args,
@@ -94,15 +87,16 @@ pub(crate) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         speeds: BTreeMap::new(),
     };
     it.measure_speeds()?;
-    let left = (it.settings.budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
-    let plan = it.plan(left)?;
+    let left = (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
+    let costs = it.costs()?;
+    let fit = plan::fit(&costs, left);
     if !report_only {
-        print(&it.describe(&plan, left))?;
+        print(&it.describe(&costs, &fit, left))?;
     }
     if args.plan {
         return Ok(());
     }
-    let (session, results) = it.make(plan)?;
+    let results = it.make(&fit.chosen)?;
     if results.levels.is_empty() {
         if !results.points.is_empty() {
             queue::check_made(&results.missing, report_only)?;
@@ -115,24 +109,23 @@ pub(crate) fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
             usage!("{what}, and none fits into the budget: there is nothing to report").into(),
         );
     }
-    report::report(session, &results)?;
+    report::report(it.session, &results)?;
     queue::check_made(&results.missing, report_only)
 }
 
 /// Makes the runs shorter if not even the first level fits into the budget.
-fn shorten(settings: &mut Settings, effort: Effort) -> anyhow::Result<()> {
-    let mut asked = settings.all_dials.iter().filter(|it| settings.asks_for(it));
-    let Some(level) = asked.find_map(|dial| dial.level_points().next()) else {
+fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow::Result<()> {
+    let Some(level) = settings.levels.iter().find(|it| it.is_asked) else {
         return Ok(());
     };
     let base = settings.common.config(&level.base)?;
     let mut seconds = 0.0;
     for (point, is_base) in [(&level.base, true), (&level.point, false)] {
         let config = settings.common.config(point)?;
-        let speed = speed::measure(&base, &config, effort)?;
+        let speed = speed::measure(&base, &config, smoke)?;
         seconds += f64::from(settings.seeds_of(is_base)) * estimate(&config, &speed);
     }
-    settings.common.frames = plan::frames(settings.common.frames, seconds, settings.budget_seconds);
+    settings.common.frames = plan::frames(settings.common.frames, seconds, budget_seconds);
     Ok(())
 }
 
@@ -151,64 +144,42 @@ impl Tradeoff<'_> {
 
     /// The bench of every level that is asked for and of its base; of the others, and for a report, what is there.
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
-        let effort = Effort::of(self.args.flags.smoke);
+        let smoke = self.args.flags.smoke;
         let (units, program) = (self.piece_units(), cache::program()?);
-        for dial in &self.settings.all_dials {
-            let base = dial.base_point();
-            let levels = dial.level_points().map(|it| it.point);
-            for point in std::iter::once(base.clone()).chain(levels) {
-                let key = format!("speed-{}", point.key);
+        for of in &self.settings.levels {
+            for point in [&of.base, &of.point] {
                 if self.speeds.contains_key(&point.key) {
                     continue;
                 }
-                if self.args.queue.report || !self.settings.asks_for(dial) {
+                let key = format!("speed-{}", point.key);
+                let speed = if self.args.queue.report || !of.is_asked {
                     // Of whatever program made it: only what is asked for is made anew.
-                    let kept = self.session.kept_piece(&key);
-                    self.speeds.extend(kept.map(|speed| (point.key, speed)));
-                    continue;
-                }
-                let common = &self.settings.common;
-                let (base, config) = (common.config(&base)?, common.config(&point)?);
-                self.session.work().1.again(units);
-                let speed = self.session.piece_of(&program, &key, units, |progress| {
-                    let speed = speed::measure(&base, &config, effort)?;
-                    progress.advance(units)?;
-                    Ok(speed)
-                })?;
-                self.speeds.insert(point.key, speed);
+                    self.session.kept_piece(&key)
+                } else {
+                    let common = &self.settings.common;
+                    let (base, config) = (common.config(&of.base)?, common.config(point)?);
+                    self.session.work().1.again(units);
+                    let measure = || speed::measure(&base, &config, smoke);
+                    Some(self.session.whole_piece(&program, &key, units, measure)?)
+                };
+                self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
             }
         }
         Ok(())
     }
 
-    /// Every level of every dial, what it would cost, and whether it is run.
-    fn plan(&self, budget_seconds: f64) -> anyhow::Result<Plan> {
+    /// Of every level that is asked for what its base and it still cost; a report costs nothing, as it runs nothing.
+    fn costs(&self) -> anyhow::Result<Vec<Option<[Cost; 2]>>> {
         let runs = Runs::open(self.session.folder())?;
-        let dials = self.settings.all_dials.iter();
-        let levels: Vec<_> = dials.flat_map(Dial::level_points).collect();
         let mut costs = Vec::new();
-        for LevelOf { base, point, .. } in &levels {
-            let cost = |of| self.cost(&runs, of, base);
-            costs.push([cost(base)?, cost(point)?]);
+        for of in &self.settings.levels {
+            let cost = |point| self.cost(&runs, point, &of.base);
+            costs.push(match of.is_asked && !self.args.queue.report {
+                true => Some([cost(&of.base)?, cost(&of.point)?]),
+                false => None,
+            });
         }
-        let asked: Vec<usize> = (0..levels.len())
-            .filter(|&at| !self.args.queue.report && self.settings.asks_for(&levels[at].dial))
-            .collect();
-        let asked_costs: Vec<_> = asked.iter().map(|&at| costs[at].clone()).collect();
-        let Fit {
-            chosen: fits,
-            seconds,
-        } = plan::fit(&asked_costs, budget_seconds);
-        let mut chosen = vec![false; levels.len()];
-        for (at, fits) in asked.into_iter().zip(fits) {
-            chosen[at] = fits;
-        }
-        Ok(Plan {
-            levels,
-            costs,
-            chosen,
-            seconds,
-        })
+        Ok(costs)
     }
 
     /// What is left to run of a point, which is compared with this base or is it.
@@ -246,7 +217,7 @@ impl Tradeoff<'_> {
     }
 
     /// What is printed of the plan before anything is run.
-    fn describe(&self, plan: &Plan, left: f64) -> String {
+    fn describe(&self, costs: &[Option<[Cost; 2]>], fit: &Fit, left: f64) -> String {
         let common = &self.settings.common;
         let mut text = format!(
             "world       {}, {} frames a run, seeds 1 to {}\nsettings    preset {} with {}\n",
@@ -256,29 +227,30 @@ impl Tradeoff<'_> {
             common.preset,
             common.sets.join(", ")
         );
-        for (at, level) in plan.levels.iter().enumerate() {
-            let about = rough_duration(plan.costs[at][1].seconds);
-            let what = match (plan.chosen[at], plan.costs[at][1].seconds) {
+        for ((of, costs), chosen) in self.settings.levels.iter().zip(costs).zip(&fit.chosen) {
+            let Some([_, Cost { seconds, .. }]) = costs else {
+                continue;
+            };
+            let about = rough_duration(*seconds);
+            let what = match (chosen, *seconds) {
                 (true, 0.0) => "finished".to_owned(),
                 (true, _) => format!("about {about}"),
                 (false, _) => format!("does not fit, about {about}"),
             };
-            if self.settings.asks_for(&level.dial) {
-                text += &format!("level       {}: {what}\n", level.name());
-            }
+            text += &format!("level       {}: {what}\n", of.name());
         }
         text + &format!(
             "time        about {} of runs, with their bases, of {} that are left of the budget\n",
-            rough_duration(plan.seconds),
+            rough_duration(fit.seconds),
             rough_duration(left)
         )
     }
 
     /// The runs of the chosen levels and their bases, and those that are there already.
-    fn wanted(&self, plan: &Plan) -> anyhow::Result<Vec<Planned<Point>>> {
+    fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<Planned<Point>>> {
         // How many seeds of each point are to be there: none of what was not chosen.
         let mut points: Vec<(Point, u32)> = Vec::new();
-        for (of, &is_chosen) in plan.levels.iter().zip(&plan.chosen) {
+        for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
             for (point, is_base) in [(&of.base, true), (&of.point, false)] {
                 let seeds = u32::from(is_chosen) * self.settings.seeds_of(is_base);
                 match points.iter_mut().find(|(known, _)| known == point) {
@@ -303,18 +275,19 @@ impl Tradeoff<'_> {
     }
 
     /// Makes the chosen runs and plays with their weights, and those that are there already.
-    fn make(mut self, plan: Plan) -> anyhow::Result<(Session, Results)> {
-        let wanted = self.wanted(&plan)?;
+    fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
+        let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
         let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
         // A random policy plays once.
         self.session.work().1.again(work + units);
-        let jobs = self.settings.common.jobs;
-        let Swept { made, missing } = queue::make(&mut self.session, wanted, jobs, report_only)?;
+        let common = self.settings.common.clone();
+        let Swept { made, missing } =
+            queue::make(&mut self.session, wanted, common.jobs, report_only)?;
         let play = Played {
             levels: Levels::Train,
             checkpoints: 1,
-            episodes: self.settings.common.episodes,
+            episodes: common.episodes,
             units,
         };
         let commands = self.commands()?;
@@ -328,12 +301,10 @@ impl Tradeoff<'_> {
             }
             // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
             if !points.contains_key(&point.key) {
-                let result = PointResult {
-                    speed: self.speeds.get(&point.key).cloned(),
-                    exactness: Some(self.exactness(&point, &run)?),
-                    seeds: Vec::new(),
-                };
-                points.insert(point.key.clone(), result);
+                let mut measured = fields(self.speeds.get(&point.key));
+                measured.extend(fields(Some(self.exactness(&point, &run)?)));
+                let seeds = Vec::new();
+                points.insert(point.key.clone(), PointResult { measured, seeds });
             }
             points.entry(point.key).or_default().seeds.push(SeedResult {
                 seed: plan.call.seed,
@@ -343,38 +314,35 @@ impl Tradeoff<'_> {
         }
         let is_made = |point: &Point| points.contains_key(&point.key);
         let (mut levels, mut left_out) = (Vec::new(), Vec::new());
-        for (of, is_chosen) in plan.levels.into_iter().zip(plan.chosen) {
-            let is_asked = !report_only || self.settings.asks_for(&of.dial);
-            if is_made(&of.point) && is_made(&of.base) && is_asked {
-                levels.push(of);
+        for (of, is_chosen) in self.settings.levels.iter().zip(chosen) {
+            if is_made(&of.point) && is_made(&of.base) && (!report_only || of.is_asked) {
+                levels.push(of.clone());
             } else if !is_chosen {
                 left_out.push(of.name());
             }
         }
-        let results = Results {
+        Ok(Results {
+            common,
             commands,
-            smoke: self.args.flags.smoke,
             levels,
             points,
             random,
             left_out,
             missing,
-            settings: self.settings,
-        };
-        Ok((self.session, results))
+        })
     }
 
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Exactness> {
         let (units, config) = (self.piece_units(), self.settings.common.config(point)?);
         self.session.work().1.again(units);
-        let sizes = exactness::Sizes::of(&config);
-        let of = format!("{}, {sizes}", run.summary.weights_sha256);
+        let (rows, states) = exactness::sizes(&config);
+        let of = format!(
+            "{}, {rows} rows, {states} states",
+            run.summary.weights_sha256
+        );
         let key = format!("exactness-{}", point.key);
-        self.session.piece_of(&of, &key, units, |progress| {
-            let made = exactness::measure(&config, &run.folder)?;
-            progress.advance(units)?;
-            Ok(made)
-        })
+        let measure = || exactness::measure(&config, &run.folder);
+        self.session.whole_piece(&of, &key, units, measure)
     }
 
     /// The calls that made the folder's runs, this one last unless it makes none.

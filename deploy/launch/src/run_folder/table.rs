@@ -45,7 +45,7 @@ impl Table {
     }
 
     /// Reads the file at `path`; one that is not there is empty.
-    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+    pub fn read(path: &Path) -> anyhow::Result<Self> {
         let reading = || format!("reading {}", path.display());
         match fs::read(path) {
             Err(e) if e.kind() == ErrorKind::NotFound => Ok(Self::default()),

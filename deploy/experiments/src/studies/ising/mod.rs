@@ -1,7 +1,6 @@
 //! Fig. 2: local DIM on a patch of an Ising model in noise scores high where the future can be predicted.
 //! Learning and measuring are in `training`; here the seeds, the figures and the page.
 
-mod settings;
 mod training;
 
 use driml_envs::{WorldConfig, WorldName};
@@ -11,15 +10,13 @@ use driml_settings::{
     presets,
     resolve::{Flags, Source, resolve},
 };
+use serde_json::{Value, json};
 
-use self::{
-    settings::Settings,
-    training::{Episodes, Measured, Task, Trained, View, train},
-};
+use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
 use crate::{
     cache::Session,
-    flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values, numbers},
+    flags::{self, ExperimentFlags},
+    page::{Table, numbers},
     plot::Curve,
     stats::Spread,
 };
@@ -73,7 +70,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &trained)?;
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
-    session.finish(&page(&task, &trained, args.smoke))
+    session.finish(include_str!("page.md"), values(&task, &trained))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
@@ -219,21 +216,20 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
     }
 }
 
-fn page(task: &Task, trained: &[Trained], smoke: bool) -> Page {
+fn values(task: &Task, trained: &[Trained]) -> Value {
     let last: Vec<_> = trained.iter().map(|one| one.last).collect();
     let untrained: Vec<_> = trained.iter().map(|one| one.checks[0].1.auc).collect();
     let blind_loss = (task.settings.batch_size as f64).ln();
-    let mut values = Values::default();
-    values
-        .set("task", task)
-        .set("settings", &task.settings)
-        .set("seeds", trained.len())
-        .set("view", View::of(&task.model).side)
-        .set("last", last)
-        .set("untrained", untrained)
-        .set("blind_loss", blind_loss)
-        .set("loss_window", LOSS_WINDOW);
-    Page::new(include_str!("page.md"), values, &this_command(), smoke)
+    json!({
+        "task": task,
+        "settings": task.settings,
+        "seeds": trained.len(),
+        "view": View::of(&task.model).side,
+        "last": last,
+        "untrained": untrained,
+        "blind_loss": blind_loss,
+        "loss_window": LOSS_WINDOW,
+    })
 }
 
 #[cfg(test)]

@@ -12,13 +12,38 @@ use serde::{Deserialize, Serialize};
 
 use crate::{progress::Progress, stats::auc, studies::dim::DimLearner};
 
+/// The contents of `config.toml` or `smoke.toml` beside this file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Settings {
+    /// What differs from the settings of a run in this world, in the form of `--set`.
+    pub(super) sets: Vec<String>,
+    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    #[serde(skip_serializing)]
+    pub(super) seeds: u32,
+    /// Updates of a training.
+    pub(super) updates: u64,
+    /// Pairs in a batch, each with all others as negatives.
+    pub(super) batch_size: usize,
+    /// Measurements before the end.
+    pub(super) checks: u64,
+    /// Episodes of each.
+    pub(super) check_episodes: usize,
+    /// Episodes of the measurement at the end.
+    pub(super) episodes: usize,
+    /// Scores are those from this environment step to the next.
+    pub(super) from_t: u32,
+    /// The environment step of the late lattices.
+    pub(super) late_t: u32,
+}
+
 /// What one training depends on.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Task {
     pub(super) world: IsingConfig,
     pub(super) model: ModelConfig,
     pub(super) learner: LearnerSettings,
-    pub(super) settings: super::settings::Settings,
+    pub(super) settings: Settings,
 }
 
 /// Seed of the worlds that are measured on: the same for every training, and of none that is trained on.
@@ -65,18 +90,22 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     let dim = Dim { lambda, tanh_clip };
     let learner = DimLearner::new(&task.model, dim, adam, max_grad_norm, &mut rng)?;
     let mut scorer = Scorer { task, learner };
-    let mut pairs = Pairs {
-        task,
-        episodes: Episodes::default(),
-        batches_left: 0,
-    };
+    let (mut episodes, mut batches_left) = (Episodes::default(), 0);
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
     let period = (settings.updates / settings.checks.max(1)).max(1);
     for update in 0..settings.updates {
         if update.is_multiple_of(period) {
             checks.push((update, scorer.measure(settings.check_episodes)?.0));
         }
-        let (now, next) = pairs.batch(&mut rng)?;
+        if batches_left == 0 {
+            // As many batches as there are pairs in an episode: each is used once, on average.
+            batches_left = (task.world.episode_steps - 1).max(1);
+            // Below the measured worlds' seeds.
+            let seed = rng.random_range(0..MEASURED_SEED);
+            episodes = Episodes::play(&task.world, settings.batch_size, batches_left, seed)?;
+        }
+        batches_left -= 1;
+        let (now, next) = episodes.pairs(settings.batch_size, &mut rng);
         loss.push(scorer.learn(&now, &next)?);
         progress.advance(1)?;
     }
@@ -133,40 +162,18 @@ impl Episodes {
         let seed = MEASURED_SEED;
         Self::play(&task.world, task.settings.batch_size, steps, seed)
     }
-}
 
-/// Batches of pairs (s_t, s_{t+1}): each row another episode, at its own t.
-struct Pairs<'a> {
-    task: &'a Task,
-    episodes: Episodes,
-    batches_left: u32,
-}
-
-impl Pairs<'_> {
-    fn batch(&mut self, rng: &mut ChaCha8Rng) -> anyhow::Result<(Vec<u8>, Vec<u8>)> {
-        let Task {
-            world, settings, ..
-        } = self.task;
-        let rows = settings.batch_size;
-        if self.batches_left == 0 {
-            let steps = (world.episode_steps - 1).max(1);
-            // Below the measured worlds' seeds.
-            let seed = rng.random_range(0..MEASURED_SEED);
-            self.episodes = Episodes::play(world, rows, steps, seed)?;
-            // As many batches as there are pairs in an episode: each is used once, on average.
-            self.batches_left = steps;
-        }
-        self.batches_left -= 1;
-        let bytes = world.frame_shape().bytes();
-        let frames = &self.episodes.frames;
+    /// A batch of pairs (s_t, s_{t+1}): each row another episode, at its own t.
+    fn pairs(&self, rows: usize, rng: &mut ChaCha8Rng) -> (Vec<u8>, Vec<u8>) {
         let (mut now, mut next) = (Vec::new(), Vec::new());
         for row in 0..rows {
-            let t = rng.random_range(0..frames.len() - 1);
+            let t = rng.random_range(0..self.frames.len() - 1);
+            let bytes = self.frames[t].len() / rows;
             let place = row * bytes..(row + 1) * bytes;
-            now.extend_from_slice(&frames[t][place.clone()]);
-            next.extend_from_slice(&frames[t + 1][place]);
+            now.extend_from_slice(&self.frames[t][place.clone()]);
+            next.extend_from_slice(&self.frames[t + 1][place]);
         }
-        Ok((now, next))
+        (now, next)
     }
 }
 
@@ -199,13 +206,6 @@ impl Scorer<'_> {
         Ok(local.to_scalar()?)
     }
 
-    /// Clipped scores [L, B, B] of every anchor with every candidate, at each location.
-    fn scores(&self, now: &[u8], next: &[u8]) -> anyhow::Result<Vec<f64>> {
-        let (now, next) = (self.features(now)?, self.features(next)?);
-        let local = [true, false, false, false];
-        self.learner.scores(&now, &next, local)
-    }
-
     /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
     fn measure(&self, episodes: usize) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
         let Task {
@@ -222,7 +222,12 @@ impl Scorer<'_> {
         for batch in 0..episodes.div_ceil(rows).max(1) {
             let seed = MEASURED_SEED + batch as u64;
             let played = Episodes::play(world, rows, settings.from_t + 1, seed)?;
-            let scores = self.scores(&played.frames[t], &played.frames[t + 1])?;
+            let (now, next) = (&played.frames[t], &played.frames[t + 1]);
+            let (now, next) = (self.features(now)?, self.features(next)?);
+            // [L, B, B] of every anchor with every candidate, at each location.
+            let scores = self
+                .learner
+                .scores(&now, &next, [true, false, false, false])?;
             let logs = log_softmax(&scores, rows);
             let locations = scores.len() / (rows * rows);
             for location in 0..locations {

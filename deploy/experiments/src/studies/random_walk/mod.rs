@@ -4,21 +4,19 @@
 pub(crate) mod chain;
 mod figures;
 mod results;
-mod settings;
 mod training;
 
 use serde_json::{Value, json};
 
 use self::{
     chain::Chain,
-    results::{Measure, Results, Trained},
-    settings::Settings,
-    training::{Sampling, train},
+    results::{Measure, Results, SHARE, TV, Trained},
+    training::{Sampling, Settings, train},
 };
 use crate::{
     cache::Session,
-    flags::{self, ExperimentFlags, this_command},
-    page::{Page, Table, Values, number, numbers},
+    flags::{self, ExperimentFlags},
+    page::{Table, number, numbers},
     plot::Curve,
     stats::Spread,
 };
@@ -49,7 +47,10 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         let learnt = session.piece(&key, settings.updates, |progress| {
             train(&chain, &settings, sampling, seed.into(), progress)
         })?;
+        let share = settings.share_reached * chain.mutual_information();
         trained.push(Trained {
+            updates_to_tv: learnt.updates_to(&learnt.tv, settings.tv_reached),
+            updates_to_share: learnt.updates_to(&learnt.excess, share),
             chain,
             sampling,
             seed,
@@ -60,7 +61,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &results)?;
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
-    session.finish(&page(&results, args.smoke))
+    session.finish(include_str!("page.md"), values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -93,17 +94,11 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     session.csv("ratio", &Table::of_lines(columns, entries))?;
 
     let times = results.trained.iter().map(|one| {
-        let time = |measure| number(results.time(one, measure).map(|it| it as f64), 0);
-        format!(
-            "{},{},{},{:.6},{},{},{}",
-            one.sampling.name(),
-            one.chain.alpha,
-            one.seed,
-            one.chain.spectral_gap(),
-            time(Measure::Tv),
-            time(Measure::Share),
-            numbers([one.final_tv(), one.final_excess()], 6),
-        )
+        let time = |measure: Measure| number(measure(one).map(|it| it as f64), 0);
+        let (name, alpha, seed) = (one.sampling.name(), one.chain.alpha, one.seed);
+        let (gap, tv, share) = (one.chain.spectral_gap(), time(TV), time(SHARE));
+        let last = numbers([one.final_tv(), one.final_excess()], 6);
+        format!("{name},{alpha},{seed},{gap:.6},{tv},{share},{last}")
     });
     let columns =
         "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
@@ -120,7 +115,7 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     session.csv("curves", &Table::of_lines(columns, curves))
 }
 
-fn page(results: &Results, smoke: bool) -> Page {
+fn values(results: &Results) -> Value {
     let settings = &results.settings;
     let truth = results.true_ratio();
     let of_seed = |one: &Trained| {
@@ -130,7 +125,7 @@ fn page(results: &Results, smoke: bool) -> Page {
     let at_figure = || results.of(Sampling::Stationary, settings.figure_alpha);
     let errors: Vec<Spread> = at_figure().filter_map(of_seed).collect();
     let of_errors = |part: fn(&Spread) -> f64| errors.iter().map(part).collect::<Vec<_>>();
-    let holds = |measure| {
+    let holds = |measure: Measure| {
         let found = results.gap_correlations(Sampling::Stationary, measure);
         Spread::of(found).is_some_and(|spread| spread.mean > 0.5)
     };
@@ -144,51 +139,51 @@ fn page(results: &Results, smoke: bool) -> Page {
         })
     });
     let final_tv = at_figure().map(Trained::final_tv);
-    let mut values = Values::default();
-    values
-        .set("settings", settings)
-        .set("seeds", settings.seeds)
-        .set("mean_errors", of_errors(|it| it.mean))
-        .set("largest_errors", of_errors(|it| it.max))
-        .set("largest_ratio", truth.iter().copied().fold(0.0, f64::max))
-        .set("final_tv", final_tv.collect::<Vec<_>>())
-        .set("convergence", convergence(results))
-        .set("missed", 1.0 - settings.share_reached)
-        .set("tv_reached", settings.tv_reached)
-        .set("absolute", holds(Measure::Tv))
-        .set("relative", holds(Measure::Share))
-        .set("closed_forms", closed_forms)
-        .set("most", (settings.states as f64).ln());
-    Page::new(include_str!("page.md"), values, &this_command(), smoke)
+    json!({
+        "settings": settings,
+        "seeds": settings.seeds,
+        "mean_errors": of_errors(|it| it.mean),
+        "largest_errors": of_errors(|it| it.max),
+        "largest_ratio": truth.iter().copied().fold(0.0, f64::max),
+        "final_tv": final_tv.collect::<Vec<_>>(),
+        "convergence": convergence(results),
+        "missed": 1.0 - settings.share_reached,
+        "tv_reached": settings.tv_reached,
+        "absolute": holds(TV),
+        "relative": holds(SHARE),
+        "closed_forms": closed_forms,
+        "most": (settings.states as f64).ln(),
+    })
 }
 
 /// How long each sampling takes, by either measure: the updates at the first, the figure's and the last alpha.
 fn convergence(results: &Results) -> Vec<Value> {
-    let settings = &results.settings;
-    let alpha = settings.figure_alpha;
-    let ends = [settings.alphas.first(), settings.alphas.last()];
-    let [first, last] = ends.map(|end| end.copied().unwrap_or(alpha));
-    let measures = [Measure::Tv, Measure::Share].into_iter();
-    let all = measures.flat_map(|it| Sampling::ALL.map(|sampling| (it, sampling)));
-    let row = |(measure, sampling): (Measure, Sampling)| {
-        let time_at = |alpha: f64| {
-            let times = results.of(sampling, alpha);
-            let times = times.filter_map(|one| results.time(one, measure));
-            json!({ "alpha": alpha, "updates": times.collect::<Vec<_>>() })
-        };
-        let trained = results.trained.iter();
-        let trained = trained.filter(|one| one.sampling == sampling);
-        let late = trained.filter(|one| results.time(one, measure).is_none());
-        let (times, late) = ([first, alpha, last].map(time_at), late.count());
-        json!({
-            "measure": measure,
-            "sampling": sampling.name(),
-            "times": times,
-            "late": late,
-            "correlations": results.gap_correlations(sampling, measure),
-        })
-    };
-    all.map(row).collect()
+    let Settings {
+        alphas,
+        figure_alpha,
+        ..
+    } = &results.settings;
+    let ends = [alphas.first(), alphas.last()];
+    let [first, last] = ends.map(|end| end.unwrap_or(figure_alpha));
+    let mut rows = Vec::new();
+    for (name, measure) in [("tv", TV), ("share", SHARE)] {
+        for sampling in Sampling::ALL {
+            let times = [first, figure_alpha, last].map(|&alpha| {
+                let times = results.of(sampling, alpha).filter_map(measure);
+                json!({ "alpha": alpha, "updates": times.collect::<Vec<_>>() })
+            });
+            let trained = results.trained.iter();
+            let late = trained.filter(|it| it.sampling == sampling && measure(it).is_none());
+            rows.push(json!({
+                "measure": name,
+                "sampling": sampling.name(),
+                "times": times,
+                "late": late.count(),
+                "correlations": results.gap_correlations(sampling, measure),
+            }));
+        }
+    }
+    rows
 }
 
 #[cfg(test)]

@@ -1,23 +1,24 @@
 //! All trainings of the grid, and what follows from them together.
 
-use serde::Serialize;
-
 use super::{
     chain::Chain,
-    settings::Settings,
-    training::{Learnt, Sampling},
+    training::{Learnt, Sampling, Settings},
 };
 use crate::{
     plot::Curve,
     stats::{Spread, rank_correlation},
 };
 
-/// One piece of the grid.
+/// One training of the grid.
 pub(super) struct Trained {
     pub(super) chain: Chain,
     pub(super) sampling: Sampling,
     pub(super) seed: u32,
     pub(super) learnt: Learnt,
+    /// Updates until the law of the next state is near the true one, however near a blind guess is; none if it never was.
+    pub(super) updates_to_tv: Option<u64>,
+    /// Updates until most of what there is to learn is learnt, however little that is; none if it never was.
+    pub(super) updates_to_share: Option<u64>,
 }
 
 impl Trained {
@@ -29,6 +30,11 @@ impl Trained {
         self.learnt.excess.last().copied().unwrap_or(f64::NAN)
     }
 }
+
+/// When a training counts as converged.
+pub(super) type Measure = fn(&Trained) -> Option<u64>;
+pub(super) const TV: Measure = |it| it.updates_to_tv;
+pub(super) const SHARE: Measure = |it| it.updates_to_share;
 
 /// All trainings, and what was asked for.
 pub(super) struct Results {
@@ -91,18 +97,6 @@ impl Results {
         }))
     }
 
-    /// Updates until a training's error is small; none where it never was.
-    pub(super) fn time(&self, one: &Trained, measure: Measure) -> Option<u64> {
-        let learnt = &one.learnt;
-        match measure {
-            Measure::Tv => learnt.updates_to(&learnt.tv, self.settings.tv_reached),
-            Measure::Share => {
-                let all = one.chain.mutual_information();
-                learnt.updates_to(&learnt.excess, self.settings.share_reached * all)
-            }
-        }
-    }
-
     /// Of each seed, the rank correlation over alpha between 1 / gap and the updates until the error is small.
     ///
     /// A training that never got there counts as one update more than the longest.
@@ -111,22 +105,11 @@ impl Results {
             let all = self.trained.iter();
             let of_seed = all.filter(|one| one.sampling == sampling && one.seed == seed);
             let pairs = of_seed.map(|one| {
-                let time = self.time(one, measure);
-                let time = time.unwrap_or(self.settings.updates + 1);
+                let time = measure(one).unwrap_or(self.settings.updates + 1);
                 (1.0 / one.chain.spectral_gap(), time as f64)
             });
             rank_correlation(&pairs.collect::<Vec<_>>())
         };
         (1..=self.settings.seeds).filter_map(of_seed).collect()
     }
-}
-
-/// When a training counts as converged; the page names it.
-#[derive(Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub(super) enum Measure {
-    /// The law of the next state is near the true one, however near a blind guess is.
-    Tv,
-    /// Most of what there is to learn is learnt, however little that is.
-    Share,
 }

@@ -20,8 +20,7 @@ pub(super) fn figure(results: &Results) -> Figure {
         let mut series = Vec::new();
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
-            let here = results.losses(column).filter(|it| it.epsilon == epsilon);
-            let each = here.map(|it| {
+            let each = results.losses(column, epsilon).map(|it| {
                 let mut points = smoothed(&it.points, window);
                 // While the learner catches up at the end, several rows have the same frames.
                 points.dedup_by_key(|point| point.0);
@@ -79,7 +78,7 @@ fn task_series(results: &Results, part: usize) -> Vec<Series> {
         series.push(curve.series(agent, index));
         let tasks = if index == 0 { continual.tasks } else { 0 };
         for task in 0..tasks {
-            let ends = own().filter_map(|trace| trace.task(continual, task));
+            let ends = own().filter_map(|trace| trace.tasks[task as usize]);
             if let Some(end) = Spread::of(ends.map(|it| it.0)) {
                 let x = length * task as f64;
                 let line = vec![(x, end.mean), (x + length, end.mean)];

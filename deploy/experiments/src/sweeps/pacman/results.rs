@@ -1,5 +1,7 @@
 //! What the runs of Fig. 3 left: their losses over frames, and their returns over episodes.
 
+use serde::Serialize;
+
 use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
@@ -22,21 +24,23 @@ pub(super) struct Results {
     pub(super) losses: Vec<Loss>,
     /// Of (b) and of (c).
     pub(super) traces: [Vec<Trace>; PARTS],
-    /// Of each epsilon the episodes of its runs.
-    pub(super) episodes: Vec<(f64, f64)>,
     /// Runs that are missing.
     pub(super) missing: Vec<String>,
 }
 
 /// A loss over frames, of a run of (a).
+#[derive(Serialize)]
 pub(super) struct Loss {
     pub(super) epsilon: f64,
     pub(super) seed: u32,
     pub(super) column: &'static str,
+    #[serde(skip)]
     pub(super) points: Points,
     /// Means of the last fifth and of the whole run; none if it has no value there.
     pub(super) last: Option<f64>,
     pub(super) whole: Option<f64>,
+    /// Of the run.
+    pub(super) episodes: f64,
 }
 
 /// Training return over episodes.
@@ -44,53 +48,56 @@ pub(super) struct Trace {
     pub(super) agent: String,
     pub(super) seed: u32,
     pub(super) points: Points,
+    /// Of each task the mean return at its end, and its mean over the task; none if the run has no row there.
+    pub(super) tasks: Vec<Option<(f64, f64)>>,
 }
 
 impl Results {
     /// Reads the metrics of the finished runs.
     pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
-        let mut results = Self {
-            losses: Vec::new(),
-            traces: std::array::from_fn(|_| Vec::new()),
-            episodes: Vec::new(),
-            missing: swept.missing,
-            settings,
-        };
+        let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
         for Made { point, plan, run } in swept.made {
             let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
             match point {
                 Point::Epsilon(epsilon) => {
-                    let episodes = run.summary.episodes as f64;
-                    results.episodes.push((epsilon, episodes));
-                    let frames = results.settings.predictability.frames as f64;
+                    let frames = settings.predictability.frames as f64;
                     for (column, _) in LOSSES {
                         let points = metrics.values(column)?;
-                        results.losses.push(Loss {
+                        losses.push(Loss {
                             epsilon,
                             seed,
                             column,
                             last: mean_from(&points, frames * (1.0 - FINAL)),
                             whole: mean_from(&points, 0.0),
+                            episodes: run.summary.episodes as f64,
                             points,
                         });
                     }
                 }
                 Point::Tasks(part, agent) => {
-                    let points = trace(&metrics, results.settings.tasks(part))?;
-                    results.traces[part].push(Trace {
+                    let continual = settings.tasks(part);
+                    let points = trace(&metrics, continual)?;
+                    traces[part].push(Trace {
                         agent,
                         seed,
+                        tasks: tasks(&points, continual),
                         points,
                     });
                 }
             }
         }
-        Ok(results)
+        Ok(Self {
+            settings,
+            losses,
+            traces,
+            missing: swept.missing,
+        })
     }
 
-    /// The losses of one column.
-    pub(super) fn losses(&self, column: &str) -> impl Iterator<Item = &Loss> {
-        self.losses.iter().filter(move |it| it.column == column)
+    /// The losses of one column and one epsilon.
+    pub(super) fn losses(&self, column: &str, epsilon: f64) -> impl Iterator<Item = &Loss> {
+        let all = self.losses.iter();
+        all.filter(move |it| it.column == column && it.epsilon == epsilon)
     }
 
     /// The traces of an agent, by seed.
@@ -101,10 +108,9 @@ impl Results {
 
     /// Rank correlation of epsilon and a final loss, and of how many runs it is.
     pub(super) fn order_of_epsilon(&self, column: &str) -> Option<(f64, usize)> {
-        let pairs = self.losses(column);
-        let pairs: Points = pairs
-            .filter_map(|it| Some((it.epsilon, it.last?)))
-            .collect();
+        let pairs = self.losses.iter().filter(|it| it.column == column);
+        let pairs = pairs.filter_map(|it| Some((it.epsilon, it.last?)));
+        let pairs: Points = pairs.collect();
         Some((rank_correlation(&pairs)?, pairs.len()))
     }
 }
@@ -126,19 +132,22 @@ fn trace(run: &Run, continual: &Continual) -> anyhow::Result<Points> {
     Ok(points)
 }
 
-impl Trace {
-    /// The mean return at the end of a task, counted from 0, and its mean over the task; none if the run has no row there.
-    pub(super) fn task(&self, continual: &Continual, task: u64) -> Option<(f64, f64)> {
-        let length = continual.episodes_per_task as f64;
+/// See [`Trace::tasks`].
+fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
+    let length = continual.episodes_per_task as f64;
+    let of_task = |task: u64| {
         let (start, end) = (length * task as f64, length * (task + 1) as f64);
-        let inside = self.points.iter().filter(|(x, _)| *x > start && *x <= end);
+        let inside = points.iter().filter(|(x, _)| *x > start && *x <= end);
         let values: Vec<f64> = inside.map(|point| point.1).collect();
-        Some((*values.last()?, Spread::of(values.iter().copied())?.mean))
-    }
+        Some((*values.last()?, Spread::of(values)?.mean))
+    };
+    (0..continual.tasks).map(of_task).collect()
+}
 
+impl Trace {
     /// The mean over all tasks; none if the run lacks one.
-    pub(super) fn over_tasks(&self, continual: &Continual) -> Option<f64> {
-        let tasks = (0..continual.tasks).map(|task| Some(self.task(continual, task)?.1));
+    pub(super) fn over_tasks(&self) -> Option<f64> {
+        let tasks = self.tasks.iter().map(|task| Some((*task)?.1));
         Spread::of(tasks.collect::<Option<Vec<_>>>()?).map(|spread| spread.mean)
     }
 }
@@ -150,19 +159,14 @@ mod tests {
     #[test]
     fn a_task_s_end_is_its_last_row() {
         let continual = Continual {
-            tasks: 2,
+            tasks: 3,
             order: vec![0, 2],
             episodes_per_task: 10,
             envs: 2,
             sets: Vec::new(),
         };
-        let trace = Trace {
-            agent: "c51".into(),
-            seed: 1,
-            points: vec![(4.0, 1.0), (10.0, 3.0), (11.0, 0.0), (18.0, 5.0)],
-        };
-        for (task, expected) in [(0, Some((3.0, 2.0))), (1, Some((5.0, 2.5))), (2, None)] {
-            assert_eq!(trace.task(&continual, task), expected);
-        }
+        let points = vec![(4.0, 1.0), (10.0, 3.0), (11.0, 0.0), (18.0, 5.0)];
+        let expected = [Some((3.0, 2.0)), Some((5.0, 2.5)), None];
+        assert_eq!(tasks(&points, &continual), expected);
     }
 }

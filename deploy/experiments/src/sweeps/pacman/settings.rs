@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     flags::{PacmanArgs, sweep_settings},
-    sweep::plan::{Call, PlannedRun},
+    sweep::plan::{Call, Planned, PlannedRun},
 };
 
 pub(super) const NAME: &str = "pacman";
@@ -91,47 +91,47 @@ impl Settings {
         [&self.continual, &self.noise][part]
     }
 
-    /// What there are runs for, with each seed.
-    pub(super) fn points(&self) -> Vec<Point> {
-        let epsilons = self.predictability.epsilons.iter();
-        let epsilons = epsilons.map(|&epsilon| Point::Epsilon(epsilon));
-        let agents = |part| {
-            let agents = self.agents.iter();
-            agents.map(move |agent| Point::Tasks(part, agent.clone()))
-        };
-        epsilons.chain((0..PARTS).flat_map(agents)).collect()
-    }
-
-    /// The run of a seed.
-    pub(super) fn plan(&self, point: &Point, seed: u32) -> PlannedRun {
-        match point {
-            Point::Epsilon(epsilon) => {
-                let Predictability { agent, frames, .. } = &self.predictability;
-                let sets = [format!("world.epsilon={epsilon}")];
-                let call = self.call(agent, seed, *frames, &sets);
-                PlannedRun::new(format!("epsilon{epsilon}-seed{seed}"), call, *frames)
-            }
-            Point::Tasks(part, agent) => {
-                let continual = self.tasks(*part);
-                let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
-                let mut sets = continual.sets.clone();
-                sets.push(format!(
-                    "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",
-                    continual.episodes_per_task / continual.envs,
-                    order.join(",")
-                ));
-                sets.push("local.actors=1".into());
-                sets.push(format!("actor.envs={}", continual.envs));
-                let episodes = continual.episodes();
-                let frames = episodes * EPISODE_FRAMES_MAX;
-                let name = format!("{}-{agent}-seed{seed}", PART_NAMES[*part]);
-                PlannedRun {
+    /// The runs of a seed.
+    pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
+        let mut plans = Vec::new();
+        let Predictability {
+            agent,
+            epsilons,
+            frames,
+        } = &self.predictability;
+        for &epsilon in epsilons {
+            let name = format!("epsilon{epsilon}-seed{seed}");
+            let call = self.call(agent, seed, *frames, &[format!("world.epsilon={epsilon}")]);
+            let plan = PlannedRun::new(name, call, *frames);
+            plans.push((Point::Epsilon(epsilon), plan));
+        }
+        for part in 0..PARTS {
+            let continual = self.tasks(part);
+            let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
+            let schedule = format!(
+                "world.lethal_schedule={{episodes_per_task={},order=[{}]}}",
+                continual.episodes_per_task / continual.envs,
+                order.join(",")
+            );
+            let envs = format!("actor.envs={}", continual.envs);
+            let sets = [
+                &continual.sets[..],
+                &[schedule, "local.actors=1".into(), envs],
+            ];
+            let episodes = continual.episodes();
+            let frames = episodes * EPISODE_FRAMES_MAX;
+            for agent in &self.agents {
+                let name = format!("{}-{agent}-seed{seed}", PART_NAMES[part]);
+                let call = self.call(agent, seed, frames, &sets.concat());
+                let plan = PlannedRun {
                     episodes: Some(episodes),
                     units: episodes * EPISODE_FRAMES,
-                    ..PlannedRun::new(name, self.call(agent, seed, frames, &sets), frames)
-                }
+                    ..PlannedRun::new(name, call, frames)
+                };
+                plans.push((Point::Tasks(part, agent.clone()), plan));
             }
         }
+        plans
     }
 
     fn call(&self, agent: &str, seed: u32, frames: u64, sets: &[String]) -> Call {

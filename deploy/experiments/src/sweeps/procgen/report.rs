@@ -1,26 +1,139 @@
-//! Figure and page of table 1, from finished runs.
+//! What the runs of table 1 gave: data, figure and page.
 
+use std::collections::BTreeMap;
+
+use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
-use driml_launch::evaluate::Levels;
+use driml_launch::{evaluate::Levels, run_folder::RunFolder};
 use driml_protocol::RETURNS_OF;
+use serde::Serialize;
+use serde_json::{Value, json};
 
-use super::{
-    results::{ERRORS, Game},
-    settings::{CHECKPOINTS, Settings},
-};
+use super::settings::{CHECKPOINTS, Point, Settings};
 use crate::{
     cache::Session,
-    page::Values,
+    page::{Table, number},
     plot::{Run, over_seeds},
-    stats::over_games::{Scores, improvement, iqm},
-    sweep::results::mean,
-    sweeps::published::Published,
+    stats::{
+        Spread,
+        over_games::{Scores, improvement, iqm},
+    },
+    sweep::{plan::Made, results::mean},
+    sweeps::published::{normalised, paper},
 };
 
+/// Standard errors from which on a mean return counts as different from the random policy's.
+const ERRORS: f64 = 2.0;
 /// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;
 /// Seeds of each game and agent from which on scores over all games are made.
 const SEEDS_MIN: usize = 3;
+
+/// A run and how it plays.
+pub(super) struct Scored {
+    pub(super) made: Made<Point>,
+    /// Returns of its agent, played greedily.
+    pub(super) greedy: Vec<f64>,
+    /// Returns of a random policy in its world.
+    pub(super) random: Vec<f64>,
+}
+
+impl Scored {
+    /// Whether a run's greedy episodes are better than the random policy's.
+    fn is_above_random(&self) -> bool {
+        let spreads = [&self.greedy, &self.random].map(|it| Spread::of(it.iter().copied()));
+        let [Some(greedy), Some(random)] = spreads else {
+            return false;
+        };
+        let error = |it: Spread| it.sd.powi(2) / it.count as f64;
+        greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
+    }
+}
+
+/// A game that has a run.
+#[derive(Serialize)]
+pub(super) struct Game<'a> {
+    name: &'a str,
+    /// Returns of the random policy.
+    random: &'a [f64],
+    /// Of each agent that is asked for, in that order.
+    agents: Vec<OfAgent<'a>>,
+}
+
+/// What the runs of an agent in a game gave; nothing where none is finished.
+#[derive(Serialize)]
+struct OfAgent<'a> {
+    #[serde(skip)]
+    runs: Vec<&'a Made<Point>>,
+    training: Vec<f64>,
+    greedy: Vec<f64>,
+    paper: Option<f64>,
+    /// Whether each of the runs plays better than at random.
+    is_above_random: bool,
+}
+
+/// The games of all runs.
+pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Game<'a>> {
+    let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
+    for it in scored {
+        games.entry(&it.made.point.game).or_default().push(it);
+    }
+    let of = |name: &str, runs: &[&'a Scored], agent: &String| {
+        let own = || runs.iter().filter(|it| it.made.point.agent == *agent);
+        let training = own().filter_map(|it| it.made.run.summary.mean_return);
+        OfAgent {
+            runs: own().map(|it| &it.made).collect(),
+            training: training.collect(),
+            greedy: own().filter_map(|it| mean(&it.greedy)).collect(),
+            paper: paper(name, agent),
+            is_above_random: own().all(|it| it.is_above_random()),
+        }
+    };
+    let game = |(name, runs): (&'a str, Vec<&'a Scored>)| Game {
+        name,
+        random: &runs[0].random,
+        agents: settings
+            .agents
+            .iter()
+            .map(|it| of(name, &runs, it))
+            .collect(),
+    };
+    games.into_iter().map(game).collect()
+}
+
+/// A line a run.
+pub(super) fn data(scored: &[Scored]) -> anyhow::Result<Table> {
+    let mut rows = Vec::new();
+    for it in scored {
+        let Made { point, plan, run } = &it.made;
+        rows.push(vec![
+            point.game.clone(),
+            point.agent.clone(),
+            torso(&run.folder)?,
+            plan.call.seed.to_string(),
+            run.summary.frames.to_string(),
+            number(run.summary.mean_return, 4),
+            number(mean(&it.greedy), 4),
+            number(mean(&it.random), 4),
+            number(paper(&point.game, &point.agent), 4),
+            format!("{:.0}", run.summary.wall_seconds),
+            run.commit.clone(),
+        ]);
+    }
+    let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
+    Ok(Table::new(columns.split(','), rows))
+}
+
+/// The torso of a run's network, from its settings; those without a choice have the one of Nature's DQN.
+fn torso(folder: &RunFolder) -> anyhow::Result<String> {
+    let path = folder.config();
+    let text = std::fs::read_to_string(&path);
+    let text = text.with_context(|| format!("reading {}", path.display()))?;
+    let config: toml::Table = text.parse()?;
+    let torso = config.get("model").and_then(|model| model.get("torso"));
+    let torso = torso.and_then(toml::Value::as_str);
+    Ok(torso.unwrap_or("nature").to_owned())
+}
 
 /// Training return over frames, a chart a game.
 pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<Figure> {
@@ -33,7 +146,7 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
         }
         for (index, (agent, of)) in settings.agents.iter().zip(&game.agents).enumerate() {
             let each = of.runs.iter();
-            let each = each.map(|it| Ok(Run::read(&it.made.run.folder)?.values("mean_return")?));
+            let each = each.map(|it| Ok(Run::read(&it.run.folder)?.values("mean_return")?));
             let curve = over_seeds(&each.collect::<anyhow::Result<Vec<_>>>()?);
             if curve.points.is_empty() {
                 continue;
@@ -63,7 +176,6 @@ pub(super) fn over_games(
     session: &mut Session,
     settings: &Settings,
     games: &[Game<'_>],
-    published: &Published,
 ) -> anyhow::Result<Vec<String>> {
     let mut all = games.iter().flat_map(|it| &it.agents);
     if !all.all(|of| of.runs.len() >= SEEDS_MIN) {
@@ -77,10 +189,10 @@ pub(super) fn over_games(
             let mut of_game = Vec::new();
             for it in &game.agents[at].runs {
                 session.work().1.again(play.units);
-                let key = format!("{}-single", it.made.plan.name);
-                let returns = play.greedy(session, &key, &it.made.run)?;
+                let key = format!("{}-single", it.plan.name);
+                let returns = play.greedy(session, &key, &it.run)?;
                 let returns = returns.and_then(|it| mean(&it));
-                of_game.extend(returns.and_then(|it| published.normalised(game.name, it)));
+                of_game.extend(returns.and_then(|it| normalised(game.name, it)));
             }
             if of_game.len() >= SEEDS_MIN {
                 scores.push(of_game);
@@ -107,25 +219,24 @@ pub(super) fn over_games(
 }
 
 /// What the page says.
-pub(super) fn page(settings: &Settings, games: &[Game<'_>], missing: &[String]) -> Values {
+pub(super) fn page(settings: &Settings, games: &[Game<'_>], missing: &[String]) -> Value {
     let runs = games
         .iter()
         .flat_map(|it| &it.agents)
         .flat_map(|it| &it.runs);
-    let has_seeds = runs.clone().any(|it| it.made.plan.call.seed > 1);
-    let mut values = Values::default();
-    values
-        .set("settings", settings)
-        .set("agents", &settings.agents)
-        .set("seeds", settings.seeds)
-        .set("games", games)
-        .set("percent", percent(settings.frames as f64 / PAPER_FRAMES))
-        .set("above_random", above_random(settings, games))
-        .set("missing", missing)
-        .set("returns_of", RETURNS_OF)
-        .set("episodes", CHECKPOINTS * settings.episodes)
-        .set("some_seeds", has_seeds);
-    values
+    let has_seeds = runs.clone().any(|it| it.plan.call.seed > 1);
+    json!({
+        "settings": settings,
+        "agents": settings.agents,
+        "seeds": settings.seeds,
+        "games": games,
+        "percent": percent(settings.frames as f64 / PAPER_FRAMES),
+        "above_random": above_random(settings, games),
+        "missing": missing,
+        "returns_of": RETURNS_OF,
+        "episodes": CHECKPOINTS * settings.episodes,
+        "some_seeds": has_seeds,
+    })
 }
 
 fn percent(share: f64) -> String {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     flags::{ProcgenArgs, sweep_settings},
     sweep::{
-        plan::{Call, PlannedRun},
+        plan::{Call, Planned, PlannedRun},
         results::Played,
     },
 };
@@ -53,9 +53,10 @@ pub(super) struct Settings {
 }
 
 /// Where in the sweep a run is.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct Point {
-    pub(super) world: String,
+    /// The world's name as files have it.
+    pub(super) game: String,
     pub(super) agent: String,
 }
 
@@ -83,33 +84,29 @@ impl Settings {
         Ok(settings)
     }
 
-    /// What there are runs for, with each seed.
-    pub(super) fn points(&self) -> Vec<Point> {
+    /// The runs of a seed.
+    pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
+        let mut plans = Vec::new();
         let games = self.games.iter();
-        let pairs = games.flat_map(|game| self.agents.iter().map(move |agent| (game, agent)));
-        let point = |(world, agent): (&String, &String)| Point {
-            world: world.clone(),
-            agent: agent.clone(),
-        };
-        pairs.map(point).collect()
-    }
-
-    /// The run of a seed.
-    pub(super) fn plan(&self, point: &Point, seed: u32) -> PlannedRun {
-        let (agent, k) = with_k(&point.agent);
-        let k = k.map(|k| format!("run.horizon.k={k}"));
-        PlannedRun::new(
-            format!("{}-{}-seed{seed}", short(&point.world), point.agent),
-            Call {
-                env: Some(point.world.clone()),
+        for (world, name) in games.flat_map(|it| self.agents.iter().map(move |name| (it, name))) {
+            let (agent, k) = with_k(name);
+            let k = k.map(|k| format!("run.horizon.k={k}"));
+            let call = Call {
+                env: Some(world.clone()),
                 agent: Some(agent.to_owned()),
                 preset: Some(self.preset.clone()),
                 seed,
                 frames: Some(self.frames),
                 sets: self.sets.iter().cloned().chain(k).collect(),
-            },
-            self.frames,
-        )
+            };
+            let point = Point {
+                game: world.strip_prefix("procgen:").unwrap_or(world).to_owned(),
+                agent: name.clone(),
+            };
+            let name = format!("{}-{name}-seed{seed}", point.game);
+            plans.push((point, PlannedRun::new(name, call, self.frames)));
+        }
+        plans
     }
 
     /// How a run is played on these levels.
@@ -123,22 +120,19 @@ impl Settings {
     }
 }
 
-/// A world's name as files have it.
-pub(super) fn short(world: &str) -> &str {
-    world.strip_prefix("procgen:").unwrap_or(world)
-}
-
 /// Worlds by their names or their games', each once; `all` is every game.
 fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
-    once(names, |name| match name {
-        "all" => {
-            let games = WorldName::all().filter(|it| it.kind() == "procgen");
-            Ok(games.map(|world| world.to_string()).collect())
-        }
-        name => {
-            let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
-            Ok(vec![world.to_string()])
-        }
+    once(names, |name| {
+        Ok(match name {
+            "all" => {
+                let games = WorldName::all().filter(|it| it.kind() == "procgen");
+                games.map(|world| world.to_string()).collect()
+            }
+            name => {
+                let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
+                vec![world.to_string()]
+            }
+        })
     })
 }
 
@@ -153,16 +147,12 @@ fn with_k(name: &str) -> (&str, Option<u32>) {
 
 /// Agents by name, each once; `all` is every one of the paper's, and a name with a k one that looks so far ahead.
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
-    once(names, |name| match name {
-        "all" => Ok(AGENTS.map(String::from).into()),
-        name => {
-            let (agent, k) = with_k(name);
-            let agent = presets::agent(agent)?.name;
-            Ok(vec![k.map_or_else(
-                || agent.to_owned(),
-                |k| format!("{agent}-k{k}"),
-            )])
-        }
+    once(names, |name| {
+        Ok(match (name, with_k(name)) {
+            ("all", _) => AGENTS.map(String::from).into(),
+            (_, (agent, None)) => vec![presets::agent(agent)?.name.to_owned()],
+            (_, (agent, Some(k))) => vec![format!("{}-k{k}", presets::agent(agent)?.name)],
+        })
     })
 }
 
@@ -224,11 +214,12 @@ mod tests {
     /// The layout of runs that earlier programs made.
     #[test]
     fn a_run_is_named_and_called_as_ever() {
-        let point = Point {
-            world: "procgen:heist".into(),
-            agent: "driml-noact-k5".into(),
+        let settings = Settings {
+            games: vec!["procgen:heist".into()],
+            agents: vec!["driml-noact-k5".into()],
+            ..settings(true)
         };
-        let plan = settings(true).plan(&point, 2);
+        let plan = &settings.plans(2)[0].1;
         assert_eq!(plan.name, "heist-driml-noact-k5-seed2");
         assert_eq!(
             plan.call.args().join(" "),

@@ -5,9 +5,6 @@ use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
 use serde::{Deserialize, Serialize};
 
-/// The agent of a dial that names none.
-const AGENT: &str = "c51";
-
 /// A dial in one world: a base and the levels that are compared with it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -19,9 +16,9 @@ pub(super) struct Dial {
     buys: String,
     /// Why they are expected to cost accuracy.
     costs: String,
-    /// The agent of its base.
-    #[serde(default = "agent")]
-    agent: String,
+    /// The agent of its base; C51 if it names none.
+    #[serde(default = "c51")]
+    pub(super) agent: String,
     /// Kinds of worlds that have it; all if it names none.
     #[serde(default)]
     worlds: Vec<String>,
@@ -29,8 +26,8 @@ pub(super) struct Dial {
     levels: Vec<Level>,
 }
 
-fn agent() -> String {
-    AGENT.into()
+fn c51() -> String {
+    "c51".into()
 }
 
 /// A level of a dial.
@@ -62,6 +59,8 @@ pub(super) struct LevelOf {
     pub(super) level: String,
     pub(super) base: Point,
     pub(super) point: Point,
+    /// Whether the call asks for its dial. What others have made of a dial is on the page too.
+    pub(super) is_asked: bool,
 }
 
 impl LevelOf {
@@ -72,19 +71,15 @@ impl LevelOf {
 }
 
 impl Dial {
-    /// What its levels are compared with.
-    pub(super) fn base_point(&self) -> Point {
-        Point {
+    /// Its levels, and what each is made with.
+    fn levels(&self, is_asked: bool) -> impl Iterator<Item = LevelOf> {
+        let base = Point {
             key: self.agent.clone(),
             agent: self.agent.clone(),
             sets: Vec::new(),
-        }
-    }
-
-    /// Its levels, and what each is made with.
-    pub(super) fn level_points(&self) -> impl Iterator<Item = LevelOf> {
-        self.levels.iter().map(|level| {
-            let agent = level.agent.as_ref().unwrap_or(&self.agent);
+        };
+        self.levels.iter().map(move |level| {
+            let agent = level.agent.as_ref().unwrap_or(&self.agent).clone();
             let key = match level.sets.is_empty() {
                 true => agent.clone(),
                 false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
@@ -92,12 +87,13 @@ impl Dial {
             LevelOf {
                 dial: self.clone(),
                 level: level.name.clone(),
-                base: self.base_point(),
+                base: base.clone(),
                 point: Point {
                     key,
-                    agent: agent.clone(),
+                    agent,
                     sets: level.sets.clone(),
                 },
+                is_asked,
             }
         })
     }
@@ -159,11 +155,23 @@ pub(super) struct WorldBase {
     pub(super) sets: Vec<String>,
 }
 
-/// The dials that a world has, in the order in which they are tried.
-pub(super) fn dials(world: WorldName) -> Vec<Dial> {
+/// The levels of all dials that a world has, in the order in which they are tried. `names` are the dials that are asked for; all if it is
+/// empty.
+pub(super) fn levels(world: WorldName, names: &[String]) -> Result<Vec<LevelOf>, Usage> {
     let has =
         |dial: &Dial| dial.worlds.is_empty() || dial.worlds.iter().any(|kind| kind == world.kind());
-    file().dial.into_iter().filter(has).collect()
+    let dials: Vec<Dial> = file().dial.into_iter().filter(has).collect();
+    let known: Vec<_> = dials.iter().map(|dial| dial.name.as_str()).collect();
+    if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
+        return Err(usage!(
+            "there is no dial {unknown:?} in this world{}; --dials takes {}",
+            nearest(unknown, known.iter().copied()),
+            known.join(", ")
+        ));
+    }
+    let asks_for = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
+    let levels = dials.iter().flat_map(|dial| dial.levels(asks_for(dial)));
+    Ok(levels.collect())
 }
 
 /// What all runs in a world have.
@@ -182,22 +190,6 @@ pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
             "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
             kinds.join(", ")
         )
-    })
-}
-
-/// The names of `all` that are asked for; all if none are.
-pub(super) fn chosen(all: &[Dial], names: &[String]) -> Result<Vec<String>, Usage> {
-    let known: Vec<_> = all.iter().map(|dial| dial.name.as_str()).collect();
-    if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
-        return Err(usage!(
-            "there is no dial {unknown:?} in this world{}; --dials takes {}",
-            nearest(unknown, known.iter().copied()),
-            known.join(", ")
-        ));
-    }
-    Ok(match names {
-        [] => known.into_iter().map(String::from).collect(),
-        names => names.to_vec(),
     })
 }
 

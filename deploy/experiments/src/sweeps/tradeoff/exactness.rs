@@ -2,8 +2,6 @@
 //! operations.
 //! It says nothing of what is learned: a level may be exact and learn less.
 
-use std::fmt;
-
 use anyhow::Context;
 use driml_launch::run_folder::RunFolder;
 use driml_learner::{
@@ -21,55 +19,29 @@ const ROWS_MAX: usize = 64;
 /// States whose values and greedy actions are compared, for each of these rows.
 const STATES_A_ROW: usize = 16;
 
-/// Errors of a level against the reference, at the weights of one of its runs.
+/// Errors of a level against the reference, at the weights of one of its runs; named as in the data.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Exactness {
     /// Relative error of the total loss.
-    #[serde(rename = "loss_error", alias = "loss")]
-    loss: f64,
+    loss_error: f64,
     /// Relative error of the gradient, and 1 - cosine of its angle to the reference.
-    #[serde(rename = "gradient_error", alias = "gradient")]
-    gradient: f64,
-    #[serde(rename = "gradient_angle", alias = "angle")]
-    angle: f64,
+    gradient_error: f64,
+    gradient_angle: f64,
     /// Of the learner's values, in units of return.
-    #[serde(rename = "q_rms_error", alias = "q_rms")]
-    q_rms: f64,
-    #[serde(rename = "q_max_error", alias = "q_max")]
-    q_max: f64,
+    q_rms_error: f64,
+    q_max_error: f64,
     /// Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
-    #[serde(rename = "same_action_learner", alias = "same_learner")]
-    same_learner: f64,
-    #[serde(rename = "same_action_actor", alias = "same_actor")]
-    same_actor: f64,
+    same_action_learner: f64,
+    same_action_actor: f64,
     /// Of the actor's values.
-    #[serde(rename = "actor_q_rms_error", alias = "actor_q_rms")]
-    actor_q_rms: f64,
+    actor_q_rms_error: f64,
 }
 
-/// Of what the errors are made, beside a run's weights.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Sizes {
-    /// Whose loss and gradient are compared.
-    pub(super) rows: usize,
-    /// Whose values and greedy actions are.
-    pub(super) states: usize,
-}
-
-impl Sizes {
-    pub(super) fn of(config: &RunConfig) -> Self {
-        let rows = ROWS_MAX.min(config.learner.batch_size as usize);
-        Self {
-            rows,
-            states: rows * STATES_A_ROW,
-        }
-    }
-}
-
-impl fmt::Display for Sizes {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} rows, {} states", self.rows, self.states)
-    }
+/// Of what the errors of a run of `config` are made, beside its weights: rows whose loss and gradient are compared, and states whose values
+/// and greedy actions are.
+pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
+    let rows = ROWS_MAX.min(config.learner.batch_size as usize);
+    (rows, rows * STATES_A_ROW)
 }
 
 /// Measures the newest checkpoint of a run of a level with `config`.
@@ -93,7 +65,7 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
         .with_equal_states(config.learner.equal_states);
     let weights = agent.weights()?;
-    let Sizes { rows, states } = Sizes::of(config);
+    let (rows, states) = sizes(config);
     let held = HeldBatch::play(config, Some(&weights), rows)?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_as)?;
@@ -105,13 +77,13 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
         .map(|values| QError::of(&values, &expected, model.num_actions));
     Ok(Exactness {
-        loss: found.loss,
-        gradient: found.gradient,
-        angle: found.angle,
-        q_rms: learning.rms,
-        q_max: learning.max,
-        same_learner: learning.same_action,
-        same_actor: acting.same_action,
-        actor_q_rms: acting.rms,
+        loss_error: found.loss,
+        gradient_error: found.gradient,
+        gradient_angle: found.angle,
+        q_rms_error: learning.rms,
+        q_max_error: learning.max,
+        same_action_learner: learning.same_action,
+        same_action_actor: acting.same_action,
+        actor_q_rms_error: acting.rms,
     })
 }

@@ -33,23 +33,25 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
         .flat_map(|it| [it.ends.0, it.ends.1])
         .collect();
     let label = format!("{name} return");
-    let panels = by_dial(results).map(|(dial, named)| {
+    let panels = results.by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
         let mut series = vec![line.coloured(GREY).marked(Mark::Dashed)];
-        for (index, (name, point)) in named.enumerate() {
-            let Some(it) = place(point) else { continue };
+        for (index, row) in rows.iter().enumerate() {
+            let Some(it) = place(row.result) else {
+                continue;
+            };
             series.push(
-                Series::line(name, index, vec![(it.speed, it.value)])
+                Series::line(row.name, index, vec![(it.speed, it.value)])
                     .banded(vec![(it.speed, it.ends.0, it.ends.1)])
                     .marked(Mark::Bars),
             );
         }
         let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
         let (x, y) = (x.showing(&speeds), y.showing(&values));
-        Panel::Chart(Chart::new(dial, x, y, series))
+        Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series))
     });
     Figure {
-        title: format!("{}: {label} against speed", results.settings.common.env),
+        title: format!("{}: {label} against speed", results.common.env),
         notes: vec![
             format!(
                 "Return ({name}), mean over seeds, and frames a second of whole runs; to the upper right is better."
@@ -88,33 +90,20 @@ fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
     front.into_iter()
 }
 
-/// The dials that have runs, each with its base and then its levels, by their names.
-fn by_dial(
-    results: &Results,
-) -> impl Iterator<Item = (&str, impl Iterator<Item = (&str, &PointResult)>)> {
-    results.by_dial().map(|levels| {
-        let (dial, base) = (&levels[0].dial, &levels[0].base);
-        let base = std::iter::once((dial.base.as_str(), results.at(base)));
-        let levels = levels.iter();
-        let levels = levels.map(|of| (of.level.as_str(), results.at(&of.point)));
-        (dial.name.as_str(), base.chain(levels))
-    })
-}
-
 /// Training return over seconds, a panel for each dial with its base.
 pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
-    for (dial, named) in by_dial(results) {
+    for rows in results.by_dial() {
         let mut series = Vec::new();
-        for (index, (name, point)) in named.enumerate() {
-            let curve = over_seeds(&point.training_curves()?);
-            series.push(curve.series(name, index));
+        for (index, row) in rows.iter().enumerate() {
+            let curve = over_seeds(&row.result.training_curves()?);
+            series.push(curve.series(row.name, index));
         }
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));
-        panels.push(Panel::Chart(Chart::new(dial, x, y, series)));
+        panels.push(Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series)));
     }
     Ok(Figure {
-        title: format!("{}: return against wall-clock time", results.settings.common.env),
+        title: format!("{}: return against wall-clock time", results.common.env),
         notes: vec![
             "Training return, mean of the last 100 episodes; mean and range over seeds. Every run has the same number of frames."
                 .into(),

@@ -60,9 +60,8 @@ impl HeldBatch {
         };
         let history = history(config, weights, steps + 1, wanted_at)?;
         let len = config.model.frame_len();
-        let wanted = usize::from(config.run.horizon.positives() > 0);
         let mut batch = Self {
-            positives: wanted,
+            positives: config.run.horizon.positives().min(1),
             ..Self::default()
         };
         for row in 0..rows {
@@ -87,7 +86,7 @@ impl HeldBatch {
             });
             batch.n_step_return.push(n_step_return as f32);
             batch.bootstrap_discount.push(discount as f32);
-            if wanted > 0 {
+            if batch.positives > 0 {
                 batch.states_k.extend_from_slice(state(t + k));
                 let is_running = history[t].ends[env] == StepEnd::Running;
                 batch.positive_valid.push(u8::from(is_running));

@@ -20,21 +20,23 @@ pub(super) struct Fit {
 }
 
 /// Which levels fit into `budget_seconds`, in their order, each with all its seeds and its base or not at all; of each the cost of
-/// its base and its own. What costs nothing any more always fits. A level that does not fit leaves room to those after it.
-pub(super) fn fit(levels: &[[Cost; 2]], budget_seconds: f64) -> Fit {
+/// its base and its own, none for a level that is not asked for. What costs nothing any more always fits. A level that does not fit
+/// leaves room to those after it.
+pub(super) fn fit(levels: &[Option<[Cost; 2]>], budget_seconds: f64) -> Fit {
     let mut paid = BTreeSet::new();
     let mut seconds = 0.0;
-    let mut chosen = Vec::with_capacity(levels.len());
-    for costs in levels {
-        let new = costs.iter().filter(|it| !paid.contains(it.key.as_str()));
+    let mut fits = |costs: &'_ [Cost; 2]| {
+        let new = costs.iter().filter(|it| !paid.contains(&it.key));
         let more: f64 = new.map(|it| it.seconds).sum();
         let fits = more == 0.0 || seconds + more <= budget_seconds;
         if fits {
             seconds += more;
-            paid.extend(costs.iter().map(|it| it.key.as_str()));
+            paid.extend(costs.iter().map(|it| it.key.clone()));
         }
-        chosen.push(fits);
-    }
+        fits
+    };
+    let chosen = levels.iter().map(|it| it.as_ref().is_some_and(&mut fits));
+    let chosen = chosen.collect();
     Fit { chosen, seconds }
 }
 
@@ -50,25 +52,25 @@ pub(super) fn frames(full: u64, seconds: f64, budget_seconds: f64) -> u64 {
 mod tests {
     use super::*;
 
-    fn level(base: (&str, f64), level: (&str, f64)) -> [Cost; 2] {
-        [base, level].map(|(key, seconds)| Cost {
-            key: key.into(),
-            seconds,
-        })
-    }
-
     #[test]
     fn a_budget_is_kept_and_a_base_is_paid_once() {
+        let level = |base: (&str, f64), level: (&str, f64)| {
+            Some([base, level].map(|(key, seconds)| Cost {
+                key: key.into(),
+                seconds,
+            }))
+        };
         let all = [
             level(("c51", 100.0), ("bf16", 60.0)),
             level(("c51", 100.0), ("driml-fix", 200.0)),
             level(("c51", 100.0), ("f16", 100.0)),
             level(("driml-fix", 200.0), ("rkhs", 40.0)),
         ];
-        // What is finished costs nothing and is always there.
+        // What is finished costs nothing and is always there; what is not asked for never is.
         let finished = [
             level(("c51", 0.0), ("bf16", 0.0)),
             level(("c51", 0.0), ("f16", 50.0)),
+            None,
         ];
         for (all, budget, chosen, seconds) in [
             (&all[..], 0.0, vec![false; 4], 0.0),
@@ -77,8 +79,8 @@ mod tests {
             (&all, 260.0, vec![true, false, true, false], 260.0),
             (&all, 400.0, vec![true, true, false, true], 400.0),
             (&all, 500.0, vec![true; 4], 500.0),
-            (&finished, 0.0, vec![true, false], 0.0),
-            (&finished, 50.0, vec![true, true], 50.0),
+            (&finished, 0.0, vec![true, false, false], 0.0),
+            (&finished, 50.0, vec![true, true, false], 50.0),
         ] {
             assert_eq!(fit(all, budget), Fit { chosen, seconds }, "{budget} s");
         }

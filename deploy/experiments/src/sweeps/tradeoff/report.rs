@@ -6,13 +6,12 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use super::{
-    dials::{LevelOf, Point},
     exactness, figures,
-    results::{GREEDY, MEASURES, PointResult, Results, TRAINING},
+    results::{GREEDY, MEASURES, Results, Row, TRAINING},
 };
 use crate::{
     cache::Session,
-    page::{Page, Table, Values, interval_cells, number},
+    page::{Table, interval_cells, number},
     stats::{apart_by_chance, difference, interval},
 };
 
@@ -47,7 +46,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     session.csv("levels", &levels(results))?;
     session.csv(
         "equal_time",
-        &Table::of(EQUAL_TIME, equal.iter().map(EqualTime::cells)),
+        &Table::new(EQUAL_TIME.split(','), equal.iter().map(EqualTime::cells)),
     )?;
     for (stem, returns, name) in [
         ("pareto", GREEDY, "greedy"),
@@ -56,7 +55,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
         session.figure(stem, &figures::pareto(results, returns, name))?;
     }
     session.figure("wall", &figures::wall(results)?)?;
-    session.finish(&page(results, &equal)?)
+    session.finish(include_str!("../tradeoff.md"), values(results, &equal)?)
 }
 
 fn runs(results: &Results) -> Table {
@@ -66,7 +65,7 @@ fn runs(results: &Results) -> Table {
     let all = all.flat_map(|(key, point)| point.seeds.iter().map(move |it| (key, it)));
     let rows = all.map(|(key, it)| {
         let summary = &it.ran.summary;
-        let head = vec![
+        let mut row = vec![
             key.clone(),
             summary.agent.clone(),
             it.seed.to_string(),
@@ -74,13 +73,10 @@ fn runs(results: &Results) -> Table {
             format!("{:.2}", summary.updates_per_second),
             summary.weights_sha256.clone(),
         ];
-        [
-            head,
-            MEASURES.map(|measure| number((measure.of)(it), 4)).into(),
-        ]
-        .concat()
+        row.extend(MEASURES.map(|measure| number((measure.of)(it), 4)));
+        row
     });
-    Table::of(&columns, rows)
+    Table::new(columns.split(','), rows)
 }
 
 fn levels(results: &Results) -> Table {
@@ -92,49 +88,39 @@ fn levels(results: &Results) -> Table {
         columns += &format!(",{name},{name}_low,{name}_high");
         columns += &format!(",{name}_minus_base,{name}_minus_base_low,{name}_minus_base_high");
     }
-    let rows = results.by_dial().flat_map(|levels| {
-        let base = std::iter::once((&levels[0], true));
-        base.chain(levels.iter().map(|of| (of, false)))
-    });
-    Table::of(
-        &columns,
-        rows.map(|(of, is_base)| row(results, of, is_base)),
-    )
+    let rows = results.by_dial().flatten();
+    Table::new(columns.split(','), rows.map(|it| cells(&it)))
 }
 
-/// A level, or the base that it is compared with.
-fn row(results: &Results, of: &LevelOf, is_base: bool) -> Vec<String> {
-    let (point, level) = match is_base {
-        true => (&of.base, &of.dial.base),
-        false => (&of.point, &of.level),
-    };
-    let point: &PointResult = results.at(point);
-    let mut row = vec![of.dial.name.clone(), level.clone(), of.dial.base.clone()];
-    row.push(point.seeds.len().to_string());
-    let measured = point.measured();
-    row.extend(MEASURED.map(|(name, decimals)| {
-        let value = measured.get(name).and_then(Value::as_f64);
+fn cells(row: &Row<'_>) -> Vec<String> {
+    let seeds = row.result.seeds.len().to_string();
+    let (dial, name, base) = (&row.dial.name, row.name.to_owned(), &row.dial.base);
+    let mut cells = vec![dial.clone(), name, base.clone(), seeds];
+    cells.extend(MEASURED.map(|(name, decimals)| {
+        let value = row.result.measured.get(name).and_then(Value::as_f64);
         match decimals {
             Some(decimals) => number(value, decimals),
             None => value.map_or(String::new(), |it| format!("{it:.3e}")),
         }
     }));
     for measure in MEASURES {
-        let difference = results.difference(of, measure).filter(|_| !is_base);
-        row.extend(interval_cells(point.mean(measure)));
-        row.extend(interval_cells(difference.map(|it| it.interval)));
+        let difference = row.difference(measure).filter(|_| !row.is_base);
+        cells.extend(interval_cells(row.result.mean(measure)));
+        cells.extend(interval_cells(difference.map(|it| it.interval)));
     }
-    row
+    cells
 }
 
-/// C51 beside an agent with DIM in training return: when runs of the faster of the two are done, and at the ends of all.
+/// C51 beside an agent with DIM in training return, by the base's runs and the level's.
 #[derive(Serialize)]
 struct EqualTime {
     agent: String,
     base: String,
+    /// When runs of the faster of the two are done.
     seconds: f64,
     base_end: Vec<f64>,
     level_end: Vec<f64>,
+    /// At that time.
     base_then: Vec<f64>,
     level_then: Vec<f64>,
 }
@@ -142,48 +128,43 @@ struct EqualTime {
 impl EqualTime {
     /// As [`EQUAL_TIME`] has it.
     fn cells(&self) -> Vec<String> {
-        let frames = difference(&self.base_end, &self.level_end);
-        let time = difference(&self.base_then, &self.level_then);
-        let head = [
-            self.agent.clone(),
-            self.base.clone(),
-            format!("{:.3}", self.seconds),
-        ];
-        let both = [frames, time].map(|it| interval_cells(it.map(|it| it.interval)));
-        head.into_iter().chain(both.into_iter().flatten()).collect()
+        let mut row = vec![self.agent.clone(), self.base.clone()];
+        row.push(format!("{:.3}", self.seconds));
+        for (base, level) in [
+            (&self.base_end, &self.level_end),
+            (&self.base_then, &self.level_then),
+        ] {
+            row.extend(interval_cells(
+                difference(base, level).map(|it| it.interval),
+            ));
+        }
+        row
     }
 }
 
 /// Runs that ended alone are compared, in training return: the agent after part of a run was not kept.
 fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
     let mut all = Vec::new();
-    for of in results.levels.iter().filter(|of| of.dial.name == DIM) {
-        let base = results.at(&of.base).training_curves()?;
-        let level = results.at(&of.point).training_curves()?;
-        let ends = |curves: &[Vec<(f64, f64)>]| -> (Vec<f64>, Vec<f64>) {
-            curves
-                .iter()
-                .filter_map(|curve| curve.last())
-                .copied()
-                .unzip()
-        };
-        let ((base_seconds, base_end), (level_seconds, level_end)) = (ends(&base), ends(&level));
-        let means = [interval(&base_seconds), interval(&level_seconds)];
-        let [Some(one), Some(other)] = means else {
+    for row in results.levels().filter(|row| row.dial.name == DIM) {
+        let curves = [row.base.training_curves()?, row.result.training_curves()?];
+        let ends = curves.each_ref().map(|curves| -> (Vec<f64>, Vec<f64>) {
+            let ends = curves.iter().filter_map(|curve| curve.last());
+            ends.copied().unzip()
+        });
+        let [Some(base), Some(level)] = ends.each_ref().map(|(seconds, _)| interval(seconds))
+        else {
             continue;
         };
-        let seconds = one.mean.min(other.mean);
-        let then = |curves: &[Vec<(f64, f64)>]| -> Vec<f64> {
-            curves
-                .iter()
-                .filter_map(|curve| at(curve, seconds))
-                .collect()
-        };
-        let (base_then, level_then) = (then(&base), then(&level));
+        let seconds = base.mean.min(level.mean);
+        let [base_then, level_then] = curves.map(|curves| -> Vec<f64> {
+            let then = curves.iter().filter_map(|curve| at(curve, seconds));
+            then.collect()
+        });
         if !base_then.is_empty() && !level_then.is_empty() {
+            let [base_end, level_end] = ends.map(|(_, returns)| returns);
             all.push(EqualTime {
-                agent: of.point.agent.clone(),
-                base: of.base.agent.clone(),
+                agent: row.agent.into(),
+                base: row.dial.agent.clone(),
                 seconds,
                 base_end,
                 level_end,
@@ -201,75 +182,62 @@ fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     before.map(|(_, value)| *value)
 }
 
-/// The page of what was run.
-fn page(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Page> {
-    let common = &results.settings.common;
-    let sizes = exactness::Sizes::of(&common.config(&results.levels[0].base)?);
-    let dials = results.by_dial().map(|levels| {
-        let of = &levels[0];
-        let each = levels.iter().map(|of| {
-            let mut row = page_row(results, &of.point, &of.level);
-            row.insert("frames_gain".into(), json!(results.frames_gain(of)));
-            row
-        });
-        json!({
-            "dial": of.dial,
-            "base": page_row(results, &of.base, &of.dial.base),
-            "levels": each.collect::<Vec<_>>(),
-        })
+/// What the page says.
+fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
+    let common = &results.common;
+    let (rows, states) = exactness::sizes(&common.config(&results.levels[0].base)?);
+    let dials = results.by_dial().map(|rows| {
+        let all: Vec<_> = rows.iter().map(page_row).collect();
+        json!({ "dial": rows[0].dial, "base": all[0], "levels": all[1..] })
     });
-    let by_key: BTreeMap<_, _> = results.levels.iter().map(|of| (&of.base.key, of)).collect();
-    let bases = by_key.iter().map(|(key, of)| {
-        let mut row = page_row(results, &of.base, key);
-        let above = difference(&results.random, &results.at(&of.base).values(TRAINING));
+    // Dials may share a base.
+    let bases = results.by_dial().map(|mut rows| rows.swap_remove(0));
+    let bases: BTreeMap<_, _> = bases.map(|base| (base.agent, base)).collect();
+    let bases = bases.values().map(|base| {
+        let above = difference(&results.random, &base.result.values(TRAINING));
         let unsure = above.is_some_and(|it| {
             it.interval.ends.is_some() && !(it.is_apart && it.interval.mean > 0.0)
         });
+        let mut row = page_row(base);
         row.insert("may_have_learned_nothing".into(), unsure.into());
         row
     });
     let (judged, by_chance) = by_chance(results);
-    let mut values = Values::default();
-    values
-        .set("settings", common)
-        .set("dials", dials.collect::<Vec<_>>())
-        .set("bases", bases.collect::<Vec<_>>())
-        .set("equal", equal)
-        .set("random", &results.random)
-        .set("seeds", seeds(results))
-        .set("judged", judged)
-        .set("by_chance", by_chance)
-        .set("rows", sizes.rows)
-        .set("states", sizes.states)
-        .set("missing", &results.missing)
-        .set("left_out", &results.left_out);
-    let commands = results.commands.join("`, then `");
-    let template = include_str!("../tradeoff.md");
-    Ok(Page::new(template, values, &commands, results.smoke))
+    Ok(json!({
+        "settings": common,
+        "dials": dials.collect::<Vec<_>>(),
+        "bases": bases.collect::<Vec<_>>(),
+        "equal": equal,
+        "random": results.random,
+        "seeds": seeds(results),
+        "judged": judged,
+        "by_chance": by_chance,
+        "rows": rows,
+        "states": states,
+        "missing": results.missing,
+        "left_out": results.left_out,
+        "command": results.commands.join("`, then `"),
+    }))
 }
 
-/// A point as the template reads it: what was measured, and of each measure the numbers of its runs.
-fn page_row(results: &Results, point: &Point, level: &str) -> Map<String, Value> {
-    let (result, mut row) = (results.at(point), Map::new());
-    row.insert("level".into(), level.into());
-    row.insert("agent".into(), point.agent.clone().into());
-    let measured = result.measured();
+/// A line as the template reads it: what was measured, and of each measure the numbers of its runs.
+fn page_row(row: &Row<'_>) -> Map<String, Value> {
+    let mut values = Map::new();
+    values.insert("level".into(), row.name.into());
+    values.insert("agent".into(), row.agent.into());
+    values.insert("frames_gain".into(), json!(row.frames_gain()));
     for (name, _) in MEASURED {
-        row.insert(name.into(), json!(measured.get(name)));
+        values.insert(name.into(), json!(row.result.measured.get(name)));
     }
     for measure in MEASURES {
-        row.insert(measure.name.into(), json!(result.values(measure)));
+        values.insert(measure.name.into(), json!(row.result.values(measure)));
     }
-    row
+    values
 }
 
 /// How many seeds the intervals are over, in words.
 fn seeds(results: &Results) -> String {
-    let bases: BTreeSet<&str> = results
-        .levels
-        .iter()
-        .map(|of| of.base.key.as_str())
-        .collect();
+    let bases: BTreeSet<&str> = results.levels.iter().map(|of| &*of.base.key).collect();
     let [bases, levels] = [true, false].map(|is_base| {
         let all = results.points.iter();
         let counts = all.filter(|(key, _)| bases.contains(key.as_str()) == is_base);
@@ -288,8 +256,8 @@ fn seeds(results: &Results) -> String {
 /// anything and returns were normal.
 fn by_chance(results: &Results) -> (usize, f64) {
     let mut known = BTreeMap::new();
-    let each = results.levels.iter().flat_map(|of| {
-        let points = [&of.base, &of.point].map(|it| results.at(it));
+    let each = results.levels().flat_map(|row| {
+        let points = [row.base, row.result];
         [GREEDY, TRAINING].map(|it| points.map(|point| point.values(it).len()))
     });
     let judged = each.filter(|counts| counts.iter().all(|&it| it > 1));

@@ -2,13 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::{
-    dials::{LevelOf, Point},
-    exactness::Exactness,
-    settings::Settings,
-    speed::Speed,
+    dials::{Dial, LevelOf},
+    settings::Common,
 };
 use crate::{
     plot::{Over, Run},
@@ -19,10 +18,17 @@ use crate::{
 /// What a point gave.
 #[derive(Default)]
 pub(super) struct PointResult {
-    pub(super) speed: Option<Speed>,
-    /// At the weights of its first seed.
-    pub(super) exactness: Option<Exactness>,
+    /// The bench, and the errors at the weights of its first seed, by their names in the data.
+    pub(super) measured: Map<String, Value>,
     pub(super) seeds: Vec<SeedResult>,
+}
+
+/// The fields of a measurement by their names; none if there is none.
+pub(super) fn fields(measured: Option<impl Serialize>) -> Map<String, Value> {
+    match serde_json::to_value(measured) {
+        Ok(Value::Object(map)) => map,
+        _ => Map::new(),
+    }
 }
 
 /// A finished run and the returns of its agent, played greedily.
@@ -34,7 +40,7 @@ pub(super) struct SeedResult {
 
 /// All there is to report.
 pub(super) struct Results {
-    pub(super) settings: Settings,
+    pub(super) common: Common,
     /// Levels that have runs, as their bases do.
     pub(super) levels: Vec<LevelOf>,
     /// By the point's key.
@@ -47,7 +53,6 @@ pub(super) struct Results {
     pub(super) missing: Vec<String>,
     /// The calls that made it.
     pub(super) commands: Vec<String>,
-    pub(super) smoke: bool,
 }
 
 /// A number of a run, and how the data calls it.
@@ -118,47 +123,65 @@ impl PointResult {
         };
         self.seeds.iter().map(read).collect()
     }
-
-    /// The bench and the errors by their names in the data.
-    pub(super) fn measured(&self) -> Map<String, Value> {
-        let both = [
-            serde_json::to_value(&self.speed),
-            serde_json::to_value(self.exactness),
-        ];
-        let maps = both.into_iter().filter_map(|it| match it {
-            Ok(Value::Object(map)) => Some(map),
-            _ => None,
-        });
-        maps.flatten().collect()
-    }
 }
 
-impl Results {
-    /// What was measured at a point.
-    pub(super) fn at(&self, point: &Point) -> &PointResult {
-        &self.points[&point.key]
-    }
+/// A base or a level of a dial: a line of the tables.
+pub(super) struct Row<'a> {
+    pub(super) dial: &'a Dial,
+    pub(super) name: &'a str,
+    pub(super) agent: &'a str,
+    pub(super) is_base: bool,
+    pub(super) result: &'a PointResult,
+    /// What it is compared with.
+    pub(super) base: &'a PointResult,
+}
 
-    /// The levels of each dial that has runs.
-    pub(super) fn by_dial(&self) -> impl Iterator<Item = &[LevelOf]> {
-        self.levels.chunk_by(|a, b| a.dial.name == b.dial.name)
-    }
-
+impl Row<'_> {
     /// Level minus base, with its interval. Seeds are not paired: through real processes no two runs of a seed are alike.
-    pub(super) fn difference(&self, of: &LevelOf, measure: Measure) -> Option<Difference> {
-        let [base, level] = [&of.base, &of.point].map(|it| self.at(it).values(measure));
-        difference(&base, &level)
+    pub(super) fn difference(&self, measure: Measure) -> Option<Difference> {
+        difference(&self.base.values(measure), &self.result.values(measure))
     }
 
     /// The level's frames a second over the base's, of the seeds that both have: a base's further seeds run at another time, beside other
     /// runs.
-    pub(super) fn frames_gain(&self, of: &LevelOf) -> Option<f64> {
-        let [base, level] = [&of.base, &of.point].map(|it| self.at(it));
+    pub(super) fn frames_gain(&self) -> Option<f64> {
         let mean = |point: &PointResult, other: &PointResult| {
             let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
             let values = point.seeds.iter().filter(both);
             Spread::of(values.filter_map(FRAMES_PER_SECOND.of)).map(|it| it.mean)
         };
-        Some(mean(level, base)? / mean(base, level)?)
+        Some(mean(self.result, self.base)? / mean(self.base, self.result)?)
+    }
+}
+
+impl Results {
+    /// Of each dial that has runs its base, and then its levels.
+    pub(super) fn by_dial(&self) -> impl Iterator<Item = Vec<Row<'_>>> {
+        let dials = self.levels.chunk_by(|a, b| a.dial.name == b.dial.name);
+        dials.map(|levels| {
+            let base = std::iter::once(self.row(&levels[0], true));
+            base.chain(levels.iter().map(|of| self.row(of, false)))
+                .collect()
+        })
+    }
+
+    /// Every level.
+    pub(super) fn levels(&self) -> impl Iterator<Item = Row<'_>> {
+        self.levels.iter().map(|of| self.row(of, false))
+    }
+
+    fn row<'a>(&'a self, of: &'a LevelOf, is_base: bool) -> Row<'a> {
+        let (name, point) = match is_base {
+            true => (&of.dial.base, &of.base),
+            false => (&of.level, &of.point),
+        };
+        Row {
+            dial: &of.dial,
+            name,
+            agent: &point.agent,
+            is_base,
+            result: &self.points[&point.key],
+            base: &self.points[&of.base.key],
+        }
     }
 }

@@ -1,11 +1,11 @@
 //! What a call of `driml tradeoff` asks for, and the runs and settings that follow from it.
 
 use driml_envs::WorldName;
-use driml_machine::error::{Usage, usage};
-use driml_settings::{config::RunConfig, presets};
+use driml_machine::error::Usage;
+use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-use super::dials::{self, Dial, Point};
+use super::dials::{self, LevelOf, Point};
 use crate::{
     flags::TradeoffArgs,
     sweep::plan::{Call, PlannedRun},
@@ -32,27 +32,24 @@ pub(super) struct Common {
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) common: Common,
-    /// Those of the world, asked for or not: what has runs is on the page.
-    pub(super) all_dials: Vec<Dial>,
-    /// The names of those that are asked for.
-    pub(super) asked: Vec<String>,
+    /// Those of the world.
+    pub(super) levels: Vec<LevelOf>,
     pub(super) seeds: u32,
-    /// Machine time for the runs of this call, in seconds.
-    pub(super) budget_seconds: f64,
     /// Whether the frames may still be made fewer to fit the budget.
     pub(super) frames_open: bool,
 }
 
 /// The settings that the call asks for. A folder that has runs keeps their length.
-pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings, Usage> {
-    let world: WorldName = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
+pub(super) fn of(
+    args: &TradeoffArgs,
+    world: WorldName,
+    found: Option<Common>,
+) -> Result<Settings, Usage> {
     let base = dials::world_base(world)?;
     let length = dials::length(args.flags.smoke);
     let asked = [length.sets, args.queue.sets.clone()];
-    let found = found.as_ref();
-    let frames = args.frames.or(found.map(|it| it.frames));
-    let jobs = args.queue.jobs.or(found.map(|it| it.jobs));
-    let all_dials = dials::dials(world);
+    let (found_frames, found_jobs) = found.map(|it| (it.frames, it.jobs)).unzip();
+    let frames = args.frames.or(found_frames);
     Ok(Settings {
         common: Common {
             env: world.to_string(),
@@ -60,12 +57,10 @@ pub(super) fn of(args: &TradeoffArgs, found: Option<Common>) -> Result<Settings,
             sets: base.sets.into_iter().chain(asked.concat()).collect(),
             frames: frames.or(length.frames).unwrap_or(base.frames),
             episodes: args.episodes.unwrap_or(length.episodes),
-            jobs: jobs.unwrap_or(1),
+            jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
         },
-        asked: dials::chosen(&all_dials, &args.dials)?,
-        all_dials,
+        levels: dials::levels(world, &args.dials)?,
         seeds: args.flags.seeds.unwrap_or(length.seeds),
-        budget_seconds: f64::from(args.budget) * 60.0,
         frames_open: frames.is_none(),
     })
 }
@@ -78,11 +73,6 @@ impl Settings {
         } else {
             self.seeds
         }
-    }
-
-    /// Whether the call asks for this dial.
-    pub(super) fn asks_for(&self, dial: &Dial) -> bool {
-        self.asked.contains(&dial.name)
     }
 }
 
@@ -114,6 +104,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use clap::Parser;
+    use driml_settings::presets;
 
     use super::*;
 
@@ -123,95 +114,74 @@ mod tests {
         args: TradeoffArgs,
     }
 
-    fn args(line: &str) -> TradeoffArgs {
+    fn of(line: &str, found: Option<Common>) -> Result<Settings, Usage> {
         let words = ["tradeoff"].into_iter().chain(line.split(' '));
-        CommandLine::parse_from(words).args
+        let args = CommandLine::parse_from(words).args;
+        super::of(&args, presets::world(&args.env)?, found)
     }
 
-    fn settings(world: &str, smoke: bool) -> Settings {
+    fn settings(world: &str, smoke: &str) -> Settings {
         // Else the free memory of the moment decides.
-        let line = format!("--env={world} --set=replay.capacity_transitions=10000");
-        let mut args = args(&line);
-        args.flags.smoke = smoke;
-        of(&args, None).unwrap()
+        let line = format!("--env={world} --set=replay.capacity_transitions=10000{smoke}");
+        of(&line, None).unwrap()
     }
 
     #[test]
     fn every_level_of_every_dial_is_a_run_that_can_be_made() {
         let worlds = ["mspacman", "coinrun", "fruitbot", "dodgeball", "chain"];
-        for (name, smoke) in worlds.iter().flat_map(|it| [(it, false), (it, true)]) {
-            let Settings {
-                common, all_dials, ..
-            } = settings(name, smoke);
+        for (name, smoke) in worlds.iter().flat_map(|it| [(it, ""), (it, " --smoke")]) {
+            let Settings { common, levels, .. } = settings(name, smoke);
             let mut keys = BTreeSet::new();
-            for level in all_dials.iter().flat_map(Dial::level_points) {
-                let config = common.config(&level.point);
-                let config = config.unwrap_or_else(|e| panic!("{name} {}: {e}", level.point.key));
-                let base = common.config(&level.base).unwrap();
-                let key = level.point.key;
-                assert_ne!(config, base, "{key}: nothing is turned");
+            for LevelOf { base, point, .. } in levels {
+                let config = common.config(&point);
+                let config = config.unwrap_or_else(|e| panic!("{name} {}: {e}", point.key));
+                let key = point.key;
+                let is_base = config == common.config(&base).unwrap();
+                assert!(!is_base, "{key}: nothing is turned");
                 let one = keys.insert(key.clone());
-                assert!(one || level.point.sets.is_empty(), "{key} twice");
+                assert!(one || point.sets.is_empty(), "{key} twice");
             }
         }
     }
 
+    /// Worlds, a dial, and the settings that are its base's there.
+    const BASES: &str = "\
+mspacman coinrun chain|learner.precision|learner.precision=f32
+mspacman coinrun chain|actor.precision|actor.precision=f32
+mspacman coinrun chain|learner.publish_as|learner.publish_as=f32
+mspacman coinrun chain|learner.batch_size|learner.batch_size=64
+mspacman coinrun chain|replay.replay_ratio|replay.replay_ratio=8
+mspacman coinrun chain|model.atoms|model.atoms=51
+mspacman coinrun chain|replay.compression|replay.compression=none
+mspacman coinrun chain|learner.affinity.estimator|learner.affinity.estimator=learned
+mspacman coinrun chain|replay.shards|replay.shards=1
+mspacman coinrun chain|transport.shared_memory|transport.shared_memory=true
+mspacman coinrun|learner.publish_period_updates|learner.publish_period_updates=8
+mspacman coinrun|model.hidden|model.hidden=512
+mspacman coinrun|model.rkhs|model.rkhs=512
+mspacman coinrun|pairs NtM|learner.update.lambda.3t3=0 learner.update.lambda.3t4=0 learner.update.lambda.4t3=0
+mspacman|observation|input.height=42 input.width=38
+coinrun|observation|input.height=64 input.width=64";
+
     #[test]
     fn a_base_has_what_its_dial_says() {
-        const ALL: [&str; 3] = ["mspacman", "coinrun", "chain"];
-        for (worlds, dial, sets) in [
-            (&ALL[..], "learner.precision", "learner.precision=f32"),
-            (&ALL, "actor.precision", "actor.precision=f32"),
-            (&ALL, "learner.publish_as", "learner.publish_as=f32"),
-            (&ALL, "learner.batch_size", "learner.batch_size=64"),
-            (&ALL, "replay.replay_ratio", "replay.replay_ratio=8"),
-            (&ALL, "model.atoms", "model.atoms=51"),
-            (&ALL, "replay.compression", "replay.compression=none"),
-            (
-                &ALL,
-                "learner.affinity.estimator",
-                "learner.affinity.estimator=learned",
-            ),
-            (&ALL, "replay.shards", "replay.shards=1"),
-            (
-                &ALL,
-                "transport.shared_memory",
-                "transport.shared_memory=true",
-            ),
-            (
-                &ALL[..2],
-                "learner.publish_period_updates",
-                "learner.publish_period_updates=8",
-            ),
-            (&ALL[..2], "model.hidden", "model.hidden=512"),
-            (&ALL[..2], "model.rkhs", "model.rkhs=512"),
-            (
-                &ALL[..2],
-                "pairs NtM",
-                "learner.update.lambda.3t3=0 learner.update.lambda.3t4=0 learner.update.lambda.4t3=0",
-            ),
-            (&ALL[..1], "observation", "input.height=42 input.width=38"),
-            (&ALL[1..2], "observation", "input.height=64 input.width=64"),
-        ] {
-            for world in worlds {
-                let Settings {
-                    common, all_dials, ..
-                } = settings(world, false);
-                let dial = all_dials.iter().find(|it| it.name == dial).unwrap();
-                let base = dial.base_point();
+        for line in BASES.lines() {
+            let words: Vec<_> = line.split('|').collect();
+            for world in words[0].split(' ') {
+                let Settings { common, levels, .. } = settings(world, "");
+                let level = levels.iter().find(|it| it.dial.name == words[1]);
+                let base = &level.unwrap().base;
                 let mut said = base.clone();
-                said.sets = sets.split(' ').map(String::from).collect();
-                let configs = [&base, &said].map(|point| common.config(point).unwrap());
-                assert_eq!(configs[0], configs[1], "{} in {world}", dial.name);
+                said.sets = words[2].split(' ').map(String::from).collect();
+                let configs = [base, &said].map(|point| common.config(point).unwrap());
+                assert_eq!(configs[0], configs[1], "{line} in {world}");
             }
         }
     }
 
     #[test]
     fn a_preset_as_a_level_is_that_preset() {
-        let Settings {
-            common, all_dials, ..
-        } = settings("mspacman", false);
+        let Settings { common, levels, .. } = settings("mspacman", "");
         let of = |preset: &str, point: &Point| {
             let mut common = common.clone();
             common.preset = preset.to_owned();
@@ -220,26 +190,26 @@ mod tests {
             config.notes.clear();
             config
         };
-        for dial in all_dials.iter().filter(|it| it.name.starts_with("preset")) {
-            let base = dial.base_point();
-            assert_eq!(of("paper", &base), of(&dial.base, &base));
-            for level in dial.level_points() {
-                let whole = of(&level.level, &base);
-                assert_eq!(of("paper", &level.point), whole, "{}", level.point.key);
-            }
+        for it in levels
+            .iter()
+            .filter(|it| it.dial.name.starts_with("preset"))
+        {
+            assert_eq!(of("paper", &it.base), of(&it.dial.base, &it.base));
+            let whole = of(&it.level, &it.base);
+            assert_eq!(of("paper", &it.point), whole, "{}", it.point.key);
         }
     }
 
     #[test]
     fn a_folder_keeps_its_length() {
-        let first = of(&args("--env mspacman"), None).unwrap();
+        let first = of("--env mspacman", None).unwrap();
         assert!(first.frames_open);
         let found = Common {
             frames: 777,
             jobs: 2,
             ..first.common
         };
-        let again = of(&args("--env mspacman"), Some(found)).unwrap();
+        let again = of("--env mspacman", Some(found)).unwrap();
         assert_eq!(
             (again.common.frames, again.common.jobs, again.frames_open),
             (777, 2, false)
@@ -255,7 +225,7 @@ mod tests {
             ),
             ("--env ising", "it has some for mspacman, procgen, chain"),
         ] {
-            let said = of(&args(line), None).unwrap_err().to_string();
+            let said = of(line, None).unwrap_err().to_string();
             assert!(said.contains(expected), "{said}");
         }
     }

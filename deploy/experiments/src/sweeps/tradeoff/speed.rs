@@ -12,24 +12,6 @@ use serde::{Deserialize, Serialize};
 
 use super::held::HeldBatch;
 
-/// How long is measured.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Effort {
-    /// Turns of each side, an odd number.
-    rounds: usize,
-    /// How long a turn takes, at least; a turn has one call or more.
-    turn: Duration,
-}
-
-impl Effort {
-    /// Some seconds a level; a tenth of one for the smoke length.
-    pub(super) const fn of(smoke: bool) -> Self {
-        let (rounds, turn) = if smoke { (1, 20) } else { (9, 80) };
-        let turn = Duration::from_millis(turn);
-        Self { rounds, turn }
-    }
-}
-
 /// Times of one update and one action, of a level and of its base in turns with it. Medians over the turns.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Speed {
@@ -105,12 +87,11 @@ fn timed(turn: Duration, mut work: impl FnMut() -> anyhow::Result<()>) -> anyhow
     Ok(started.elapsed().as_secs_f64() / f64::from(calls))
 }
 
-/// Times `level` beside `base`.
-pub(super) fn measure(
-    base: &RunConfig,
-    level: &RunConfig,
-    Effort { rounds, turn }: Effort,
-) -> anyhow::Result<Speed> {
+/// Times `level` beside `base`: some seconds of both, a tenth of one for the smoke length.
+pub(super) fn measure(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyhow::Result<Speed> {
+    // Turns of each side, an odd number, and how long a turn takes, at least; a turn has one call or more.
+    let (rounds, turn) = if smoke { (1, 20) } else { (9, 80) };
+    let turn = Duration::from_millis(turn);
     let (mut from, mut to) = (Side::new(base)?, Side::new(level)?);
     // Buffers are made in the first call.
     from.seconds(Duration::ZERO)?;
