@@ -124,6 +124,7 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let pairs = (0..count).map(|_| pair(actions as u8, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
         estimate.observe(&pairs, &mut cases.rng)?;
+        estimate.check_valid()?;
         counts.iter_mut().for_each(|it| *it *= settings.decay);
         for (i, j) in pairs {
             counts[usize::from(i) * actions + usize::from(j)] += 1.0;

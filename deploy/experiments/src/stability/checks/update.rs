@@ -5,7 +5,7 @@ use driml_learner::{
     Batch, Compute, EqualStates, Lambda, LearnerSettings,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
-use driml_model::{ConvLayer, HeadConfig, ModelConfig, Parameters, TorsoName};
+use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -89,18 +89,11 @@ impl Setting {
             width: 20,
             input_channels: 2,
             num_actions: ACTIONS,
-            atoms: 51,
-            v_min: self.support.0,
-            v_max: self.support.1,
-            torso: TorsoName::Nature,
             conv: vec![layer(4, 2), layer(3, 1)],
-            channels: vec![],
-            scale_blocks: false,
-            hidden: 32,
             rkhs: 16,
             action_embed: 4,
             dim: settings.dim_heads(ACTIONS),
-            head: HeadConfig::PLAIN,
+            ..small::config(51, 32, self.support)
         }
     }
 
