@@ -56,8 +56,6 @@ mod bellman;
 pub mod checkpoint;
 mod config;
 pub mod cost;
-#[cfg(test)]
-mod edges;
 mod error;
 pub mod importance;
 pub mod insight;

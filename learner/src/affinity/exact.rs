@@ -162,10 +162,10 @@ mod tests {
         }
     }
 
-    fn of_15(smoothing: f64) -> ExactAffinity {
+    fn of_15() -> ExactAffinity {
         let settings = ExactSettings {
             decay: 0.999,
-            smoothing,
+            smoothing: 1.0,
         };
         ExactAffinity::new(Alphabet::raw(15).unwrap(), settings).unwrap()
     }
@@ -174,7 +174,7 @@ mod tests {
     #[test]
     fn actions_that_tell_nothing_leave_a_uniform() {
         let uniform = |row: &[f32]| row.iter().all(|a| (a * 15.0 - 1.0).abs() < 1e-4);
-        let (mut always_1, mut odd_ones) = (of_15(1.0), of_15(1.0));
+        let (mut always_1, mut odd_ones) = (of_15(), of_15());
         for _ in 0..100 {
             always_1.observe(&[(1, 1); 64]).unwrap();
             // Independent of each other; the even ones never.
@@ -185,20 +185,6 @@ mod tests {
         for exact in [always_1, odd_ones] {
             for (action, row) in exact.matrix.chunks_exact(15).enumerate() {
                 assert!(uniform(row), "action {action}: {row:?}");
-            }
-        }
-    }
-
-    #[test]
-    fn rows_are_laws_at_both_ends_of_the_smoothing() {
-        for smoothing in [1e-100, 1e-9, 1e9, 1e100] {
-            let mut exact = of_15(smoothing);
-            for _ in 0..50 {
-                exact.observe(&[(0, 0), (0, 3), (3, 14), (14, 0)]).unwrap();
-                exact.check_valid().unwrap();
-                for row in exact.matrix.chunks_exact(15) {
-                    assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-5, "{row:?}");
-                }
             }
         }
     }

@@ -132,45 +132,10 @@ fn factors_do_what_their_names_say() {
     assert_eq!(seen, [15, 30, 45, 40, 50, 60]);
 }
 
-/// Bilinear resizing in f64, by its definition.
-fn resized(
-    state: &[u8],
-    size: (usize, usize, usize),
-    crop: (usize, usize),
-    at: (usize, usize),
-) -> Vec<f64> {
-    let (height, width, channels) = size;
-    let place = |d: usize, from: usize, to: usize| {
-        let x = ((d as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
-        (
-            x.floor() as usize,
-            (x.floor() as usize + 1).min(from - 1),
-            x.fract(),
-        )
-    };
-    let mut out = Vec::new();
-    for y in 0..height {
-        let (y0, y1, v) = place(y, crop.0, height);
-        for x in 0..width {
-            let (x0, x1, u) = place(x, crop.1, width);
-            for c in 0..channels {
-                let pixel = |y: usize, x: usize| {
-                    f64::from(state[((at.0 + y) * width + at.1 + x) * channels + c])
-                };
-                let (top, bottom) = (
-                    pixel(y0, x0) * (1.0 - u) + pixel(y0, x1) * u,
-                    pixel(y1, x0) * (1.0 - u) + pixel(y1, x1) * u,
-                );
-                out.push(top * (1.0 - v) + bottom * v);
-            }
-        }
-    }
-    out
-}
-
+/// What their pixels become is in the table of properties of `driml experiment stability`.
 #[test]
-fn crops_are_resized_bilinearly() {
-    for (size, side, wanted) in [
+fn crops_are_of_a_share_of_each_side() {
+    for (size, crop_side, wanted) in [
         ((64, 64, 3), 0.8, (51, 51)),
         ((84, 84, 12), 0.8, (67, 67)),
         ((104, 80, 3), 0.8, (83, 64)),
@@ -179,27 +144,10 @@ fn crops_are_resized_bilinearly() {
         ((7, 8, 5), 0.01, (1, 1)),
     ] {
         let settings = AugmentSettings {
-            crop_side: side,
+            crop_side,
             ..NOTHING
         };
-        let augment = Augment::new(settings, size, 1);
-        assert_eq!(augment.crop(), wanted);
-        let state = noise(size.0 * size.1 * size.2, 5);
-        let mut rng = rng(6);
-        for _ in 0..4 {
-            let view = augment.draw(&mut rng);
-            let mut seen = vec![0; state.len()];
-            augment.apply_view(&state, &view, &mut seen);
-            let right = resized(&state, size, augment.crop(), (view.top, view.left));
-            for (at, (&seen, right)) in seen.iter().zip(right).enumerate() {
-                // Half a byte of rounding, and two weights within 1/512 of theirs.
-                let error = (f64::from(seen) - right).abs();
-                assert!(
-                    error < 0.5 + 2.0 * 255.0 / 512.0,
-                    "{size:?} at {at}: {error}"
-                );
-            }
-        }
+        assert_eq!(Augment::new(settings, size, 1).crop(), wanted);
     }
 }
 

@@ -96,7 +96,7 @@ pub(super) fn probability(rng: &mut impl Rng) -> f32 {
 }
 
 /// Supports from one step of a float to 2e30 wide, near 0 and far from it.
-pub(super) const SUPPORTS: [(f32, f32); 12] = [
+pub(super) const SUPPORTS: [(f32, f32); 14] = [
     (-10.0, 10.0),
     (0.0, 1.0),
     (1000.0, 1001.0),
@@ -109,6 +109,9 @@ pub(super) const SUPPORTS: [(f32, f32); 12] = [
     (-1e30, 1e30),
     (0.0, 1e30),
     (0.0, 1e-45),
+    (-1e6 - 1.0, -1e6),
+    // Low and width do not add up to high in f64 either.
+    (-9.174_887e29, -7.596_588_6),
 ];
 
 /// The ends of a support within 1e30: usual, one step of a float wide, or any.
@@ -127,6 +130,19 @@ pub(super) fn support(rng: &mut impl Rng) -> (f32, f32) {
             }
         },
     }
+}
+
+/// The least normal float; an error of what is smaller is a share of this.
+pub(super) const LEAST: f64 = f32::MIN_POSITIVE as f64;
+pub(super) const F32_STEP: f64 = f32::EPSILON as f64;
+
+/// exp(x - max) / sum of a row, without a logarithm; the largest, and the sum.
+pub(super) fn shares(row: &[f64]) -> (Vec<f64>, f64, f64) {
+    let max = row.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = row.iter().map(|x| (x - max).exp()).collect();
+    let sum = exact_sum(weights.iter().copied());
+    let shares = weights.iter().map(|weight| weight / sum);
+    (shares.collect(), max, sum)
 }
 
 /// The same numbers in f64.
@@ -151,7 +167,7 @@ pub(super) fn exact_sum(terms: impl IntoIterator<Item = f64>) -> f64 {
 
 /// The error of `found` as a share of what it should be, or of the least normal number where that is larger.
 pub(super) fn off(found: f32, expected: f64) -> f64 {
-    (f64::from(found) - expected).abs() / expected.abs().max(f32::MIN_POSITIVE.into())
+    (f64::from(found) - expected).abs() / expected.abs().max(LEAST)
 }
 
 /// The largest of errors, and NaN if one is.
@@ -168,9 +184,10 @@ pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
 }
 
 /// One of these.
-pub(super) fn one_of<T: Copy>(values: &[T], rng: &mut impl Rng) -> T {
-    *values
-        .choose(rng)
+pub(super) fn one_of<T: Clone>(values: &[T], rng: &mut impl Rng) -> T {
+    let value = values.choose(rng);
+    value
+        .cloned()
         .expect("a list that is written out has an item")
 }
 

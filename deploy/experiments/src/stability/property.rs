@@ -1,14 +1,13 @@
 //! A property: a routine of the product, the inputs for which it promises something, the promises and what tries them; and what was
 //! seen of each promise at each kind of extreme.
-//! It computes nothing itself: a check brings errors and the input that gave them.
+//! It computes nothing itself: a check brings the errors of one case and the input that gave them.
 
-use std::{fmt::Arguments, ops::Range};
+use std::fmt::Arguments;
 
-use driml_machine::error::Interrupted;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::settings::Settings;
+use super::{Settings, edges::one_of};
 use crate::progress::Progress;
 
 /// A row of the table of properties.
@@ -18,9 +17,22 @@ pub(super) struct Property {
     pub(super) range: &'static str,
     /// Each in words, with what an error is a share of, and the largest error that it allows; 0 where it allows none.
     pub(super) promises: &'static [(&'static str, f64)],
-    /// Runs the routine beside its reference on as many inputs as the settings want.
-    pub(super) check: fn(&mut Cases<'_>) -> anyhow::Result<()>,
+    /// Kinds of extremes in words, how many cases of each, and what runs the routine beside its reference in one case.
+    pub(super) extremes: &'static [(&'static str, Inputs, Check)],
 }
+
+pub(super) use Inputs::{Drawn, Listed};
+
+/// Where the inputs of a check come from.
+#[derive(Clone, Copy)]
+pub(super) enum Inputs {
+    /// Every combination of what the check lists.
+    Listed,
+    /// The generator, in this share of the draws.
+    Drawn(f64),
+}
+
+pub(super) type Check = fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
     /// A promise at one kind of extreme, before the first case.
@@ -88,40 +100,118 @@ pub(super) fn merge(rows: &mut Vec<Row>, others: Vec<Row>) {
     }
 }
 
-/// What a check draws its cases with, and reports them to.
+/// What a check takes the inputs of a case from, and reports its errors to.
 pub(super) struct Cases<'a> {
     pub(super) settings: &'a Settings,
     /// The generator of inputs, and of nothing else.
     pub(super) rng: ChaCha8Rng,
-    pub(super) property: &'static Property,
-    pub(super) progress: &'a mut Progress,
-    /// What was seen so far.
-    pub(super) rows: Vec<Row>,
+    property: &'static Property,
+    progress: &'a mut Progress,
+    extreme: String,
+    /// Which item of each list the case takes, and of how many; none where they are drawn.
+    taken: Option<Vec<(usize, usize)>>,
+    /// The lists that the case has taken an item of.
+    lists: usize,
+    rows: Vec<Row>,
 }
 
-impl Cases<'_> {
+impl<'a> Cases<'a> {
+    pub(super) fn new(
+        settings: &'a Settings,
+        rng: ChaCha8Rng,
+        property: &'static Property,
+        progress: &'a mut Progress,
+    ) -> Self {
+        Self {
+            settings,
+            rng,
+            property,
+            progress,
+            extreme: String::new(),
+            taken: None,
+            lists: 0,
+            rows: Vec::new(),
+        }
+    }
+
     /// The rows of all cases.
     pub(super) fn run(mut self) -> anyhow::Result<Vec<Row>> {
-        (self.property.check)(&mut self)?;
+        for &(extreme, inputs, check) in self.property.extremes {
+            let steps = self.settings.adam_steps.to_string();
+            let updates = self.settings.affinity_updates.to_string();
+            self.extreme = extreme
+                .replace("{adam_steps}", &steps)
+                .replace("{affinity_updates}", &updates);
+            match inputs {
+                Listed => {
+                    self.taken = Some(Vec::new());
+                    while self.taken.is_some() {
+                        check(&mut self)?;
+                        self.combine_anew();
+                    }
+                }
+                Drawn(share) => {
+                    let draws = (self.settings.draws as f64 * share).ceil().max(8.0) as u64;
+                    for _ in 0..draws {
+                        check(&mut self)?;
+                    }
+                }
+            }
+        }
         self.progress.advance(1)?;
         Ok(self.rows)
     }
 
-    /// Numbers of `share` of the draws, and of at least 8.
-    pub(super) fn draws(&self, share: f64) -> Range<u64> {
-        0..(self.settings.draws as f64 * share).ceil().max(8.0) as u64
+    /// Goes to the next combination of listed inputs, the last list's item first; none is taken after the last.
+    fn combine_anew(&mut self) {
+        self.lists = 0;
+        let mut taken = self.taken.take().unwrap_or_default();
+        while let Some((at, count)) = taken.pop() {
+            if at + 1 < count {
+                taken.push((at + 1, count));
+                self.taken = Some(taken);
+                break;
+            }
+        }
     }
 
-    /// Counts a case with its errors, in the order and the units of the promises; NaN is the largest, none says nothing.
+    /// One of these: in turn where inputs are listed, beside every item of the other lists; else any.
+    pub(super) fn each<T: Clone>(&mut self, items: &[T]) -> T {
+        self.of(items, |rng| one_of(items, rng))
+    }
+
+    /// One of these where inputs are listed, as [`Cases::each`] takes it; else one that is drawn.
+    pub(super) fn of<T: Clone>(
+        &mut self,
+        items: &[T],
+        draw: impl FnOnce(&mut ChaCha8Rng) -> T,
+    ) -> T {
+        let Some(taken) = &mut self.taken else {
+            return draw(&mut self.rng);
+        };
+        if self.lists == taken.len() {
+            taken.push((0, items.len()));
+        }
+        self.lists += 1;
+        items[taken[self.lists - 1].0].clone()
+    }
+
+    /// Counts errors of this case, in the order and the units of the promises; NaN is the largest, none says nothing.
     pub(super) fn see<E: Into<Option<f64>>, const N: usize>(
         &mut self,
-        extreme: &str,
         input: Arguments<'_>,
         errors: [E; N],
-    ) -> Result<(), Interrupted> {
+    ) -> anyhow::Result<()> {
         for (promise, error) in errors.into_iter().enumerate() {
             let Some(error) = error.into() else { continue };
-            let row = self.row(promise, extreme);
+            let words = self.property.promises[promise].0;
+            let mut rows = self.rows.iter();
+            let found = rows.position(|it| it.is_beside(words, &self.extreme));
+            let at = found.unwrap_or_else(|| {
+                self.rows.push(self.property.row(promise, &self.extreme));
+                self.rows.len() - 1
+            });
+            let row = &mut self.rows[at];
             row.cases += 1;
             // The least of a number and NaN is the number.
             let error = error.abs().min(f64::MAX);
@@ -132,70 +222,73 @@ impl Cases<'_> {
         self.pause()
     }
 
-    /// Where an interrupt ends a check that has long to go until its next case.
-    pub(super) fn pause(&mut self) -> Result<(), Interrupted> {
-        self.progress.advance(0)
+    /// Counts whether this case keeps a promise, one of the first three, that allows no error.
+    pub(super) fn keeps(
+        &mut self,
+        promise: usize,
+        input: Arguments<'_>,
+        is_kept: bool,
+    ) -> anyhow::Result<()> {
+        let mut errors = [None; 3];
+        errors[promise] = Some(if is_kept { 0.0 } else { 1.0 });
+        self.see(input, errors)
     }
 
-    fn row(&mut self, promise: usize, extreme: &str) -> &mut Row {
-        let words = self.property.promises[promise].0;
-        let mut rows = self.rows.iter();
-        let found = rows.position(|it| it.is_beside(words, extreme));
-        let at = found.unwrap_or_else(|| {
-            self.rows.push(self.property.row(promise, extreme));
-            self.rows.len() - 1
-        });
-        &mut self.rows[at]
+    /// Where an interrupt ends a case that has long to go until it sees an error.
+    pub(super) fn pause(&mut self) -> anyhow::Result<()> {
+        Ok(self.progress.advance(0)?)
     }
-}
-
-/// The error of a promise that allows none.
-pub(super) fn broken(is_kept: bool) -> f64 {
-    f64::from(u8::from(!is_kept))
 }
 
 #[cfg(test)]
 mod tests {
     use driml_launch::interrupts::Interrupts;
-    use rand::SeedableRng;
+    use rand::{Rng, SeedableRng};
 
     use super::*;
 
     static HALVING: Property = Property {
         routine: "halving",
         range: "any",
-        promises: &[("error", 0.5), ("other bits", 0.0), ("untried", 0.0)],
-        check: |cases| {
-            for (input, error) in [(1, 0.25), (2, -0.375), (3, 0.125)] {
-                cases.see("small", format_args!("{input}"), [error, broken(true)])?;
-            }
-            cases.see("large", format_args!("4"), [Some(f64::NAN), None])?;
-            Ok(())
-        },
+        promises: &[("error", 320.0), ("other bits", 0.0), ("untried", 0.0)],
+        extremes: &[
+            ("listed", Listed, |cases| {
+                // Which items there are may depend on what was taken before.
+                let first = cases.each(&[1, 2, 3]);
+                let second = cases.of(&[0, 1, 2][..first], |_| 9);
+                let number = 100 * first + 10 * second;
+                cases.see(format_args!("{number}"), [-(number as f64), 0.0])
+            }),
+            ("drawn", Drawn(0.1), |cases| {
+                let number = cases.of(&[1000], |rng| rng.random_range(0..10));
+                cases.see(format_args!("{number}"), [f64::from(number)])
+            }),
+            ("large", Listed, |cases| {
+                cases.see(format_args!("4"), [Some(f64::NAN), None])
+            }),
+        ],
     };
 
     #[test]
-    fn a_row_keeps_its_worst_case_and_no_number_is_worst_of_all() {
-        let cases = Cases {
-            settings: &toml::from_str(include_str!("smoke.toml")).unwrap(),
-            rng: ChaCha8Rng::seed_from_u64(1),
-            property: &HALVING,
-            progress: &mut Progress::new(1, Interrupts::default()),
-            rows: Vec::new(),
-        };
+    fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
+        let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
+        let progress = &mut Progress::new(1, Interrupts::default());
+        let rng = ChaCha8Rng::seed_from_u64(1);
+        let cases = Cases::new(&settings, rng, &HALVING, progress);
         let mut rows = cases.run().unwrap();
         rows.extend(HALVING.untried(&rows));
         let seen = |row: &Row| (row.cases, row.worst, row.input.clone(), row.is_kept());
         let expected = [
-            (3, 0.375, "2".to_owned(), true),
-            (3, 0.0, String::new(), true),
+            (6, 320.0, "320".to_owned(), true),
+            (6, 0.0, String::new(), true),
+            (40, 9.0, "9".to_owned(), true),
             (1, f64::MAX, "4".to_owned(), false),
             (0, 0.0, String::new(), false),
         ];
         assert_eq!(rows.iter().map(seen).collect::<Vec<_>>(), expected);
         let mut both = rows.clone();
-        both[0].worst = 0.125;
+        both[0].worst = 160.0;
         merge(&mut both, rows);
-        assert_eq!((both.len(), both[0].cases, both[0].worst), (4, 6, 0.375));
+        assert_eq!((both.len(), both[0].cases, both[0].worst), (5, 12, 320.0));
     }
 }

@@ -1,44 +1,37 @@
 //! States cropped and recoloured, as an auxiliary objective sees them, against bytes that are rounded once.
 
-use driml_learner::augment::{Augment, AugmentSettings, View};
+use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR, View};
 use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
 use crate::stability::{
     edges::{one_of, worst},
-    property::Cases,
+    property::{Cases, Drawn, Listed, Property},
 };
 
-/// States [height, width, stack * frame channels] and a crop of each side.
+const STATES: &str = "states of 1 to 13 pixels a side, 1 to 4 frames in colour or grey; crops resized to the whole; the same states recoloured, factors and turns at the ends of their ranges and between, drawn";
+
+pub(super) const PROPERTIES: &[Property] = &[Property {
+    routine: "augmentation",
+    range: "crops of a pixel and more; brightness, contrast and saturation 0 to 2, hue -0.5 to 0.5 turns",
+    promises: &[
+        ("a byte of a crop", CROP_ERROR),
+        ("a recoloured byte", COLOUR_ERROR),
+    ],
+    extremes: &[
+        ("states and crops of the sizes of worlds", Listed, check),
+        (STATES, Drawn(0.5), check),
+    ],
+}];
+
+/// States [height, width, stack * frame channels].
 struct Picture {
     size: (usize, usize, usize),
     frame_channels: usize,
-    crop_side: f64,
     state: Vec<u8>,
 }
 
 impl Picture {
-    fn drawn(rng: &mut ChaCha8Rng) -> Self {
-        let frame_channels = one_of(&[1, 3], rng);
-        let (height, width) = (rng.random_range(1..14), rng.random_range(1..14));
-        let channels = frame_channels * rng.random_range(1..=4);
-        // Of all bytes, or of the two ends alone.
-        let any = rng.random_bool(0.5);
-        let mut byte = || {
-            if any {
-                rng.random()
-            } else {
-                one_of(&[0, 255], rng)
-            }
-        };
-        Self {
-            size: (height, width, channels),
-            frame_channels,
-            state: (0..height * width * channels).map(|_| byte()).collect(),
-            crop_side: rng.random_range(0.01..=1.0),
-        }
-    }
-
+    /// The strongest, with crops of this side.
     fn augment(&self, crop_side: f64) -> Augment {
         let strongest = AugmentSettings {
             crop_side,
@@ -57,8 +50,7 @@ impl Picture {
     }
 
     /// The largest error of a crop, in bytes.
-    fn crop_error(&self, view: &View) -> f64 {
-        let augment = self.augment(self.crop_side);
+    fn crop_error(&self, augment: &Augment, view: &View) -> f64 {
         let (height, width, channels) = self.size;
         let (rows, columns) = augment.crop();
         // Where an output pixel lies in the crop: two pixels and the second one's share.
@@ -68,7 +60,7 @@ impl Picture {
             let near = place as usize;
             (near, (near + 1).min(crop - 1), place.fract())
         };
-        let seen = self.seen(&augment, view);
+        let seen = self.seen(augment, view);
         worst(seen.iter().enumerate().map(|(at, &found)| {
             let (pixel, channel) = (at / channels, at % channels);
             let (top, bottom, down) = place(pixel / width, rows, height);
@@ -91,62 +83,79 @@ impl Picture {
         };
         let of_state = mean(&self.state);
         let (sin, cos) = (view.hue * std::f64::consts::TAU).sin_cos();
-        let pixels = self.state.chunks_exact(self.frame_channels);
-        let pixels = pixels.zip(seen.chunks_exact(self.frame_channels));
-        worst(pixels.flat_map(|(pixel, found)| {
+        worst(seen.iter().enumerate().map(|(at, &found)| {
+            let (first, i) = (at - at % self.frame_channels, at % self.frame_channels);
+            let pixel = &self.state[first..first + self.frame_channels];
             let grey = mean(pixel);
-            let d: Vec<f64> = pixel
-                .iter()
-                .map(|&channel| f64::from(channel) - grey)
-                .collect();
-            let errors = found.iter().enumerate().map(|(i, &found)| {
-                let coloured = match d.as_slice() {
-                    // A turn about the axis of greys, by Rodrigues' formula.
-                    [_, _, _] => {
-                        let cross = (d[(i + 2) % 3] - d[(i + 1) % 3]) / 3f64.sqrt();
-                        grey + view.saturation * (d[i] * cos + cross * sin)
-                    }
-                    _ => grey,
-                };
-                let expected = view.brightness * (of_state + view.contrast * (coloured - of_state));
-                (f64::from(found) - expected.clamp(0.0, 255.0)).abs()
-            });
-            errors.collect::<Vec<_>>()
+            let coloured = match pixel {
+                // A turn about the axis of greys, by Rodrigues' formula.
+                [_, _, _] => {
+                    let d = |i: usize| f64::from(pixel[i % 3]) - grey;
+                    let cross = (d(i + 2) - d(i + 1)) / 3f64.sqrt();
+                    grey + view.saturation * (d(i) * cos + cross * sin)
+                }
+                _ => grey,
+            };
+            let expected = view.brightness * (of_state + view.contrast * (coloured - of_state));
+            (f64::from(found) - expected.clamp(0.0, 255.0)).abs()
         }))
     }
 }
 
-pub(crate) fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    for _ in cases.draws(0.5) {
-        let rng = &mut cases.rng;
-        let picture = Picture::drawn(rng);
-        let any = picture.augment(picture.crop_side).draw(rng);
-        // At the ends of its ranges, or anywhere in them.
-        let mut end = |value: f64, ends: [f64; 3]| match rng.random_bool(0.5) {
-            true => value,
-            false => one_of(&ends, rng),
-        };
-        let view = View {
-            brightness: end(any.brightness, [0.0, 1.0, 2.0]),
-            contrast: end(any.contrast, [0.0, 1.0, 2.0]),
-            saturation: end(any.saturation, [0.0, 1.0, 2.0]),
-            hue: end(any.hue, [-0.5, 0.0, 0.5]),
-            ..any
-        };
-        let plain = View {
-            brightness: 1.0,
-            contrast: 1.0,
-            saturation: 1.0,
-            hue: 0.0,
-            ..view
-        };
-        let extreme = "states of 1 to 13 pixels a side, 1 to 4 frames in colour or grey; crops resized to the whole; the same states recoloured, factors and turns at the ends of their ranges and between, drawn";
-        let input = format_args!(
-            "{:?}, crop_side {}: {view:?}",
-            picture.size, picture.crop_side
-        );
-        let errors = [picture.crop_error(&plain), picture.colour_error(&view)];
-        cases.see(extreme, input, errors)?;
-    }
-    Ok(())
+fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let sizes = [
+        (64, 64, 3, 1, 0.8),
+        (84, 84, 3, 4, 0.8),
+        (104, 80, 1, 3, 0.8),
+        (12, 12, 1, 1, 0.5),
+        (9, 5, 1, 4, 0.6),
+        (7, 8, 1, 5, 0.01),
+    ];
+    let (height, width, frame_channels, stack, crop_side) = cases.of(&sizes, |rng| {
+        let (height, width) = (rng.random_range(1..14), rng.random_range(1..14));
+        let (channels, stack) = (one_of(&[1, 3], rng), rng.random_range(1..=4));
+        (height, width, channels, stack, rng.random_range(0.01..=1.0))
+    });
+    let (rng, channels) = (&mut cases.rng, frame_channels * stack);
+    // Of all bytes, or of the two ends alone.
+    let bytes: &[u8] = if rng.random() { &[] } else { &[0, 255] };
+    let state = (0..height * width * channels).map(|_| match bytes {
+        [] => rng.random(),
+        ends => one_of(ends, rng),
+    });
+    let picture = Picture {
+        state: state.collect(),
+        size: (height, width, channels),
+        frame_channels,
+    };
+    let augment = picture.augment(crop_side);
+    let any = augment.draw(rng);
+    // At the ends of its ranges, or anywhere in them.
+    let mut end = |value: f64, ends: [f64; 3]| match rng.random_bool(0.5) {
+        true => value,
+        false => one_of(&ends, rng),
+    };
+    let view = View {
+        brightness: end(any.brightness, [0.0, 1.0, 2.0]),
+        contrast: end(any.contrast, [0.0, 1.0, 2.0]),
+        saturation: end(any.saturation, [0.0, 1.0, 2.0]),
+        hue: end(any.hue, [-0.5, 0.0, 0.5]),
+        ..any
+    };
+    let plain = View {
+        brightness: 1.0,
+        contrast: 1.0,
+        saturation: 1.0,
+        hue: 0.0,
+        ..view
+    };
+    let errors = [
+        picture.crop_error(&augment, &plain),
+        picture.colour_error(&view),
+    ];
+    let size = picture.size;
+    cases.see(
+        format_args!("{size:?}, crop_side {crop_side}: {view:?}"),
+        errors,
+    )
 }

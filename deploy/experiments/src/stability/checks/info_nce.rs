@@ -1,19 +1,55 @@
 //! InfoNCE: the soft clip of a score, and the loss with its slopes.
 
 use driml_learner::losses::{
-    info_nce::{info_nce, slope_error},
-    scores::{self, Scores},
+    info_nce::{LOSS_ERROR, info_nce, slope_error},
+    scores::{self, CLIP_ERROR, Scores},
 };
 use rand::Rng;
 
-use super::c51::shares;
 use crate::stability::{
-    edges::{Shown, exact_sum, finite, finites, not_finite, one_of, worst},
-    property::{Cases, broken},
+    edges::{Shown, exact_sum, finite, finites, not_finite, one_of, shares, worst},
+    property::{Cases, Drawn, Listed, Property},
 };
 
-/// Errors of a score and of its slope.
-fn clip_errors(dot: f32, rkhs: usize, bound: f64) -> [f64; 2] {
+const RANGE: &str = "dot products finite; bounds 1e-30 to 1e30";
+const DOTS: &str =
+    "dot products 0 to 3.4e38, bounds 1e-30, 1e-3, 1, 20, 1e9, 1e12, 1e15, 1e17, 1e30";
+const BATCHES: &str = "2, 3, 17, 256 rows; bounds 1e-30 to 1e30; dot products all 0, all 3.4e38, 1 to 1e4, 1e30; none, one, all rows valid";
+const NOT_FINITE: &str = "infinite or not a number in rows and columns that are not valid; of two valid rows infinite, beside 3.4e38, or not a number";
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "soft clip",
+        range: RANGE,
+        promises: &[
+            ("a score, as a share of it", CLIP_ERROR),
+            ("its slope, as a share of `slope_error` times it", 1.0),
+        ],
+        extremes: &[(DOTS, Listed, clip), ("drawn", Drawn(5.0), clip)],
+    },
+    Property {
+        routine: "InfoNCE",
+        range: "dot products finite; bounds 1e-30 to 1e30; any rows valid",
+        promises: &[
+            ("the loss, as a share of 10 + the largest score", LOSS_ERROR),
+            // Of 1e-7 of it + 1e-15 + what the rounding of the largest score leaves open.
+            ("a slope, as a share of `slope_error`", 1.0),
+            ("cases with other bits, or that hide it", 0.0),
+        ],
+        extremes: &[
+            (BATCHES, Listed, loss),
+            ("drawn", Drawn(0.5), loss),
+            (NOT_FINITE, Drawn(0.1), loss_of_not_finite),
+        ],
+    },
+];
+
+fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let bounds = [1e-30, 1e-3, 1.0, 20.0, 1e9, 1e12, 1e15, 1e17, 1e30];
+    let bound: f64 = cases.of(&bounds, |rng| 10f64.powf(rng.random_range(-30.0..=30.0)));
+    let dots = [0.0, 1e-45, 1e-20, 3.7, 400.0, 7e3, 1e10, 1e30, f32::MAX];
+    let dot = cases.of(&dots, finite) * cases.of(&[1.0, -1.0], |_| 1.0);
+    let rkhs = cases.of(&[256usize], |rng| rng.random_range(1..4096));
     let (score, slope) = Scores::new(rkhs, bound).clip(dot);
     let x = f64::from(dot) / (rkhs as f64).sqrt();
     let ratio = x / bound;
@@ -25,27 +61,9 @@ fn clip_errors(dot: f32, rkhs: usize, bound: f64) -> [f64; 2] {
     // Divided twice, as the square of the cosh may be too large for a float where the slope is not yet too small for one.
     let expected = 1.0 / (rkhs as f64).sqrt() / ratio.cosh() / ratio.cosh();
     let allowed = scores::slope_error(x, bound) * expected.max(scores::LEAST_SLOPE);
-    [of_score, (slope - expected).abs() / allowed]
-}
-
-pub(crate) fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let see = |cases: &mut Cases<'_>, extreme, dot: f32, rkhs, bound: f64| {
-        let input = format_args!("dot {dot:e}, width {rkhs}, bound {bound:e}");
-        cases.see(extreme, input, clip_errors(dot, rkhs, bound))
-    };
-    let listed = "dot products 0 to 3.4e38, bounds 1e-30, 1e-3, 1, 20, 1e9, 1e12, 1e15, 1e17, 1e30";
-    for bound in [1e-30, 1e-3, 1.0, 20.0, 1e9, 1e12, 1e15, 1e17, 1e30] {
-        for dot in [0.0, 1e-45, 1e-20, 3.7, 400.0, 7e3, 1e10, 1e30, f32::MAX] {
-            see(cases, listed, dot, 256, bound)?;
-            see(cases, listed, -dot, 256, bound)?;
-        }
-    }
-    for _ in cases.draws(5.0) {
-        let bound = 10f64.powf(cases.rng.random_range(-30.0..=30.0));
-        let (dot, rkhs) = (finite(&mut cases.rng), cases.rng.random_range(1..4096));
-        see(cases, "drawn", dot, rkhs, bound)?;
-    }
-    Ok(())
+    let of_slope = (slope - expected).abs() / allowed;
+    let input = format_args!("dot {dot:e}, width {rkhs}, bound {bound:e}");
+    cases.see(input, [of_score, of_slope])
 }
 
 /// `dots` [L, B, B] of vectors of 64 numbers.
@@ -65,17 +83,14 @@ impl Batch {
 
     fn bits(&self) -> (u64, Vec<u32>) {
         let (loss, slopes) = self.loss();
-        (
-            loss.to_bits(),
-            slopes.iter().map(|slope| slope.to_bits()).collect(),
-        )
+        let slopes = slopes.iter().map(|slope| slope.to_bits());
+        (loss.to_bits(), slopes.collect())
     }
 
     /// The rows that count.
     fn there(&self) -> Vec<usize> {
-        (0..self.valid.len())
-            .filter(|&row| self.valid[row] != 0)
-            .collect()
+        let rows = 0..self.valid.len();
+        rows.filter(|&row| self.valid[row] != 0).collect()
     }
 
     /// Errors of the loss and of its slopes.
@@ -95,9 +110,8 @@ impl Batch {
             let scores: Vec<f64> = there.iter().map(|&j| score(j)).collect();
             let (shares, max, sum) = shares(&scores);
             losses.extend([sum.ln(), max - score(anchor)]);
-            largest = scores
-                .iter()
-                .fold(largest, |most, score| most.max(score.abs()));
+            let sizes = scores.iter().map(|score| score.abs());
+            largest = sizes.fold(largest, f64::max);
             for (&j, share) in there.iter().zip(shares) {
                 let target = if j == anchor { 1.0 } else { 0.0 };
                 let slope = (share - target) * weight / 8.0;
@@ -111,55 +125,37 @@ impl Batch {
         let of_loss = (loss - exact_sum(losses) * weight) / (10.0 + largest);
         [of_loss, worst(of_slopes)]
     }
-
-    fn see(&self, extreme: &str, cases: &mut Cases<'_>) -> anyhow::Result<()> {
-        let (rows, there, dots) = (self.valid.len(), self.there().len(), Shown(&self.dots));
-        let bound = self.bound;
-        let input =
-            format_args!("{rows} rows, {there} of them valid, bound {bound:e}, dots {dots}");
-        Ok(cases.see(extreme, input, self.errors())?)
-    }
 }
 
-pub(crate) fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let listed = "2, 3, 17, 256 rows; bounds 1e-30 to 1e30; dot products all 0, all 3.4e38, 1 to 1e4, 1e30; none, one, all rows valid";
-    for count in [2usize, 3, 17, 256] {
-        let equal = [0.0, f32::MAX].map(|dot| vec![dot; count * count]);
-        let ramps = [1.0f32, 1e4, 1e30].map(|scale| {
-            let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;
-            (0..count * count).map(dot).collect()
-        });
-        for bound in [1e-30, 1e-3, 1.0, 20.0, 1e6, 1e15, 1e17, 1e30] {
-            for dots in equal.iter().chain(&ramps) {
-                for valid in [0, 1, count] {
-                    let batch = Batch {
-                        dots: dots.clone(),
-                        valid: (0..count).map(|row| u8::from(row < valid)).collect(),
-                        bound,
-                    };
-                    batch.see(listed, cases)?;
-                }
-            }
+fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let rows = cases.of(&[2usize, 3, 17, 256], |rng| rng.random_range(1..12));
+    let bounds = [1e-30, 1e-3, 1.0, 20.0, 1e6, 1e15, 1e17, 1e30];
+    let bound = cases.each(&bounds);
+    let dots = match cases.of(&["0", "3.4e38", "1", "1e4", "1e30"], |_| "drawn") {
+        "drawn" => {
+            let locations = cases.rng.random_range(1..3);
+            finites(locations * rows * rows, &mut cases.rng)
         }
-    }
-    for _ in cases.draws(0.5) {
-        let rng = &mut cases.rng;
-        let (locations, count) = (rng.random_range(1..3), rng.random_range(1..12));
-        let batch = Batch {
-            dots: finites(locations * count * count, rng),
-            valid: (0..count).map(|_| u8::from(rng.random_bool(0.8))).collect(),
-            bound: one_of(&[1e-30, 1e-3, 1.0, 20.0, 1e6, 1e17, 1e30], rng),
-        };
-        batch.see("drawn", cases)?;
-    }
-    for _ in cases.draws(0.1) {
-        see_not_finite(cases)?;
-    }
-    Ok(())
+        "0" => vec![0.0; rows * rows],
+        "3.4e38" => vec![f32::MAX; rows * rows],
+        scale => {
+            let scale: f32 = scale.parse()?;
+            let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;
+            (0..rows * rows).map(dot).collect()
+        }
+    };
+    let some = |count: usize| (0..rows).map(|row| u8::from(row < count)).collect();
+    let valid = cases.of(&[some(0), some(1), some(rows)], |rng| -> Vec<u8> {
+        (0..rows).map(|_| rng.random_bool(0.8).into()).collect()
+    });
+    let batch = Batch { dots, valid, bound };
+    let (there, dots) = (batch.there().len(), Shown(&batch.dots));
+    let input = format_args!("{rows} rows, {there} of them valid, bound {bound:e}, dots {dots}");
+    cases.see(input, batch.errors())
 }
 
 /// Dot products that are not finite: in rows that do not count, and in those that do.
-fn see_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn loss_of_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let count = rng.random_range(2..12);
     // The first row is valid, the last is not.
@@ -174,27 +170,17 @@ fn see_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             *dot = not_finite(rng);
         }
     }
+    let mut is_kept = batch.bits() == before;
     let there = batch.there();
     let at = one_of(&there, rng) * count + one_of(&there, rng);
-    let mut see = |extreme, batch: &Batch, kept| {
-        let input = format_args!("valid {:?}, dots {}", batch.valid, Shown(&batch.dots));
-        cases.see(extreme, input, [None, None, Some(broken(kept))])
-    };
-    let extreme = "infinite or not a number in rows and columns that are not valid";
-    see(extreme, &batch, before == batch.bits())?;
     for end in [f32::MAX, f32::MIN] {
         batch.dots[at] = end;
         let at_the_bound = batch.bits();
         batch.dots[at] = end * 2.0;
-        let extreme = "an infinite dot product of two valid rows, beside 3.4e38";
-        see(extreme, &batch, batch.bits() == at_the_bound)?;
+        is_kept &= batch.bits() == at_the_bound;
     }
     batch.dots[at] = f32::NAN;
-    let shows = !batch.loss().0.is_finite();
-    see(
-        "a dot product of two valid rows is not a number",
-        &batch,
-        shows,
-    )?;
-    Ok(())
+    is_kept &= !batch.loss().0.is_finite();
+    let input = format_args!("valid {:?}, dots {}", batch.valid, Shown(&batch.dots));
+    cases.keeps(2, input, is_kept)
 }

@@ -1,18 +1,39 @@
-//! The checks of the properties, a file a family: which inputs a routine gets, and the reference it is held to.
-//! References are written without a look at the routine.
+//! The table of properties, a file a family: which inputs a routine gets, and the reference it is held to.
+//! References are written without a look at the routine. A bound is a constant of the routine wherever it has one.
 
-pub(super) mod adam;
-pub(super) mod affinity;
-pub(super) mod augment;
-pub(super) mod c51;
-pub(super) mod counters;
-pub(super) mod info_nce;
-pub(super) mod optimiser;
-pub(super) mod products;
-pub(super) mod refused;
-pub(super) mod replay;
-pub(super) mod sampling;
-pub(super) mod stored;
-pub(super) mod update;
-pub(super) mod values;
-pub(super) mod worlds;
+mod adam;
+mod affinity;
+mod augment;
+mod c51;
+mod counters;
+mod info_nce;
+mod optimiser;
+mod products;
+mod refused;
+mod replay;
+mod sampling;
+mod stored;
+mod update;
+mod values;
+mod worlds;
+
+use super::property::Property;
+
+/// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
+pub(super) const TABLE: [&[Property]; 15] = [
+    c51::PROPERTIES,
+    values::PROPERTIES,
+    info_nce::PROPERTIES,
+    optimiser::PROPERTIES,
+    adam::PROPERTIES,
+    products::PROPERTIES,
+    update::PROPERTIES,
+    augment::PROPERTIES,
+    stored::PROPERTIES,
+    affinity::PROPERTIES,
+    sampling::PROPERTIES,
+    replay::PROPERTIES,
+    counters::PROPERTIES,
+    worlds::PROPERTIES,
+    refused::PROPERTIES,
+];

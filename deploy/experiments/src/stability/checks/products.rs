@@ -8,8 +8,61 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::stability::{
     edges::{Shown, clamped, finite, not_finite, worst},
-    property::{Cases, broken},
+    property::{Cases, Check, Drawn, Inputs, Listed, Property},
 };
+
+const PRODUCT: &str = "a sum of products, as a share of the precision's `product_error` and floor";
+const PROMISES: &[(&str, f64)] = &[
+    (PRODUCT, 1.0),
+    (
+        "cases that hide it, or change other rows or later calls",
+        0.0,
+    ),
+];
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "products, f32",
+        range: "operands finite, the sum of their products' sizes below 3.4e38",
+        promises: PROMISES,
+        extremes: &extremes::<false>(),
+    },
+    Property {
+        routine: "products, bf16",
+        range: "operands within 3.38e38, the sum of their products' sizes below 3.3e38",
+        promises: PROMISES,
+        extremes: &extremes::<true>(),
+    },
+];
+
+const SIZES: &str = "fully connected, results and gradients: operands of 0, 1e-45, 1e-40, 1e-38, 1e-20, 1, 1e17, one among others";
+const DRAWN: &str = "fully connected, results and gradients, drawn";
+const MAPS: &str = "convolution with ReLU, results and gradients, on floats and bytes, drawn";
+const PROCGEN: &str = "both at the sizes of Procgen's network, 32 images, and of DIM's heads";
+const SPOILT: &str = "one operand infinite or not a number, before and after ReLU";
+
+const fn extremes<const BF16: bool>() -> [(&'static str, Inputs, Check); 6] {
+    [
+        (SIZES, Listed, dense_of_sizes::<BF16>),
+        (DRAWN, Drawn(0.02), dense::<BF16>),
+        (MAPS, Drawn(0.02), convolution::<BF16>),
+        (PROCGEN, Listed, layers_of_procgen::<BF16>),
+        (SPOILT, Drawn(0.02), spoilt::<BF16>),
+        (
+            "products beyond 3.4e38, all of one sign",
+            Drawn(0.01),
+            infinite::<BF16>,
+        ),
+    ]
+}
+
+const fn precision<const BF16: bool>() -> Precision {
+    if BF16 {
+        Precision::Bf16
+    } else {
+        Precision::F32
+    }
+}
 
 /// From the maps to the hidden layer, from there to the atoms of 15 actions, and each place of a map to a score of DIM.
 const DENSE: [Layer; 3] = [
@@ -172,16 +225,27 @@ impl Layer {
         Ok(worst(errors))
     }
 
-    fn see(
+    fn see<const BF16: bool>(
         &self,
-        extreme: &str,
         cases: &mut Cases<'_>,
         operands: &Operands,
-        precision: Precision,
     ) -> anyhow::Result<()> {
+        let error = self.error(operands, precision::<BF16>())?;
         let w = operands[1].flatten_all()?.to_vec1()?;
         let input = format_args!("{self:?}, {:?}, w {}", operands[0].dtype(), Shown(&w));
-        Ok(cases.see(extreme, input, [self.error(operands, precision)?])?)
+        cases.see(input, [error])
+    }
+
+    /// The same with inputs that are bytes.
+    fn see_bytes<const BF16: bool>(
+        &self,
+        cases: &mut Cases<'_>,
+        mut operands: Operands,
+    ) -> anyhow::Result<()> {
+        let bytes = (0..operands[0].elem_count()).map(|_| cases.rng.random());
+        let bytes: Vec<u8> = bytes.collect();
+        operands[0] = Tensor::from_vec(bytes, operands[0].shape(), &Device::Cpu)?;
+        self.see::<BF16>(cases, &operands)
     }
 }
 
@@ -215,90 +279,61 @@ fn moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     clamped(count, 1e17, rng)
 }
 
-fn bytes(operands: &mut Operands, rng: &mut ChaCha8Rng) -> anyhow::Result<()> {
-    let bytes: Vec<u8> = (0..operands[0].elem_count())
-        .map(|_| rng.random())
-        .collect();
-    operands[0] = Tensor::from_vec(bytes, operands[0].shape(), &Device::Cpu)?;
+fn dense_of_sizes<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let size = cases.each(&[0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17]);
+    let other = cases.each(&[1e-40f32, 1e-20, 1.0, 1e17]);
+    let layer = Layer::drawn_dense(&mut cases.rng);
+    let mut sizes = [other, size].into_iter().cycle();
+    let mut draw = |count: usize, rng: &mut ChaCha8Rng| {
+        let size = sizes.next().unwrap_or(size);
+        usual(count, rng).into_iter().map(|x| x * size).collect()
+    };
+    let operands = layer.operands(&mut draw, &mut cases.rng)?;
+    layer.see::<BF16>(cases, &operands)
+}
+
+fn dense<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let most = if BF16 { BF16_MAX } else { f32::MAX };
+    let layer = Layer::drawn_dense(&mut cases.rng);
+    let mut draw = |count: usize, rng: &mut ChaCha8Rng| match rng.random_bool(0.7) {
+        true => moderate(count, rng),
+        false => clamped(count, most, rng),
+    };
+    let operands = layer.operands(&mut draw, &mut cases.rng)?;
+    layer.see::<BF16>(cases, &operands)
+}
+
+fn convolution<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let layer = Layer::drawn_convolution(&mut cases.rng);
+    let operands = layer.operands(&mut { moderate }, &mut cases.rng)?;
+    layer.see::<BF16>(cases, &operands)?;
+    layer.see_bytes::<BF16>(cases, operands)
+}
+
+fn layers_of_procgen<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let layer = cases.each(&[DENSE, CONVOLUTIONS].concat());
+    let mut draw = cases.each(&[usual as fn(_, &mut _) -> _, moderate]);
+    let operands = layer.operands(&mut draw, &mut cases.rng)?;
+    layer.see::<BF16>(cases, &operands)?;
+    if layer.is_convolution() {
+        layer.see_bytes::<BF16>(cases, operands)?;
+    }
     Ok(())
 }
 
-pub(crate) fn check(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
-    for size in [0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17] {
-        for other in [1e-40f32, 1e-20, 1.0, 1e17] {
-            let layer = Layer::drawn_dense(&mut cases.rng);
-            let mut sizes = [other, size].into_iter().cycle();
-            let mut draw = |count: usize, rng: &mut ChaCha8Rng| {
-                let size = sizes.next().unwrap_or(size);
-                usual(count, rng).into_iter().map(|x| x * size).collect()
-            };
-            let operands = layer.operands(&mut draw, &mut cases.rng)?;
-            let extreme = "fully connected, results and gradients: operands of 0, 1e-45, 1e-40, 1e-38, 1e-20, 1, 1e17, one among others";
-            layer.see(extreme, cases, &operands, precision)?;
-        }
-    }
-    let most = if precision == Precision::Bf16 {
-        BF16_MAX
-    } else {
-        f32::MAX
-    };
-    for _ in cases.draws(0.02) {
-        let layer = Layer::drawn_dense(&mut cases.rng);
-        let mut draw = |count: usize, rng: &mut ChaCha8Rng| match rng.random_bool(0.7) {
-            true => moderate(count, rng),
-            false => clamped(count, most, rng),
-        };
-        let operands = layer.operands(&mut draw, &mut cases.rng)?;
-        let extreme = "fully connected, results and gradients, drawn";
-        layer.see(extreme, cases, &operands, precision)?;
-    }
-    for layer in DENSE {
-        for draw in [usual, moderate] {
-            let operands = layer.operands(&mut { draw }, &mut cases.rng)?;
-            let extreme = "the same at the sizes of Procgen's network and DIM's heads";
-            layer.see(extreme, cases, &operands, precision)?;
-        }
-    }
-    for _ in cases.draws(0.02) {
-        let layer = Layer::drawn_convolution(&mut cases.rng);
-        let mut operands = layer.operands(&mut { moderate }, &mut cases.rng)?;
-        let extreme = "convolution with ReLU, results and gradients, drawn";
-        layer.see(extreme, cases, &operands, precision)?;
-        bytes(&mut operands, &mut cases.rng)?;
-        layer.see("the same on bytes 0 to 255", cases, &operands, precision)?;
-    }
-    for layer in CONVOLUTIONS {
-        for draw in [usual, moderate] {
-            let mut operands = layer.operands(&mut { draw }, &mut cases.rng)?;
-            let extreme = "both at the sizes of Procgen's network, 32 images";
-            layer.see(extreme, cases, &operands, precision)?;
-            bytes(&mut operands, &mut cases.rng)?;
-            layer.see(extreme, cases, &operands, precision)?;
-        }
-    }
-    for _ in cases.draws(0.02) {
-        see_spoilt(cases, precision)?;
-    }
-    for _ in cases.draws(0.01) {
-        let inputs = cases.rng.random_range(1..200);
-        let large = finite(&mut cases.rng).abs().clamp(1e20, 1e38);
-        let line = |x: f32| Tensor::full(x, (1, inputs), &Device::Cpu);
-        let bias = Tensor::zeros(1, DType::F32, &Device::Cpu)?;
-        let y = linear(&line(large)?, &line(1e20)?, &bias, precision)?;
-        let y = y.flatten_all()?.to_vec1::<f32>()?[0];
-        let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
-        let shows = Some(broken(!y.is_finite()));
-        cases.see(
-            "products beyond 3.4e38, all of one sign",
-            input,
-            [None, shows],
-        )?;
-    }
-    Ok(())
+fn infinite<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let inputs = cases.rng.random_range(1..200);
+    let large = finite(&mut cases.rng).abs().clamp(1e20, 1e38);
+    let line = |x: f32| Tensor::full(x, (1, inputs), &Device::Cpu);
+    let bias = Tensor::zeros(1, DType::F32, &Device::Cpu)?;
+    let y = linear(&line(large)?, &line(1e20)?, &bias, precision::<BF16>())?;
+    let y = y.flatten_all()?.to_vec1::<f32>()?[0];
+    let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
+    cases.keeps(1, input, !y.is_finite())
 }
 
 /// A row with a number that is none spoils itself, visibly, and nothing else.
-fn see_spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+fn spoilt<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let mut layer = Layer::drawn_dense(rng);
     layer.rows += 1;
@@ -312,7 +347,7 @@ fn see_spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()>
     let spoilt = Tensor::from_vec(x, clean.shape(), &Device::Cpu)?;
     for with_relu in [false, true] {
         let bits = |x: &Tensor| -> anyhow::Result<Vec<u32>> {
-            let y = linear(x, &w, &b, precision)?.flatten_all()?;
+            let y = linear(x, &w, &b, precision::<BF16>())?.flatten_all()?;
             let y = if with_relu { relu(&y)? } else { y };
             Ok(y.to_vec1::<f32>()?.iter().map(|y| y.to_bits()).collect())
         };
@@ -325,9 +360,8 @@ fn see_spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()>
         let shows = may_hide || !spoilt[own.clone()].iter().any(is_finite);
         let mut others = (0..before.len()).filter(|at| !own.contains(at));
         let kept = shows && before == after && others.all(|at| before[at] == spoilt[at]);
-        let extreme = "one operand infinite or not a number, before and after ReLU";
         let input = format_args!("{bad} at {at} of {layer:?}");
-        cases.see(extreme, input, [None, Some(broken(kept))])?;
+        cases.keeps(1, input, kept)?;
     }
     Ok(())
 }

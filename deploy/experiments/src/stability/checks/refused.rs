@@ -10,13 +10,21 @@ use driml_protocol::{AffinityUpdate, Chunk, End, InsertReply, TimeoutRule};
 use driml_replay_server::horizon::Affinity;
 
 use super::{
+    counters::insert_silently,
     optimiser::gradients,
     replay::{chunk, config, replay, spec},
 };
 use crate::stability::{
-    property::{Cases, broken},
+    property::{Cases, Listed, Property},
     small,
 };
+
+pub(super) const PROPERTIES: &[Property] = &[Property {
+    routine: "values out of range",
+    range: "every setting and every number that a part receives",
+    promises: &[("values not refused by name", 0.0)],
+    extremes: &[("settings", Listed, settings), ("data", Listed, data)],
+}];
 
 /// World, key and values of settings as `--set` takes them.
 const SETTINGS: &str = r#"
@@ -50,15 +58,14 @@ chain learner.batch_size 0 100000
 ising world.temperature 0.0 5.1 1e300
 "#;
 
-pub(crate) fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn settings(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     for line in SETTINGS.trim().lines() {
         let words: Vec<&str> = line.split(' ').collect();
         let (world, key) = (words[0].parse()?, words[1]);
-        let (_, last) = key.rsplit_once('.').unwrap_or(("", key));
-        let name = if last == "temperature" {
-            "Ising temperature"
-        } else {
-            last
+        let name = match key.rsplit_once('.') {
+            Some((_, "temperature")) => "Ising temperature",
+            Some((_, last)) => last,
+            None => key,
         };
         let agent = match key.starts_with("learner.affinity") {
             true => "driml-ada",
@@ -70,18 +77,20 @@ pub(crate) fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
                 sets.push("learner.affinity.estimator=exact".into());
             }
             let said = said(small::run(world, agent, sets));
-            let by_name = broken(said.contains(name));
-            cases.see(
-                "settings",
+            cases.keeps(
+                0,
                 format_args!("{key} = {value}: {said}"),
-                [by_name],
+                said.contains(name),
             )?;
         }
     }
+    Ok(())
+}
+
+fn data(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let data = batches()?.into_iter().chain(replays()?).chain(weights()?);
     for (name, said) in data {
-        let by_name = broken(said.contains(name));
-        cases.see("data", format_args!("{name}: {said}"), [by_name])?;
+        cases.keeps(0, format_args!("{name}: {said}"), said.contains(name))?;
     }
     Ok(())
 }
@@ -136,10 +145,7 @@ fn batches() -> anyhow::Result<Vec<Refusal>> {
 fn replays() -> anyhow::Result<[Refusal; 3]> {
     let mut replay = replay(&spec(7, 0.99, TimeoutRule::Terminal), 1, &config(4096))?;
     let too_large = chunk(&[(1e38, End::Running); 10]);
-    // What the replay server logs of it would look like a fault.
-    let silence = tracing::subscriber::NoSubscriber::default();
-    let inserted = tracing::subscriber::with_default(silence, || replay.insert(&too_large));
-    let inserted = match inserted {
+    let inserted = match insert_silently(&mut replay, &too_large) {
         InsertReply::Refused { why } => why.to_string(),
         _ => String::new(),
     };

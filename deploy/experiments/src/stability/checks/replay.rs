@@ -7,9 +7,33 @@ use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, Unready, re
 use rand::Rng;
 
 use crate::stability::{
-    edges::{clamped, exact_sum, finite, one_of},
-    property::{Cases, broken},
+    edges::{LEAST, clamped, exact_sum, finite, one_of},
+    property::{Cases, Drawn, Listed, Property},
 };
+
+const REWARDS: &str = "rewards 0, 1e-45, +-1e30 that cancel, 3.4e38 / n; n 1, 7, 1,000; gamma 0, 1e-320, 0.5, 0.99, 1 - 1e-12, 1";
+const SIZES: &str = "capacities 1 to 8 and 1,000 to 1,008, n_step 1 to 8 and 1,000, 1, 2 and 4 frames a state; filled three times and more by chunks of any length";
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "n-step return",
+        range: "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1",
+        promises: &[
+            // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
+            ("return or discount, as a share of its bound", 1.0),
+        ],
+        extremes: &[(REWARDS, Listed, returns), ("drawn", Drawn(0.1), returns)],
+    },
+    Property {
+        routine: "replay",
+        range: "capacities from n_step + frame_stack on; n_step 1 to 1,000",
+        promises: &[
+            ("capacities too small not refused by name, or others", 0.0),
+            ("batches too early, or with other frames or returns", 0.0),
+        ],
+        extremes: &[(SIZES, Listed, capacity)],
+    },
+];
 
 /// Of a world whose frames are the number of their step.
 pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
@@ -58,26 +82,29 @@ pub(super) fn replay(spec: &RunSpec, rows: u32, config: &Config) -> anyhow::Resu
     Ok(replay)
 }
 
-/// Steps of one stream as a chunk.
-pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
+/// Steps of one stream as a chunk, the first of which has this number.
+pub(super) fn chunk_from(first: u64, steps: &[(f32, End)]) -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 0,
         incarnation: 1,
         sequence: 0,
-        first_transition: 0,
+        first_transition: first,
         weights_version: 0,
         leaving: false,
         streams: 1,
         steps: steps.len() as u32,
         frame_bytes: 4,
     });
-    for (row, (reward, end)) in steps.iter().enumerate() {
-        chunk
-            .frame_mut(row)
-            .copy_from_slice(&(row as u32).to_le_bytes());
+    for ((row, (reward, end)), number) in steps.iter().enumerate().zip(first as u32..) {
+        chunk.frame_mut(row).copy_from_slice(&number.to_le_bytes());
         chunk.set(row, 1, *reward, *end);
     }
     chunk
+}
+
+/// The first steps of a stream as a chunk.
+pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
+    chunk_from(0, steps)
 }
 
 /// The number that is frame `at` of a state [1, 4, stack].
@@ -114,95 +141,67 @@ impl Stream {
         let discount = follows.map_or(0.0, |i| self.gamma.powi(i as i32));
         (exact_sum(terms).clamp(-largest, largest), sizes, discount)
     }
-
-    fn see(&self, extreme: &str, cases: &mut Cases<'_>) -> anyhow::Result<()> {
-        let rows = 16;
-        let spec = spec(self.n as u32, self.gamma, self.timeout);
-        let mut replay = replay(&spec, rows, &config(4096))?;
-        let stored = replay.insert(&chunk(&self.steps));
-        let is_stored = matches!(stored, InsertReply::Stored { .. });
-        anyhow::ensure!(
-            is_stored,
-            "a chunk within the limits was not stored: {stored:?}"
-        );
-        // An episode may have ended nowhere in reach.
-        let Ok(batch) = replay.sample(rows) else {
-            return Ok(());
-        };
-        let found = batch.n_step_returns().into_iter();
-        let found = found.zip(batch.bootstrap_discounts());
-        for (state, (found, discount)) in batch.states_t().chunks_exact(4).zip(found) {
-            let t = number(state, 1, 0) as usize;
-            let (expected, sizes, expected_discount) = self.expected(t);
-            let least = f64::from(f32::MIN_POSITIVE);
-            let allowed =
-                RETURN_ERROR * expected.abs().max(least) + return_sum_error(self.n) * sizes;
-            let of_return = (f64::from(found) - expected).abs() / allowed;
-            let allowed = RETURN_ERROR * expected_discount.max(least);
-            let of_discount = (f64::from(discount) - expected_discount).abs() / allowed;
-            let (n, gamma) = (self.n, self.gamma);
-            let input = format_args!("n = {n}, gamma = {gamma:e}, the row at {t}: {found:e}");
-            cases.see(extreme, input, [of_return.max(of_discount)])?;
-        }
-        Ok(())
-    }
 }
 
-fn ends(count: usize, likely: f64, rng: &mut impl Rng) -> Vec<End> {
-    let mut end = || match rng.random_bool(likely) {
-        true => one_of(&[End::Terminal, End::TimedOut, End::LevelChange], rng),
+fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let n = cases.of(&[1usize, 7, 1000], |rng| rng.random_range(1..60));
+    let gammas = [0.0, 1e-320, 0.5, 0.99, 1.0 - 1e-12, 1.0];
+    let gamma = cases.of(&gammas, |rng| match rng.random_range(0..3) {
+        0 => rng.random(),
+        1 => f64::from(finite(rng)).abs().min(1.0),
+        _ => one_of(&gammas, rng),
+    });
+    let timeout = cases.each(&[TimeoutRule::Terminal, TimeoutRule::Bootstrap]);
+    let count = cases.of(&[2 * n + 40], |rng| n + rng.random_range(17..60));
+    let likely = cases.of(&[0.5 / n as f64], |rng| rng.random_range(0.0..0.2));
+    let most = f32::MAX / n as f32;
+    let patterns: [&[f32]; 5] = [
+        &[0.0],
+        &[1e-45],
+        &[1e30, 1.0, -1e30],
+        &[most],
+        &[-most, most],
+    ];
+    let repeated = patterns.map(|it| it.iter().copied().cycle().take(count).collect());
+    let rewards: Vec<f32> = cases.of(&repeated, |rng| clamped(count, most, rng));
+    let ends = (0..count).map(|_| match cases.rng.random_bool(likely) {
+        true => one_of(
+            &[End::Terminal, End::TimedOut, End::LevelChange],
+            &mut cases.rng,
+        ),
         false => End::Running,
+    });
+    let stream = Stream {
+        n,
+        gamma,
+        timeout,
+        steps: rewards.into_iter().zip(ends).collect(),
     };
-    (0..count).map(|_| end()).collect()
-}
 
-pub(crate) fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    for n in [1usize, 7, 1000] {
-        let count = 2 * n + 40;
-        let most = f32::MAX / n as f32;
-        let kinds = [
-            [0.0; 3],
-            [1e-45; 3],
-            [1e30, 1.0, -1e30],
-            [most; 3],
-            [-most, most, 0.0],
-        ];
-        for gamma in [0.0, 1e-320, 0.5, 0.99, 1.0 - 1e-12, 1.0] {
-            for (kind, rewards) in kinds.iter().enumerate() {
-                let period = if kind == 4 { 2 } else { 3 };
-                let rewards = rewards.iter().copied().take(period).cycle();
-                for timeout in [TimeoutRule::Terminal, TimeoutRule::Bootstrap] {
-                    let ends = ends(count, 0.5 / n as f64, &mut cases.rng);
-                    let stream = Stream {
-                        n,
-                        gamma,
-                        timeout,
-                        steps: rewards.clone().zip(ends).collect(),
-                    };
-                    let extreme = "rewards 0, 1e-45, +-1e30 that cancel, 3.4e38 / n; n 1, 7, 1,000; gamma 0, 1e-320, 0.5, 0.99, 1 - 1e-12, 1";
-                    stream.see(extreme, cases)?;
-                }
-            }
-        }
-    }
-    for _ in cases.draws(0.1) {
-        let rng = &mut cases.rng;
-        let n = rng.random_range(1..60);
-        let most = f32::MAX / n as f32;
-        let count = n + rng.random_range(17..60);
-        let ends = ends(count, rng.random_range(0.0..0.2), rng);
-        let rewards = clamped(count, most, rng).into_iter();
-        let stream = Stream {
-            n,
-            steps: rewards.zip(ends).collect(),
-            gamma: match rng.random_range(0..3) {
-                0 => rng.random(),
-                1 => f64::from(finite(rng)).abs().min(1.0),
-                _ => one_of(&[0.0, 1e-320, 0.99, 1.0 - 1e-12, 1.0], rng),
-            },
-            timeout: one_of(&[TimeoutRule::Terminal, TimeoutRule::Bootstrap], rng),
-        };
-        stream.see("drawn", cases)?;
+    let rows = 16;
+    let spec = spec(n as u32, gamma, timeout);
+    let mut replay = replay(&spec, rows, &config(4096))?;
+    let stored = replay.insert(&chunk(&stream.steps));
+    let is_stored = matches!(stored, InsertReply::Stored { .. });
+    anyhow::ensure!(
+        is_stored,
+        "a chunk within the limits was not stored: {stored:?}"
+    );
+    // An episode may have ended nowhere in reach.
+    let Ok(batch) = replay.sample(rows) else {
+        return Ok(());
+    };
+    let found = batch.n_step_returns().into_iter();
+    let found = found.zip(batch.bootstrap_discounts());
+    for (state, (found, discount)) in batch.states_t().chunks_exact(4).zip(found) {
+        let t = number(state, 1, 0) as usize;
+        let (expected, sizes, expected_discount) = stream.expected(t);
+        let allowed = RETURN_ERROR * expected.abs().max(LEAST) + return_sum_error(n) * sizes;
+        let of_return = (f64::from(found) - expected).abs() / allowed;
+        let allowed = RETURN_ERROR * expected_discount.max(LEAST);
+        let of_discount = (f64::from(discount) - expected_discount).abs() / allowed;
+        let input = format_args!("n = {n}, gamma = {gamma:e}, the row at {t}: {found:e}");
+        cases.see(input, [of_return.max(of_discount)])?;
     }
     Ok(())
 }
@@ -250,63 +249,45 @@ impl Sizes {
             .all(|&sum| sum == self.n_step as f32)
             && batch.bootstrap_discounts().iter().all(|&rest| rest == 1.0)
     }
-
-    fn see(self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
-        let Self {
-            capacity,
-            n_step,
-            frame_stack,
-        } = self;
-        let spec = RunSpec {
-            frame_stack,
-            ..spec(n_step, 1.0, TimeoutRule::Terminal)
-        };
-        let found = replay(&spec, ROWS, &config(capacity));
-        let is_small = capacity < u64::from(n_step) + u64::from(frame_stack);
-        let name = format!("replay.capacity_transitions = {capacity} ");
-        let said = found.as_ref().err().map(ToString::to_string);
-        let right = match &said {
-            Some(said) => is_small && said.contains(&name),
-            None => !is_small,
-        };
-        let extreme =
-            "capacities 1 to 8 and 1,000, n_step 1 to 8 and 1,000, 1, 2 and 4 frames a state";
-        cases.see(extreme, format_args!("{self:?}: {said:?}"), [broken(right)])?;
-        let Ok(mut replay) = found else {
-            return Ok(());
-        };
-        let (mut inserted, mut sequence) = (0, 0);
-        while inserted < 3 * capacity {
-            let steps = cases.rng.random_range(1..=capacity.min(300));
-            let mut chunk = chunk(&vec![(1.0, End::Running); steps as usize]);
-            (chunk.header.sequence, chunk.header.first_transition) = (sequence, inserted);
-            for (row, number) in (0..steps as usize).zip(inserted as u32..) {
-                chunk.frame_mut(row).copy_from_slice(&number.to_le_bytes());
-            }
-            replay.insert(&chunk);
-            inserted += steps;
-            sequence += 1;
-            let right = self.is_right(&mut replay, inserted);
-            let extreme =
-                "the same and 1,001 to 1,008, filled three times and more by chunks of any length";
-            let input = format_args!("{self:?}, {inserted} stored");
-            cases.see(extreme, input, [None, Some(broken(right))])?;
-        }
-        Ok(())
-    }
 }
 
-pub(crate) fn capacity(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    for n_step in (1..=8).chain([1000]) {
-        for capacity in (1..=8).chain([1000, 1001, 1002, 1004, 1008]) {
-            for frame_stack in [1, 2, 4] {
-                let sizes = Sizes {
-                    capacity,
-                    n_step,
-                    frame_stack,
-                };
-                sizes.see(cases)?;
-            }
+fn capacity(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let sizes = Sizes {
+        capacity: cases.each(&[1, 2, 3, 4, 5, 6, 7, 8, 1000, 1001, 1002, 1004, 1008]),
+        n_step: cases.each(&[1, 2, 3, 4, 5, 6, 7, 8, 1000]),
+        frame_stack: cases.each(&[1, 2, 4]),
+    };
+    let Sizes {
+        capacity,
+        n_step,
+        frame_stack,
+    } = sizes;
+    let spec = RunSpec {
+        frame_stack,
+        ..spec(n_step, 1.0, TimeoutRule::Terminal)
+    };
+    let found = replay(&spec, ROWS, &config(capacity));
+    let is_small = capacity < u64::from(n_step) + u64::from(frame_stack);
+    let name = format!("replay.capacity_transitions = {capacity} ");
+    let said = found.as_ref().err().map(ToString::to_string);
+    let right = said
+        .as_ref()
+        .map_or(!is_small, |said| is_small && said.contains(&name));
+    cases.keeps(0, format_args!("{sizes:?}: {said:?}"), right)?;
+    let Ok(mut replay) = found else {
+        return Ok(());
+    };
+    let mut inserted = 0;
+    for sequence in 0.. {
+        let steps = cases.rng.random_range(1..=capacity.min(300));
+        let mut chunk = chunk_from(inserted, &vec![(1.0, End::Running); steps as usize]);
+        chunk.header.sequence = sequence;
+        replay.insert(&chunk);
+        inserted += steps;
+        let right = sizes.is_right(&mut replay, inserted);
+        cases.keeps(1, format_args!("{sizes:?}, {inserted} stored"), right)?;
+        if inserted >= 3 * capacity {
+            break;
         }
     }
     Ok(())

@@ -1,21 +1,71 @@
 //! What batches are drawn by: k along the stored actions, rows by priority, and the weights that undo their bias.
 
 use anyhow::Context;
-use driml_learner::importance::importance_weights;
+use driml_learner::importance::{WEIGHT_ERROR, importance_weights};
 use driml_protocol::{
     AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{
-    Config, PRIORITY_MIN, Replay,
-    horizon::{Affinity, nhg::draw_k},
+    CHANCE_ERROR, Config, PRIORITY_MIN, Replay,
+    horizon::{
+        Affinity,
+        nhg::{GO_ON_ERROR, draw_k},
+    },
 };
 use rand::{Rng, RngCore};
 
 use super::replay::{chunk, config, number, replay, spec};
 use crate::stability::{
-    edges::{Shown, exact_sum, finite, finites, off, probability},
-    property::Cases,
+    edges::{LEAST, Shown, exact_sum, finite, finites, off, probability},
+    property::{Cases, Drawn, Listed, Property},
 };
+
+/// Deviations of a chi-square that one right law in two million passes.
+pub(super) const DEVIATIONS: f64 = 5.0;
+
+const EVERY: &str =
+    "A 0, 1e-45, 1e-9, 0.5, 1 - 6e-8, 1 and drawn; all 2^24 values that a draw can have";
+const WALKS: &str = "H 1, 2, 5, 50, 255, 1,000; A 0, 1e-9, 0.5, 0.99, 1 - 6e-8, 1, and drawn";
+const PRIORITIES: &str =
+    "all 0, 1e-45, 1, 3.4e38; one of 3.4e38 among 0; 1e-45 to 3.4e38; alpha 0, 0.5, 1";
+const CHANCES: &str =
+    "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and between, drawn";
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "k by NHG",
+        range: "A 0 to 1; k_max 1 to 1,000",
+        promises: &[
+            ("the probability of a step, beside A", GO_ON_ERROR),
+            ("chi-square of k, in deviations", DEVIATIONS),
+        ],
+        extremes: &[
+            (EVERY, Listed, probability_of_a_step),
+            (WALKS, Listed, law_of_k),
+        ],
+    },
+    Property {
+        routine: "prioritised draw",
+        range: "priorities, which are C51 losses, 0 to 3.4e38; alpha 0 to 1",
+        promises: &[
+            ("a row's chance, as a share of it", CHANCE_ERROR),
+            ("chi-square of the draws, in deviations", DEVIATIONS),
+        ],
+        extremes: &[
+            (PRIORITIES, Listed, prioritised),
+            ("drawn", Drawn(0.01), prioritised),
+        ],
+    },
+    Property {
+        routine: "importance weight",
+        range: "chances 1.2e-38 to 1; beta 0 to 1",
+        promises: &[
+            // The least likely row's is 1.
+            ("a weight, as a share of it", WEIGHT_ERROR),
+        ],
+        extremes: &[(CHANCES, Drawn(1.0), weights)],
+    },
+];
 
 /// Gives every value that a float can be drawn as, one after the other.
 struct EveryFloat(u32);
@@ -46,36 +96,30 @@ fn affinity(num_actions: u32, matrix: Vec<f32>) -> anyhow::Result<Affinity> {
     Ok(affinity)
 }
 
-pub(crate) fn horizon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let mut probabilities = vec![0.0, -0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0];
-    for _ in 0..cases.settings.whole_draws {
-        probabilities.push(probability(&mut cases.rng));
-    }
-    for a in probabilities {
-        let affinity = affinity(1, vec![a])?;
-        let mut every = EveryFloat(0);
-        let draws = 1u32 << 24;
-        let further = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
-        let found = further.count() as f64 / f64::from(draws);
-        // Certain is certain, and impossible impossible.
-        let is_certain = a == 0.0 || a == 1.0;
-        let error = match found - f64::from(a) {
-            error if is_certain && error != 0.0 => f64::NAN,
-            error => error,
-        };
-        let extreme =
-            "A 0, 1e-45, 1e-9, 0.5, 1 - 6e-8, 1 and drawn; all 2^24 values that a draw can have";
-        cases.see(extreme, format_args!("A = {a:e}: {found}"), [error])?;
-    }
-    for steps in [1usize, 2, 5, 50, 255, 1000] {
-        for kind in 0..8 {
-            see_law_of_k(cases, steps, kind)?;
-        }
-    }
-    Ok(())
+fn probability_of_a_step(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let listed = [0.0, -0.0, 1e-45, 1e-9, 0.5, 1.0 - f32::EPSILON / 2.0, 1.0];
+    let mut all: Vec<Option<f32>> = listed.map(Some).to_vec();
+    all.resize(all.len() + cases.settings.whole_draws as usize, None);
+    let a = cases
+        .each(&all)
+        .unwrap_or_else(|| probability(&mut cases.rng));
+    let affinity = affinity(1, vec![a])?;
+    let mut every = EveryFloat(0);
+    let draws = 1u32 << 24;
+    let further = (0..draws).filter(|_| draw_k(&affinity, &[0, 0], &mut every) == 2);
+    let found = further.count() as f64 / f64::from(draws);
+    // Certain is certain, and impossible impossible.
+    let is_certain = a == 0.0 || a == 1.0;
+    let error = match found - f64::from(a) {
+        error if is_certain && error != 0.0 => f64::NAN,
+        error => error,
+    };
+    cases.see(format_args!("A = {a:e}: {found}"), [error])
 }
 
-fn see_law_of_k(cases: &mut Cases<'_>, steps: usize, kind: usize) -> anyhow::Result<()> {
+fn law_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let steps = cases.each(&[1usize, 2, 5, 50, 255, 1000]);
+    let kind = cases.each(&[0, 1, 2, 3, 4, 5, 6, 7]);
     let rng = &mut cases.rng;
     let mut draw = || match [0.0, 1e-9, 0.5, 0.99, 1.0 - f32::EPSILON / 2.0, 1.0].get(kind) {
         Some(&a) => a,
@@ -97,9 +141,9 @@ fn see_law_of_k(cases: &mut Cases<'_>, steps: usize, kind: usize) -> anyhow::Res
     for _ in 0..cases.settings.law_draws / 10 {
         counts[draw_k(&affinity, &actions, rng) as usize - 1] += 1;
     }
-    let extreme = "H 1, 2, 5, 50, 255, 1,000; A 0, 1e-9, 0.5, 0.99, 1 - 6e-8, 1, and drawn";
+    let deviations = deviations(&counts, &law);
     let input = format_args!("H = {steps}, kind {kind} of A");
-    Ok(cases.see(extreme, input, [None, Some(deviations(&counts, &law))])?)
+    cases.see(input, [None, Some(deviations)])
 }
 
 /// How far counts are beyond a law, in standard deviations of a normal of the same tail; cells that expect less than 5 are one.
@@ -122,11 +166,10 @@ pub(super) fn deviations(counts: &[u64], law: &[f64]) -> f64 {
     if degrees == 0.0 {
         return 0.0;
     }
-    let square = exact_sum(
-        cells
-            .iter()
-            .map(|(have, want)| (have - want).powi(2) / want),
-    );
+    let terms = cells
+        .iter()
+        .map(|(have, want)| (have - want).powi(2) / want);
+    let square = exact_sum(terms);
     let spread = 2.0 / (9.0 * degrees);
     (((square / degrees).cbrt() - (1.0 - spread)) / spread.sqrt()).max(0.0)
 }
@@ -135,77 +178,7 @@ pub(super) fn deviations(counts: &[u64], law: &[f64]) -> f64 {
 const HELD: usize = 300;
 const ROWS: u32 = 64;
 
-/// A replay that draws by one seed, whose transitions have these priorities, and the law of its draws.
-struct Prioritised {
-    replay: Replay,
-    law: Vec<f64>,
-    counts: Vec<u64>,
-}
-
-impl Prioritised {
-    fn new(seed: u64, alpha: f64, priorities: &[f32]) -> anyhow::Result<Self> {
-        let config = Config {
-            sampling: Sampling::Prioritised {
-                alpha,
-                beta_start: 0.4,
-                beta_end: 1.0,
-                beta_updates: 100,
-            },
-            // As often as the law is to be seen.
-            replay_ratio: 1e9,
-            ..config(4096)
-        };
-        let spec = RunSpec {
-            seed,
-            ..spec(1, 0.99, TimeoutRule::Terminal)
-        };
-        let mut replay = replay(&spec, ROWS, &config)?;
-        // The last one lacks a step that follows.
-        replay.insert(&chunk(&[(1.0, End::Running); HELD + 1]));
-        let batch = replay
-            .sample(ROWS)
-            .map_err(|why| anyhow::anyhow!("no batch: {why:?}"))?;
-        let update = PriorityUpdate {
-            learner: 1,
-            number: 1,
-            parts: vec![PriorityPart {
-                origin: batch.header.origin.context("rows drawn by priority")?,
-                transitions: (0..HELD as u64).collect(),
-                priorities: priorities.to_vec(),
-            }],
-        };
-        replay.set_priorities(&update).map_err(anyhow::Error::msg)?;
-        let mass = |&priority: &f32| (f64::from(priority) + PRIORITY_MIN).powf(alpha);
-        let sum = exact_sum(priorities.iter().map(mass));
-        let law = priorities.iter().map(|it| mass(it) / sum).collect();
-        Ok(Self {
-            replay,
-            law,
-            counts: vec![0; HELD],
-        })
-    }
-
-    /// Sees the chances of a batch's rows; counts which transitions they are.
-    fn see_batch(&mut self, extreme: &str, cases: &mut Cases<'_>) -> anyhow::Result<()> {
-        let batch = self
-            .replay
-            .sample(ROWS)
-            .map_err(|why| anyhow::anyhow!("no batch: {why:?}"))?;
-        let chances = batch.probabilities().context("rows drawn by priority")?;
-        for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
-            let transition = number(frame, 1, 0) as usize;
-            let expected = self.law[transition];
-            let input = format_args!("{chance:e}, which should be {expected:e}");
-            // A chance below the least normal number counts as that.
-            let error = f64::from(chance) / expected.max(f32::MIN_POSITIVE.into()) - 1.0;
-            cases.see(extreme, input, [error])?;
-            self.counts[transition] += 1;
-        }
-        Ok(())
-    }
-}
-
-pub(crate) fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let kinds: [fn(usize) -> f32; 6] = [
         |_| 0.0,
         |_| 1e-45,
@@ -214,56 +187,96 @@ pub(crate) fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         |at| if at == HELD / 2 { f32::MAX } else { 0.0 },
         |at| 10f64.powf(-45.0 + 83.5 * at as f64 / HELD as f64) as f32,
     ];
-    for (number, kind) in (1..).zip(kinds) {
-        let priorities: Vec<f32> = (0..HELD).map(kind).collect();
-        for alpha in [0.0, 0.5, 1.0] {
-            let mut replay = Prioritised::new(cases.rng.random(), alpha, &priorities)?;
-            let extreme =
-                "all 0, 1e-45, 1, 3.4e38; one of 3.4e38 among 0; 1e-45 to 3.4e38; alpha 0, 0.5, 1";
-            for _ in 0..cases.settings.law_draws / u64::from(ROWS) {
-                replay.see_batch(extreme, cases)?;
-            }
-            let deviations = deviations(&replay.counts, &replay.law);
-            let input = format_args!("kind {number} of priorities, alpha {alpha}");
-            cases.see("the same", input, [None, Some(deviations)])?;
+    let priorities = cases.of(&kinds.map(|kind| (0..HELD).map(kind).collect()), |rng| {
+        let sizes = finites(HELD, rng).into_iter();
+        sizes.map(f32::abs).collect::<Vec<_>>()
+    });
+    let alpha = cases.of(&[0.0, 0.5, 1.0], |rng| rng.random());
+    // Of one batch the law is not seen.
+    let batches = cases.of(&[cases.settings.law_draws / u64::from(ROWS)], |_| 1);
+
+    let config = Config {
+        sampling: Sampling::Prioritised {
+            alpha,
+            beta_start: 0.4,
+            beta_end: 1.0,
+            beta_updates: 100,
+        },
+        // As often as the law is to be seen.
+        replay_ratio: 1e9,
+        ..config(4096)
+    };
+    let spec = RunSpec {
+        seed: cases.rng.random(),
+        ..spec(1, 0.99, TimeoutRule::Terminal)
+    };
+    let mut replay = replay(&spec, ROWS, &config)?;
+    let batch_of = |replay: &mut Replay| {
+        let batch = replay.sample(ROWS);
+        batch.map_err(|why| anyhow::anyhow!("no batch: {why:?}"))
+    };
+    // The last one lacks a step that follows.
+    replay.insert(&chunk(&[(1.0, End::Running); HELD + 1]));
+    let origin = batch_of(&mut replay)?.header.origin;
+    let update = PriorityUpdate {
+        learner: 1,
+        number: 1,
+        parts: vec![PriorityPart {
+            origin: origin.context("rows drawn by priority")?,
+            transitions: (0..HELD as u64).collect(),
+            priorities: priorities.clone(),
+        }],
+    };
+    replay.set_priorities(&update).map_err(anyhow::Error::msg)?;
+    let mass = |&priority: &f32| (f64::from(priority) + PRIORITY_MIN).powf(alpha);
+    let sum = exact_sum(priorities.iter().map(mass));
+    let law: Vec<f64> = priorities.iter().map(|it| mass(it) / sum).collect();
+    let mut counts = vec![0; HELD];
+    for _ in 0..batches {
+        let batch = batch_of(&mut replay)?;
+        let chances = batch.probabilities().context("rows drawn by priority")?;
+        for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
+            let transition = number(frame, 1, 0) as usize;
+            counts[transition] += 1;
+            // A chance below the least normal number counts as that.
+            let expected = law[transition];
+            let error = f64::from(chance) / expected.max(LEAST) - 1.0;
+            let input = format_args!("{chance:e}, which should be {expected:e}");
+            cases.see(input, [error])?;
         }
     }
-    for _ in cases.draws(0.01) {
-        let rng = &mut cases.rng;
-        let sizes: Vec<f32> = finites(HELD, rng).into_iter().map(f32::abs).collect();
-        Prioritised::new(rng.random(), rng.random(), &sizes)?.see_batch("drawn", cases)?;
+    if batches > 1 {
+        let deviations = deviations(&counts, &law);
+        let input = format_args!("alpha {alpha}, priorities {}", Shown(&priorities));
+        cases.see(input, [None, Some(deviations)])?;
     }
     Ok(())
 }
 
-pub(crate) fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    for number in cases.draws(1.0) {
-        let rng = &mut cases.rng;
-        let mut chances = finites(rng.random_range(2..=64), rng);
-        if rng.random_bool(0.2) {
-            chances.fill(finite(rng));
-        }
-        chances
-            .iter_mut()
-            .for_each(|it| *it = it.abs().clamp(f32::MIN_POSITIVE, 1.0));
-        let beta = match number % 4 {
-            0 => 0.0,
-            1 => 1.0,
-            _ => rng.random(),
+fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let rng = &mut cases.rng;
+    let mut chances = finites(rng.random_range(2..=64), rng);
+    if rng.random_bool(0.2) {
+        chances.fill(finite(rng));
+    }
+    for it in &mut chances {
+        *it = it.abs().clamp(f32::MIN_POSITIVE, 1.0);
+    }
+    let beta = match rng.random_range(0..4) {
+        0 => 0.0,
+        1 => 1.0,
+        _ => rng.random(),
+    };
+    let least = chances.iter().copied().fold(f32::INFINITY, f32::min);
+    let found = importance_weights(&chances, beta);
+    for (&found, &chance) in found.iter().zip(&chances) {
+        let expected = (beta * (f64::from(least).ln() - f64::from(chance).ln())).exp();
+        let error = match chance == least && found != 1.0 {
+            true => f64::NAN,
+            false => off(found, expected),
         };
-        let least = chances.iter().copied().fold(f32::INFINITY, f32::min);
-        let found = importance_weights(&chances, beta);
-        for (&found, &chance) in found.iter().zip(&chances) {
-            let expected = (beta * (f64::from(least).ln() - f64::from(chance).ln())).exp();
-            let error = match chance == least && found != 1.0 {
-                true => f64::NAN,
-                false => off(found, expected),
-            };
-            let extreme =
-                "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and between, drawn";
-            let input = format_args!("beta {beta}, chances {}", Shown(&chances));
-            cases.see(extreme, input, [error])?;
-        }
+        let input = format_args!("beta {beta}, chances {}", Shown(&chances));
+        cases.see(input, [error])?;
     }
     Ok(())
 }

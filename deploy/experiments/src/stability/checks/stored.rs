@@ -6,9 +6,40 @@ use rand::Rng;
 
 use crate::stability::{
     edges::clamped,
-    property::{Cases, broken},
+    property::{Cases, Drawn, Listed, Property},
     small,
 };
+
+const NEAREST: &str = "weights not read as the nearest, ties to even, with their sign";
+const OF_WEIGHT: &str = "a weight, as a share of it";
+const ALL: &str = "every number of the type, the middles between them and the floats beside those";
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "f32 weights",
+        range: "as published (learner.publish_as); finite",
+        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F32.error())],
+        extremes: &[("drawn", Drawn(0.005), |cases| any(cases, StoredAs::F32))],
+    },
+    Property {
+        routine: "f16 weights",
+        range: "as published (learner.publish_as); within 65,504",
+        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F16.error())],
+        extremes: &[
+            (ALL, Listed, |cases| all(cases, StoredAs::F16)),
+            ("drawn", Drawn(0.005), |cases| any(cases, StoredAs::F16)),
+        ],
+    },
+    Property {
+        routine: "bf16 weights",
+        range: "as published (learner.publish_as); within 3.3895e38",
+        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::Bf16.error())],
+        extremes: &[
+            (ALL, Listed, |cases| all(cases, StoredAs::Bf16)),
+            ("drawn", Drawn(0.005), |cases| any(cases, StoredAs::Bf16)),
+        ],
+    },
+];
 
 /// Scalars a row of the head's weight that carries the values.
 const HIDDEN: usize = 256;
@@ -34,18 +65,7 @@ fn nearest(stored: StoredAs, x: f32) -> f64 {
     (f64::from(x) / step).round_ties_even() * step
 }
 
-/// The values after a journey as weights.
-fn travelled(stored: StoredAs, values: &[f32]) -> anyhow::Result<Vec<f32>> {
-    let atoms = values.len().div_ceil(HIDDEN).max(2);
-    let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
-    let mut all = vec![0.0; small::len(&config)];
-    all[..values.len()].copy_from_slice(values);
-    let bytes = small::parameters(&config, &all)?.to_safetensors_as(stored, |_| true)?;
-    let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
-    Ok(small::values(&config, &read)?)
-}
-
-/// Every number of the type, the middle between it and the next, and the floats beside that: all places where rounding turns.
+/// All places where rounding turns.
 fn turning_points(stored: StoredAs) -> Vec<f32> {
     let mut values = Vec::new();
     let mut x = 0.0f32;
@@ -60,29 +80,34 @@ fn turning_points(stored: StoredAs) -> Vec<f32> {
     values.iter().flat_map(|&x| [x, -x]).collect()
 }
 
-pub(crate) fn check(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
-    let see = |cases: &mut Cases<'_>, extreme, values: &[f32]| -> anyhow::Result<()> {
-        for (&x, found) in values.iter().zip(travelled(stored, values)?) {
-            let has_its_sign = x.is_sign_negative() == found.is_sign_negative();
-            let is_nearest = has_its_sign && f64::from(found) == nearest(stored, x);
-            let scale = f64::from(x.abs().max(stored.least_normal()));
-            let error = (f64::from(found) - f64::from(x)) / scale;
-            let input = format_args!("{x:e} became {found:e}");
-            cases.see(extreme, input, [broken(is_nearest), error])?;
-        }
-        Ok(())
-    };
-    if stored != StoredAs::F32 {
-        let extreme =
-            "every number of the type, the middles between them and the floats beside those";
-        see(cases, extreme, &turning_points(stored))?;
-    }
-    for _ in cases.draws(0.005) {
-        let count = cases.rng.random_range(1..4096);
-        let values = clamped(count, stored.largest(), &mut cases.rng);
-        see(cases, "drawn", &values)?;
+/// Sees what the values become as weights that are saved and loaded.
+fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Result<()> {
+    let atoms = values.len().div_ceil(HIDDEN).max(2);
+    let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
+    let mut all = vec![0.0; small::len(&config)];
+    all[..values.len()].copy_from_slice(values);
+    let bytes = small::parameters(&config, &all)?.to_safetensors_as(stored, |_| true)?;
+    let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
+    for (&x, found) in values.iter().zip(small::values(&config, &read)?) {
+        let has_its_sign = x.is_sign_negative() == found.is_sign_negative();
+        let is_nearest = has_its_sign && f64::from(found) == nearest(stored, x);
+        let scale = f64::from(x.abs().max(stored.least_normal()));
+        let error = (f64::from(found) - f64::from(x)) / scale;
+        let input = format_args!("{x:e} became {found:e}");
+        cases.keeps(0, input, is_nearest)?;
+        cases.see(input, [None, Some(error)])?;
     }
     Ok(())
+}
+
+fn all(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
+    see(cases, stored, &turning_points(stored))
+}
+
+fn any(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
+    let count = cases.rng.random_range(1..4096);
+    let values = clamped(count, stored.largest(), &mut cases.rng);
+    see(cases, stored, &values)
 }
 
 #[cfg(test)]

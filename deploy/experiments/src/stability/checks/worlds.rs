@@ -5,14 +5,41 @@ use std::f64::consts::PI;
 use driml_envs::{Boundary, IsingLattice};
 use rand::Rng;
 
-use super::sampling::deviations;
+use super::sampling::{DEVIATIONS, deviations};
 use crate::{
     stability::{
         edges::{exact_sum, worst},
-        property::{Cases, broken},
+        property::{Cases, Drawn, Listed, Property},
     },
-    studies::random_walk::chain::Chain,
+    studies::random_walk::chain::{Chain, GAP_ERROR, LAW_ERROR, MUTUAL_INFORMATION_ERROR},
 };
+
+const WALKS: &str = "2 to 1e6 states (gap: 1e8); alpha 0, 1e-300, 0.1, 0.499, 0.5 - 2.4e-7, 0.5, 0.5 + 1e-12, 0.9, 1";
+const LATTICES: &str = "3 x 3 periodic and 3 x 4 free, all states counted; T 2, 2.27, 4, 5";
+const SWEEPS: &str = "T 1e-300 to 5, for the energy 1e-300, 1e-9, 0.02; 3 x 3 to 64 x 64";
+
+pub(super) const PROPERTIES: &[Property] = &[
+    Property {
+        routine: "random walk",
+        range: "closed forms; alpha 0 to 1; 2 to 1e6 states, for the gap to 1e8",
+        promises: &[
+            ("a state's probability", LAW_ERROR),
+            ("mutual information, nats", MUTUAL_INFORMATION_ERROR),
+            ("spectral gap, as a share of it", GAP_ERROR),
+        ],
+        extremes: &[(WALKS, Listed, walk), ("drawn", Drawn(0.05), walk)],
+    },
+    Property {
+        routine: "Ising lattice",
+        range: "temperatures above 0 and up to 5; sides up to 4,096",
+        promises: &[
+            ("chi-square of the energy, in deviations", DEVIATIONS),
+            ("sweeps in which the energy rises", 0.0),
+            ("sweeps whose books are not those of the spins", 0.0),
+        ],
+        extremes: &[(LATTICES, Listed, energies), (SWEEPS, Listed, books)],
+    },
+];
 
 /// The law and ln of it: each state's weight by itself over their sum.
 fn law_of_walk(states: usize, alpha: f64) -> (Vec<f64>, Vec<f64>) {
@@ -51,30 +78,12 @@ fn gap(states: usize, alpha: f64) -> f64 {
     tilt * tilt / (1.0 + s) + s * versine
 }
 
-fn see_walk(extreme: &str, cases: &mut Cases<'_>, states: usize, alpha: f64) -> anyhow::Result<()> {
-    let chain = Chain { states, alpha };
-    let of_gap = chain.spectral_gap() / gap(states, alpha) - 1.0;
-    let [mut of_law, mut of_information] = [None, None];
-    if states <= 1_000_000 {
-        let (law, logs) = law_of_walk(states, alpha);
-        let pairs = chain.stationary().into_iter().zip(&law);
-        of_law = Some(worst(
-            pairs.map(|(found, expected)| (found - expected).abs()),
-        ));
-        let step = [alpha, 1.0 - alpha];
-        let information = entropy(&law, &logs) - entropy(&step, &step.map(f64::ln));
-        of_information = Some(chain.mutual_information() - information);
-    }
-    let errors = [of_law, of_information, Some(of_gap)];
-    Ok(cases.see(
-        extreme,
-        format_args!("{states} states, alpha {alpha:e}"),
-        errors,
-    )?)
-}
-
-pub(crate) fn walk(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let alphas = [
+fn walk(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let listed = [2, 3, 10, 324, 1000, 100_000, 1_000_000, 100_000_000];
+    let states = cases.of(&listed, |rng| {
+        10f64.powf(rng.random_range(0.4..4.0)) as usize
+    });
+    let listed = [
         0.0,
         1e-300,
         1e-9,
@@ -89,25 +98,27 @@ pub(crate) fn walk(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         1.0 - 1e-9,
         1.0,
     ];
-    for states in [2, 3, 10, 324, 1000, 100_000, 1_000_000, 100_000_000] {
-        for alpha in alphas {
-            let extreme = "2 to 1e6 states (gap: 1e8); alpha 0, 1e-300, 0.1, 0.499, 0.5 - 2.4e-7, 0.5, 0.5 + 1e-12, 0.9, 1";
-            see_walk(extreme, cases, states, alpha)?;
-        }
-    }
-    for _ in cases.draws(0.05) {
-        let rng = &mut cases.rng;
-        let states = 10f64.powf(rng.random_range(0.4..4.0)) as usize;
+    let alpha = cases.of(&listed, |rng| {
         let near = 10f64.powf(rng.random_range(-16.0..-0.4));
-        let alpha = match rng.random_range(0..4) {
+        match rng.random_range(0..4) {
             0 => rng.random(),
             1 => near,
             2 => 0.5 + near,
             _ => 0.5 - near,
-        };
-        see_walk("drawn", cases, states, alpha)?;
+        }
+    });
+    let chain = Chain { states, alpha };
+    let input = format_args!("{states} states, alpha {alpha:e}");
+    if states <= 1_000_000 {
+        let (law, logs) = law_of_walk(states, alpha);
+        let found = chain.stationary().into_iter().zip(&law);
+        let of_law = worst(found.map(|(found, expected)| (found - expected).abs()));
+        let step = [alpha, 1.0 - alpha];
+        let information = entropy(&law, &logs) - entropy(&step, &step.map(f64::ln));
+        cases.see(input, [of_law, chain.mutual_information() - information])?;
     }
-    Ok(())
+    let of_gap = chain.spectral_gap() / gap(states, alpha) - 1.0;
+    cases.see(input, [None, None, Some(of_gap)])
 }
 
 /// Energy of spins [height, width], each bond once.
@@ -144,45 +155,43 @@ fn law_of_lattice(height: usize, width: usize, t: f64, boundary: Boundary) -> (i
     (least, law.into_iter().map(|p| p / sum).collect())
 }
 
-pub(crate) fn ising(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn energies(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let samples = (cases.settings.law_draws / 8).max(2000);
-    for (height, width, boundary) in [(3, 3, Boundary::Periodic), (3, 4, Boundary::Free)] {
-        for t in [2.0, 2.269_185, 4.0, 5.0] {
-            let rng = &mut cases.rng;
-            let mut lattice = IsingLattice::random(height, width, t, boundary, rng)?;
-            let (least, law) = law_of_lattice(height, width, t, boundary);
-            let mut counts = vec![0u64; law.len()];
-            for sample in 0..samples + 20 {
-                // So far apart that energies hardly know of each other.
-                (0..30).for_each(|_| lattice.sweep(rng));
-                if sample >= 20 {
-                    counts[(lattice.energy() - least) as usize] += 1;
-                }
-            }
-            let extreme = "3 x 3 periodic and 3 x 4 free, all states counted; T 2, 2.27, 4, 5";
-            let input = format_args!("{height} x {width}, {boundary:?}, T = {t}");
-            cases.see(extreme, input, [deviations(&counts, &law)])?;
+    let lattices = [(3, 3, Boundary::Periodic), (3, 4, Boundary::Free)];
+    let (height, width, boundary) = cases.each(&lattices);
+    let t = cases.each(&[2.0, 2.269_185, 4.0, 5.0]);
+    let rng = &mut cases.rng;
+    let mut lattice = IsingLattice::random(height, width, t, boundary, rng)?;
+    let (least, law) = law_of_lattice(height, width, t, boundary);
+    let mut counts = vec![0u64; law.len()];
+    for sample in 0..samples + 20 {
+        // So far apart that energies hardly know of each other.
+        (0..30).for_each(|_| lattice.sweep(rng));
+        if sample >= 20 {
+            counts[(lattice.energy() - least) as usize] += 1;
         }
     }
-    for side in [3usize, 7, 64] {
-        for t in [1e-300, 1e-9, 0.02, 0.4, 2.27, 5.0] {
-            for boundary in [Boundary::Periodic, Boundary::Free] {
-                let mut lattice = IsingLattice::random(side, side, t, boundary, &mut cases.rng)?;
-                for sweep in 0..100 {
-                    let before = lattice.energy();
-                    lattice.sweep(&mut cases.rng);
-                    let falls = (t < 0.1).then(|| broken(lattice.energy() <= before));
-                    let spins = lattice.spins();
-                    let sum: i64 = spins.iter().map(|&s| i64::from(s)).sum();
-                    let right = lattice.energy() == energy(spins, side, side, boundary)
-                        && lattice.magnetisation() == sum;
-                    let extreme =
-                        "T 1e-300 to 5, for the energy 1e-300, 1e-9, 0.02; 3 x 3 to 64 x 64";
-                    let input = format_args!("side {side}, {boundary:?}, T = {t:e}, sweep {sweep}");
-                    cases.see(extreme, input, [None, falls, Some(broken(right))])?;
-                }
-            }
+    let input = format_args!("{height} x {width}, {boundary:?}, T = {t}");
+    cases.see(input, [deviations(&counts, &law)])
+}
+
+fn books(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let side = cases.each(&[3usize, 7, 64]);
+    let t = cases.each(&[1e-300, 1e-9, 0.02, 0.4, 2.27, 5.0]);
+    let boundary = cases.each(&[Boundary::Periodic, Boundary::Free]);
+    let mut lattice = IsingLattice::random(side, side, t, boundary, &mut cases.rng)?;
+    for sweep in 0..100 {
+        let before = lattice.energy();
+        lattice.sweep(&mut cases.rng);
+        let spins = lattice.spins();
+        let sum: i64 = spins.iter().map(|&s| i64::from(s)).sum();
+        let right = lattice.energy() == energy(spins, side, side, boundary)
+            && lattice.magnetisation() == sum;
+        let input = format_args!("side {side}, {boundary:?}, T = {t:e}, sweep {sweep}");
+        if t < 0.1 {
+            cases.keeps(1, input, lattice.energy() <= before)?;
         }
+        cases.keeps(2, input, right)?;
     }
     Ok(())
 }
