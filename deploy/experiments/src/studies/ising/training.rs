@@ -3,7 +3,7 @@
 
 use anyhow::Context;
 use candle_core::{Device, Tensor};
-use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd, WorldSettings};
+use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
 use driml_learner::{LearnerSettings, auxiliary::dim::Dim};
 use driml_model::{Features, ModelConfig};
 use rand::{Rng, SeedableRng};

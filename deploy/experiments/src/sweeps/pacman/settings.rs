@@ -105,7 +105,7 @@ impl Settings {
             let plan = PlannedRun::new(name, call, *frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
-        for part in 0..PARTS {
+        for (part, part_name) in PART_NAMES.iter().enumerate() {
             let continual = self.tasks(part);
             let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
             let schedule = format!(
@@ -121,7 +121,7 @@ impl Settings {
             let episodes = continual.episodes();
             let frames = episodes * EPISODE_FRAMES_MAX;
             for agent in &self.agents {
-                let name = format!("{}-{agent}-seed{seed}", PART_NAMES[part]);
+                let name = format!("{part_name}-{agent}-seed{seed}");
                 let call = self.call(agent, seed, frames, &sets.concat());
                 let plan = PlannedRun {
                     episodes: Some(episodes),
