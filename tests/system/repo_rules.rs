@@ -10,12 +10,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. These numbers only fall: a change that adds code pays for it.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 9_370),
-    ("actor", 13_680),
-    ("replay-server", 11_500),
-    ("learner", 27_550),
-    ("deploy", 36_400),
-    ("tests", 12_240),
+    ("protocol", 8_980),
+    ("actor", 13_100),
+    ("replay-server", 11_450),
+    ("learner", 26_610),
+    ("deploy", 35_160),
+    ("tests", 11_520),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
