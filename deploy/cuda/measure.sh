@@ -82,7 +82,7 @@ step() {
 train() {
     local game=$1 agent=$2 folder code=0 spent=0 what
     folder=$out/runs/$game-$agent-$seed
-    # The time ends it: more frames than any GPU learns from in that time, or it would stop at the preset's 200,000.
+    # The time ends it: more frames than any GPU learns from in that time.
     what=(--env "procgen:$game" --agent "$agent" --seed "$seed" --frames 1000000000 --run-dir "$folder")
     if compgen -G "$folder/checkpoints/checkpoint-*[0-9]" >/dev/null; then
         what=(--resume "$folder")
