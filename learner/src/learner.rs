@@ -10,10 +10,11 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     affinity::{AffinityError, AffinityEstimator},
-    agent::{Agent, UpdateReport},
+    agent::Agent,
     checkpoint::{self, CheckpointError, RunState},
     config::{ConfigError, LearnerConfig},
     error::UpdateError,
+    evaluation::UpdateReport,
     importance::drawn_evenly,
     prepare::{Columns, Preparation},
     progress::Progress,

@@ -57,6 +57,7 @@ pub mod checkpoint;
 mod config;
 pub mod cost;
 mod error;
+mod evaluation;
 pub mod importance;
 pub mod insight;
 mod learner;
@@ -75,7 +76,7 @@ mod tensors;
 pub use affinity::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
 };
-pub use agent::{Agent, Evaluation, NetworkParameters, UpdateReport};
+pub use agent::{Agent, NetworkParameters};
 pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
 pub use batch::Batch;
@@ -85,6 +86,7 @@ pub use config::{
 };
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;
+pub use evaluation::{Evaluation, UpdateReport};
 pub use learner::{Learner, LearnerError};
 pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;

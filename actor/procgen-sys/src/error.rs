@@ -66,13 +66,15 @@ pub enum InstallError {
     #[error(
         "procgen's engine in {}: {reason}; run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network \
          with `{}` and put it into {} {WITHOUT_ENGINE}",
-        .root.display(), crate::wheel::command_for_people(), .root.parent().unwrap_or(.root).display()
+        .root.display(), .fetched_by, .root.parent().unwrap_or(.root).display()
     )]
     Missing {
         /// Where it would lie.
         root: PathBuf,
         /// What is missing.
         reason: String,
+        /// The command that fetches the wheel.
+        fetched_by: String,
     },
     /// The cache folder cannot be used: no variable names it, or others can change it.
     #[error("procgen's engine has no safe place: {0} {WITHOUT_ENGINE}")]

@@ -174,6 +174,7 @@ impl Cache {
         InstallError::Missing {
             root: self.root(),
             reason: reason.to_owned(),
+            fetched_by: wheel::command_for_people(),
         }
     }
 

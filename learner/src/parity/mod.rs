@@ -18,7 +18,7 @@ use case::{Case, values};
 use tolerance::Tolerances;
 
 use crate::{
-    agent::{Agent, Evaluation, NetworkParameters},
+    agent::{Agent, NetworkParameters},
     auxiliary::{
         Objective,
         dim::DIM,
@@ -26,6 +26,7 @@ use crate::{
         loss::{LossInputs, OnlineFeatures},
         settings::{AuxiliarySettings, Lambda},
     },
+    evaluation::Evaluation,
     losses::scores::{Dots, Scores},
     repeats::EqualStates,
 };

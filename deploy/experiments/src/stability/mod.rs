@@ -5,6 +5,7 @@ mod checks;
 mod edges;
 mod figure;
 mod property;
+mod settings;
 mod small;
 
 use anyhow::ensure;
@@ -12,12 +13,12 @@ use driml_machine::resources;
 use driml_model::{Precision, kernels_in_words};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use self::{
     checks::TABLE,
     property::{Cases, Row},
+    settings::Settings,
 };
 use crate::{
     cache::{self, Session},
@@ -26,27 +27,6 @@ use crate::{
 };
 
 const NAME: &str = "stability";
-
-/// The contents of `config.toml` or `smoke.toml` beside this file.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Settings {
-    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
-    #[serde(skip_serializing)]
-    seeds: u32,
-    /// Random inputs of a quick routine; slower ones take a share of it.
-    draws: u64,
-    /// Steps of the longest run of Adam.
-    adam_steps: u64,
-    /// Most moves of a target network towards one that stands still; a tau that needs more is left out.
-    follow_moves: u64,
-    /// Updates of the learned affinity.
-    affinity_updates: u64,
-    /// Draws from each law that is tested.
-    law_draws: u64,
-    /// Random probabilities for which every value that can be drawn is drawn.
-    whole_draws: u64,
-}
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {

@@ -7,7 +7,7 @@ use std::fmt::Arguments;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Settings, edges::one_of};
+use super::{edges::one_of, settings::Settings};
 use crate::progress::Progress;
 
 /// A row of the table of properties.

@@ -11,6 +11,7 @@
 //! ghost finds its way) is decided here and in `config`.
 
 mod config;
+mod game;
 mod ghost;
 mod maze;
 mod render;
@@ -20,18 +21,16 @@ mod state_tests;
 #[cfg(test)]
 pub(crate) mod tests;
 
-use rand_chacha::ChaCha8Rng;
-
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
-use ghost::{Chance, Ghost};
-use maze::{GHOSTS, Item, Maze, Place};
+use game::Game;
+use ghost::Chance;
+use maze::{GHOSTS, Maze};
 use saved::SavedGame;
 
-use crate::copies::{Copies, RngUse, check_num_envs, copy_rng};
+use crate::copies::{Copies, check_num_envs};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::settings::WorldSettings;
-use crate::worlds::ising::IsingLattice;
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
@@ -43,24 +42,6 @@ pub struct PacmanWorld {
     /// The frame at the start of an episode, without what moves.
     fresh: Vec<u8>,
     copies: Vec<Game>,
-}
-
-struct Game {
-    rng: ChaCha8Rng,
-    agent: Place,
-    ghosts: [Ghost; GHOSTS],
-    lethal: [bool; GHOSTS],
-    /// Steps that the agent is still invincible.
-    boost_left: u32,
-    items: Vec<Item>,
-    pellets_left: u32,
-    episode_step: u32,
-    /// Episodes that this copy has ended.
-    episodes: u64,
-    /// The frame without what moves.
-    background: Vec<u8>,
-    /// Its own generator, so that the ghosts do the same with and without it.
-    walls: Option<(IsingLattice, ChaCha8Rng)>,
 }
 
 impl PacmanWorld {
@@ -171,116 +152,5 @@ impl Copies for PacmanWorld {
 
     fn restore(&mut self, copy: usize, saved: SavedGame) -> Result<(), EnvError> {
         self.copies[copy].load(saved, &self.maze)
-    }
-}
-
-impl Game {
-    fn new(
-        config: &PacmanConfig,
-        maze: &Maze,
-        fresh: &[u8],
-        env: usize,
-        seed: u64,
-    ) -> Result<Self, EnvError> {
-        let mut overlay_rng = copy_rng(seed, env, RngUse::Overlay);
-        let walls = match &config.ising {
-            Some(overlay) => Some((
-                overlay.lattice(&maze.walls(), &mut overlay_rng)?,
-                overlay_rng,
-            )),
-            None => None,
-        };
-        let mut game = Self {
-            rng: copy_rng(seed, env, RngUse::Game),
-            agent: maze.agent_start(),
-            ghosts: maze.ghost_starts().map(Ghost::at),
-            lethal: config.lethal_in(0),
-            boost_left: 0,
-            items: maze.items().to_vec(),
-            pellets_left: maze.pellets(),
-            episode_step: 0,
-            episodes: 0,
-            background: fresh.to_vec(),
-            walls,
-        };
-        game.reset(config, maze, fresh);
-        Ok(game)
-    }
-
-    fn reset(&mut self, config: &PacmanConfig, maze: &Maze, fresh: &[u8]) {
-        self.agent = maze.agent_start();
-        self.ghosts = maze.ghost_starts().map(Ghost::at);
-        self.lethal = config.lethal_in(self.episodes);
-        self.boost_left = 0;
-        self.items.copy_from_slice(maze.items());
-        self.pellets_left = maze.pellets();
-        self.episode_step = 0;
-        self.background.copy_from_slice(fresh);
-        if let Some((lattice, rng)) = &mut self.walls {
-            lattice.randomise(rng);
-        }
-    }
-
-    /// One step of one game; it does not reset. Returns what was earned and what ended.
-    fn step(
-        &mut self,
-        config: &PacmanConfig,
-        maze: &Maze,
-        chance: Chance,
-        action: u8,
-    ) -> (f32, StepEnd) {
-        let (agent_before, boosted_before) = (self.agent, self.boost_left > 0);
-        self.episode_step += 1;
-        self.boost_left = self.boost_left.saturating_sub(1);
-        if action > 0 {
-            self.agent = maze.next(self.agent, action - 1);
-        }
-        let item = std::mem::replace(&mut self.items[usize::from(self.agent)], Item::Nothing);
-        let mut reward = self.eat(config, maze, item);
-        let boosted = boosted_before || item == Item::Boost;
-
-        let ghosts_before = self.ghosts.map(|ghost| ghost.place);
-        for ghost in &mut self.ghosts {
-            ghost.step(maze, agent_before, boosted_before, chance, &mut self.rng);
-        }
-        if self.pellets_left == 0 {
-            return (reward + config.reward_cleared, StepEnd::Terminal);
-        }
-        for (index, before) in ghosts_before.into_iter().enumerate() {
-            let here = self.ghosts[index].place;
-            let crossed = here == agent_before && before == self.agent;
-            if here != self.agent && !crossed {
-                continue;
-            }
-            if boosted {
-                self.ghosts[index] = Ghost::at(maze.ghost_starts()[index]);
-                if self.lethal[index] {
-                    reward += config.reward_ghost;
-                }
-            } else if self.lethal[index] {
-                return (reward + config.reward_death, StepEnd::Terminal);
-            }
-        }
-        match self.episode_step >= config.step_limit {
-            true => (reward, StepEnd::TimedOut),
-            false => (reward, StepEnd::Running),
-        }
-    }
-
-    fn eat(&mut self, config: &PacmanConfig, maze: &Maze, item: Item) -> f32 {
-        if item != Item::Nothing {
-            render::erase(maze, self.agent, &mut self.background);
-        }
-        match item {
-            Item::Nothing => 0.0,
-            Item::Pellet => {
-                self.pellets_left -= 1;
-                config.reward_pellet
-            }
-            Item::Boost => {
-                self.boost_left = config.boost_steps;
-                config.reward_boost
-            }
-        }
     }
 }

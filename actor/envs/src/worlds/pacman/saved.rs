@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Game,
+    game::Game,
     ghost::Ghost,
     maze::{DIRECTIONS, GHOSTS, Item, Maze, Place},
 };

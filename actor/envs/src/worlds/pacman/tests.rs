@@ -1,9 +1,10 @@
 //! The rules of Ms. PacMan, checked on games put into chosen situations.
 
 use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
-use super::ghost::Mode;
-use super::maze::WIDTH;
+use super::ghost::{Ghost, Mode};
+use super::maze::{Item, Place, WIDTH};
 use super::*;
 
 pub(crate) fn config() -> PacmanConfig {

@@ -28,20 +28,20 @@ pub(crate) enum AnyUnit {
 macro_rules! on_unit {
     ($unit:expr, $typed:ident => $body:expr) => {
         match $unit {
-            $crate::kernels::units::AnyUnit::PlainF32($typed) => $body,
-            $crate::kernels::units::AnyUnit::PlainBf16($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::PlainF32($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::PlainBf16($typed) => $body,
             #[cfg(target_arch = "x86_64")]
-            $crate::kernels::units::AnyUnit::Avx2F32($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::Avx2F32($typed) => $body,
             #[cfg(target_arch = "x86_64")]
-            $crate::kernels::units::AnyUnit::Avx2Bf16($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::Avx2Bf16($typed) => $body,
             #[cfg(target_arch = "x86_64")]
-            $crate::kernels::units::AnyUnit::Avx512F32($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::Avx512F32($typed) => $body,
             #[cfg(target_arch = "x86_64")]
-            $crate::kernels::units::AnyUnit::Avx512Bf16($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::Avx512Bf16($typed) => $body,
             #[cfg(target_arch = "x86_64")]
-            $crate::kernels::units::AnyUnit::Amx($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::Amx($typed) => $body,
             #[cfg(all(test, target_arch = "x86_64"))]
-            $crate::kernels::units::AnyUnit::EmulatedAmx($typed) => $body,
+            $crate::kernels::units::choice::AnyUnit::EmulatedAmx($typed) => $body,
         }
     };
 }

@@ -6,7 +6,7 @@ mod amx_permission;
 mod avx2;
 mod avx512;
 mod avx512_rounding;
-mod choice;
+pub(crate) mod choice;
 pub(crate) mod element;
 mod emulated;
 mod plain;
