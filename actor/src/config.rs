@@ -219,19 +219,24 @@ impl Config {
     /// # Errors
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let (copies, steps) = (
-            "an actor steps 1 to 4096 copies",
-            "a chunk has 1 to 4096 steps",
-        );
-        let (chunks, wait) = ("1 to 64 chunks may wait", "a wait lasts 100 ms to one day");
         for (key, value, most, why) in [
-            ("actor.envs", self.envs, 4096, copies),
-            ("actor.steps_per_chunk", self.steps_per_chunk, 4096, steps),
+            (
+                "actor.envs",
+                self.envs,
+                4096,
+                "an actor steps 1 to 4096 copies",
+            ),
+            (
+                "actor.steps_per_chunk",
+                self.steps_per_chunk,
+                4096,
+                "a chunk has 1 to 4096 steps",
+            ),
             (
                 "actor.chunks_in_flight_max",
                 self.chunks_in_flight_max,
                 64,
-                chunks,
+                "1 to 64 chunks may wait",
             ),
         ] {
             check((1..=most).contains(&value), key, value, || why)?;
@@ -250,7 +255,8 @@ impl Config {
             ("actor.ack_timeout_ms", self.ack_timeout_ms),
             ("actor.unreachable_max_ms", self.unreachable_max_ms),
         ] {
-            check((100..=86_400_000).contains(&ms), key, ms, || wait)?;
+            let why = "a wait lasts 100 ms to one day";
+            check((100..=86_400_000).contains(&ms), key, ms, || why)?;
         }
         Ok(())
     }

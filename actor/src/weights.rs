@@ -38,13 +38,13 @@ pub enum WeightsError {
         /// Why the last pull failed, if it did.
         source: Option<Box<Self>>,
     },
-    /// A request that cannot be sent, or an answer that did not come.
+    /// An answer that did not come.
     #[error(transparent)]
     Session(#[from] SessionError),
     /// A piece that is damaged or not the next one, or a whole that is not what its header says.
     #[error(transparent)]
     Damaged(#[from] CodecError),
-    /// Pieces that are missing or of another version, or announcements that cannot be heard.
+    /// A request that cannot be sent, pieces that are missing or of another version, or announcements that cannot be received.
     #[error("{0}")]
     Failed(String),
     /// The system starts no thread.

@@ -108,7 +108,7 @@ step parity "$driml" parity "$root"/tests/parity/*.safetensors --device "$device
 step learner "$driml" bench learner --device "$device" --json "$out/learner.json"
 if [ -n "$python" ]; then
     if "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
-        torch_update() { PYTHONPATH=$root/deploy/python "$python" "$root/deploy/bench/peers/torch_update.py" --device "$device" "$@"; }
+        torch_update() { PYTHONPATH=$root/deploy/python${PYTHONPATH:+:$PYTHONPATH} "$python" "$root/deploy/bench/peers/torch_update.py" --device "$device" "$@"; }
         step torch-parity torch_update --check "$root"/tests/parity/*.safetensors
         step torch-eager torch_update
         step torch-compiled torch_update --compile

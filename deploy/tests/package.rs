@@ -55,7 +55,8 @@ fn words(text: &str) -> Vec<String> {
 
 /// The calls of the program in a recipe: of a shell's line, of systemd's, or the list under a key of YAML, in a line or an item a line.
 fn calls(text: &str) -> Vec<Vec<String>> {
-    let mut lines = text.lines().map(str::trim).peekable();
+    let lines = text.lines().map(str::trim);
+    let mut lines = lines.filter(|line| !line.starts_with('#')).peekable();
     let mut found = Vec::new();
     while let Some(line) = lines.next() {
         let of_yaml = line

@@ -148,16 +148,15 @@ impl RunSpec {
             let why = "it must be at least 1 and of a sensible size";
             check((1..=max).contains(&value), key, value, || why)?;
         }
-        let (actions, n_step, gamma) = (self.num_actions, self.n_step, self.gamma);
-        let fits = (1..=255).contains(&actions);
+        let fits = (1..=255).contains(&self.num_actions);
         let why = "a world has 1 to 255 actions";
-        check(fits, "run.num_actions", actions, || why)?;
-        let fits = (1..=1000).contains(&n_step);
+        check(fits, "run.num_actions", self.num_actions, || why)?;
+        let fits = (1..=1000).contains(&self.n_step);
         let why = "a return spans 1 to 1000 steps";
-        check(fits, "run.n_step", n_step, || why)?;
-        let fits = (0.0..=1.0).contains(&gamma);
+        check(fits, "run.n_step", self.n_step, || why)?;
+        let fits = (0.0..=1.0).contains(&self.gamma);
         let why = "a discount lies between 0 and 1";
-        check(fits, "run.gamma", gamma, || why)?;
+        check(fits, "run.gamma", self.gamma, || why)?;
         let (horizon, k_max) = (self.horizon, self.horizon.k_max());
         let fits = horizon == Horizon::None || (1..=1000).contains(&k_max);
         check(fits, "run.horizon", k_max, || "k lies between 1 and 1000")?;

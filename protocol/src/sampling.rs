@@ -102,10 +102,8 @@ impl Sampling {
             let fits = (0.0..=1.0).contains(&value);
             check(fits, key, value, || "it lies between 0 and 1")?;
         }
-        let (key, why) = (
-            "replay.sampling.beta_end",
-            "beta rises: use at least beta_start",
-        );
+        let key = "replay.sampling.beta_end";
+        let why = "beta rises: use at least beta_start";
         check(beta_end >= beta_start, key, beta_end, || why)?;
         let key = "replay.sampling.beta_updates";
         let why = "beta rises over at least one update";

@@ -36,22 +36,15 @@ const NOTHING: Tally = Tally {
     rows_sampled: 0,
 };
 
-/// A session with the process that listens at an endpoint.
-///
-/// # Panics
-/// At the deadline.
+/// A session with the process that listens at an endpoint, in one try.
 pub fn connect(endpoint: &str) -> Session {
-    let deadline = Instant::now() + DEADLINE;
-    let endpoints = Endpoints {
+    session::open(&to(endpoint)).unwrap()
+}
+
+fn to(endpoint: &str) -> Endpoints {
+    Endpoints {
         listen: Vec::new(),
         connect: vec![endpoint.to_owned()],
-    };
-    // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-    loop {
-        match session::open(&endpoints) {
-            Ok(session) => return session,
-            Err(e) => assert!(Instant::now() < deadline, "{e}"),
-        }
     }
 }
 
@@ -107,7 +100,14 @@ impl Client {
     /// # Panics
     /// At the deadline.
     pub fn join(endpoint: &str) -> Self {
-        Self::over(connect(endpoint))
+        let deadline = Instant::now() + DEADLINE;
+        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        loop {
+            match session::open(&to(endpoint)) {
+                Ok(session) => return Self::over(session),
+                Err(e) => assert!(Instant::now() < deadline, "{e}"),
+            }
+        }
     }
 
     /// Sends bytes and gives the bytes of the answer.

@@ -23,7 +23,7 @@ pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
 pub use network::Network;
 pub use process::{Ended, Process};
 pub use run_folder::{EpisodeRow, RunFolder, Summary, updates_of};
-pub use skipped::{note, skip, skipped_offline};
+pub use skipped::{is_offline, note, skip, skipped_offline};
 pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};
 pub use waiting::{DEADLINE, wait_for};

@@ -239,15 +239,15 @@ fn no_files_of_a_crate_form_a_circle() {
     );
 }
 
-/// A crate of four files in which `b` and `c` name each other, and one of them does so within a macro.
+/// A crate of four files in which `b` and `c` name each other, one within braces and the other within a macro. Only their tests name `a`.
 #[test]
 fn a_circle_is_found() {
     let folder = tempfile::tempdir().unwrap();
     let files = r#"
 lib.rs: mod a; mod b; #[cfg(test)] mod tests; pub use a::f;
 a.rs: use crate::b::g; pub fn f() { g() }
-b/mod.rs: mod c; pub const N: u32 = 1; pub fn g() { self::c::h() }
-b/c.rs: pub fn h() { println!("{}", super::N) } #[cfg(test)] mod tests { use crate::a::f; }"#;
+b/mod.rs: mod c; use self::{c::{h as k}}; pub const N: u32 = 1; pub fn g() { k() }
+b/c.rs: #[cfg(test)] use crate::a::{f}; pub fn h() { println!("{}", super::N) } #[cfg(test)] fn t() { crate::a::f() } #[cfg(test)] mod tests { use crate::a::f; }"#;
     fs::create_dir(folder.path().join("b")).unwrap();
     for (name, text) in files.lines().filter_map(|it| it.split_once(": ")) {
         fs::write(folder.path().join(name), text).unwrap();

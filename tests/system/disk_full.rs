@@ -67,7 +67,7 @@ impl Filler {
 }
 
 /// Updates between two checkpoints of a run that ends before the first.
-const NEVER: u32 = 100_000_000;
+pub(crate) const NEVER: u32 = 100_000_000;
 
 /// A run on the disk, with a checkpoint after so many updates, that has learned something.
 fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
@@ -110,8 +110,9 @@ fn a_run_continues_while_the_disk_is_full() {
         let cells = run.column(name).into_iter();
         cells.map(|it| it.parse().unwrap()).collect()
     };
-    assert!(numbers("seconds").is_sorted_by(|a, b| a < b));
-    assert!(numbers("frames").is_sorted());
+    let (seconds, frames) = (numbers("seconds"), numbers("frames"));
+    assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
+    assert!(frames.is_sorted(), "{frames:?}");
     check_nothing_is_left(&system, &system.path("disk/run"));
 }
 

@@ -1,5 +1,5 @@
 //! Runs that end early: Ctrl-C, a process that dies, a launcher that dies. No process is ever left.
-//! What a dead part's successor may do is in `by_hand`.
+//! What a dead process's successor may do is in `by_hand` (actors) and `successors` (learners).
 
 use std::{fs, process::Command};
 

@@ -6,7 +6,7 @@ use std::{
     net::{Ipv4Addr, TcpListener},
 };
 
-use driml_tests::{Client, wait_for};
+use driml_tests::{Client, Summary, wait_for};
 
 use crate::{LONG, SHORT, system};
 
@@ -43,6 +43,12 @@ fn c51_leaves_a_whole_run_folder() {
         .expect_printed("trains      c51 on chain, seed 1")
         .expect_printed("finished: 1280 frames and 540 updates");
     assert_eq!(system.survivors(), []);
+    // The settings that it left repeat it. Processes race, so the weights differ; the counts do not.
+    system.run_ok("local --config run/config.toml --run-dir again");
+    let again = system.run_folder("again");
+    assert_eq!(again.config(), run.config());
+    let counts = |it: &Summary| (it.frames, it.updates, it.rows_sampled);
+    assert_eq!(counts(&again.check_finished()), counts(&summary));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 
 use driml_envs::{CorridorConfig, optimal_return};
 use driml_settings::presets::AGENTS;
-use driml_tests::{Summary, TestSystem, skipped_offline};
+use driml_tests::{Summary, TestSystem, is_offline, note};
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, SHORT, system};
@@ -97,7 +97,9 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
 #[test]
 fn a_run_that_is_prolonged_is_a_longer_one() {
     let mut runs = vec![("mspacman", "driml-ada"), ("mspacman", "rainbow")];
-    if !skipped_offline() {
+    if is_offline() {
+        note("a_run_that_is_prolonged_is_a_longer_one: without Procgen (DRIML_OFFLINE=1)");
+    } else {
         runs.extend([
             ("procgen:coinrun", "driml-ada"),
             ("procgen:maze", "driml-ada"),

@@ -89,9 +89,6 @@ impl Environment for PartOfWorld {
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
-        if self.shape == self.whole {
-            return self.world.observe(frames);
-        }
         check_frames(frames, self.num_envs(), self.shape);
         self.world.observe(&mut self.frames);
         let [whole_row, row] = [self.whole, self.shape].map(|shape| shape.width * shape.channels);
@@ -162,6 +159,13 @@ mod tests {
         world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
         assert_eq!((rewards, ends), ([1.0, -1.0], [StepEnd::Terminal; 2]));
         assert!(world.step(&[0, 2], &mut rewards, &mut ends).is_err());
+        // No-op is 0, and left is not among these.
+        let mut world = part(&[0, 2], (2, 3)).unwrap();
+        world.step(&[1, 0], &mut rewards, &mut ends).unwrap();
+        assert_eq!(
+            (rewards, ends),
+            ([1.0, 0.0], [StepEnd::Terminal, StepEnd::Running])
+        );
     }
 
     #[test]

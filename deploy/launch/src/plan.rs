@@ -7,7 +7,7 @@ use driml_learner::{
     DeviceName, Precision,
     cost::{UpdateCost, UpdateShape},
 };
-use driml_machine::{resources::Machine, units::rough_duration};
+use driml_machine::{resources::Machine, units::duration};
 use driml_settings::{
     config::RunConfig,
     memory::{COMPRESSED_FIELDS_BYTES, replay_bytes_each},
@@ -57,11 +57,7 @@ pub fn describe(
     };
     let done = resume_point.updates as f64 / updates.max(1) as f64;
     let left = (1.0 - done).max(0.0);
-    let seconds = estimate(config, machine.cores).as_secs_f64() * left;
-    let time = match seconds < 60.0 {
-        true => "under a minute".to_owned(),
-        false => format!("about {}", rough_duration(seconds)),
-    };
+    let time = about(estimate(config, machine.cores).mul_f64(left));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
     let mut text = String::new();
     let mut fact = |name, fact: &str| text += &format!("{name:<INDENT$}{fact}\n");
@@ -115,6 +111,18 @@ fn size(bytes: u64) -> String {
     }
 }
 
+/// A time that pretends to no more precision than an estimate has.
+fn about(time: Duration) -> String {
+    let time = match time.as_secs() {
+        0..60 => return "under a minute".into(),
+        seconds @ 60..7200 => format!("{} min", seconds.div_ceil(60)),
+        seconds => duration(Duration::from_secs(seconds.div_ceil(3600) * 3600))
+            .replace(" 0 min", "")
+            .replace(" 0 h", ""),
+    };
+    format!("about {time}")
+}
+
 #[cfg(test)]
 mod tests {
     use expect_test::expect;
@@ -150,5 +158,18 @@ mod tests {
         let ascending = ["c51", "driml-ada", "driml-fix", "cpc"].map(time);
         assert!(ascending.is_sorted(), "{ascending:?}");
         assert!(time("c51") < time("curl") && time("curl") < time("cpc"));
+    }
+
+    #[test]
+    fn estimates_are_not_precise() {
+        for (seconds, text) in [
+            (5, "under a minute"),
+            (600, "about 10 min"),
+            (7_300, "about 3 h"),
+            (90_000, "about 1 d 1 h"),
+            (86_400, "about 1 d"),
+        ] {
+            assert_eq!(about(Duration::from_secs(seconds)), text);
+        }
     }
 }

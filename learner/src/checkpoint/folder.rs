@@ -57,7 +57,7 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
         match number.parse::<u64>() {
             Ok(updates) if !is_replaced => all.push((updates, path)),
             _ => {
-                tracing::warn!(path = %path.display(), "left from an unfinished save; not a checkpoint")
+                tracing::debug!(path = %path.display(), "left from an unfinished save; not a checkpoint")
             }
         }
     }

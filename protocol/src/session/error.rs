@@ -39,7 +39,7 @@ pub enum SessionError {
         /// What is wrong with it.
         why: CodecError,
     },
-    /// The session could not be opened, or a request not be sent: what zenoh said, or what else listens at the endpoint.
+    /// The session could not be opened, a request is too large or could not be sent, or the other side replied with an error.
     #[error("{0}")]
     Failed(String),
 }

@@ -15,6 +15,8 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
     beta_updates: 1,
 };
 
+/// Actions of [`spec`].
+pub(crate) const ACTIONS: u32 = 3;
 /// Messages of one try.
 const MESSAGES_MAX: usize = 64;
 
@@ -61,7 +63,7 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
         frame_width: 1,
         frame_channels: frame_bytes,
         frame_stack: 2,
-        num_actions: 3,
+        num_actions: ACTIONS,
         n_step: 2,
         gamma: 0.99,
         horizon: Horizon::Nhg { k_max: 3 },

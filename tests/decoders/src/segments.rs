@@ -14,12 +14,10 @@ use driml_protocol::{
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
 
-use crate::replay;
+use crate::replay::{self, ACTIONS};
 
 /// Bytes of a frame: its number, which is never 0.
 const FRAME_BYTES: usize = 4;
-/// Actions of the world.
-const ACTIONS: u32 = 3;
 /// Rows of a batch.
 const ROWS: u32 = 4;
 /// Batches that are drawn from what came back.

@@ -84,7 +84,7 @@ fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
 
 /// A learner's weights of this version, as it hands them over.
 fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec<u8> {
-    let weights = WeightsHeader::new(version, 0, safetensors);
+    let weights = WeightsHeader::new(version, version, safetensors);
     let upload = WeightsUpload { learner, weights };
     codec::encode(spec_hash, &upload, safetensors).unwrap()
 }

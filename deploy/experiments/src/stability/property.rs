@@ -28,7 +28,7 @@ pub(super) use Inputs::{Drawn, Listed};
 pub(super) enum Inputs {
     /// Every combination of what the check lists.
     Listed,
-    /// The generator, in this share of the draws.
+    /// The generator, in this share of the draws, 8 or more.
     Drawn(f64),
 }
 
@@ -134,6 +134,11 @@ impl<'a> Cases<'a> {
         }
     }
 
+    /// How many cases this share of the draws is.
+    pub(super) fn draws(&self, share: f64) -> u64 {
+        (self.settings.draws as f64 * share).ceil().max(8.0) as u64
+    }
+
     /// The rows of all cases.
     pub(super) fn run(mut self) -> anyhow::Result<Vec<Row>> {
         for &(extreme, inputs, check) in self.property.extremes {
@@ -151,8 +156,7 @@ impl<'a> Cases<'a> {
                     }
                 }
                 Drawn(share) => {
-                    let draws = (self.settings.draws as f64 * share).ceil().max(8.0) as u64;
-                    for _ in 0..draws {
+                    for _ in 0..self.draws(share) {
                         check(&mut self)?;
                     }
                 }

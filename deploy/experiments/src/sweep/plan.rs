@@ -62,7 +62,7 @@ impl Call {
     }
 }
 
-/// A run to be made.
+/// A run to be made. Plans go seed by seed, so that what was stopped has one seed of everything before it has two of anything.
 #[derive(Clone, Debug)]
 pub(crate) struct PlannedRun {
     /// Its folder's name.

@@ -48,6 +48,7 @@ use super::config::ExecConfig;
 use crate::environment::FrameShape;
 use crate::error::{EnvError, Fault};
 use crate::saved;
+use crate::settings::WorldSettings;
 
 /// The protocol's version. A process that speaks another is refused.
 pub(super) const VERSION: u64 = 1;

@@ -14,6 +14,18 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::{EnvError, ExecError, Fault};
 use crate::settings::{Variants, WorldSettings};
 
+/// Longest side of a frame, in pixels.
+const SIDE_MAX: usize = 4096;
+
+/// Most bytes a pixel.
+const CHANNELS_MAX: usize = 16;
+
+/// Most actions of a world: the wire numbers them with a byte.
+const ACTIONS_MAX: usize = 255;
+
+/// Bounds of a time limit, in milliseconds: a day at most.
+const LIMIT_MS: std::ops::RangeInclusive<u64> = 1..=86_400_000;
+
 /// Says that the actions lie in the block.
 const STEP: u8 = b's';
 
@@ -166,7 +178,7 @@ impl ExecWorld {
 }
 
 /// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
-pub(super) fn introduce(
+fn introduce(
     command: &str,
     patience: Patience,
     seeds: Vec<u32>,
@@ -218,11 +230,50 @@ pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
 
 impl WorldSettings for ExecConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        ExecConfig::validate(self)
+        let bad = |text: String| Err(EnvError::Config(text));
+        if self.command.trim().is_empty() {
+            return bad(
+                "exec: without a command; give one, as in --env \"exec:python3 world.py\"".into(),
+            );
+        }
+        let sides = [self.height, self.width];
+        if sides.iter().any(|side| !(1..=SIDE_MAX).contains(side))
+            || !(1..=CHANNELS_MAX).contains(&self.channels)
+        {
+            return bad(format!(
+                "the world `{}` declares frames of {} x {} x {}; 1 x 1 x 1 to {SIDE_MAX} x {SIDE_MAX} x {CHANNELS_MAX} bytes are possible, \
+                 rows first, channels last",
+                self.command, self.height, self.width, self.channels
+            ));
+        }
+        if !(1..=ACTIONS_MAX).contains(&self.actions.len()) {
+            return bad(format!(
+                "the world `{}` declares {} actions; 1 to {ACTIONS_MAX} are possible",
+                self.command,
+                self.actions.len()
+            ));
+        }
+        for (name, value) in [
+            ("start_timeout_ms", self.start_timeout_ms),
+            ("step_timeout_ms", self.step_timeout_ms),
+        ] {
+            if !LIMIT_MS.contains(&value) {
+                return bad(format!(
+                    "world.{name} = {value}; 1 to {} milliseconds are possible",
+                    LIMIT_MS.end()
+                ));
+            }
+        }
+        Ok(())
     }
 
+    /// `height` x `width` x `channels`.
     fn frame_shape(&self) -> FrameShape {
-        ExecConfig::frame_shape(self)
+        FrameShape {
+            height: self.height,
+            width: self.width,
+            channels: self.channels,
+        }
     }
 
     fn action_names(&self) -> Vec<&str> {

@@ -6,7 +6,6 @@ use std::path::Path;
 use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options, ProcgenError};
 
 use super::shrink::Shrink;
-use crate::environment::FrameShape;
 use crate::error::EnvError;
 
 /// Which levels of which game, and how they look.
@@ -50,30 +49,11 @@ pub struct ProcgenConfig {
     pub library: Option<String>,
 }
 
-const fn whole_side() -> u32 {
+pub(super) const fn whole_side() -> u32 {
     FRAME_SIDE as u32
 }
 
-/// The smallest side of a frame.
-const SIDE_MIN: u32 = 8;
-
 impl ProcgenConfig {
-    /// Says why a world with these settings cannot be made; needs no engine.
-    ///
-    /// # Errors
-    /// Numbers out of range, or a mode that the game does not have.
-    pub fn validate(&self) -> Result<(), EnvError> {
-        if !(SIDE_MIN..=whole_side()).contains(&self.frame_side) {
-            return Err(EnvError::Config(format!(
-                "frame_side = {}; the engine draws {} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
-                 `input.width` enlarge",
-                self.frame_side,
-                whole_side()
-            )));
-        }
-        self.options(1, 0, 0).map(drop)
-    }
-
     /// The engine that plays: the build that is named, or the published one, which is fetched if it is not there.
     pub(super) fn engine(&self, progress: &mut dyn FnMut(&str)) -> Result<Engine, EnvError> {
         let engine = match &self.library {
@@ -81,11 +61,6 @@ impl ProcgenConfig {
             None => Engine::install(progress),
         };
         Ok(engine.map_err(ProcgenError::from)?)
-    }
-
-    /// The shape of a frame as it leaves the world.
-    pub(super) const fn frame_shape(&self) -> FrameShape {
-        Shrink::shape(self.frame_side as usize, self.grey)
     }
 
     /// What makes the engine's frames smaller or grey; none where they are wanted as they are.

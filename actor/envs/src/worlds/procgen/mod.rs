@@ -42,6 +42,7 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::saved;
 use crate::settings::{Levels, Variants, WorldSettings};
+use config::whole_side;
 use shrink::Shrink;
 
 pub use config::ProcgenConfig;
@@ -49,6 +50,9 @@ pub use visible_actions::visible_actions;
 
 /// Levels to draw unseen ones from, right after those trained on.
 const UNSEEN_LEVELS: u32 = 100_000;
+
+/// The smallest side of a frame.
+const SIDE_MIN: u32 = 8;
 
 /// Resets in a row that may fail to draw a level of the set before it is an error. One is enough unless the game's
 /// no-op completes the drawn level in its first step.
@@ -191,12 +195,21 @@ impl LevelSet {
 }
 
 impl WorldSettings for ProcgenConfig {
+    /// Needs no engine.
     fn validate(&self) -> Result<(), EnvError> {
-        ProcgenConfig::validate(self)
+        if !(SIDE_MIN..=whole_side()).contains(&self.frame_side) {
+            return Err(EnvError::Config(format!(
+                "frame_side = {}; the engine draws {} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
+                 `input.width` enlarge",
+                self.frame_side,
+                whole_side()
+            )));
+        }
+        self.options(1, 0, 0).map(drop)
     }
 
     fn frame_shape(&self) -> FrameShape {
-        ProcgenConfig::frame_shape(self)
+        Shrink::shape(self.frame_side as usize, self.grey)
     }
 
     /// Source: the `tps` of Procgen's own `interactive.py`.

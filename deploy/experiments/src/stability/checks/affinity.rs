@@ -37,7 +37,10 @@ pub(super) const PROPERTIES: &[Property] = &[
         promises: &[
             ("a row's sum, beside 1, at any update", ROW_SUM_ERROR),
             // One pair says nothing of how actions follow each other.
-            ("an entry, beside 1 / actions", UNIFORM_ERROR),
+            (
+                "an entry, beside 1 / actions, where the action is always the same",
+                UNIFORM_ERROR,
+            ),
         ],
         extremes: &[(UPDATES, Listed, learned)],
     },

@@ -264,8 +264,10 @@ fn with_gaps(cases: &mut Cases<'_>) -> Batch {
 fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let mut batch = with_gaps(cases);
     let rng = &mut cases.rng;
-    let at = rng.random_range(1..batch.atoms);
-    (batch.logits[at], batch.target[at]) = match rng.random_range(0..6) {
+    let kind = rng.random_range(0..6);
+    // The first atom's probability stays: without it nothing might be left.
+    let at = rng.random_range(usize::from(kind >= 3)..batch.atoms);
+    (batch.logits[at], batch.target[at]) = match kind {
         0..3 => (not_finite(rng), 1.0 / batch.atoms as f32),
         3 => (f32::INFINITY, 0.0),
         4 => (f32::NAN, 0.0),

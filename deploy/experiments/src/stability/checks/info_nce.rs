@@ -170,17 +170,24 @@ fn loss_of_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             *dot = not_finite(rng);
         }
     }
-    let mut is_kept = batch.bits() == before;
-    let there = batch.there();
+    let is_kept = batch.bits() == before;
+    keeps(cases, &batch, is_kept)?;
+    let (there, rng) = (batch.there(), &mut cases.rng);
     let at = one_of(&there, rng) * count + one_of(&there, rng);
     for end in [f32::MAX, f32::MIN] {
         batch.dots[at] = end;
         let at_the_bound = batch.bits();
         batch.dots[at] = end * 2.0;
-        is_kept &= batch.bits() == at_the_bound;
+        let is_kept = batch.bits() == at_the_bound;
+        keeps(cases, &batch, is_kept)?;
     }
     batch.dots[at] = f32::NAN;
-    is_kept &= !batch.loss().0.is_finite();
+    let is_kept = !batch.loss().0.is_finite();
+    keeps(cases, &batch, is_kept)
+}
+
+/// Notes whether what is promised of dot products that are not finite holds for this batch.
+fn keeps(cases: &mut Cases<'_>, batch: &Batch, is_kept: bool) -> anyhow::Result<()> {
     let input = format_args!("valid {:?}, dots {}", batch.valid, Shown(&batch.dots));
     cases.keeps(2, input, is_kept)
 }

@@ -165,9 +165,8 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
 
 fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let scale = cases.each(&[1e-6, 1e-3, 0.1, 1.0, 3.0, 10.0, 100.0]);
-    let draws = (cases.settings.draws as f64 * 0.0015).ceil().max(8.0) as u64;
     let mut gradients = Vec::new();
-    for _ in 0..draws {
+    for _ in 0..cases.draws(0.0015) {
         let setting = Setting::drawn(scale, &mut cases.rng);
         let (loss, gradient) = errors(&setting, &mut cases.rng)?;
         cases.see(format_args!("{setting:?}"), [loss])?;

@@ -26,7 +26,10 @@ pub(super) const PROPERTIES: &[Property] = &[
             // Beside the value's own last place; never beyond the support.
             ("a value, as a share of the width", EXPECTED_RETURN_ERROR),
         ],
-        extremes: &[(LOGITS, Listed, expected), ("drawn", Drawn(0.05), expected)],
+        extremes: &[
+            (LOGITS, Listed, expected),
+            ("drawn, some logits -inf", Drawn(0.05), expected),
+        ],
     },
     Property {
         routine: "greedy action",
@@ -62,7 +65,17 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let atoms = cases.of(&[2usize, 51, 1001], |rng| rng.random_range(2..120));
     let support = cases.of(&SUPPORTS, support);
     let rows = cases.of(&[listed_logits(atoms)], |rng| {
-        (0..20).map(|_| finites(atoms, rng)).collect()
+        let rows = (0..20).map(|row| {
+            let mut logits = finites(atoms, rng);
+            let kept = rng.random_range(0..atoms);
+            for (atom, logit) in logits.iter_mut().enumerate() {
+                if row % 2 == 1 && atom != kept && rng.random_bool(0.2) {
+                    *logit = f32::NEG_INFINITY;
+                }
+            }
+            logits
+        });
+        rows.collect()
     });
     let config = small::config(atoms, 1, support);
     let rng = &mut ChaCha8Rng::seed_from_u64(0);
