@@ -49,7 +49,7 @@ impl Interrupts {
         u32::from(self.0.ending.is_set()) + u32::from(self.0.now.is_set())
     }
 
-    /// Sleeps for `timeout`, or until there is one; returns how many there were. After the first one it returns at once: it is no pause then.
+    /// Sleeps for `timeout`, or until there is one; returns how many there were. After the first one it returns at once.
     pub fn wait_timeout(&self, timeout: Duration) -> u32 {
         self.0.ending.wait_timeout(timeout);
         self.count()

@@ -165,7 +165,6 @@ impl Results {
         })
     }
 
-    /// Every level.
     pub(super) fn levels(&self) -> impl Iterator<Item = Row<'_>> {
         self.levels.iter().map(|of| self.row(of, false))
     }
