@@ -38,7 +38,7 @@ impl Head {
             out_weight: parameters.tensor(&out, "weight")?,
             out_bias: parameters.tensor(&out, "bias")?,
             skip_weight: parameters.tensor(&skip, "weight")?,
-            skip_bias: parameters.tensor(&skip, "bias").ok(),
+            skip_bias: None,
         })
     }
 
@@ -100,8 +100,10 @@ impl ActionEmbedding {
         parameters: &Parameters,
         kernels: Kernels,
     ) -> Result<Self> {
+        let mut block = Head::new("dim.action", parameters, kernels)?;
+        block.skip_bias = Some(parameters.tensor("dim.action.skip", "bias")?);
         Ok(Self {
-            block: Head::new("dim.action", parameters, kernels)?,
+            block,
             num_actions: config.num_actions,
         })
     }

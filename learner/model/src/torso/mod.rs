@@ -1,4 +1,4 @@
-//! The menu of torsos: a file each, and a line of [`TorsoName::build`].
+//! The menu of torsos: a line of [`TorsoName::build`] each; `impoola` is `impala` with another last layer.
 //! What a torso is stands in `interface`.
 
 mod impala;
