@@ -14,7 +14,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_100),
     ("replay-server", 11_450),
     ("learner", 26_610),
-    ("deploy", 35_200),
+    ("deploy", 35_240),
     ("tests", 11_520),
 ];
 /// Most lines of one file.

@@ -1,5 +1,4 @@
-//! Plays a run's checkpoints during the run, each in its own process, one at a time. That process judges the checkpoint by what it
-//! earns, writes that into the run's folder and keeps the best.
+//! Plays a run's checkpoints and keeps the best: `keep` plays one, in this process; `Evaluator` starts a process for each during a run.
 //! What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
 
 use std::{
@@ -18,6 +17,54 @@ use crate::{
     run_folder::{Candidate, Evaluated, RunFolder, sweep},
     stats::mean_and_deviation,
 };
+
+/// The seed of the episodes on which checkpoints are compared; reports use other seeds.
+pub const SELECTION_SEED: u64 = 1 << 32;
+
+/// What a checkpoint earned, and whether it is the run's best.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Judged {
+    /// What it earned.
+    pub earned: Evaluated,
+    /// It was kept.
+    pub is_best: bool,
+    /// The best, as it was judged before this one came: over at least as many episodes.
+    pub best_before: Option<Evaluated>,
+}
+
+/// Plays a checkpoint of a run, its averaged weights if there are some, on the levels trained on, adds what it earned to the run's
+/// table, and keeps it where it earned more than the best before it.
+///
+/// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
+/// does not take its place.
+pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
+    let path = checkpoint_at(folder, which)?;
+    let candidate = Candidate::hold(folder, &path)?;
+    let play = |path: &Path| -> anyhow::Result<Evaluated> {
+        let player = Player::read(config_of(folder)?, path, Weights::default())?;
+        let world = levels(&player.config.world, Levels::Train)?;
+        let (count, watch) = (episodes as usize, &mut play_on);
+        let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
+        let earned = mean_and_deviation(&returns);
+        Ok(Evaluated::at(folder, player.updates, episodes, earned))
+    };
+    let earned = play(&path)?;
+    let mut best_before = Evaluated::best(folder)?;
+    let is_short = |it: &Evaluated| it.updates != earned.updates && it.episodes < episodes;
+    if best_before.is_some_and(|it| is_short(&it))
+        && let Some((_, best)) = checkpoint::list(&folder.best())?.pop()
+    {
+        let again = play(&best)?;
+        again.add(folder)?;
+        best_before = Some(again);
+    }
+    let is_best = candidate.judge(folder, &earned, best_before.as_ref())?;
+    Ok(Judged {
+        earned,
+        is_best,
+        best_before,
+    })
+}
 
 const LAST_MAX: Duration = Duration::from_secs(3600);
 const POLL: Duration = Duration::from_millis(100);
@@ -48,6 +95,7 @@ impl Due {
     }
 }
 
+/// Plays the checkpoints that are due, one at a time.
 pub(crate) struct Evaluator {
     due: Due,
     run_dir: RunFolder,
@@ -167,52 +215,4 @@ impl Drop for Evaluator {
         self.playing = None;
         sweep(&self.run_dir);
     }
-}
-
-/// The seed of the episodes on which checkpoints are compared; reports use other seeds.
-pub const SELECTION_SEED: u64 = 1 << 32;
-
-/// What a checkpoint earned, and whether it is the run's best.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Judged {
-    /// What it earned.
-    pub earned: Evaluated,
-    /// It was kept.
-    pub is_best: bool,
-    /// The best, as it was judged before this one came: over at least as many episodes.
-    pub best_before: Option<Evaluated>,
-}
-
-/// Plays a checkpoint of a run, its averaged weights if there are some, on the levels trained on, adds what it earned to the run's table, and keeps it where it earned more than
-/// the best before it.
-///
-/// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
-/// does not take its place.
-pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
-    let path = checkpoint_at(folder, which)?;
-    let candidate = Candidate::hold(folder, &path)?;
-    let play = |path: &Path| -> anyhow::Result<Evaluated> {
-        let player = Player::read(config_of(folder)?, path, Weights::default())?;
-        let world = levels(&player.config.world, Levels::Train)?;
-        let (count, watch) = (episodes as usize, &mut play_on);
-        let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
-        let earned = mean_and_deviation(&returns);
-        Ok(Evaluated::at(folder, player.updates, episodes, earned))
-    };
-    let earned = play(&path)?;
-    let mut best_before = Evaluated::best(folder)?;
-    let is_short = |it: &Evaluated| it.updates != earned.updates && it.episodes < episodes;
-    if best_before.is_some_and(|it| is_short(&it))
-        && let Some((_, best)) = checkpoint::list(&folder.best())?.pop()
-    {
-        let again = play(&best)?;
-        again.add(folder)?;
-        best_before = Some(again);
-    }
-    let is_best = candidate.judge(folder, &earned, best_before.as_ref())?;
-    Ok(Judged {
-        earned,
-        is_best,
-        best_before,
-    })
 }

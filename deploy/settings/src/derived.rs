@@ -281,6 +281,14 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
     }
 }
 
+/// [`put`] of a whole number; TOML has none above `i64::MAX`.
+pub(crate) fn put_number(table: &mut Table, path: &str, number: u64) -> Result<(), Usage> {
+    let whole = i64::try_from(number)
+        .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
+    put(table, path, Value::Integer(whole));
+    Ok(())
+}
+
 /// Writes a value where there is none.
 pub(crate) fn put_missing(table: &mut Table, path: &str, value: Value) {
     if find(table, path).is_none() {

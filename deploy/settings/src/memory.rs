@@ -12,7 +12,7 @@ use toml::Table;
 
 use crate::{
     config::{LocalConfig, read},
-    derived::{derive, put},
+    derived::{derive, put_number},
 };
 
 /// Makes the replay as small as the memory and says so, or refuses a size that was asked for and does not fit.
@@ -54,11 +54,7 @@ pub(crate) fn fit(
     if capacity_set || asked <= capacity {
         return Ok(None);
     }
-    put(
-        table,
-        "replay.capacity_transitions",
-        (capacity as i64).into(),
-    );
+    put_number(table, "replay.capacity_transitions", capacity)?;
     // A replay that holds the whole run anyway is as good as a larger one.
     let frames = replay.transitions_max;
     let is_smaller_than_the_run = frames.is_none_or(|frames| frames > capacity);
@@ -97,7 +93,7 @@ fn fit_compressed(
             gib(max)
         )),
         None if frames > bytes => {
-            put(table, "replay.compressed_bytes_max", (bytes as i64).into());
+            put_number(table, "replay.compressed_bytes_max", bytes)?;
             let frames = replay.transitions_max.unwrap_or(u64::MAX);
             let is_smaller_than_the_run = frames.saturating_mul(run.frame_bytes() as u64) > bytes;
             let note = format!(

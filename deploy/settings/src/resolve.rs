@@ -94,8 +94,7 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         ("run.seed", flags.seed),
     ] {
         if let Some(value) = value {
-            // The flags' parsers let no larger number through.
-            derived::put(&mut table, path, Value::Integer(value as i64));
+            derived::put_number(&mut table, path, value)?;
         }
     }
     let by_hand = set(&mut table, &flags.sets)?;

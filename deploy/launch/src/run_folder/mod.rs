@@ -22,4 +22,3 @@ pub use self::{
     summary::{Outcome, Summary},
     table::{Table, write_whole},
 };
-pub use crate::metrics::rounded;

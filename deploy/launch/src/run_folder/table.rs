@@ -227,36 +227,49 @@ mod tests {
         assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
     }
 
-    fn full(path: &Path) -> AppendLog {
-        let mut table = AppendLog::create(path, b"a\n").unwrap();
-        table.file = File::options().append(true).open("/dev/full").unwrap();
-        table
+    fn full(name: &str, unit: &'static str, waiting_max: usize) -> AppendLog {
+        AppendLog::open(Path::new("/dev/full"), name.into(), unit, waiting_max).unwrap()
     }
 
     #[test]
-    fn rows_wait_until_they_can_be_written() {
+    fn what_is_appended_waits_until_it_can_be_written() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("metrics.csv");
-        let mut table = full(&path);
-        let row = |n: u32| format!("\"{n}, of five\"\n").into_bytes();
-        let said = table.add(row(1)).unwrap();
-        let why = "metrics.csv cannot be written: No space left";
-        assert!(said.starts_with(why), "{said}");
-        assert_eq!(table.add(row(2)), None, "it is logged once");
-        let missing = table.missing().unwrap();
-        let why = "2 rows of metrics.csv are lost: ";
-        assert!(missing.starts_with(why), "{missing}");
+        let row = |n: u64| format!("\"{n}, of five\"\n");
+        for (name, unit, waiting_max, lost) in [
+            ("metrics.csv", "rows", WAITING_MAX, 0),
+            ("the log of actor-0", "lines", 2, 1),
+        ] {
+            let mut log = full(name, unit, waiting_max);
+            let said = log.add(row(1).into_bytes()).unwrap();
+            let why = format!("{name} cannot be written: No space left");
+            let wait = format!("; its {unit} wait in memory until it can be");
+            assert!(said.starts_with(&why) && said.ends_with(&wait), "{said}");
+            assert_eq!(log.add(row(2).into_bytes()), None, "it is logged once");
+            let missing = log.missing().unwrap();
+            let why = format!("2 {unit} of {name} are lost: No space left");
+            assert!(missing.starts_with(&why), "{missing}");
 
-        table.file = File::options().append(true).open(&path).unwrap();
-        assert_eq!((table.add(row(3)), table.missing()), (None, None));
-        let text = fs::read_to_string(&path).unwrap();
-        assert_eq!(text, "a\n\"1, of five\"\n\"2, of five\"\n\"3, of five\"\n");
+            let path = folder.path().join(unit);
+            fs::write(&path, "a\n").unwrap();
+            log.file = File::options().append(true).open(&path).unwrap();
+            // Of more than may wait the oldest are lost.
+            assert_eq!(log.add(row(3).into_bytes()), None);
+            let kept: String = (1 + lost..=3).map(row).collect();
+            assert_eq!(fs::read_to_string(&path).unwrap(), format!("a\n{kept}"));
+            assert_eq!((log.lost, log.missing().is_some()), (lost, lost > 0));
+        }
+    }
+
+    #[test]
+    fn a_table_is_called_by_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let table = AppendLog::create(&folder.path().join("x.csv"), b"a\n").unwrap();
+        assert_eq!((table.name.as_str(), table.unit), ("x.csv", "rows"));
     }
 
     #[test]
     fn the_oldest_of_too_many_rows_are_lost() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut table = full(&folder.path().join("x.csv"));
+        let mut table = full("x.csv", "rows", WAITING_MAX);
         table.waiting = vec![Vec::new(); WAITING_MAX - 1].into();
         table.add(b"1".to_vec());
         table.add(b"2".to_vec());

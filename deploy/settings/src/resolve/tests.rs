@@ -117,6 +117,13 @@ fn an_agent_has_all_actions_unless_it_chooses_among_those_that_differ() {
     assert_eq!(RunConfig::parse("old.toml", &old).unwrap(), all);
     let names = with("procgen:plunder", "c51", &["actor.actions=visible"]).unwrap();
     assert_eq!(names.action_names(), ["left", "no-op", "right", "d"]);
+    for world in ["procgen:plunder", "procgen:maze", "mspacman", "chain"] {
+        for set in ["actor.actions=all", "actor.actions=visible"] {
+            let config = with(world, "c51", &[set]).unwrap();
+            let names = config.action_names().len();
+            assert_eq!(names, config.run.num_actions as usize, "{world} {set}");
+        }
+    }
 }
 
 /// The rows of a file that begin with `> ` with their answers below, and its remarks.
@@ -157,6 +164,12 @@ fn settings_follow_from_one_another() {
         };
         asked.split(' ').map(value).collect::<Vec<_>>().join("\n")
     });
+    // A setting that is never set may be misspelt.
+    let unset = answers.lines().map(|line| line.strip_suffix(" is not set"));
+    for path in unset.flatten() {
+        let is_set = answers.contains(&format!("\n{path} = "));
+        assert!(is_set, "{path} has a value in no row");
+    }
     expect_file!["../../tests/snapshots/resolved.txt"].assert_eq(&answers);
 }
 
@@ -210,6 +223,12 @@ fn flags_come_before_set_and_both_before_the_machine() {
     let (run, local) = (&config.run, &config.local);
     let found = (config.frames(), run.seed, local.actors, config.actor.envs);
     assert_eq!(found, (7_000, 6, 3, 2));
+    let too_many = frames(u64::MAX, &[]);
+    let said = resolve(&source("paper", "chain", "c51"), &too_many, &MACHINE).unwrap_err();
+    expect![
+        "replay.transitions_max = 18446744073709551615: the largest number is 9223372036854775807"
+    ]
+    .assert_eq(&said.to_string());
 }
 
 #[test]

@@ -20,8 +20,9 @@ use driml_launch::{
     console::{self, Screen, print},
     evaluate::{EPSILON, Levels, Player, Who, levels},
     evaluator::{Judged, keep},
+    metrics::rounded,
     pretrained,
-    run_folder::{RunFolder, rounded, sweep, write_whole},
+    run_folder::{RunFolder, sweep, write_whole},
     stats::mean_and_deviation,
     view::TEMPLATE,
 };

@@ -37,12 +37,12 @@ pub(super) const PROPERTIES: &[Property] = &[
         promises: &[
             ("a row's sum, beside 1, at any update", ROW_SUM_ERROR),
             // One pair says nothing of how actions follow each other.
-            (
-                "an entry, beside 1 / actions, where the action is always the same",
-                UNIFORM_ERROR,
-            ),
+            ("an entry, beside 1 / actions", UNIFORM_ERROR),
         ],
-        extremes: &[(UPDATES, Listed, learned)],
+        extremes: &[
+            (UPDATES, Listed, learned),
+            ("always the same action", Listed, learned_of_one_action),
+        ],
     },
 ];
 
@@ -59,14 +59,13 @@ pub(super) const LEARNED: LearnedSettings = LearnedSettings {
 /// Ways in which actions are used, each as so many pairs a batch and what draws one of them.
 type Use = (&'static str, usize, fn(u8, &mut ChaCha8Rng) -> (u8, u8));
 
-const CONSTANT: &str = "always the same";
 const USES: [Use; 5] = [
     ("random", 64, any_pair),
     ("in a cycle", 64, |actions, rng| {
         let action = rng.random_range(0..actions);
         (action, (action + 1) % actions)
     }),
-    (CONSTANT, 64, |actions, _| (actions - 1, actions - 1)),
+    ("always the same", 64, |all, _| (all - 1, all - 1)),
     ("half of them never", 64, |actions, rng| {
         any_pair(actions / 2, rng)
     }),
@@ -141,13 +140,18 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, errors)
 }
 
-fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+/// How many actions there are, an estimate of them, and the updates to make of it.
+fn untrained(cases: &mut Cases<'_>) -> anyhow::Result<(u8, AffinityEstimator, u64)> {
     let updates = cases.settings.affinity_updates;
     let (actions, updates) = cases.each(&[(2u8, updates), (15, updates), (255, updates / 100)]);
-    let (used, count, pair) = cases.each(&USES);
     let alphabet = Alphabet::raw(actions.into())?;
     let learned = LearnedAffinity::new(alphabet, LEARNED, &mut cases.rng)?;
-    let mut estimate = AffinityEstimator::Learned(learned);
+    Ok((actions, AffinityEstimator::Learned(learned), updates))
+}
+
+fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let (actions, mut estimate, updates) = untrained(cases)?;
+    let (used, count, pair) = cases.each(&USES);
     for update in 1..=updates {
         let pairs = (0..count).map(|_| pair(actions, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
@@ -156,14 +160,18 @@ fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let input = format_args!("{actions} actions, {used}, update {update}");
         cases.see(input, [error])?;
     }
-    if used == CONSTANT {
-        let entries = estimate.matrix().iter();
-        let off = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
-        let error = worst(entries.map(off));
-        cases.see(
-            format_args!("{actions} actions, {used}"),
-            [None, Some(error)],
-        )?;
-    }
     Ok(())
+}
+
+fn learned_of_one_action(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let (actions, mut estimate, updates) = untrained(cases)?;
+    let (_, count, pair) = USES[2];
+    let pairs = vec![pair(actions, &mut cases.rng); count];
+    for _ in 0..updates {
+        estimate.observe(&pairs, &mut cases.rng)?;
+        cases.pause()?;
+    }
+    let off = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
+    let error = worst(estimate.matrix().iter().map(off));
+    cases.see(format_args!("{actions} actions"), [None, Some(error)])
 }
