@@ -18,8 +18,8 @@ use driml_machine::{
     error::{Interrupted, usage},
     resources,
 };
+use minijinja::Value;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
-use serde_json::Value;
 
 use crate::{
     flags::ExperimentFlags,

@@ -2,8 +2,7 @@
 //! Its text is a minijinja template beside the experiment; its numbers come from results alone, so that none can be stale.
 
 use driml_machine::units::rough_duration;
-use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value};
-use serde_json::Value as Json;
+use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context};
 
 use crate::{
     flags::this_command,
@@ -75,9 +74,10 @@ pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
 
 /// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
 /// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time.
+/// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
 pub(crate) fn page(
     template: &str,
-    mut values: Json,
+    values: Value,
     smoke: bool,
     seconds: f64,
     at_once: u32,
@@ -88,11 +88,11 @@ pub(crate) fn page(
     };
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let time = rough_duration(seconds);
-    values["time"] = format!("{time}{at_once} on a machine with {cores} cores.").into();
-    values["smoke"] = (if smoke { SMOKE } else { "" }).into();
-    if values["command"].is_null() {
-        values["command"] = this_command().into();
-    }
+    let values = context! {
+        time => format!("{time}{at_once} on a machine with {cores} cores."),
+        smoke => if smoke { SMOKE } else { "" },
+        ..context! { ..values, ..context! { command => this_command() } }
+    };
     fill(template, &values).unwrap_or_else(|e| {
         panic!("the template of the page is built in, and a test fills it: {e:#}")
     })
@@ -108,7 +108,7 @@ pub(crate) fn summary(page: &str) -> String {
 ///
 /// # Errors
 /// The template is not one, or names a value that its experiment does not give.
-fn fill(template: &str, values: &Json) -> Result<String, Error> {
+fn fill(template: &str, values: &Value) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);
@@ -204,8 +204,6 @@ fn figure(stem: &str, caption: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
-
     use super::*;
 
     #[test]
@@ -215,7 +213,7 @@ mod tests {
         let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
-        let values = json!({ "got": 0.5, "more": ["1", "2"], "no": false, "command": command });
+        let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
         let page = |smoke, at_once| page(template, values.clone(), smoke, 130.0, at_once);
         let text = page(true, 1);
         for part in [
@@ -236,7 +234,7 @@ mod tests {
 
     #[test]
     fn lists_of_numbers_become_what_a_page_says_of_them() {
-        let mut values = json!({ "base": [0.0, 0.01, 0.02, 0.03], "none": [], "nil": null });
+        let values = context! { base => [0.0, 0.01, 0.02, 0.03], none => [0.0; 0], nil => () };
         for (list, template, expected) in [
             (vec![1.0, 3.0], "{{ it | mean_and_sd(2) }}", "2.00 ± 1.41\n"),
             (vec![1.0], "{{ it | mean_and_sd(1) }}", "1.0\n"),
@@ -259,8 +257,9 @@ mod tests {
                 ", worse than its base\n",
             ),
             (vec![-1.0, 1.0, 0.0], "{{ it | verdict(base) }}.", ".\n"),
+            (vec![1.0, f64::NAN], "{{ it | mean | fixed(2) }}", "NaN\n"),
         ] {
-            values["it"] = list.into();
+            let values = context! { it => list, ..values.clone() };
             assert_eq!(fill(template, &values).unwrap(), expected, "{template}");
         }
     }
@@ -273,7 +272,7 @@ mod tests {
             "{{ a | mean }}",
             "{{ a | minus([]) }}",
         ] {
-            assert!(fill(template, &json!({})).is_err(), "{template}");
+            assert!(fill(template, &context! {}).is_err(), "{template}");
         }
     }
 }

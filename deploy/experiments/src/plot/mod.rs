@@ -12,6 +12,7 @@ use std::{collections::BTreeSet, path::PathBuf};
 
 use driml_figure::{Axis, Chart, Figure, Format, GREY, Look, Mark, Panel, Series};
 use driml_launch::{
+    chosen::config_of,
     console::{self, print},
     evaluate::random_returns,
     run_folder::RunFolder,
@@ -195,7 +196,7 @@ fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
 fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
     let mut worlds: Vec<(String, f64)> = Vec::new();
     for run in runs {
-        let config = run.config()?;
+        let config = config_of(&run.folder)?;
         let world = &config.run.world;
         if !worlds.iter().any(|(known, _)| known == world) {
             let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0)?);

@@ -7,7 +7,6 @@ use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, nearest, usage};
-use driml_settings::config::RunConfig;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
@@ -146,14 +145,6 @@ impl Run {
                 numbers().collect::<Vec<_>>().join(", ")
             )
         })
-    }
-
-    /// The whole settings of the run, as `driml local --config` takes them.
-    pub(crate) fn config(&self) -> anyhow::Result<RunConfig> {
-        let path = self.folder.config();
-        let text = std::fs::read_to_string(&path)
-            .with_context(|| format!("reading {}", path.display()))?;
-        Ok(RunConfig::parse(&path.display().to_string(), &text)?)
     }
 
     /// The columns of auxiliary losses: those between C51's loss and the total.

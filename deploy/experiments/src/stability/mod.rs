@@ -11,9 +11,9 @@ mod small;
 use anyhow::ensure;
 use driml_machine::resources;
 use driml_model::{Precision, kernels_in_words};
+use minijinja::{Value, context};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde_json::{Value, json};
 
 use self::{
     checks::TABLE,
@@ -139,15 +139,15 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
     let nearest: Vec<_> = nearest
         .map(|row| format!("{} ({:.0}%)", row.routine, share(row)))
         .collect();
-    json!({
-        "verdict": verdict(rows),
-        "broken": broken.collect::<Vec<_>>(),
-        "nearest": nearest.join(", "),
-        "processor": resources::processor(),
-        "kernels": Precision::ALL.map(kernels_in_words).join("; "),
-        "draws": thousands(settings.draws),
-        "seeds": settings.seeds,
-    })
+    context! {
+        verdict => verdict(rows),
+        broken => broken.collect::<Vec<_>>(),
+        nearest => nearest.join(", "),
+        processor => resources::processor(),
+        kernels => Precision::ALL.map(kernels_in_words).join("; "),
+        draws => thousands(settings.draws),
+        seeds => settings.seeds,
+    }
 }
 
 #[cfg(test)]

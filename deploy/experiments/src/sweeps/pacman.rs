@@ -6,7 +6,7 @@ mod results;
 mod settings;
 
 use driml_protocol::RETURNS_OF;
-use serde_json::{Value, json};
+use minijinja::{Value, context};
 
 use self::{
     results::{LOSSES, Results, Trace},
@@ -75,11 +75,11 @@ fn losses(results: &Results) -> Vec<Value> {
     let row = |&epsilon: &f64| {
         let of = |(column, _)| results.losses(column, epsilon).collect::<Vec<_>>();
         let losses = LOSSES.map(of);
-        json!({
-            "epsilon": epsilon.to_string(),
-            "episodes": losses[0].iter().map(|it| it.episodes).collect::<Vec<_>>(),
-            "losses": losses,
-        })
+        context! {
+            epsilon => epsilon.to_string(),
+            episodes => losses[0].iter().map(|it| it.episodes).collect::<Vec<_>>(),
+            losses,
+        }
     };
     epsilons.map(row).collect()
 }
@@ -92,14 +92,14 @@ fn tasks(part: usize, results: &Results) -> Vec<Value> {
         let of_agent = |agent: &String| {
             let both = results.traces(part, agent).filter_map(|it| it.tasks[task]);
             let (end, over): (Vec<f64>, Vec<f64>) = both.unzip();
-            json!({ "end": end, "over": over })
+            context! { end, over }
         };
         let agents = results.settings.agents.iter().map(of_agent);
-        json!({
-            "number": task + 1,
-            "ghost": GHOSTS.get(usize::from(ghost)).unwrap_or(&"?"),
-            "agents": agents.collect::<Vec<_>>(),
-        })
+        context! {
+            number => task + 1,
+            ghost => GHOSTS.get(usize::from(ghost)).unwrap_or(&"?"),
+            agents => agents.collect::<Vec<_>>(),
+        }
     };
     (0..continual.tasks as usize).map(row).collect()
 }
@@ -109,8 +109,7 @@ fn tasks(part: usize, results: &Results) -> Vec<Value> {
 fn differences(part: usize, results: &Results) -> Vec<Value> {
     let agents = &results.settings.agents;
     let row = |agent: &String, first: Option<&String>, values: Vec<f64>| {
-        let panel = PANELS[part];
-        let row = json!({ "panel": panel, "agent": agent, "first": first, "values": values });
+        let row = context! { panel => PANELS[part], agent, first, values };
         (!values.is_empty()).then_some(row)
     };
     let gains = agents.iter().map(|agent| {
@@ -135,7 +134,7 @@ fn values(results: &Results) -> Value {
     let (ghosts, noise) = (&settings.continual, &settings.noise);
     let ranks = LOSSES.iter().filter_map(|(column, what)| {
         let (rank, runs) = results.order_of_epsilon(column)?;
-        Some(json!({ "what": what, "rank": rank, "runs": runs }))
+        Some(context! { what, rank, runs })
     });
     let differences = (0..PARTS).flat_map(|part| differences(part, results));
     let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
@@ -143,20 +142,20 @@ fn values(results: &Results) -> Value {
     let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));
     let order = results.order_of_epsilon(LOSSES[1].0);
     let is_out_of_order = order.is_some_and(|(rank, _)| rank <= 0.0);
-    json!({
-        "settings": settings,
-        "agents": settings.agents,
-        "seeds": settings.seeds,
-        "ranks": ranks.collect::<Vec<_>>(),
-        "differences": differences.collect::<Vec<_>>(),
-        "losses": losses(results),
-        "ghosts": tasks(0, results),
-        "noise": tasks(1, results),
-        "missing": results.missing,
-        "out_of_order": is_out_of_order,
-        "capacity": capacity,
-        "short_tasks": short,
-        "returns_of": RETURNS_OF,
-        "episode_frames_max": EPISODE_FRAMES_MAX,
-    })
+    context! {
+        settings,
+        agents => settings.agents,
+        seeds => settings.seeds,
+        ranks => ranks.collect::<Vec<_>>(),
+        differences => differences.collect::<Vec<_>>(),
+        losses => losses(results),
+        ghosts => tasks(0, results),
+        noise => tasks(1, results),
+        missing => results.missing,
+        out_of_order => is_out_of_order,
+        capacity,
+        short_tasks => short,
+        returns_of => RETURNS_OF,
+        episode_frames_max => EPISODE_FRAMES_MAX,
+    }
 }

@@ -44,10 +44,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let games = games(&settings, &scored);
     session.figure("curves", &report::figure(&settings, &games)?)?;
     let over_games = report::over_games(&mut session, &settings, &games)?;
-    let mut values = report::page(&settings, &games, &missing);
-    values["count"] = scored.len().into();
-    values["planned"] = (scored.len() + missing.len()).into();
-    values["over_games"] = over_games.into();
+    let values = report::values(&settings, &games, &over_games, scored.len(), &missing);
     session.finish(include_str!("procgen.md"), values)?;
     queue::check_made(&missing, report)
 }

@@ -10,7 +10,7 @@ use driml_settings::{
     presets,
     resolve::{Flags, Source, resolve},
 };
-use serde_json::{Value, json};
+use minijinja::{Value, context};
 
 use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
 use crate::{
@@ -219,17 +219,16 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
 fn values(task: &Task, trained: &[Trained]) -> Value {
     let last: Vec<_> = trained.iter().map(|one| one.last).collect();
     let untrained: Vec<_> = trained.iter().map(|one| one.checks[0].1.auc).collect();
-    let blind_loss = (task.settings.batch_size as f64).ln();
-    json!({
-        "task": task,
-        "settings": task.settings,
-        "seeds": trained.len(),
-        "view": View::of(&task.model).side,
-        "last": last,
-        "untrained": untrained,
-        "blind_loss": blind_loss,
-        "loss_window": LOSS_WINDOW,
-    })
+    context! {
+        task,
+        settings => task.settings,
+        seeds => trained.len(),
+        view => View::of(&task.model).side,
+        last,
+        untrained,
+        blind_loss => (task.settings.batch_size as f64).ln(),
+        loss_window => LOSS_WINDOW,
+    }
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ mod figures;
 mod results;
 mod training;
 
-use serde_json::{Value, json};
+use minijinja::{Value, context};
 
 use self::{
     chain::Chain,
@@ -132,28 +132,27 @@ fn values(results: &Results) -> Value {
     // What follows from the closed forms alone, at any length of the experiment.
     let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {
         let chain = results.chain(alpha);
-        json!({
-            "mi": chain.mutual_information(),
-            "ring": chain.mutual_information_of_a_ring(),
-            "printed": chain.mutual_information_as_printed(),
-        })
+        context! {
+            mi => chain.mutual_information(),
+            ring => chain.mutual_information_of_a_ring(),
+            printed => chain.mutual_information_as_printed(),
+        }
     });
-    let final_tv = at_figure().map(Trained::final_tv);
-    json!({
-        "settings": settings,
-        "seeds": settings.seeds,
-        "mean_errors": of_errors(|it| it.mean),
-        "largest_errors": of_errors(|it| it.max),
-        "largest_ratio": truth.iter().copied().fold(0.0, f64::max),
-        "final_tv": final_tv.collect::<Vec<_>>(),
-        "convergence": convergence(results),
-        "missed": 1.0 - settings.share_reached,
-        "tv_reached": settings.tv_reached,
-        "absolute": holds(TV),
-        "relative": holds(SHARE),
-        "closed_forms": closed_forms,
-        "most": (settings.states as f64).ln(),
-    })
+    context! {
+        settings,
+        seeds => settings.seeds,
+        mean_errors => of_errors(|it| it.mean),
+        largest_errors => of_errors(|it| it.max),
+        largest_ratio => truth.iter().copied().fold(0.0, f64::max),
+        final_tv => at_figure().map(Trained::final_tv).collect::<Vec<_>>(),
+        convergence => convergence(results),
+        missed => 1.0 - settings.share_reached,
+        tv_reached => settings.tv_reached,
+        absolute => holds(TV),
+        relative => holds(SHARE),
+        closed_forms,
+        most => (settings.states as f64).ln(),
+    }
 }
 
 /// How long each sampling takes, by either measure: the updates at the first, the figure's and the last alpha.
@@ -170,17 +169,17 @@ fn convergence(results: &Results) -> Vec<Value> {
         for sampling in Sampling::ALL {
             let times = [first, figure_alpha, last].map(|&alpha| {
                 let times = results.of(sampling, alpha).filter_map(measure);
-                json!({ "alpha": alpha, "updates": times.collect::<Vec<_>>() })
+                context! { alpha, updates => times.collect::<Vec<_>>() }
             });
             let trained = results.trained.iter();
             let late = trained.filter(|it| it.sampling == sampling && measure(it).is_none());
-            rows.push(json!({
-                "measure": name,
-                "sampling": sampling.name(),
-                "times": times,
-                "late": late.count(),
-                "correlations": results.gap_correlations(sampling, measure),
-            }));
+            rows.push(context! {
+                measure => name,
+                sampling => sampling.name(),
+                times,
+                late => late.count(),
+                correlations => results.gap_correlations(sampling, measure),
+            });
         }
     }
     rows

@@ -6,8 +6,8 @@ use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use driml_launch::{evaluate::Levels, run_folder::RunFolder};
 use driml_protocol::RETURNS_OF;
+use minijinja::{Value, context};
 use serde::Serialize;
-use serde_json::{Value, json};
 
 use super::settings::{CHECKPOINTS, Point, Settings};
 use crate::{
@@ -218,25 +218,34 @@ pub(super) fn over_games(
     Ok(lines)
 }
 
-/// What the page says.
-pub(super) fn page(settings: &Settings, games: &[Game<'_>], missing: &[String]) -> Value {
+/// What the page says. `count` runs are finished.
+pub(super) fn values(
+    settings: &Settings,
+    games: &[Game<'_>],
+    over_games: &[String],
+    count: usize,
+    missing: &[String],
+) -> Value {
     let runs = games
         .iter()
         .flat_map(|it| &it.agents)
         .flat_map(|it| &it.runs);
     let has_seeds = runs.clone().any(|it| it.plan.call.seed > 1);
-    json!({
-        "settings": settings,
-        "agents": settings.agents,
-        "seeds": settings.seeds,
-        "games": games,
-        "percent": percent(settings.frames as f64 / PAPER_FRAMES),
-        "above_random": above_random(settings, games),
-        "missing": missing,
-        "returns_of": RETURNS_OF,
-        "episodes": CHECKPOINTS * settings.episodes,
-        "some_seeds": has_seeds,
-    })
+    context! {
+        settings,
+        agents => settings.agents,
+        seeds => settings.seeds,
+        games,
+        percent => percent(settings.frames as f64 / PAPER_FRAMES),
+        above_random => above_random(settings, games),
+        over_games,
+        count,
+        planned => count + missing.len(),
+        missing,
+        returns_of => RETURNS_OF,
+        episodes => CHECKPOINTS * settings.episodes,
+        some_seeds => has_seeds,
+    }
 }
 
 fn percent(share: f64) -> String {

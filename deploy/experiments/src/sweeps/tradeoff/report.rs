@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use minijinja::{Value, context};
 use serde::Serialize;
-use serde_json::{Map, Value, json};
+use serde_json::Value as Json;
 
 use super::{
     exactness, figures,
@@ -97,7 +98,7 @@ fn cells(row: &Row<'_>) -> Vec<String> {
     let (dial, name, base) = (&row.dial.name, row.name.to_owned(), &row.dial.base);
     let mut cells = vec![dial.clone(), name, base.clone(), seeds];
     cells.extend(MEASURED.map(|(name, decimals)| {
-        let value = row.result.measured.get(name).and_then(Value::as_f64);
+        let value = row.result.measured.get(name).and_then(Json::as_f64);
         match decimals {
             Some(decimals) => number(value, decimals),
             None => value.map_or(String::new(), |it| format!("{it:.3e}")),
@@ -145,7 +146,7 @@ impl EqualTime {
 /// Runs that ended alone are compared, in training return: the agent after part of a run was not kept.
 fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
     let mut all = Vec::new();
-    for row in results.levels().filter(|row| row.dial.name == DIM) {
+    for row in results.level_rows().filter(|row| row.dial.name == DIM) {
         let curves = [row.base.training_curves()?, row.result.training_curves()?];
         let ends = curves.each_ref().map(|curves| -> (Vec<f64>, Vec<f64>) {
             let ends = curves.iter().filter_map(|curve| curve.last());
@@ -188,7 +189,7 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let (rows, states) = exactness::sizes(&common.config(&results.levels[0].base)?);
     let dials = results.by_dial().map(|rows| {
         let all: Vec<_> = rows.iter().map(page_row).collect();
-        json!({ "dial": rows[0].dial, "base": all[0], "levels": all[1..] })
+        context! { dial => rows[0].dial, base => all[0], levels => all[1..] }
     });
     // Dials may share a base.
     let bases = results.by_dial().map(|mut rows| rows.swap_remove(0));
@@ -199,38 +200,39 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
             it.interval.ends.is_some() && !(it.is_apart && it.interval.mean > 0.0)
         });
         let mut row = page_row(base);
-        row.insert("may_have_learned_nothing".into(), unsure.into());
+        row.insert("may_have_learned_nothing", unsure.into());
         row
     });
     let (judged, by_chance) = by_chance(results);
-    Ok(json!({
-        "settings": common,
-        "dials": dials.collect::<Vec<_>>(),
-        "bases": bases.collect::<Vec<_>>(),
-        "equal": equal,
-        "random": results.random,
-        "seeds": seeds(results),
-        "judged": judged,
-        "by_chance": by_chance,
-        "rows": rows,
-        "states": states,
-        "missing": results.missing,
-        "left_out": results.left_out,
-        "command": results.commands.join("`, then `"),
-    }))
+    Ok(context! {
+        settings => common,
+        dials => dials.collect::<Vec<_>>(),
+        bases => bases.collect::<Vec<_>>(),
+        equal,
+        random => results.random,
+        seeds => seeds(results),
+        judged,
+        by_chance,
+        rows,
+        states,
+        missing => results.missing,
+        left_out => results.left_out,
+        command => results.commands.join("`, then `"),
+    })
 }
 
 /// A line as the template reads it: what was measured, and of each measure the numbers of its runs.
-fn page_row(row: &Row<'_>) -> Map<String, Value> {
-    let mut values = Map::new();
-    values.insert("level".into(), row.name.into());
-    values.insert("agent".into(), row.agent.into());
-    values.insert("frames_gain".into(), json!(row.frames_gain()));
+fn page_row(row: &Row<'_>) -> BTreeMap<&'static str, Value> {
+    let mut values = BTreeMap::new();
+    values.insert("level", row.name.into());
+    values.insert("agent", row.agent.into());
+    values.insert("frames_gain", Value::from_serialize(row.frames_gain()));
     for (name, _) in MEASURED {
-        values.insert(name.into(), json!(row.result.measured.get(name)));
+        values.insert(name, Value::from_serialize(row.result.measured.get(name)));
     }
     for measure in MEASURES {
-        values.insert(measure.name.into(), json!(row.result.values(measure)));
+        let of_runs = row.result.values(measure);
+        values.insert(measure.name, Value::from_serialize(of_runs));
     }
     values
 }
@@ -256,7 +258,7 @@ fn seeds(results: &Results) -> String {
 /// anything and returns were normal.
 fn by_chance(results: &Results) -> (usize, f64) {
     let mut known = BTreeMap::new();
-    let each = results.levels().flat_map(|row| {
+    let each = results.level_rows().flat_map(|row| {
         let points = [row.base, row.result];
         [GREEDY, TRAINING].map(|it| points.map(|point| point.values(it).len()))
     });

@@ -165,7 +165,7 @@ impl Results {
         })
     }
 
-    pub(super) fn levels(&self) -> impl Iterator<Item = Row<'_>> {
+    pub(super) fn level_rows(&self) -> impl Iterator<Item = Row<'_>> {
         self.levels.iter().map(|of| self.row(of, false))
     }
 
