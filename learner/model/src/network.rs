@@ -49,7 +49,8 @@ impl Features {
 
 /// Torso, C51 head and the DIM heads that the configuration has.
 ///
-/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network.
+/// It shares the storage of the [`Parameters`] it was built from: setting a `Var` there changes this network. Tensors of other
+/// shapes than a method names are errors, and so is a Psi or Phi that the configuration has not ([`ModelError::NoHead`]).
 #[derive(Debug)]
 pub struct Network {
     kernels: Kernels,

@@ -92,7 +92,10 @@ pub(super) fn tidy(folder: &Path) -> Result<(), CheckpointError> {
             Some(place) if !place.exists() => {
                 fs::rename(&path, place).map_err(io_error("move", &path))?;
             }
-            _ => remove_if_there(&path)?,
+            _ => {
+                tracing::warn!(path = %path.display(), "removing what an unfinished save left");
+                remove_if_there(&path)?;
+            }
         }
     }
     Ok(())

@@ -37,7 +37,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let results = Results::read(settings, swept)?;
     session.figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
-    session.finish(include_str!("pacman.md"), values(&results))?;
+    session.finish(include_str!("pacman.md.j2"), values(&results))?;
     queue::check_made(&results.missing, report)
 }
 

@@ -45,6 +45,6 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     session.figure("curves", &report::figure(&settings, &games)?)?;
     let over_games = report::over_games(&mut session, &settings, &games)?;
     let values = report::values(&settings, &games, &over_games, scored.len(), &missing);
-    session.finish(include_str!("procgen.md"), values)?;
+    session.finish(include_str!("procgen.md.j2"), values)?;
     queue::check_made(&missing, report)
 }

@@ -5,6 +5,7 @@ mod count;
 
 use anyhow::Context;
 use driml_settings::config::RunConfig;
+use indicatif::HumanCount;
 use serde::Serialize;
 
 use crate::console::aligned;
@@ -73,7 +74,7 @@ impl Inspection {
             );
             let sum = is_summed.then(|| sum("all", lines));
             for line in lines.iter().chain(&sum) {
-                text += &row(&line.what, [line.is, line.everything].map(thousands));
+                text += &row(&line.what, [line.is, line.everything].map(|count| HumanCount(count).to_string()));
             }
         }
         format!("{text}\neverything: {}\n", self.everything)
@@ -94,7 +95,7 @@ pub fn describe_worlds(inspections: &[Inspection]) -> String {
             batch,
         ];
         let sums = counts.map(|lines| sum("", lines));
-        let cells = sums.map(|it| format!("{} ({})", thousands(it.is), thousands(it.everything)));
+        let cells = sums.map(|it| format!("{} ({})", HumanCount(it.is), HumanCount(it.everything)));
         rows.push([vec![it.world.clone()], cells.into()].concat());
     }
     let table = aligned(&rows, &[1, 2, 3, 4]);
@@ -111,18 +112,6 @@ fn sum(what: &str, lines: &[Line]) -> Line {
 
 fn row(what: &str, [is, everything]: [String; 2]) -> String {
     format!("{what:WHAT_COLUMNS$}{is:>NUMBER_COLUMNS$}{everything:>NUMBER_COLUMNS$}\n")
-}
-
-fn thousands(number: u64) -> String {
-    let digits = number.to_string();
-    let mut text = String::new();
-    for (at, digit) in digits.chars().enumerate() {
-        if at > 0 && (digits.len() - at).is_multiple_of(3) {
-            text.push(',');
-        }
-        text.push(digit);
-    }
-    text
 }
 
 #[cfg(test)]

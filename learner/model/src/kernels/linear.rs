@@ -68,10 +68,8 @@ fn apply(
     let outputs = w.dims().first().copied().unwrap_or(0);
     let fits =
         w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
-    let (rows, groups) = (
-        x.elem_count() / inputs.max(1),
-        b.elem_count() / outputs.max(1),
-    );
+    let rows = x.elem_count() / inputs.max(1);
+    let groups = b.elem_count() / outputs.max(1);
     if !fits || groups == 0 || rows % groups != 0 {
         bail!(
             "linear layer of x {:?} with weight {:?} and bias {:?}",

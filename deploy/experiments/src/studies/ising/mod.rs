@@ -70,7 +70,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &trained)?;
     session.figure("fig2", &fig2(&task, &trained[0])?)?;
     session.figure("learning", &learning(&task, &trained))?;
-    session.finish(include_str!("page.md"), values(&task, &trained))
+    session.finish(include_str!("page.md.j2"), values(&task, &trained))
 }
 
 fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {

@@ -61,7 +61,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     write_data(&session, &results)?;
     session.figure("fig1", &figures::fig1(&results))?;
     session.figure("convergence", &figures::convergence(&results))?;
-    session.finish(include_str!("page.md"), values(&results))
+    session.finish(include_str!("page.md.j2"), values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {

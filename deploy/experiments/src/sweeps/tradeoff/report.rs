@@ -1,4 +1,4 @@
-//! Data, figures and page of a trade-off. What the page says of the numbers is its template, `tradeoff.md`.
+//! Data, figures and page of a trade-off. What the page says of the numbers is its template, `tradeoff.md.j2`.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -56,7 +56,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
         session.figure(stem, &figures::pareto(results, returns, name))?;
     }
     session.figure("wall", &figures::wall(results)?)?;
-    session.finish(include_str!("../tradeoff.md"), values(results, &equal)?)
+    session.finish(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
 }
 
 fn runs(results: &Results) -> Table {
