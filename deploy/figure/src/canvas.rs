@@ -1,10 +1,13 @@
-//! A list of shapes in figure units: what a figure is before it becomes SVG, PDF or PNG.
+//! Shapes in figure units, written as SVG in the order in which they are drawn, with numbers cut to two decimals.
 //! It knows no axis and no file.
 
 use super::{
     colours::{Colour, INK},
     font::{self, Weight},
 };
+
+/// Fonts of a viewer: the one by which widths are measured, or one nearly as wide.
+const FONTS: &str = "DejaVu Sans, Verdana, Segoe UI, Helvetica, Arial, sans-serif";
 
 /// A point: x to the right, y downwards.
 pub(super) type Point = (f64, f64);
@@ -97,106 +100,173 @@ impl Stroke {
     }
 }
 
-/// One shape or text of a picture, in the order of drawing.
-#[derive(Debug)]
-pub(super) enum Shape {
-    /// A line through points.
-    Line { points: Vec<Point>, stroke: Stroke },
-    /// A filled polygon.
-    Area { points: Vec<Point>, fill: Colour },
-    /// Filled rectangles of one colour, with hard edges.
-    Rects { rects: Vec<Rect>, fill: Colour },
-    /// A rectangle's rim.
-    Frame { rect: Rect, stroke: Stroke },
-    /// A background with round corners.
-    Card {
-        rect: Rect,
-        fill: Colour,
-        border: Colour,
-    },
-    /// A line of text whose baseline is at the point.
-    Text {
-        at: Point,
-        text: String,
-        style: TextStyle,
-    },
+/// How letters are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Letters {
+    /// As text, in a font of the viewer.
+    Text,
+    /// As outlines, in the font that comes along.
+    Outlines,
 }
-
-/// Radius of a card's corners.
-pub(super) const CARD_RADIUS: f64 = 8.0;
-/// Drawn and left out of a dashed line.
-pub(super) const DASH: [f64; 2] = [6.0, 4.0];
 
 /// Shapes in the order in which they are drawn.
 #[derive(Debug)]
 pub(super) struct Canvas {
     pub(super) width: f64,
     pub(super) height: f64,
-    pub(super) shapes: Vec<Shape>,
+    letters: Letters,
+    elements: String,
 }
 
 impl Canvas {
-    pub(super) const fn new(width: f64, height: f64) -> Self {
+    pub(super) const fn new(width: f64, height: f64, letters: Letters) -> Self {
         Self {
             width,
             height,
-            shapes: Vec::new(),
+            letters,
+            elements: String::new(),
         }
     }
 
-    pub(super) fn line(&mut self, points: Vec<Point>, stroke: Stroke) {
+    /// The picture as a text that ends with a line's end.
+    pub(super) fn into_svg(self) -> String {
+        let [width, height] = [self.width, self.height].map(number);
+        let size = format!(r#"width="{width}" height="{height}" viewBox="0 0 {width} {height}""#);
+        let style = format!(r#"font-family="{FONTS}" stroke-linejoin="round""#);
+        let elements = self.elements;
+        format!("<svg xmlns='http://www.w3.org/2000/svg' {size} {style}>\n{elements}</svg>\n")
+    }
+
+    fn add(&mut self, element: &str) {
+        self.elements.push_str(element);
+        self.elements.push('\n');
+    }
+
+    /// Draws a line through points.
+    pub(super) fn line(&mut self, points: &[Point], stroke: Stroke) {
         // A line without length has no direction to be drawn in.
         if points.iter().any(|point| *point != points[0]) {
-            self.shapes.push(Shape::Line { points, stroke });
+            let (points, pen) = (corners(points), pen(stroke));
+            self.add(&format!(
+                r#"<polyline points="{points}" fill="none" {pen}/>"#
+            ));
         }
     }
 
-    pub(super) fn area(&mut self, points: Vec<Point>, fill: Colour) {
+    /// Draws a filled polygon.
+    pub(super) fn area(&mut self, points: &[Point], fill: Colour) {
         if points.len() > 2 {
-            self.shapes.push(Shape::Area { points, fill });
+            let (points, brush) = (corners(points), brush(fill));
+            self.add(&format!(r#"<polygon points="{points}" {brush}/>"#));
         }
     }
 
     /// Draws a filled disc.
     pub(super) fn dot(&mut self, middle: Point, radius: f64, fill: Colour) {
-        self.area(circle(middle, radius).collect(), fill);
+        self.circle(middle, radius, &brush(fill));
     }
 
     /// Draws a circle that is not filled.
     pub(super) fn ring(&mut self, middle: Point, radius: f64, colour: Colour) {
-        let again = circle(middle, radius).take(1);
-        let points = circle(middle, radius).chain(again).collect();
-        self.line(points, Stroke::solid(colour, 1.4));
+        let pen = pen(Stroke::solid(colour, 1.4));
+        self.circle(middle, radius, &format!(r#"fill="none" {pen}"#));
     }
 
-    pub(super) fn rects(&mut self, rects: Vec<Rect>, fill: Colour) {
-        if !rects.is_empty() {
-            self.shapes.push(Shape::Rects { rects, fill });
+    fn circle(&mut self, (x, y): Point, radius: f64, ink: &str) {
+        let [x, y] = [x, y].map(number);
+        self.add(&format!(
+            r#"<circle cx="{x}" cy="{y}" r="{radius}" {ink}/>"#
+        ));
+    }
+
+    /// Draws filled rectangles of one colour, with hard edges; none for a side of 0 or NaN.
+    pub(super) fn rects(&mut self, rects: &[Rect], fill: Colour) {
+        let seen = rects.iter().filter(|it| it.width > 0.0 && it.height > 0.0);
+        let path = seen.map(|it| {
+            let [x, y, w, h] = [it.x, it.y, it.width, it.height].map(number);
+            format!("M{x} {y}h{w}v{h}h-{w}z")
+        });
+        let (path, brush) = (path.collect::<String>(), brush(fill));
+        if !path.is_empty() {
+            self.add(&format!(
+                r#"<path d="{path}" {brush} shape-rendering="crispEdges"/>"#
+            ));
         }
     }
 
+    /// Draws a rectangle's rim.
     pub(super) fn frame(&mut self, rect: Rect, stroke: Stroke) {
-        self.shapes.push(Shape::Frame { rect, stroke });
+        let (sides, pen) = (sides(rect), pen(stroke));
+        self.add(&format!(r#"<rect {sides} fill="none" {pen}/>"#));
     }
 
+    /// Draws a background with round corners.
     pub(super) fn card(&mut self, rect: Rect, fill: Colour, border: Colour) {
-        self.shapes.push(Shape::Card { rect, fill, border });
+        let pen = pen(Stroke::solid(border, 1.0));
+        let (sides, brush) = (sides(rect), brush(fill));
+        self.add(&format!(r#"<rect {sides} rx="8" {brush} {pen}/>"#));
     }
 
-    pub(super) fn text(&mut self, at: Point, text: &str, style: TextStyle) {
-        if !text.is_empty() {
-            let text = text.to_owned();
-            self.shapes.push(Shape::Text { at, text, style });
+    /// Writes a line of text whose baseline is at the point.
+    pub(super) fn text(&mut self, (x, y): Point, text: &str, style: TextStyle) {
+        if text.is_empty() {
+            return;
         }
+        let ([x, y], brush) = ([x, y].map(number), brush(style.colour));
+        let (anchor, share_left) = match style.anchor {
+            Anchor::Start => ("start", 0.0),
+            Anchor::Middle => ("middle", 0.5),
+            Anchor::End => ("end", 1.0),
+        };
+        let turn = if style.upright { " rotate(-90)" } else { "" };
+        let place = format!(r#"transform="translate({x} {y}){turn}""#);
+        if self.letters == Letters::Outlines {
+            let left = -share_left * font::width(text, style.size, style.weight);
+            let path = font::outline(text, style.size, style.weight, left);
+            self.add(&format!(r#"<path d="{path}" {place} {brush}/>"#));
+            return;
+        }
+        let weight = match style.weight {
+            Weight::Regular => "normal",
+            Weight::Bold => "bold",
+        };
+        let size = number(style.size);
+        let font = format!(r#"font-size="{size}" font-weight="{weight}" text-anchor="{anchor}""#);
+        let text = text.replace('&', "&amp;").replace('<', "&lt;");
+        self.add(&format!("<text {place} {font} {brush}>{text}</text>"));
     }
 }
 
-/// A circle as a polygon of 16 sides.
-fn circle((x, y): Point, radius: f64) -> impl Iterator<Item = Point> {
-    (0..16).map(move |i| {
-        let angle = f64::from(i) * std::f64::consts::TAU / 16.0;
-        (x + radius * angle.cos(), y + radius * angle.sin())
-    })
+fn corners(points: &[Point]) -> String {
+    let point = |(x, y): &Point| format!("{},{}", number(*x), number(*y));
+    points.iter().map(point).collect::<Vec<_>>().join(" ")
+}
+
+fn sides(rect: Rect) -> String {
+    let [x, y, width, height] = [rect.x, rect.y, rect.width, rect.height].map(number);
+    format!(r#"x="{x}" y="{y}" width="{width}" height="{height}""#)
+}
+
+fn brush(colour: Colour) -> String {
+    let opacity = match colour.alpha < 1.0 {
+        true => format!(r#" fill-opacity="{:.2}""#, colour.alpha),
+        false => String::new(),
+    };
+    format!(r#"fill="{}"{opacity}"#, colour.hex())
+}
+
+fn pen(stroke: Stroke) -> String {
+    let (hex, width) = (stroke.colour.hex(), number(stroke.width));
+    let dash = match stroke.dashed {
+        true => r#" stroke-dasharray="6 4""#,
+        false => "",
+    };
+    format!(r#"stroke="{hex}" stroke-width="{width}"{dash}"#)
+}
+
+/// Two decimals; more would make the file longer, not the picture better.
+fn number(value: f64) -> f64 {
+    (value * 100.0).round() / 100.0
 }
 
 /// Draws a panel's title and returns what is left below it.

@@ -20,16 +20,17 @@ const RING_RADIUS: f64 = 5.0;
 const SLACK: f64 = 0.05;
 
 /// How an axis spreads its values.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum Scale {
     /// Equal steps are equally long.
+    #[default]
     Linear,
     /// By their logarithm; values of 0 and below are left out.
     Log,
 }
 
 /// One axis of a chart: its name, its scale and what it must span.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Axis {
     /// What it counts, with its unit.
     pub label: String,
@@ -46,9 +47,7 @@ impl Axis {
     pub fn linear(label: &str) -> Self {
         Self {
             label: label.to_owned(),
-            scale: Scale::Linear,
-            shows: Vec::new(),
-            names: Vec::new(),
+            ..Self::default()
         }
     }
 
@@ -92,11 +91,10 @@ impl Axis {
         let all = values.chain(self.shows.iter().copied());
         let kept = all.filter(|value| self.keeps(*value));
         let (low, high) = ticks::bounds(kept.map(|value| self.spread(value)))?;
-        let least = match low == high {
-            true => low.abs().max(1.0) * 0.05,
-            false => 0.0,
+        let by = match (high - low) * slack {
+            0.0 => low.abs().max(1.0) * SLACK,
+            by => by,
         };
-        let by = ((high - low) * slack).max(least);
         Some((low - by, high + by))
     }
 
@@ -145,10 +143,9 @@ impl Series {
         Self {
             name: name.to_owned(),
             colour: series_colour(index),
-            mark: if (index / SERIES_COLOURS).is_multiple_of(2) {
-                Mark::Line
-            } else {
-                Mark::Dashed
+            mark: match (index / SERIES_COLOURS) % 2 {
+                0 => Mark::Line,
+                _ => Mark::Dashed,
             },
             points,
             band: Vec::new(),
@@ -256,30 +253,28 @@ impl Chart {
         };
         for (tick, label) in x_ticks.iter().zip(x_labels) {
             let x = frame.at(*tick, 1.0).0;
-            let line = vec![(x, plot.y), (x, plot.bottom())];
-            canvas.line(line, Stroke::solid(GRID, 1.0));
+            let line = [(x, plot.y), (x, plot.bottom())];
+            canvas.line(&line, Stroke::solid(GRID, 1.0));
             let at = (x, plot.bottom() + TICK_SIZE + 5.0);
             canvas.text(at, &label, soft(TICK_SIZE, Anchor::Middle));
         }
         for (tick, label) in y_ticks.iter().zip(y_labels) {
             let y = frame.at(1.0, *tick).1;
-            let line = vec![(plot.x, y), (plot.right(), y)];
-            canvas.line(line, Stroke::solid(GRID, 1.0));
+            let line = [(plot.x, y), (plot.right(), y)];
+            canvas.line(&line, Stroke::solid(GRID, 1.0));
             let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
         }
-        let corner = vec![
+        let corner = [
             (plot.x, plot.y),
             (plot.x, plot.bottom()),
             (plot.right(), plot.bottom()),
         ];
-        canvas.line(corner, Stroke::solid(INK_SOFT, 1.2));
-        let x_at = (
-            plot.x + plot.width / 2.0,
-            plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0,
-        );
+        canvas.line(&corner, Stroke::solid(INK_SOFT, 1.2));
         let label = |text: &str, room: f64| font::fit(text, LABEL_SIZE, Weight::Regular, room);
         let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
+        let y = plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0;
+        let x_at = (plot.x + plot.width / 2.0, y);
         canvas.text(x_at, &label(&self.x.label, plot.width), ink);
         let y_at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
         canvas.text(y_at, &label(&self.y.label, plot.height), ink.upright());
@@ -303,11 +298,11 @@ impl Chart {
             let middle = y + LEGEND_LEADING / 2.0;
             if !series.band.is_empty() && series.mark != Mark::Bars {
                 let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
-                canvas.rects(vec![patch], series.colour.with_alpha(BAND_ALPHA));
+                canvas.rects(&[patch], series.colour.with_alpha(BAND_ALPHA));
             }
             match series.mark {
                 Mark::Line | Mark::Dashed => canvas.line(
-                    vec![(x, middle), (x + LEGEND_MARK, middle)],
+                    &[(x, middle), (x + LEGEND_MARK, middle)],
                     pen(series.colour, series.mark),
                 ),
                 mark => point_mark(canvas, (x + LEGEND_MARK / 2.0, middle), mark, series.colour),
@@ -346,35 +341,28 @@ impl Plot<'_> {
 }
 
 fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
-    let band: Vec<_> = series
-        .band
-        .iter()
-        .filter(|(x, low, high)| plot.keeps(*x, *low) && plot.keeps(*x, *high))
-        .collect();
+    let kept = |(x, low, high): &&(f64, f64, f64)| plot.keeps(*x, *low) && plot.keeps(*x, *high);
+    let band: Vec<_> = series.band.iter().filter(kept).collect();
     if series.mark == Mark::Bars {
         for (x, low, high) in band {
-            let bar = vec![plot.at(*x, *low), plot.at(*x, *high)];
-            canvas.line(bar, Stroke::solid(series.colour, 1.4));
+            let bar = [plot.at(*x, *low), plot.at(*x, *high)];
+            canvas.line(&bar, Stroke::solid(series.colour, 1.4));
         }
     } else {
         let low = band.iter().map(|(x, low, _)| plot.at(*x, *low));
         let high = band.iter().rev().map(|(x, _, high)| plot.at(*x, *high));
-        let rim = low.chain(high).collect();
-        canvas.area(rim, series.colour.with_alpha(BAND_ALPHA));
+        let rim: Vec<Point> = low.chain(high).collect();
+        canvas.area(&rim, series.colour.with_alpha(BAND_ALPHA));
     }
-    let points: Vec<Point> = series
-        .points
-        .iter()
-        .filter(|(x, y)| plot.keeps(*x, *y))
-        .map(|(x, y)| plot.at(*x, *y))
-        .collect();
+    let kept = series.points.iter().filter(|(x, y)| plot.keeps(*x, *y));
+    let points: Vec<Point> = kept.map(|(x, y)| plot.at(*x, *y)).collect();
     match series.mark {
         Mark::Line | Mark::Dashed => {
             // A line of one point would be invisible.
             if let [only] = points[..] {
                 canvas.dot(only, DOT_RADIUS, series.colour);
             }
-            canvas.line(points, pen(series.colour, series.mark));
+            canvas.line(&points, pen(series.colour, series.mark));
         }
         mark => points
             .iter()

@@ -16,10 +16,10 @@ impl Colour {
         }
     }
 
-    /// The colour without its alpha.
-    pub(super) fn solid(self) -> tiny_skia::Color {
+    /// The colour without its alpha, as #rrggbb.
+    pub(super) fn hex(self) -> String {
         let [r, g, b] = self.rgb;
-        tiny_skia::Color::from_rgba8(r, g, b, u8::MAX)
+        format!("#{r:02x}{g:02x}{b:02x}")
     }
 
     pub(super) const fn with_alpha(self, alpha: f32) -> Self {

@@ -115,15 +115,10 @@ impl Film {
     /// # Errors
     /// A file that cannot be written.
     pub fn finish(self) -> Result<(), FigureError> {
-        let Self {
-            path,
-            aside,
-            encoder,
-            ..
-        } = self;
-        let ended = encoder.into_inner().map_err(io::Error::other);
+        let path = self.path;
+        let ended = self.encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
-        let ended = ended.and_then(|()| std::fs::rename(&aside, &path));
+        let ended = ended.and_then(|()| std::fs::rename(self.aside, &path));
         ended.map_err(|source| FigureError::Write { path, source })
     }
 

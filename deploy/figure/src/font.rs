@@ -1,7 +1,7 @@
 //! The font that comes along (DejaVu Sans, an open licence): widths and outlines of text.
 //! It knows no kerning and no right-to-left script; figures are in English.
 
-use std::sync::LazyLock;
+use std::{fmt::Write as _, sync::LazyLock};
 
 use ttf_parser::{Face, OutlineBuilder};
 
@@ -77,56 +77,57 @@ pub(super) fn wrap(text: &str, size: f64, width_max: f64) -> Vec<String> {
     lines
 }
 
-/// Gives the outlines of a line of text whose baseline starts at (0, 0), y downwards, to `path`.
-pub(super) fn outline(text: &str, size: f64, weight: Weight, path: &mut tiny_skia::PathBuilder) {
+/// Outlines of a line of text as an SVG path: it starts at (`left`, 0), and y runs downwards.
+pub(super) fn outline(text: &str, size: f64, weight: Weight, left: f64) -> String {
     let face = weight.face();
-    let scale = size as f32 / f32::from(face.units_per_em());
     let mut pen = Pen {
-        path,
-        x: 0.0,
-        scale,
+        path: String::new(),
+        x: left as f32,
+        scale: size as f32 / f32::from(face.units_per_em()),
     };
     for c in text.chars() {
         face.outline_glyph(face.glyph_index(c).unwrap_or_default(), &mut pen);
-        pen.x += advance(face, c) as f32 * scale;
+        pen.x += advance(face, c) as f32 * pen.scale;
     }
+    pen.path
 }
 
-struct Pen<'a> {
-    path: &'a mut tiny_skia::PathBuilder,
+struct Pen {
+    path: String,
     x: f32,
     scale: f32,
 }
 
-impl Pen<'_> {
-    fn at(&self, x: f32, y: f32) -> (f32, f32) {
-        (self.x + x * self.scale, -y * self.scale)
+impl Pen {
+    fn add(&mut self, command: char, points: &[(f32, f32)]) {
+        self.path.push(command);
+        for (x, y) in points {
+            let (x, y) = (self.x + x * self.scale, -y * self.scale);
+            // Writing to a string cannot fail.
+            let _ = write!(self.path, "{x:.2} {y:.2} ");
+        }
     }
 }
 
-impl OutlineBuilder for Pen<'_> {
+impl OutlineBuilder for Pen {
     fn move_to(&mut self, x: f32, y: f32) {
-        let (x, y) = self.at(x, y);
-        self.path.move_to(x, y);
+        self.add('M', &[(x, y)]);
     }
 
     fn line_to(&mut self, x: f32, y: f32) {
-        let (x, y) = self.at(x, y);
-        self.path.line_to(x, y);
+        self.add('L', &[(x, y)]);
     }
 
     fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
-        let ((x1, y1), (x, y)) = (self.at(x1, y1), self.at(x, y));
-        self.path.quad_to(x1, y1, x, y);
+        self.add('Q', &[(x1, y1), (x, y)]);
     }
 
     fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
-        let ((x1, y1), (x2, y2), (x, y)) = (self.at(x1, y1), self.at(x2, y2), self.at(x, y));
-        self.path.cubic_to(x1, y1, x2, y2, x, y);
+        self.add('C', &[(x1, y1), (x2, y2), (x, y)]);
     }
 
     fn close(&mut self) {
-        self.path.close();
+        self.path.push('Z');
     }
 }
 

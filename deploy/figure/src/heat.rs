@@ -121,7 +121,7 @@ impl Heat {
         let unit = self.field.map_or(cell, |field| room / field.side);
         let cells = match self.field {
             Some(field) => {
-                canvas.rects(vec![map], CELL_LIGHT);
+                canvas.rects(&[map], CELL_LIGHT);
                 let size = field.cell * self.side as f64 * unit;
                 let first = field.first * unit;
                 Rect::new(map.x + first, map.y + first, size, size)
@@ -131,16 +131,10 @@ impl Heat {
         self.cells(canvas, cells, cells.width / self.side as f64, (low, high));
         self.names(canvas, map, cell, turned);
         let label = |text: &str| font::fit(text, LABEL_SIZE, Weight::Regular, room);
-        let middle = (
-            map.x + room / 2.0,
-            map.bottom() + names_below + LABEL_SIZE + 3.0,
-        );
-        canvas.text(
-            middle,
-            &label(&self.labels.0),
-            style(LABEL_SIZE, Anchor::Middle),
-        );
-        let upright = style(LABEL_SIZE, Anchor::Middle).upright();
+        let level = style(LABEL_SIZE, Anchor::Middle);
+        let y = map.bottom() + names_below + LABEL_SIZE + 3.0;
+        canvas.text((map.x + room / 2.0, y), &label(&self.labels.0), level);
+        let upright = level.upright();
         let beside = (place.x + LABEL_SIZE - 2.0, map.y + room / 2.0);
         canvas.text(beside, &label(&self.labels.1), upright);
         if let Some(outline) = self.outline {
@@ -152,14 +146,12 @@ impl Heat {
         for i in 0..BAR_STEPS {
             let colour = heat_colour(1.0 - i as f64 / (BAR_STEPS - 1) as f64);
             let y = bar.y + i as f64 * step;
-            canvas.rects(vec![Rect::new(bar.x, y, BAR_WIDTH, step + 0.3)], colour);
+            canvas.rects(&[Rect::new(bar.x, y, BAR_WIDTH, step + 0.3)], colour);
         }
         for (tick, text) in bar_ticks.iter().zip(&bar_labels) {
             let y = bar.bottom() - (tick - low) / (high - low) * room;
-            canvas.line(
-                vec![(bar.right(), y), (bar.right() + 3.0, y)],
-                Stroke::solid(INK_SOFT, 1.0),
-            );
+            let mark = [(bar.right(), y), (bar.right() + 3.0, y)];
+            canvas.line(&mark, Stroke::solid(INK_SOFT, 1.0));
             let at = (bar.right() + 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, text, style(TICK_SIZE, Anchor::Start));
         }
@@ -176,7 +168,7 @@ impl Heat {
                 None => NO_VALUE,
             };
             // A little over the next cell, so that no line shows between them.
-            canvas.rects(vec![Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
+            canvas.rects(&[Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
             if let (Some(value), Some(decimals)) = (value, self.decimals)
                 && cell >= CELL_TEXT_MIN
             {
@@ -206,12 +198,9 @@ impl Heat {
 
 /// Draws an outline over a map of square cells.
 pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outline) {
-    let rect = Rect::new(
-        map.x + outline.left * cell,
-        map.y + outline.top * cell,
-        outline.side * cell,
-        outline.side * cell,
-    );
+    let Outline { left, top, side } = outline;
+    let [left, top, side] = [left, top, side].map(|length| length * cell);
+    let rect = Rect::new(map.x + left, map.y + top, side, side);
     canvas.frame(rect, Stroke::solid(super::colours::CARD, 4.0));
     canvas.frame(rect, Stroke::solid(OUTLINE, 2.2));
 }

@@ -31,23 +31,17 @@ impl Lattice {
         };
         let size = cell * self.side as f64;
         let map = Rect::new(place.x.round(), place.y.round(), size, size);
-        canvas.rects(vec![map], CELL_LIGHT);
+        canvas.rects(&[map], CELL_LIGHT);
         let mut runs = Vec::new();
         for (row, cells) in self.dark.chunks(self.side.max(1)).enumerate() {
-            let mut column = 0;
+            let (mut x, y) = (map.x, map.y + row as f64 * cell);
             for run in cells.chunk_by(|a, b| a == b) {
-                if run[0] {
-                    runs.push(Rect::new(
-                        map.x + column as f64 * cell,
-                        map.y + row as f64 * cell,
-                        run.len() as f64 * cell,
-                        cell,
-                    ));
-                }
-                column += run.len();
+                let width = run.len() as f64 * cell;
+                runs.extend(run[0].then(|| Rect::new(x, y, width, cell)));
+                x += width;
             }
         }
-        canvas.rects(runs, CELL_DARK);
+        canvas.rects(&runs, CELL_DARK);
         canvas.frame(map, Stroke::solid(CARD_BORDER, 1.0));
         if let Some(outline) = self.outline {
             point_out(canvas, map, cell, outline);

@@ -39,10 +39,8 @@ mod film;
 mod font;
 mod heat;
 mod lattice;
-mod pdf;
 mod picture;
-mod png;
-mod svg;
+mod render;
 mod ticks;
 
 pub use crate::{

@@ -1,13 +1,13 @@
 //! A picture of pixels, one of many: images enlarged, text, bars and cells of heat.
 //! Unlike a [`Figure`](crate::Figure) it is drawn at once, and exists as pixels alone.
 
-use tiny_skia::{Pixmap, PremultipliedColorU8, Transform};
+use resvg::tiny_skia::{Color, Pixmap, PremultipliedColorU8, Transform};
 
 use crate::{
-    canvas::{Anchor, Point, Rect, Shape, Stroke, TextStyle},
-    colours::{CARD, Colour, GREY, INK, INK_SOFT, NO_VALUE, heat_colour, series_colour},
+    canvas::{Anchor, Canvas, Letters, Rect, Stroke, TextStyle},
+    colours::{CARD, GREY, INK, INK_SOFT, NO_VALUE, heat_colour, series_colour},
     error::FigureError,
-    font, png,
+    font, render,
 };
 
 /// An upright rectangle in pixels, by its upper left corner.
@@ -56,8 +56,9 @@ impl Picture {
     /// # Errors
     /// A size without area, or too large for memory.
     pub fn new(width: usize, height: usize) -> Result<Self, FigureError> {
-        let mut pixmap = png::pixmap(width, height)?;
-        pixmap.fill(CARD.solid());
+        let mut pixmap = render::pixmap(width, height)?;
+        let [r, g, b] = CARD.rgb;
+        pixmap.fill(Color::from_rgba8(r, g, b, u8::MAX));
         Ok(Self(pixmap))
     }
 
@@ -93,8 +94,7 @@ impl Picture {
             Ink::Soft => style(INK_SOFT),
         };
         let text = font::fit(text, SIZE, style.weight, width_max as f64);
-        let at = (x as f64, y as f64);
-        self.draw(&Shape::Text { at, text, style });
+        self.draw(|canvas| canvas.text((x as f64, y as f64), &text, style));
     }
 
     /// Bars that stand on the lower edge of `area` beside each other, of these heights in 0..=1; and a line across at `mark`, a place in
@@ -113,13 +113,17 @@ impl Picture {
             let tall = share.clamp(0.0, 1.0) * height;
             Rect::new(x + i as f64 * step, y + height - tall, step - gap, tall)
         });
-        let (rects, fill) = (bars.collect(), series_colour(0));
-        self.draw(&Shape::Rects { rects, fill });
-        self.line([(x, y + height), (x + width, y + height)], GREY);
-        if let Some(place) = mark {
-            let at = x + place.clamp(0.0, 1.0) * width;
-            self.line([(at, y), (at, y + height)], series_colour(1));
-        }
+        let bars: Vec<Rect> = bars.collect();
+        self.draw(|canvas| {
+            canvas.rects(&bars, series_colour(0));
+            let floor = [(x, y + height), (x + width, y + height)];
+            canvas.line(&floor, Stroke::solid(GREY, 2.0));
+            if let Some(place) = mark {
+                let at = x + place.clamp(0.0, 1.0) * width;
+                let line = [(at, y), (at, y + height)];
+                canvas.line(&line, Stroke::solid(series_colour(1), 2.0));
+            }
+        });
     }
 
     /// Rows of `columns` cells that fill `area`, dark to light for values in 0..=1; one that is not a number is grey.
@@ -127,29 +131,28 @@ impl Picture {
         let columns = columns.max(1);
         let rows = values.len().div_ceil(columns).max(1);
         let edge = |at: usize, of: usize, length: usize| (at * length / of) as f64;
-        for (index, &value) in values.iter().enumerate() {
-            let (row, column) = (index / columns, index % columns);
-            let [left, right] = [column, column + 1].map(|at| edge(at, columns, area.width));
-            let [top, bottom] = [row, row + 1].map(|at| edge(at, rows, area.height));
-            let (x, y) = (area.x as f64 + left, area.y as f64 + top);
-            let fill = match value.is_finite() {
-                true => heat_colour(value),
-                false => NO_VALUE,
-            };
-            let rects = vec![Rect::new(x, y, right - left, bottom - top)];
-            self.draw(&Shape::Rects { rects, fill });
-        }
-    }
-
-    fn line(&mut self, points: [Point; 2], colour: Colour) {
-        self.draw(&Shape::Line {
-            points: points.to_vec(),
-            stroke: Stroke::solid(colour, 2.0),
+        self.draw(|canvas| {
+            for (index, &value) in values.iter().enumerate() {
+                let (row, column) = (index / columns, index % columns);
+                let [left, right] = [column, column + 1].map(|at| edge(at, columns, area.width));
+                let [top, bottom] = [row, row + 1].map(|at| edge(at, rows, area.height));
+                let (x, y) = (area.x as f64 + left, area.y as f64 + top);
+                let fill = match value.is_finite() {
+                    true => heat_colour(value),
+                    false => NO_VALUE,
+                };
+                canvas.rects(&[Rect::new(x, y, right - left, bottom - top)], fill);
+            }
         });
     }
 
-    fn draw(&mut self, shape: &Shape) {
-        png::draw(&mut self.0, shape, Transform::identity());
+    /// Draws shapes over what is there.
+    fn draw(&mut self, shapes: impl FnOnce(&mut Canvas)) {
+        let (width, height) = self.size();
+        let mut canvas = Canvas::new(width as f64, height as f64, Letters::Outlines);
+        shapes(&mut canvas);
+        let tree = render::tree(&canvas.into_svg()).expect("the SVG is ours, and has an area");
+        resvg::render(&tree, Transform::identity(), &mut self.0.as_mut());
     }
 
     /// The picture as a PNG.
@@ -157,7 +160,7 @@ impl Picture {
     /// # Errors
     /// It cannot be encoded.
     pub fn png(&self) -> Result<Vec<u8>, FigureError> {
-        png::packed(&self.0)
+        render::packed(&self.0)
     }
 
     /// Red, green and blue of every pixel.
@@ -219,7 +222,7 @@ mod tests {
             width: 20,
             height: 10,
         };
-        picture.bars(area, &[1.0, 0.0], None);
+        picture.bars(area, &[1.0, f64::NAN], None);
         let rgb = picture.rgb();
         assert_eq!(rgb[0], series_colour(0).rgb);
         assert_eq!(rgb[19], CARD.rgb);

@@ -93,19 +93,14 @@ fn plain(value: f64) -> String {
     } else if size >= 1e4 {
         format!("{}k", value / 1e3)
     } else {
-        let text = format!("{value:.6}");
-        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+        ((value * 1e6).round() / 1e6).to_string()
     }
 }
 
 /// A number as a few digits and a power of ten; more digits would be the rounding of a multiple of the step.
 fn power_of_ten(value: f64) -> String {
-    let text = format!("{value:.6e}");
-    let (digits, power) = text.split_once('e').unwrap_or((&text, "0"));
-    format!(
-        "{}e{power}",
-        digits.trim_end_matches('0').trim_end_matches('.')
-    )
+    let rounded = format!("{value:.6e}").parse().unwrap_or(value);
+    format!("{rounded:e}")
 }
 
 #[cfg(test)]
@@ -123,46 +118,22 @@ mod tests {
     }
 
     #[test]
-    fn labels_have_the_decimals_they_need() {
-        assert_eq!(labels(&[0.0, 0.5, 1.0]), ["0", "0.5", "1.0"]);
-        assert_eq!(labels(&[-2.0, 0.0, 2.0]), ["\u{2212}2", "0", "2"]);
-        assert_eq!(labels(&[0.0, 20_000.0, 40_000.0]), ["0", "20k", "40k"]);
-        assert_eq!(
-            labels(&[1.0, 10.0, 100.0, 1000.0]),
-            ["1", "10", "100", "1000"]
-        );
-        assert_eq!(labels(&[0.001, 0.01, 10.0]), ["0.001", "0.01", "10"]);
-        assert_eq!(labels(&[0.0, 5e5, 1e6]), ["0", "0.5M", "1.0M"]);
-        assert_eq!(labels(&[5e6, 1e7]), ["5M", "10M"]);
-    }
-
-    #[test]
-    fn labels_of_very_small_and_large_numbers_are_powers_of_ten() {
-        assert_eq!(
-            labels(&linear(-1e-7, 1e-7, 4)),
-            [
-                "\u{2212}1e\u{2212}7",
-                "\u{2212}5e\u{2212}8",
-                "0",
-                "5e\u{2212}8",
-                "1e\u{2212}7"
-            ]
-        );
-        assert_eq!(
-            labels(&[2e-5, 4e-5, 3.0 * 2e-5]),
-            ["2e\u{2212}5", "4e\u{2212}5", "6e\u{2212}5"]
-        );
-        assert_eq!(
-            labels(&[0.0, 5e29, 1e30, 1.5e30]),
-            ["0", "5e29", "1e30", "1.5e30"]
-        );
-        assert_eq!(
-            labels(&log(1e-9, 1e-6)),
-            ["1e\u{2212}9", "1e\u{2212}8", "1e\u{2212}7", "1e\u{2212}6"]
-        );
-        assert_eq!(
-            labels(&[1.0, 1e4, 1e9, 1e12]),
-            ["1", "10k", "1000M", "1e12"]
-        );
+    fn labels_have_the_decimals_they_need_and_powers_of_ten_beyond() {
+        for (ticks, expected) in [
+            (&[0.0, 0.5, 1.0][..], "0 0.5 1.0"),
+            (&[-2.0, 0.0, 2.0], "-2 0 2"),
+            (&[0.0, 20_000.0, 40_000.0], "0 20k 40k"),
+            (&[1.0, 10.0, 100.0, 1000.0], "1 10 100 1000"),
+            (&[0.001, 0.01, 10.0], "0.001 0.01 10"),
+            (&[0.0, 5e5, 1e6], "0 0.5M 1.0M"),
+            (&[5e6, 1e7], "5M 10M"),
+            (&linear(-1e-7, 1e-7, 4), "-1e-7 -5e-8 0 5e-8 1e-7"),
+            (&[2e-5, 4e-5, 3.0 * 2e-5], "2e-5 4e-5 6e-5"),
+            (&[0.0, 5e29, 1e30, 1.5e30], "0 5e29 1e30 1.5e30"),
+            (&log(1e-9, 1e-6), "1e-9 1e-8 1e-7 1e-6"),
+            (&[1.0, 1e4, 1e9, 1e12], "1 10k 1000M 1e12"),
+        ] {
+            assert_eq!(labels(ticks).join(" "), expected.replace('-', "\u{2212}"));
+        }
     }
 }

@@ -3,19 +3,16 @@
 
 use anyhow::Context;
 use driml_figure::{Figure, Heat, Panel};
-use driml_launch::run_folder::RunFolder;
+use driml_launch::{chosen::config_of, run_folder::RunFolder};
 use driml_learner::{AffinityEstimator, checkpoint};
 use driml_machine::error::usage;
-use driml_settings::config::RunConfig;
 
 use super::runs::folder_name;
 
 /// One heat map a run.
 pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
-    let panels = folders
-        .iter()
-        .map(|folder| heat(folder).map(Panel::Heat))
-        .collect::<anyhow::Result<Vec<_>>>()?;
+    let panels = folders.iter().map(|it| heat(it).map(Panel::Heat));
+    let panels = panels.collect::<anyhow::Result<Vec<_>>>()?;
     Ok(Figure {
         title: "Action affinity A of the newest checkpoint".into(),
         notes: vec![
@@ -59,13 +56,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
 
 /// The actions' names, or their numbers where the settings cannot be read.
 fn action_names(folder: &RunFolder, side: usize) -> Vec<String> {
-    let path = folder.config();
-    let config = std::fs::read_to_string(&path)
-        .ok()
-        .and_then(|text| RunConfig::parse("config.toml", &text).ok());
-    let names = config.map(|config| config.action_names());
-    match names {
-        Some(names) if names.len() == side => names,
-        _ => (0..side).map(|action| action.to_string()).collect(),
-    }
+    let names = config_of(folder).map(|config| config.action_names());
+    let names = names.ok().filter(|names| names.len() == side);
+    names.unwrap_or_else(|| (0..side).map(|action| action.to_string()).collect())
 }

@@ -145,11 +145,9 @@ pub(crate) fn smoothed(points: &[(f64, f64)], width: f64) -> Vec<(f64, f64)> {
 
 fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let step = points.len().div_ceil(POINTS_MAX).max(1);
-    let last = points.len().saturating_sub(1);
-    let kept = points.iter().enumerate();
-    kept.filter(|(index, _)| index % step == 0 || *index == last)
-        .map(|(_, point)| *point)
-        .collect()
+    let is_left_out = |_: &&_| !(points.len() - 1).is_multiple_of(step);
+    let last = points.last().filter(is_left_out);
+    points.iter().step_by(step).chain(last).copied().collect()
 }
 
 /// Mean and band of several curves, over the x that all of them have.
@@ -168,12 +166,11 @@ fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
         let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
         let spread = Spread::of(values.iter().copied()).expect("there are curves");
         let mean = spread.mean;
+        let ends = || interval(&values)?.ends;
         let (low, high) = match band {
             Band::Range => (spread.min, spread.max),
             Band::Sd => (mean - spread.sd, mean + spread.sd),
-            Band::Ci => interval(&values)
-                .and_then(|it| it.ends)
-                .unwrap_or((mean, mean)),
+            Band::Ci => ends().unwrap_or((mean, mean)),
         };
         curve.points.push((x, mean));
         curve.band.push((x, low, high));

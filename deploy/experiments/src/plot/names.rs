@@ -1,7 +1,7 @@
 //! What a line is called: world and agent, the settings in which it differs from others of these, and its seeds.
 //! It groups nothing.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use toml::Value;
 
@@ -26,27 +26,22 @@ pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
     };
     let names: Vec<String> = groups.iter().map(name).collect();
     let alike = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
-    let told_apart = names
-        .iter()
-        .zip(groups)
-        .map(|(name, runs)| match alike(name) {
-            true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
-            _ => name.clone(),
-        });
-    told_apart.collect()
+    let told_apart = |(name, runs): (&String, &&[&Run])| match alike(name) {
+        true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
+        _ => name.clone(),
+    };
+    names.iter().zip(groups).map(told_apart).collect()
 }
 
 /// How many seeds there are, and that some were run again where that is so: runs of one seed are not independent samples.
 fn seeds(runs: &[&Run]) -> String {
-    let mut seeds: Vec<_> = runs.iter().map(|run| run.seed).collect();
-    seeds.sort_unstable();
-    seeds.dedup();
-    let seed = |seed: &Option<i64>| seed.map_or("unknown".into(), |seed| seed.to_string());
-    match (runs.len(), &seeds[..]) {
-        (1, [only]) => format!("seed {}", seed(only)),
-        (count, [only]) => format!("{count} runs of seed {}", seed(only)),
-        (count, seeds) if count == seeds.len() => format!("{count} seeds"),
-        (count, seeds) => format!("{count} runs of {} seeds", seeds.len()),
+    let seeds: BTreeSet<_> = runs.iter().map(|run| run.seed).collect();
+    let seed = |seed: Option<i64>| seed.map_or("unknown".into(), |seed| seed.to_string());
+    match (runs.len(), seeds.len()) {
+        (1, _) => format!("seed {}", seed(runs[0].seed)),
+        (count, 1) => format!("{count} runs of seed {}", seed(runs[0].seed)),
+        (count, seeds) if count == seeds => format!("{count} seeds"),
+        (count, seeds) => format!("{count} runs of {seeds} seeds"),
     }
 }
 
@@ -60,35 +55,26 @@ fn settings(run: &Run) -> BTreeMap<String, String> {
 }
 
 fn flatten(name: &str, value: &Value, all: &mut BTreeMap<String, String>) {
-    match value {
-        Value::Table(table) => {
-            for (key, value) in table {
-                flatten(&format!("{name}.{key}"), value, all);
-            }
+    if let Value::Table(table) = value {
+        for (key, value) in table {
+            flatten(&format!("{name}.{key}"), value, all);
         }
-        Value::String(text) => {
-            all.insert(name.to_owned(), text.clone());
-        }
-        other => {
-            all.insert(name.to_owned(), other.to_string());
-        }
+    } else {
+        let text = value.as_str().map(str::to_owned);
+        all.insert(name.to_owned(), text.unwrap_or_else(|| value.to_string()));
     }
 }
 
 /// The settings of `own` that are not the same in all of `peers`, which contain it, each as `name=value`.
 fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>]) -> Vec<String> {
-    let mut keys: Vec<&String> = peers.iter().flat_map(BTreeMap::keys).collect();
-    keys.sort_unstable();
-    keys.dedup();
-    keys.retain(|key| peers.iter().any(|peer| peer.get(*key) != own.get(*key)));
-    let mut told: Vec<String> = keys
-        .iter()
-        .take(TOLD_MAX)
-        .map(|key| {
-            let value = own.get(*key).map_or("unset", String::as_str);
-            format!("{}={value}", short(key, &keys))
-        })
-        .collect();
+    let keys = peers.iter().flat_map(BTreeMap::keys);
+    let differs = |key: &&String| peers.iter().any(|peer| peer.get(*key) != own.get(*key));
+    let keys: BTreeSet<&String> = keys.filter(differs).collect();
+    let setting = |key: &&String| {
+        let value = own.get(*key).map_or("unset", String::as_str);
+        format!("{}={value}", short(key, &keys))
+    };
+    let mut told: Vec<String> = keys.iter().take(TOLD_MAX).map(setting).collect();
     if keys.len() > TOLD_MAX {
         told.push(format!("and {} more settings", keys.len() - TOLD_MAX));
     }
@@ -96,13 +82,11 @@ fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>
 }
 
 /// The last parts of a key that no other of these keys ends with.
-fn short<'a>(key: &'a str, keys: &[&String]) -> &'a str {
+fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
     let starts = key.rmatch_indices('.').map(|(at, _)| &key[at + 1..]);
     let unique = |end: &&str| {
-        let others = keys.iter().filter(|other| other.as_str() != key);
-        !others
-            .into_iter()
-            .any(|other| other.ends_with(&format!(".{end}")) || other.as_str() == *end)
+        let mut others = keys.iter().filter(|other| other.as_str() != key);
+        !others.any(|other| other.ends_with(&format!(".{end}")) || other.as_str() == *end)
     };
     starts.chain([key]).find(unique).unwrap_or(key)
 }

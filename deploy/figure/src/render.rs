@@ -1,0 +1,59 @@
+//! SVG as pixels or as PDF. Its letters are outlines, so no font of the machine is needed.
+//! It decides nothing about a figure's look: that is done where its SVG is written.
+
+use resvg::{
+    tiny_skia::{Pixmap, Transform},
+    usvg::{Options, Tree},
+};
+use svg2pdf::{ConversionOptions, PageOptions};
+
+use super::error::FigureError;
+
+/// The picture as PNG, `zoom` pixels to a unit; what no shape covers is transparent.
+pub(super) fn png(svg: &str, zoom: f32) -> Result<Vec<u8>, FigureError> {
+    let tree = tree(svg)?;
+    let sides = [tree.size().width(), tree.size().height()];
+    let [width, height] = sides.map(|side| (side * zoom).ceil() as usize);
+    let mut pixmap = pixmap(width, height)?;
+    let scale = Transform::from_scale(zoom, zoom);
+    resvg::render(&tree, scale, &mut pixmap.as_mut());
+    packed(&pixmap)
+}
+
+/// The picture as PDF of one page; a unit is a CSS pixel, of which an inch has 96.
+pub(super) fn pdf(svg: &str) -> Result<Vec<u8>, FigureError> {
+    let page = PageOptions { dpi: 96.0 };
+    let packed = svg2pdf::to_pdf(&tree(svg)?, ConversionOptions::default(), page);
+    packed.map_err(|e| FigureError::Encode(e.to_string()))
+}
+
+/// The picture's shapes.
+pub(super) fn tree(svg: &str) -> Result<Tree, FigureError> {
+    let tree = Tree::from_str(svg, &Options::default());
+    tree.map_err(|e| FigureError::Encode(e.to_string()))
+}
+
+/// A picture of transparent pixels, to draw on.
+pub(super) fn pixmap(width: usize, height: usize) -> Result<Pixmap, FigureError> {
+    let size = u32::try_from(width).ok().zip(u32::try_from(height).ok());
+    let pixmap = size.and_then(|(width, height)| Pixmap::new(width, height));
+    pixmap.ok_or(FigureError::Size { width, height })
+}
+
+/// The pixels as a file. tiny-skia's own takes three times the room, as it packs fast.
+pub(super) fn packed(pixmap: &Pixmap) -> Result<Vec<u8>, FigureError> {
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, pixmap.width(), pixmap.height());
+    encoder.set_color(png::ColorType::Rgba);
+    encoder.set_compression(png::Compression::Default);
+    encoder.set_adaptive_filter(png::AdaptiveFilterType::Adaptive);
+    let pixels = pixmap.pixels().iter().flat_map(|it| {
+        let it = it.demultiply();
+        [it.red(), it.green(), it.blue(), it.alpha()]
+    });
+    let pixels: Vec<u8> = pixels.collect();
+    let header = encoder.write_header();
+    let written = header.and_then(|mut image| image.write_image_data(&pixels));
+    written.map_err(|e| FigureError::Encode(e.to_string()))?;
+    Ok(file)
+}
