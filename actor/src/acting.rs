@@ -1,4 +1,4 @@
-//! The acting loop: a policy in a world, one step of all copies at a time.
+//! The acting loop: a policy in a world, one step of all environments at a time.
 //! It does not send, count or stop; recording, delivery and limits consume what it yields.
 
 use driml_envs::{EnvError, Environment, FrameStack, StepEnd};
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{error::ActError, policy::Policy};
 
-/// One step of every copy.
+/// One step of every environment.
 #[derive(Debug)]
 pub struct Step<'a> {
     /// Frames [N, frame bytes] in which the actions were taken, unstacked.
@@ -40,7 +40,7 @@ pub struct Acting {
 pub struct ActingState {
     world: Vec<u8>,
     stacked: Vec<u8>,
-    /// Of each copy, whether its next frame is the first of an episode or level.
+    /// Of each environment, whether its next frame is the first of an episode or level.
     first: Vec<bool>,
     rng: ChaCha8Rng,
 }
@@ -69,7 +69,7 @@ impl Acting {
         })
     }
 
-    /// Lets `policy` act once in every copy.
+    /// Lets `policy` act once in every environment.
     ///
     /// # Errors
     /// The policy or the world failed; the world must not be stepped again.
@@ -112,7 +112,7 @@ impl Acting {
     pub fn go_on_from(&mut self, state: ActingState) -> Result<(), EnvError> {
         if state.first.len() != self.first.len() {
             let (found, own) = (state.first.len(), self.first.len());
-            return Err(EnvError::State(format!("{found} copies, not {own}")));
+            return Err(EnvError::State(format!("{found} environments, not {own}")));
         }
         self.world.load(&state.world)?;
         self.stack.load(&state.stacked)?;

@@ -1,7 +1,7 @@
 //! One actor's work without its network connections: act with the newest weights, give chunk after chunk.
 //! The processes and the lockstep mode run this same code; it neither sends nor waits.
 
-use driml_envs::PartOfWorld;
+use driml_envs::RestrictedWorld;
 use driml_protocol::{BufferPool, Chunk, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -72,14 +72,14 @@ impl Collector {
     pub fn new(
         settings: ActorSettings,
         pool: BufferPool,
-        life: Incarnation,
+        incarnation: Incarnation,
         weights_version: u64,
         safetensors: &[u8],
     ) -> Result<Self, ActError> {
         let spec = &settings.spec;
         let config = &settings.actor;
-        let schedule = Schedule::new(config, life.actor)?;
-        let world_seed = life.seed(spec, "world");
+        let schedule = Schedule::new(config, incarnation.actor)?;
+        let world_seed = incarnation.seed(spec, "world");
         let world_seed = u64::from_le_bytes(world_seed[..8].try_into().expect("eight bytes"));
         let (envs, threads) = (config.envs as usize, config.world_threads as usize);
         let no_world = |source| ActError::NoWorld {
@@ -111,8 +111,8 @@ impl Collector {
                 spec.world
             )));
         }
-        let rng = ChaCha8Rng::from_seed(life.seed(spec, "exploration"));
-        let world = PartOfWorld::of(world, actions, sent).map_err(no_world)?;
+        let rng = ChaCha8Rng::from_seed(incarnation.seed(spec, "exploration"));
+        let world = RestrictedWorld::of(world, actions, sent).map_err(no_world)?;
         let policy = NetworkPolicy::new(
             &settings.model,
             settings.input.enlarge(sent, &settings.model)?,
@@ -124,8 +124,8 @@ impl Collector {
             acting: Acting::new(world, spec.frame_stack as usize, rng)?,
             recorder: ChunkRecorder::new(
                 pool,
-                life.actor,
-                life.id,
+                incarnation.actor,
+                incarnation.id,
                 config.envs,
                 spec.frame_bytes() as u32,
             ),
@@ -192,7 +192,7 @@ impl Collector {
 
 #[cfg(test)]
 mod tests {
-    use driml_envs::{CorridorConfig, WorldConfig};
+    use driml_envs::{ChainConfig, WorldConfig};
     use driml_model::{Compute, ConvLayer, InputSize, ModelConfig, Parameters};
     use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
 
@@ -225,7 +225,7 @@ mod tests {
                 horizon: Horizon::None,
                 timeout: TimeoutRule::Terminal,
             },
-            world: WorldConfig::Chain(CorridorConfig {
+            world: WorldConfig::Chain(ChainConfig {
                 cells: 8,
                 height: 12,
                 width: 12,
@@ -265,16 +265,16 @@ mod tests {
         }
     }
 
-    fn collector(settings: ActorSettings, life: Incarnation) -> Result<Collector, ActError> {
+    fn collector(settings: ActorSettings, incarnation: Incarnation) -> Result<Collector, ActError> {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        Collector::new(settings, BufferPool::new(1), life, 1, &weights)
+        Collector::new(settings, BufferPool::new(1), incarnation, 1, &weights)
     }
 
     /// The actions of a life's first chunk.
-    fn actions(settings: ActorSettings, life: Incarnation) -> Vec<u8> {
-        let chunk = collector(settings, life)
+    fn actions(settings: ActorSettings, incarnation: Incarnation) -> Vec<u8> {
+        let chunk = collector(settings, incarnation)
             .unwrap()
             .collect(0, STEPS)
             .unwrap();
@@ -284,7 +284,7 @@ mod tests {
 
     #[test]
     fn a_restarted_actor_does_not_repeat_its_own_random_numbers() {
-        let random = |life| actions(settings(1.0), life);
+        let random = |incarnation| actions(settings(1.0), incarnation);
         let first = random(FIRST);
         assert_eq!(random(Incarnation { id: 2, ..FIRST }), first);
         let at = |after_updates, earlier_incarnations| Incarnation {
@@ -304,17 +304,17 @@ mod tests {
         ];
         let spec = settings(1.0).spec;
         let mut seen = Vec::new();
-        for life in lives {
+        for incarnation in lives {
             let new = (
-                random(life),
-                life.seed(&spec, "world"),
-                life.seed(&spec, "exploration"),
+                random(incarnation),
+                incarnation.seed(&spec, "world"),
+                incarnation.seed(&spec, "exploration"),
             );
             assert_ne!(new.1, new.2);
             let repeats = |old: &(Vec<u8>, [u8; 32], [u8; 32])| {
                 old.0 == new.0 || old.1 == new.1 || old.2 == new.2
             };
-            assert!(!seen.iter().any(repeats), "{life:?}");
+            assert!(!seen.iter().any(repeats), "{incarnation:?}");
             seen.push(new);
         }
         // The first life has the seeds that it has always had.

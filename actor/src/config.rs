@@ -17,9 +17,9 @@ const ACTORS_MAX: u32 = 65_536;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Copies of the world in one actor process, stepped together.
+    /// Environments in one actor process, stepped together.
     pub envs: u32,
-    /// Steps of every copy in one chunk: how often an actor sends, and takes newer weights.
+    /// Steps of every environment in one chunk: how often an actor sends, and takes newer weights.
     pub steps_per_chunk: u32,
     /// Transitions that one chunk of every actor of the run has together, at most: where there are many actors, chunks get
     /// shorter than `steps_per_chunk`, so that no actor waits long to send what it has and to take newer weights. None: chunks
@@ -34,7 +34,7 @@ pub struct Config {
     /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
     #[serde(default)]
     pub actions: driml_envs::ActionSet,
-    /// Threads that step the copies; 0 steps them in the acting thread.
+    /// Threads that step the environments; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
     pub epsilon_start: f64,
@@ -69,7 +69,7 @@ pub struct EpsilonLadder {
 pub struct ActorSettings {
     /// What all processes agree on.
     pub spec: RunSpec,
-    /// The world that its copies are of.
+    /// The world that its environments are of.
     pub world: driml_envs::WorldConfig,
     /// The size at which the network sees it.
     pub input: driml_model::InputSize,
@@ -112,7 +112,7 @@ impl ActorSettings {
         Ok(this)
     }
 
-    /// Steps `envs` copies of the world instead of those that the settings say.
+    /// Steps `envs` environments instead of those that the settings say.
     ///
     /// # Errors
     /// Too many, or chunks that are longer than those of this run may be; what to do.
@@ -168,7 +168,7 @@ impl ActorSettings {
             bytes <= PAYLOAD_BYTES_MAX as u64,
             "actor.steps_per_chunk",
             steps_per_chunk,
-            || "a chunk of so many steps of so many copies (actor.envs) is larger than a message may be, 512 MiB: use fewer",
+            || "a chunk of so many steps of so many environments (actor.envs) is larger than a message may be, 512 MiB: use fewer",
         )
     }
 
@@ -224,7 +224,7 @@ impl Config {
                 "actor.envs",
                 self.envs,
                 4096,
-                "an actor steps 1 to 4096 copies",
+                "an actor steps 1 to 4096 environments",
             ),
             (
                 "actor.steps_per_chunk",

@@ -19,9 +19,9 @@ pub struct Evaluation {
     pub frame_stack: usize,
     /// Probability of a random action.
     pub epsilon: f64,
-    /// Whole episodes of all copies together.
+    /// Whole episodes of all environments together.
     pub episodes: usize,
-    /// Steps of each copy after which it is given up.
+    /// Steps of each environment after which it is given up.
     pub steps_max: u64,
 }
 
@@ -31,11 +31,11 @@ pub type Watch<'a> = &'a mut dyn FnMut(&Step<'_>, &[f64]) -> ControlFlow<()>;
 /// Returns of whole episodes of `policy` in `world`, in the order in which they ended; `rng` is for exploration alone. They are fewer
 /// where `watch` breaks.
 ///
-/// Each copy contributes the same number of episodes (the last round's surplus is dropped by copy order), so that short
+/// Each environment contributes the same number of episodes (the last round's surplus is dropped by environment order), so that short
 /// episodes are not favoured by being over first.
 ///
 /// # Errors
-/// The policy or the world failed, or episodes have not ended after `steps_max` steps a copy.
+/// The policy or the world failed, or episodes have not ended after `steps_max` steps an environment.
 pub fn episode_returns(
     world: Box<dyn Environment>,
     policy: &mut dyn Policy,
@@ -50,7 +50,7 @@ pub fn episode_returns(
         steps_max,
     } = evaluation;
     let envs = world.num_envs();
-    let quota = |copy: usize| episodes / envs + usize::from(copy < episodes % envs);
+    let quota = |env: usize| episodes / envs + usize::from(env < episodes % envs);
     let mut acting = Acting::new(world, frame_stack, rng)?;
     let mut running = vec![0.0; envs];
     let mut ended = vec![0; envs];
@@ -60,14 +60,14 @@ pub fn episode_returns(
             return Ok(returns);
         }
         let step = acting.step(policy, epsilon)?;
-        for copy in 0..envs {
-            running[copy] += f64::from(step.rewards[copy]);
-            if matches!(step.ends[copy], StepEnd::Terminal | StepEnd::TimedOut) {
-                if ended[copy] < quota(copy) {
-                    returns.push(running[copy]);
-                    ended[copy] += 1;
+        for env in 0..envs {
+            running[env] += f64::from(step.rewards[env]);
+            if matches!(step.ends[env], StepEnd::Terminal | StepEnd::TimedOut) {
+                if ended[env] < quota(env) {
+                    returns.push(running[env]);
+                    ended[env] += 1;
                 }
-                running[copy] = 0.0;
+                running[env] = 0.0;
             }
         }
         if watch(&step, &returns).is_break() {
@@ -77,7 +77,7 @@ pub fn episode_returns(
     if returns.len() < episodes {
         let ended = returns.len();
         return Err(ActError::Other(format!(
-            "only {ended} of {episodes} episodes ended within {steps_max} steps of each copy: ask for fewer"
+            "only {ended} of {episodes} episodes ended within {steps_max} steps of each environment: ask for fewer"
         )));
     }
     Ok(returns)
@@ -90,7 +90,7 @@ mod tests {
 
     use super::*;
 
-    /// A world whose copies play what is written down for each, over and over.
+    /// A world whose environments play what is written down for each, over and over.
     struct Scripted {
         scripts: Vec<Vec<(f32, StepEnd)>>,
         step: usize,
@@ -123,8 +123,8 @@ mod tests {
             rewards: &mut [f32],
             ends: &mut [StepEnd],
         ) -> Result<(), EnvError> {
-            for (copy, script) in self.scripts.iter().enumerate() {
-                (rewards[copy], ends[copy]) = script[self.step % script.len()];
+            for (env, script) in self.scripts.iter().enumerate() {
+                (rewards[env], ends[env]) = script[self.step % script.len()];
             }
             self.step += 1;
             Ok(())
@@ -190,12 +190,12 @@ mod tests {
         assert_eq!(play(&[cut_off], 2, 100).unwrap(), [5.0, 5.0]);
     }
 
-    /// Taken as they end, the first four episodes would all be the short copy's.
+    /// Taken as they end, the first four episodes would all be the short environment's.
     #[test]
-    fn every_copy_plays_its_share_of_the_episodes() {
+    fn every_environment_plays_its_share_of_the_episodes() {
         let all = play(&[SHORT, LONG], 4, 100).unwrap();
         assert_eq!(all, [1.0, 1.0, 100.0, 100.0]);
-        // What is left over goes to the first copies.
+        // What is left over goes to the first environments.
         assert_eq!(play(&[SHORT, LONG], 3, 100).unwrap(), [1.0, 1.0, 100.0]);
         assert_eq!(play(&[LONG, SHORT], 3, 100).unwrap(), [1.0, 100.0, 100.0]);
         assert_eq!(play(&[SHORT, LONG], 1, 100).unwrap(), [1.0]);
@@ -228,7 +228,7 @@ mod tests {
         let said = play(&[LONG], 2, 7).unwrap_err().to_string();
         assert_eq!(
             said,
-            "only 1 of 2 episodes ended within 7 steps of each copy: ask for fewer"
+            "only 1 of 2 episodes ended within 7 steps of each environment: ask for fewer"
         );
         let endless: &[_] = &[(1.0, StepEnd::LevelChange)];
         assert!(play(&[endless], 1, 50).is_err());

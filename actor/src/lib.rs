@@ -1,4 +1,4 @@
-//! An actor: a policy in many copies of a world, whose transitions go to the replay server.
+//! An actor: a policy in many environments, whose transitions go to the replay server.
 //! It never sees a batch and never learns; weights come from the learner.
 //!
 //! Start at [`run`], a whole actor process, or at [`Collector`], the same without a network connection. Below them [`Acting`]
@@ -10,7 +10,7 @@
 //! use driml_protocol::BufferPool;
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
-//! /// Two copies of a world that shows how often it was stepped.
+//! /// Two environments that shows how often it was stepped.
 //! struct Counter(u8);
 //!
 //! impl Environment for Counter {
@@ -45,7 +45,7 @@
 //! }
 //!
 //! let mut acting = Acting::new(Box::new(Counter(0)), 1, ChaCha8Rng::seed_from_u64(1))?;
-//! // Chunks of actor 7's incarnation 1, from two copies with frames of one byte.
+//! // Chunks of actor 7's incarnation 1, from two environments with frames of one byte.
 //! let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 1, 2, 1);
 //! recorder.begin(0, 3);
 //! let chunk = loop {

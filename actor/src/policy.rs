@@ -56,7 +56,7 @@ pub struct NetworkPolicy {
     enlarge: Option<Enlarge>,
     num_actions: u8,
     noise: bool,
-    /// The copies in which the network decides, their states if these are not all, at the network's size if that is another,
+    /// The environments in which the network decides, their states if these are not all, at the network's size if that is another,
     /// and their actions: memory to use again.
     deciding: Vec<usize>,
     states: Vec<u8>,
@@ -92,7 +92,7 @@ impl NetworkPolicy {
     }
 
     /// The same, exploring by the noise of the network's noisy layers, if it has some: drawn anew in each step, and the same for all
-    /// copies, as they pass through the network together. Without this their means act.
+    /// environments, as they pass through the network together. Without this their means act.
     ///
     /// Source: Fortunato et al. 2018, section 3.2 (a) and algorithm 1: a new sample before every action.
     #[must_use]
@@ -119,11 +119,11 @@ impl Policy for NetworkPolicy {
         actions: &mut [u8],
     ) -> Result<(), ActError> {
         self.deciding.clear();
-        for (copy, action) in actions.iter_mut().enumerate() {
+        for (env, action) in actions.iter_mut().enumerate() {
             if rng.random_bool(epsilon) {
                 *action = rng.random_range(0..self.num_actions);
             } else {
-                self.deciding.push(copy);
+                self.deciding.push(env);
             }
         }
         let count = self.deciding.len();
@@ -131,8 +131,8 @@ impl Policy for NetworkPolicy {
         if count < actions.len() {
             let state_bytes = states.len() / actions.len();
             self.states.clear();
-            for &copy in &self.deciding {
-                let state = &states[copy * state_bytes..][..state_bytes];
+            for &env in &self.deciding {
+                let state = &states[env * state_bytes..][..state_bytes];
                 self.states.extend_from_slice(state);
             }
             input = &self.states;
@@ -147,8 +147,8 @@ impl Policy for NetworkPolicy {
         }
         self.greedy.resize(count, 0);
         self.network.greedy_actions(input, &mut self.greedy)?;
-        for (&copy, &action) in self.deciding.iter().zip(&self.greedy) {
-            actions[copy] = action;
+        for (&env, &action) in self.deciding.iter().zip(&self.greedy) {
+            actions[env] = action;
         }
         Ok(())
     }
@@ -190,7 +190,7 @@ pub(crate) mod tests {
             channels: vec![],
             scale_blocks: false,
             hidden: 4,
-            rkhs: 4,
+            embedding_dim: 4,
             action_embed: 4,
             dim: DimHeads::NONE,
             head: HeadConfig::PLAIN,

@@ -34,7 +34,7 @@ pub struct ChunkRecorder {
 }
 
 impl ChunkRecorder {
-    /// A recorder for `streams` copies; how long its chunks are is for [`ChunkRecorder::begin`].
+    /// A recorder for `streams` environments; how long its chunks are is for [`ChunkRecorder::begin`].
     pub fn new(
         pool: BufferPool,
         actor: u32,
@@ -97,7 +97,7 @@ impl ChunkRecorder {
         self.header.first_transition = next.first_transition;
     }
 
-    /// Records one step of every copy: frames [N, frame bytes] in which `actions` [N] were taken, and what came of it.
+    /// Records one step of every environment: frames [N, frame bytes] in which `actions` [N] were taken, and what came of it.
     ///
     /// Gives the chunk that this step completed, if it did.
     pub fn record(

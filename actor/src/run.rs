@@ -6,7 +6,7 @@ use std::{sync::Arc, time::Duration};
 use anyhow::Context;
 use driml_envs::WorldName;
 use driml_protocol::{
-    Activity, ActorJoin, Keys, Life, RunClient, Shutdown, Weights, join, reporter,
+    Activity, ActorJoin, Keys, Participant, RunClient, Shutdown, Weights, join, reporter,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -33,7 +33,7 @@ pub struct RunArgs {
     pub namespace: String,
     /// Which actor this is; unique in the run.
     pub actor: u32,
-    /// Copies of the world, if not as many as the settings say.
+    /// Environments, if not as many as the settings say.
     pub envs: Option<u32>,
     /// The world as this machine has it, where it is code outside this program: nothing else of that kind is started
     /// or loaded, whatever the replay server says.
@@ -60,16 +60,16 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     else {
         return Ok(());
     };
-    let Some(hello) = join::hello(&session, &keys, shutdown)? else {
+    let Some(run_info) = join::run_info(&session, &keys, shutdown)? else {
         return Ok(());
     };
-    let mut settings = ActorSettings::from_toml(&hello.config_toml)
+    let mut settings = ActorSettings::from_toml(&run_info.config_toml)
         .context("the settings that the replay server sent")?;
     if let Some(envs) = args.envs {
         settings.set_envs(envs)?;
     }
     settings.set_world(args.world)?;
-    if settings.transport.shared_memory && !hello.shared_memory {
+    if settings.transport.shared_memory && !run_info.shared_memory {
         tracing::info!(
             "chunks go through sockets: the replay server takes none through shared memory"
         );
@@ -80,7 +80,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         actor: args.actor,
         incarnation: rand::random(),
     };
-    let who = Life::Actor {
+    let who = Participant::Actor {
         actor: join.actor,
         incarnation: join.incarnation,
     };
@@ -113,7 +113,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         return Ok(());
     };
     // The learner has joined by now, and with it the replay server knows where a resumed run stands.
-    let Some(hello) = join::hello(client.session(), client.keys(), shutdown)? else {
+    let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
         return Ok(());
     };
     let limits = DeliveryLimits::of(&settings.actor);
@@ -126,7 +126,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         Incarnation {
             actor: join.actor,
             id: join.incarnation,
-            after_updates: hello.after_updates,
+            after_updates: run_info.after_updates,
             earlier_incarnations: welcome.earlier_incarnations,
         },
         first.header.version,
@@ -135,13 +135,13 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let newest = source.watch(first.header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         client.clone(),
-        hello.inserted_total,
+        run_info.inserted_total,
         limits,
         pool,
         shutdown.clone(),
     )?;
     tracing::info!(
-        "actor {} steps {} copies, run {spec_hash:016x}",
+        "actor {} steps {} environments, run {spec_hash:016x}",
         args.actor,
         config.envs
     );
@@ -206,7 +206,7 @@ fn play(
         activity.begin("plays");
         let steps = chunk_steps(delivery.actors());
         let chunk = collector.collect(delivery.inserted_total(), steps)?;
-        if let Some(waits) = delivery.waits_in_words() {
+        if let Some(waits) = delivery.describe_wait() {
             activity.begin(waits);
         }
         if !delivery.send(chunk) {

@@ -8,8 +8,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Assembly, BufferPool, CodecError, PIECE_BYTES, PendingReply, RunClient, Seldom, Shutdown,
-    Weights, WeightsReply, WeightsRequest, WeightsVersion, fault, session::SessionError,
+    Assembly, BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown,
+    Weights, WeightsReply, WeightsRequest, WeightsVersion, fail_point, session::SessionError,
 };
 
 /// How long one piece may take to come.
@@ -155,7 +155,7 @@ impl WeightsSource {
         shutdown: &Shutdown,
     ) -> Result<Option<Weights>, WeightsError> {
         let mut started = Instant::now();
-        let mut said = Seldom::default();
+        let mut said = LogLimiter::default();
         loop {
             let pulled = self.pull(0);
             match pulled {
@@ -203,7 +203,7 @@ impl WeightsSource {
             let _announcements = announcements;
             let mut looked = Instant::now();
             while !shutdown.is_set() {
-                fault::point("weights-watch");
+                fail_point::reach("weights-watch");
                 let wanted = slot.wait_until_wanted(TICK);
                 let Some(version) = wanted.or_else(|| {
                     // An announcement may have been lost.

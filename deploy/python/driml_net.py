@@ -141,7 +141,7 @@ class Network(nn.Module):
         else:
             self.head = layer(model["hidden"], outputs)
         self.dim = nn.ModuleDict()
-        dim, rkhs = model["dim"], model["rkhs"]
+        dim, embedding_dim = model["dim"], model["embedding_dim"]
         embed = model["action_embed"] if dim["action"] and (dim["psi3"] or dim["psi4"]) else 0
         if embed:
             self.dim["action"] = Block(self.actions, embed, skip_bias=True)
@@ -152,7 +152,7 @@ class Network(nn.Module):
             ("phi4", model["hidden"]),
         ]:
             if dim[name]:
-                self.dim[name] = Block(inputs, rkhs)
+                self.dim[name] = Block(inputs, embedding_dim)
 
     def features(self, states):
         """f3 [B, c, h, w] after its ReLU and f4 [B, hidden] before it, of u8 states [B, H, W, C]."""

@@ -7,6 +7,7 @@ mod cli;
 mod commands;
 #[cfg(test)]
 mod reference;
+mod registry;
 
 use std::process::ExitCode;
 
@@ -17,10 +18,18 @@ use driml_machine::{
     process_env,
 };
 
+pub use crate::registry::Registry;
+
 use crate::cli::Cli;
 
 /// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
 pub fn main() -> ExitCode {
+    main_with(Registry::default())
+}
+
+/// [`main`] of a program that adds worlds, losses or agents.
+pub fn main_with(registry: Registry) -> ExitCode {
+    registry.register();
     panics::end_the_process();
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::fault;
+use driml_protocol::fail_point;
 
 /// Calls the program with these words.
 fn driml(folder: &Path, call: &str) -> Output {
@@ -62,17 +62,17 @@ fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
 }
 
 /// The parts of a page, and the files beside it.
-fn check_page(folder: &Path, parts: &[&str], files: &str) -> String {
+fn check_page(folder: &Path, processes: &[&str], files: &str) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let of_all = [
         "smoke length",
-        "**Claim.**",
+        "**ChunkPoll.**",
         "**Command.** `driml experiment",
         "**Got.**",
         "**Differences from the paper.**",
     ];
-    for part in of_all.iter().chain(parts) {
-        assert!(page.contains(part), "{part}\n{page}");
+    for role in of_all.iter().chain(processes) {
+        assert!(page.contains(role), "{role}\n{page}");
     }
     let found = data(folder);
     assert_eq!(names(&found), files);
@@ -230,7 +230,7 @@ fn pacman() {
     let noise = config("noise-driml-fix-seed1");
     assert!(
         noise.contains("episodes_per_task = 8"),
-        "32 among 4 copies: {noise}"
+        "32 among 4 environments: {noise}"
     );
     assert!(noise.contains("[world.ising]"), "{noise}");
     assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
@@ -278,7 +278,7 @@ fn tradeoff() {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let is_shown = page.contains("at equal wall-clock time");
     assert_eq!(is_shown, at_equal_time > 0, "{page}");
-    for part in [
+    for role in [
         "smoke length",
         "| learner.precision | bf16 | c51 |",
         "| DIM | driml-ada | driml-ada |",
@@ -286,7 +286,7 @@ fn tradeoff() {
         "over 1 seed of a level and 2 of a base",
         "--dials learner.precision`, then `driml tradeoff --env chain",
     ] {
-        assert!(page.contains(part), "{part}\n{page}");
+        assert!(page.contains(role), "{role}\n{page}");
     }
     let again = call("--report");
     assert!(
@@ -315,7 +315,7 @@ fn killed_and_resumed() {
         .args(call.split(' '))
         .current_dir(root.path())
         // Its run is not over before it is killed.
-        .env(fault::HOLD, format!("100 {}", go.display()))
+        .env(fail_point::HOLD, format!("100 {}", go.display()))
         .spawn()
         .unwrap();
     let run = root.path().join("x/runs/mspacman-c51-seed1");
@@ -359,9 +359,9 @@ fn a_grid_makes_every_combination_once() {
     let root = tempfile::tempdir().unwrap();
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
-    let refused = |call: &str, parts: &[&str]| {
+    let refused = |call: &str, processes: &[&str]| {
         let text = said(root.path(), call, 64);
-        assert!(parts.iter().all(|it| text.contains(it)), "{text}");
+        assert!(processes.iter().all(|it| text.contains(it)), "{text}");
     };
     // What cannot work is rejected before anything starts.
     let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");

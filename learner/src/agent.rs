@@ -1,11 +1,11 @@
-//! One update: C51 plus the auxiliary objective, clipped, through Adam; then the target network's turn.
+//! One update: C51 plus the auxiliary loss, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
 use std::collections::HashMap;
 
 use candle_core::Tensor;
 use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
-use driml_protocol::fault;
+use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
@@ -24,7 +24,6 @@ use crate::{
         gradients::{Gradients, clip_factor},
         target,
     },
-    repeats::EqualStates,
     settings::LearnerSettings,
     tensors::{finite, flat, states},
 };
@@ -36,7 +35,7 @@ pub struct NetworkParameters {
     pub online: Parameters,
     /// C51's target network: torso and head.
     pub target: Parameters,
-    /// CURL's key encoder: torso and Psi_4; there for that objective and for no other.
+    /// CURL's key encoder: torso and Psi_4; there for that auxiliary loss and for no other.
     pub key: Option<Parameters>,
 }
 
@@ -46,7 +45,7 @@ pub struct Agent {
     model: ModelConfig,
     settings: LearnerSettings,
     compute: Compute,
-    equal_states: EqualStates,
+    deduplicate: bool,
     noise_seed: [u8; 32],
     auxiliary: Box<dyn AuxiliaryLoss>,
     pub(crate) online: Parameters,
@@ -64,7 +63,7 @@ impl Agent {
     /// A learner with initial weights drawn from `rng`, the same on every device; the slow networks are copies.
     ///
     /// # Errors
-    /// Settings out of their ranges, or a model whose heads are not those that the objective uses.
+    /// Settings out of their ranges, or a model whose heads are not those that the auxiliary loss uses.
     pub fn new(
         model: ModelConfig,
         settings: LearnerSettings,
@@ -105,7 +104,7 @@ impl Agent {
         let needed = settings.dim_heads(model.num_actions);
         if needed != built {
             return Err(UpdateError::Settings(format!(
-                "the objective uses {needed:?}, the model builds {built:?}"
+                "the auxiliary_loss uses {needed:?}, the model builds {built:?}"
             )));
         }
         let kernels = compute.kernels;
@@ -115,9 +114,9 @@ impl Agent {
             (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
             (wanted, _) => {
                 let there = if wanted.is_some() { "missing" } else { "there" };
-                let objective = settings.objective.name();
+                let auxiliary_loss = settings.auxiliary_loss.name();
                 return Err(UpdateError::State(format!(
-                    "a key encoder is {there}, with objective = {objective}"
+                    "a key encoder is {there}, with auxiliary_loss = {auxiliary_loss}"
                 )));
             }
         };
@@ -129,7 +128,7 @@ impl Agent {
             key,
             adam: Adam::new(settings.adam, &online, kernels)?,
             compute: compute.clone(),
-            equal_states: EqualStates::default(),
+            deduplicate: false,
             noise_seed: [0; 32],
             auxiliary,
             updates: 0,
@@ -140,10 +139,10 @@ impl Agent {
         })
     }
 
-    /// The same, with equal states of a batch computed so. Without this each is computed.
+    /// The same; `deduplicate` says whether equal states of a batch are computed once. Without this each is computed.
     #[must_use]
-    pub const fn with_equal_states(mut self, equal_states: EqualStates) -> Self {
-        self.equal_states = equal_states;
+    pub const fn with_deduplication(mut self, deduplicate: bool) -> Self {
+        self.deduplicate = deduplicate;
         self
     }
 
@@ -179,7 +178,7 @@ impl Agent {
         &self.target
     }
 
-    /// The parameters of CURL's key encoder, if that is the objective.
+    /// The parameters of CURL's key encoder, if that is the auxiliary loss.
     pub fn key(&self) -> Option<&Parameters> {
         self.key.as_ref().map(KeyEncoder::parameters)
     }
@@ -232,7 +231,7 @@ impl Agent {
         &mut self,
         batch: &Batch<'_>,
     ) -> Result<UpdateReport, UpdateError> {
-        fault::hold(self.updates());
+        fail_point::hold(self.updates());
         // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
         rayon::scope(|_| {
             let evaluation = self.evaluate_checked(batch, &self.noise())?;
@@ -250,9 +249,9 @@ impl Agent {
         })
     }
 
-    /// Checks that `batch` is one of this network's and objective's.
+    /// Checks that `batch` is one of this network's and auxiliary loss's.
     pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
-        batch.validate(&self.model, self.settings.objective.positives())
+        batch.validate(&self.model, self.settings.auxiliary_loss.positives())
     }
 
     /// The noise of the next update's noisy layers.
@@ -295,7 +294,7 @@ impl Agent {
                     &self.model,
                     &*self.auxiliary,
                     batch,
-                    self.equal_states,
+                    self.deduplicate,
                     &self.compute.device,
                 )
             },
@@ -400,7 +399,7 @@ impl Agent {
             online: &self.online_network,
             target: &self.target_network,
             double_dqn: self.settings.double_dqn,
-            equal_states: self.equal_states,
+            deduplicate: self.deduplicate,
         }
     }
 

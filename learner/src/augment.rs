@@ -1,4 +1,4 @@
-//! Augmentation: what the auxiliary objective sees of a state, cropped and recoloured at random; bytes in, bytes out.
+//! Augmentation: what the auxiliary loss sees of a state, cropped and recoloured at random; bytes in, bytes out.
 //! C51 never sees it. It knows neither networks nor losses, and keeps no generator.
 
 use rand::Rng;

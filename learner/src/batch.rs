@@ -15,11 +15,11 @@ pub struct Batch<'a> {
     pub rows: usize,
     /// s_t [B, H, W, C].
     pub states_t: &'a [u8],
-    /// s_t as the auxiliary objective sees it, augmented [B, H, W, C]; `None` where that is `states_t`.
+    /// s_t as the auxiliary loss sees it, augmented [B, H, W, C]; `None` where that is `states_t`.
     pub anchors: Option<&'a [u8]>,
     /// Positives of a row, P; 0 where the agent has no use for any.
     pub positives: usize,
-    /// s_{t+k} as the auxiliary objective sees it [P, B, H, W, C]; or of those positives alone that rows have, in this order.
+    /// s_{t+k} as the auxiliary loss sees it [P, B, H, W, C]; or of those positives alone that rows have, in this order.
     pub states_k: &'a [u8],
     /// s_{t+n} [B, H, W, C]; or of those rows alone that bootstrap.
     pub states_n: &'a [u8],
@@ -51,7 +51,7 @@ impl<'a> Batch<'a> {
         if !wants.fit(positives, self.anchors.is_some()) {
             return fault(format!(
                 "it has {positives} positives a row; this agent needs {}",
-                wants.wanted_words()
+                wants.describe_wanted()
             ));
         }
         let anchors = self.anchors.unwrap_or(self.states_t);

@@ -9,10 +9,10 @@ use driml_protocol::NO_ACTION;
 
 use crate::{
     batch::Batch,
+    deduplicate::{self, Distinct, State, one_after_another},
     error::UpdateError,
     losses::{c51::softmax, projection::project},
     noise::UpdateNoise,
-    repeats::{Distinct, EqualStates, State, one_after_another},
     tensors::{flat, states},
 };
 
@@ -31,7 +31,7 @@ pub(crate) struct Bellman<'a> {
     pub(crate) target: &'a Network,
     /// Whether the online network chooses the action, not the target network.
     pub(crate) double_dqn: bool,
-    pub(crate) equal_states: EqualStates,
+    pub(crate) deduplicate: bool,
 }
 
 impl Bellman<'_> {
@@ -97,7 +97,7 @@ impl Bellman<'_> {
         } = *self.model;
         let len = self.model.frame_len();
         let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
-        let once = self.equal_states.once_by(self.compute.kernels);
+        let once = deduplicate::applies(self.deduplicate, self.compute.kernels);
         let distinct = once.then(|| Distinct::of(&frames)).flatten();
         let states_n = match &distinct {
             Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),

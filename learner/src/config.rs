@@ -17,7 +17,6 @@ use crate::{
     augment::AugmentSettings,
     auxiliary::positives::Positives,
     error::UpdateError,
-    repeats::EqualStates,
     settings::LearnerSettings,
 };
 
@@ -27,18 +26,14 @@ use crate::{
 pub struct Config {
     /// Rows of one update, B.
     pub batch_size: u32,
-    /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either. Settings of
-    /// earlier versions do not have it: f32.
-    #[serde(default)]
+    /// In which numbers an update's products are computed; weights, moments, losses and sums are f32 in either.
     pub precision: Precision,
-    /// What is done with states of a batch that are equal. Settings of earlier versions do not have it: each is computed.
-    #[serde(default)]
-    pub equal_states: EqualStates,
+    /// Whether equal states of a batch are computed once.
+    pub deduplicate_states: bool,
     /// Batches asked for ahead of the one being learned from.
     pub batches_in_flight: u32,
-    /// What the scalars of published weights are. Settings of earlier versions do not have it: f32.
-    #[serde(default)]
-    pub publish_as: StoredAs,
+    /// What the scalars of published weights are.
+    pub publish_dtype: StoredAs,
     /// Updates from one version of the weights to the next.
     pub publish_period_updates: u64,
     /// Updates from one checkpoint to the next.
@@ -49,7 +44,7 @@ pub struct Config {
     pub unreachable_max_ms: u64,
     /// Losses, optimiser and target network.
     pub update: LearnerSettings,
-    /// What is done to the states that the auxiliary objective sees; nothing if it is not there.
+    /// What is done to the states that the auxiliary loss sees; nothing if it is not there.
     pub augment: Option<AugmentSettings>,
     /// How the action affinity A is estimated, if the horizon follows it.
     pub affinity: AffinityConfig,
@@ -208,19 +203,19 @@ impl Config {
                 why: why.into(),
             })
         };
-        let objective = self.update.objective;
-        match (objective.positives(), self.augment) {
+        let auxiliary_loss = self.update.auxiliary_loss;
+        match (auxiliary_loss.positives(), self.augment) {
             (Positives::OtherView, None) => bad(
                 "(missing)",
                 &format!(
                     "{} compares two augmentations of a state: take the agent {}, or set all of learner.augment",
-                    objective.name().to_uppercase(),
-                    objective.name()
+                    auxiliary_loss.name().to_uppercase(),
+                    auxiliary_loss.name()
                 ),
             ),
             (Positives::None, Some(_)) => bad(
                 "(there)",
-                "nothing but an auxiliary objective sees augmented states, and this agent has none",
+                "nothing but an auxiliary loss sees augmented states, and this agent has none",
             ),
             _ => Ok(()),
         }

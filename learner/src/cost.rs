@@ -92,7 +92,7 @@ impl UpdateCost {
             heads: rows
                 * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
                     + passes.phi * learning(&["dim.phi3", "dim.phi4"])),
-            scores: 2 * products * matrices * rows * rows * model.rkhs as u64,
+            scores: 2 * products * matrices * rows * rows * model.embedding_dim as u64,
         }
     }
 
@@ -119,11 +119,11 @@ mod tests {
     use super::*;
     use crate::auxiliary::settings::Lambda;
 
-    /// 6 x 6 x 1, a map of 2 x 2 x 3, f4 of 5; rkhs 4, 2 actions of 3 atoms.
+    /// 6 x 6 x 1, a map of 2 x 2 x 3, f4 of 5; embedding_dim 4, 2 actions of 3 atoms.
     fn model(dim: DimHeads) -> ModelConfig {
         let model: ModelConfig = toml::from_str(
             "height = 6\nwidth = 6\ninput_channels = 1\nnum_actions = 2\natoms = 3\nv_min = -1.0\nv_max = 1.0\n\
-             conv = [{ out = 3, kernel = 4, stride = 2 }]\nhidden = 5\nrkhs = 4\naction_embed = 2\n\
+             conv = [{ out = 3, kernel = 4, stride = 2 }]\nhidden = 5\nembedding_dim = 4\naction_embed = 2\n\
              dim = { psi3 = false, phi3 = false, psi4 = false, phi4 = false, action = false }",
         )
         .unwrap();

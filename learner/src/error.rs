@@ -10,9 +10,9 @@ pub enum UpdateError {
     /// A setting out of its range.
     #[error("{0}: that cannot work; start from a preset")]
     Settings(String),
-    /// Settings of the auxiliary objective that are at odds with each other.
+    /// Settings of the auxiliary loss that are at odds with each other.
     #[error("{0}")]
-    Objective(String),
+    AuxiliaryLoss(String),
     /// State that does not fit the network, as from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),

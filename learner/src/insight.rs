@@ -19,7 +19,7 @@ pub struct Insight {
     model: ModelConfig,
     network: Network,
     compute: Compute,
-    /// The objective, if it compares local features of s_t with local ones of s_{t+k}.
+    /// The auxiliary loss, if it compares local features of s_t with local ones of s_{t+k}.
     local_dim: Option<Dim>,
 }
 
@@ -46,7 +46,7 @@ impl Insight {
         parameters: &Parameters,
         compute: Compute,
     ) -> Result<Self, UpdateError> {
-        let is_local = settings.objective.name() == DIM.name
+        let is_local = settings.auxiliary_loss.name() == DIM.name
             && settings.lambda.wanted()[0]
             && model.dim.psi3
             && model.dim.phi3;
@@ -86,7 +86,7 @@ impl Insight {
 
     /// Probabilities [B, L] with which local DIM, given the features of a location in state b of `now` and the action that was taken
     /// there, picks that location of the state that followed out of those of all B in `later`: what InfoNCE raises. 1 / B is chance;
-    /// none where the agent's objective is another.
+    /// none where the agent's auxiliary loss is another.
     ///
     /// `later` holds s_{t+k} of the s_t in `now`, in the same order. Source: Mazoure et al. 2020, section 4; its negatives are a
     /// batch's other states.
@@ -110,7 +110,7 @@ impl Insight {
             return Ok(None);
         };
         let dots = dots_of(vectors.kernels, psi, phi)?;
-        let scores = dim.scores(dots.rkhs);
+        let scores = dim.scores(dots.width);
         let (locations, rows, _) = dots.dots.dims3()?;
         let dots = flat(&dots.dots)?;
         let mut matches = vec![0.0; rows * locations];
@@ -135,9 +135,9 @@ mod tests {
     use crate::Lambda;
 
     const MODEL: &str = "height = 10\nwidth = 12\ninput_channels = 2\nnum_actions = 3\natoms = 5\nv_min = -1.0\n\
-        v_max = 1.0\nconv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nrkhs = 8\naction_embed = 2\n\
+        v_max = 1.0\nconv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nembedding_dim = 8\naction_embed = 2\n\
         dim = { psi3 = false, phi3 = false, psi4 = false, phi4 = false, action = false }";
-    const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
+    const UPDATE: &str = "double_dqn = false\nauxiliary_loss = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
         lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\
         target_tau = 0.95\nadam = { lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8 }";
 

@@ -73,7 +73,7 @@ impl Learner {
             compute,
             &mut init,
         )?
-        .with_equal_states(config.learner.equal_states)
+        .with_deduplication(config.learner.deduplicate_states)
         .with_noise_seed(spec.seed_for(NOISE, 0));
         let affinity = config
             .learner
@@ -123,7 +123,7 @@ impl Learner {
         this.progress = restored.progress;
         this.agent = restored
             .agent
-            .with_equal_states(this.config.learner.equal_states)
+            .with_deduplication(this.config.learner.deduplicate_states)
             .with_noise_seed(this.config.spec.seed_for(NOISE, 0));
         this.affinity = restored.affinity;
         this.rng = restored.rng;
@@ -230,7 +230,7 @@ impl Learner {
 
     /// The present weights as a new version.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
-        let safetensors = self.agent.weights_as(self.config.learner.publish_as)?;
+        let safetensors = self.agent.weights_as(self.config.learner.publish_dtype)?;
         self.weights_version += 1;
         let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
         Ok(Weights {

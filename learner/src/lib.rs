@@ -9,9 +9,9 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! // The tables [model] and [learner.update] of a run's config.toml.
 //! # const MODEL: &str = "height = 8\nwidth = 8\ninput_channels = 1\nnum_actions = 2\natoms = 5\nv_min = -1.0\nv_max = 1.0\n\
-//! #     conv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nrkhs = 8\naction_embed = 2\n\
+//! #     conv = [{ out = 4, kernel = 4, stride = 2 }]\nhidden = 8\nembedding_dim = 8\naction_embed = 2\n\
 //! #     dim = { psi3 = false, phi3 = false, psi4 = true, phi4 = true, action = true }";
-//! # const UPDATE: &str = "double_dqn = false\nobjective = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
+//! # const UPDATE: &str = "double_dqn = false\nauxiliary_loss = \"dim\"\ncondition_on_action = true\ntanh_clip = 20.0\n\
 //! #     lambda = { 3t3 = 0.0, 3t4 = 0.0, 4t3 = 0.0, 4t4 = 1.0 }\nmax_grad_norm = 10.0\ntarget_period_updates = 312\n\
 //! #     target_tau = 0.95\nadam = { lr = 1e-3, beta1 = 0.9, beta2 = 0.999, eps = 1e-8 }";
 //! let (model, settings): (_, LearnerSettings) = (toml::from_str(MODEL)?, toml::from_str(UPDATE)?);
@@ -56,6 +56,7 @@ mod bellman;
 pub mod checkpoint;
 mod config;
 pub mod cost;
+mod deduplicate;
 mod error;
 mod evaluation;
 pub mod importance;
@@ -69,7 +70,6 @@ mod prepare;
 mod progress;
 mod ranges;
 pub mod remote;
-mod repeats;
 mod settings;
 mod tensors;
 
@@ -78,7 +78,7 @@ pub use affinity::{
 };
 pub use agent::{Agent, NetworkParameters};
 pub use augment::{Augment, AugmentSettings};
-pub use auxiliary::{Objective, positives::Positives, settings::Lambda};
+pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::Batch;
 pub use config::{
     AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
@@ -92,5 +92,4 @@ pub use noise::UpdateNoise;
 pub use optimiser::adam::AdamSettings;
 pub use progress::{Progress, ServedPart};
 pub use remote::run::{RunArgs, run};
-pub use repeats::EqualStates;
 pub use settings::LearnerSettings;

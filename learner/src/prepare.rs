@@ -52,7 +52,7 @@ pub(crate) struct Preparation {
     /// States at the network's input size, if that is another.
     enlarged: [Vec<u8>; 3],
     augment: Option<Augment>,
-    /// What the auxiliary objective sees, if that is not the plain states.
+    /// What the auxiliary loss sees, if that is not the plain states.
     seen: [Vec<u8>; 2],
 }
 
@@ -64,7 +64,7 @@ impl Preparation {
         let channels = spec.frame_channels as usize;
         let augment = config.learner.augment;
         Ok(Self {
-            positives: config.learner.update.objective.positives(),
+            positives: config.learner.update.auxiliary_loss.positives(),
             state_bytes: model.frame_len(),
             enlarge: config.input.enlarge(sent, model)?,
             enlarged: Default::default(),

@@ -1,7 +1,7 @@
 //! What a run has done so far, as its learner counts it. The checkpoint keeps it: no other process knows what was learned.
 //! It derives nothing: every number was counted.
 
-use driml_protocol::Tally;
+use driml_protocol::ShardCounts;
 use serde::{Deserialize, Serialize};
 
 /// Largest count: no run comes near it, and what is added to counts cannot overflow.
@@ -14,7 +14,7 @@ pub struct Progress {
     /// Which run it is: a random number that its first learner drew; 0 before.
     pub run: u64,
     /// Of each shard of the replay: transitions stored, by its last report, and rows learned.
-    pub shards: Vec<Tally>,
+    pub shards: Vec<ShardCounts>,
 }
 
 /// Rows of a batch that came from one shard.
@@ -47,7 +47,7 @@ impl Progress {
         let (frames, rows, of) = (self.frames(), self.rows(), shards as u64);
         let share = |all: u64, at: u64| all / of + u64::from(at < all % of);
         self.shards = (0..of)
-            .map(|at| Tally {
+            .map(|at| ShardCounts {
                 inserted: share(frames, at),
                 rows_sampled: share(rows, at),
             })
@@ -65,17 +65,17 @@ impl Progress {
     /// A shard has stored so many transitions by now.
     pub fn note_inserted(&mut self, shard: usize, inserted: u64) {
         if self.shards.len() <= shard {
-            self.shards.resize(shard + 1, Tally::default());
+            self.shards.resize(shard + 1, ShardCounts::default());
         }
         let known = &mut self.shards[shard].inserted;
         *known = inserted.max(*known);
     }
 
     /// What all shards but `this` have counted together.
-    pub fn other_shards(&self, this: usize) -> Tally {
+    pub fn other_shards(&self, this: usize) -> ShardCounts {
         let others = self.shards.iter().enumerate();
         let others = others.filter(|(at, _)| *at != this);
-        others.fold(Tally::default(), |sum, (_, tally)| sum + *tally)
+        others.fold(ShardCounts::default(), |sum, (_, counts)| sum + *counts)
     }
 
     /// Whether no count is one that no run reaches.

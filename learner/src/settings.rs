@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize, de::Error};
 
 use crate::{
     auxiliary::{
-        Objective,
+        AuxiliaryKind,
         loss::AuxiliaryLoss,
         settings::{AuxiliarySettings, Lambda},
     },
@@ -28,8 +28,8 @@ const MAX_GRAD_NORM: RangeInclusive<f64> = 1e-6..=1e15;
 pub struct LearnerSettings {
     /// Choose the action in s_{t+n} by the online network instead of the target network.
     pub double_dqn: bool,
-    /// The auxiliary objective.
-    pub objective: Objective,
+    /// The auxiliary loss.
+    pub auxiliary_loss: AuxiliaryKind,
     /// Whether Psi is given a_t, in a world where there is something to decide.
     pub condition_on_action: bool,
     /// Weights of the auxiliary losses, by pair of levels; all 0 for an agent without any.
@@ -49,7 +49,7 @@ pub struct LearnerSettings {
     /// averaged network is saved in checkpoints and is what `evaluate` plays; training does not use it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub average_tau: Option<f64>,
-    /// The objective's own numbers, a table of its name such as `[learner.update.curl]`; none for an objective that has none.
+    /// The auxiliary loss's own numbers, a table of its name such as `[learner.update.curl]`; none for an auxiliary loss that has none.
     #[serde(flatten, deserialize_with = "own_tables")]
     pub own: toml::Table,
 }
@@ -57,7 +57,8 @@ pub struct LearnerSettings {
 /// What is left of the settings: nothing but tables of auxiliary losses.
 fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
     let own = toml::Table::deserialize(from)?;
-    let unknown = own.keys().find(|name| name.parse::<Objective>().is_err());
+    let mut names = own.keys();
+    let unknown = names.find(|name| name.parse::<AuxiliaryKind>().is_err());
     match unknown {
         Some(name) => Err(D::Error::custom(format!("unknown field `{name}`"))),
         None => Ok(own),
@@ -84,7 +85,7 @@ impl LearnerSettings {
     /// What the auxiliary loss is made from.
     pub const fn auxiliary_settings(&self) -> AuxiliarySettings<'_> {
         AuxiliarySettings {
-            objective: self.objective.name(),
+            auxiliary_loss: self.auxiliary_loss.name(),
             lambda: self.lambda,
             condition_on_action: self.condition_on_action,
             tanh_clip: self.tanh_clip,
@@ -97,7 +98,7 @@ impl LearnerSettings {
     /// # Errors
     /// Settings of it that cannot work.
     pub fn auxiliary(&self) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-        self.objective.loss(&self.auxiliary_settings())
+        self.auxiliary_loss.loss(&self.auxiliary_settings())
     }
 
     /// The heads that the online network needs in a world of `num_actions` actions; none where the settings cannot work, which

@@ -34,7 +34,7 @@ pub fn check<W: Display>(
 }
 
 /// What is wrong with a table, and at which of its keys, in one line.
-pub fn in_words(error: &toml::de::Error) -> String {
+pub fn describe(error: &toml::de::Error) -> String {
     error.to_string().trim_end().replace('\n', ", ")
 }
 
@@ -73,7 +73,7 @@ impl Settings {
         };
         let value = self.0.get(name).ok_or_else(missing)?;
         let why = |e: toml::de::Error| {
-            ConfigError(format!("in the settings' [{name}] table: {}", in_words(&e)))
+            ConfigError(format!("in the settings' [{name}] table: {}", describe(&e)))
         };
         value.clone().try_into().map_err(why)
     }

@@ -8,11 +8,11 @@ use zenoh::{Session, bytes::ZBytes};
 use crate::{
     client::RunClient,
     messages::{
-        hello::Hello,
         join::{ActorJoin, JoinReply, LearnerJoin},
         recovering::Recovering,
+        run_info::RunInfo,
     },
-    process::{seldom::Seldom, shutdown::Shutdown},
+    process::{log_limiter::LogLimiter, shutdown::Shutdown},
     session::{self, SessionError},
     wire::{
         codec,
@@ -65,15 +65,15 @@ pub struct Welcome {
 ///
 /// # Errors
 /// No replay server answered within 60 s, or its protocol version differs.
-pub fn hello(
+pub fn run_info(
     session: &Session,
     keys: &Keys,
     shutdown: &Shutdown,
-) -> Result<Option<Hello>, JoinError> {
+) -> Result<Option<RunInfo>, JoinError> {
     let mut patience = Patience::begin();
     loop {
-        match hello_within(session, keys, TRY_MAX) {
-            Ok(hello) => return Ok(Some(hello)),
+        match run_info_within(session, keys, TRY_MAX) {
+            Ok(run_info) => return Ok(Some(run_info)),
             Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(e) => patience.wait_after(e)?,
         }
@@ -87,29 +87,29 @@ pub fn hello(
 ///
 /// # Errors
 /// No answer within `wait_max`, or of another protocol version.
-pub fn hello_within(
+pub fn run_info_within(
     session: &Session,
     keys: &Keys,
     wait_max: Duration,
-) -> Result<Hello, SessionError> {
-    let (key, nothing) = (keys.of::<Hello>(), ZBytes::new());
-    session::send(session, &key, nothing, Hello::PRIORITY, wait_max)?
-        .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(hello, _)| hello))
+) -> Result<RunInfo, SessionError> {
+    let (key, nothing) = (keys.of::<RunInfo>(), ZBytes::new());
+    session::send(session, &key, nothing, RunInfo::PRIORITY, wait_max)?
+        .wait_for(|bytes| codec::decode(&bytes.to_bytes(), None).map(|(run_info, _)| run_info))
 }
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
 struct Patience {
     silent_since: Instant,
-    silence_said: Seldom,
-    recovery_said: Seldom,
+    silence_said: LogLimiter,
+    recovery_said: LogLimiter,
 }
 
 impl Patience {
     fn begin() -> Self {
         Self {
             silent_since: Instant::now(),
-            silence_said: Seldom::default(),
-            recovery_said: Seldom::default(),
+            silence_said: LogLimiter::default(),
+            recovery_said: LogLimiter::default(),
         }
     }
 

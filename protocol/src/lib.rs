@@ -6,17 +6,17 @@
 //! kind. [`RunSpec`] is what all processes of a run agree on, and its hash is in every message.
 //!
 //! ```
-//! use driml_protocol::{Goodbye, codec};
+//! use driml_protocol::{Leave, codec};
 //!
 //! let run = 0x0c6c_6069_564f_3984; // RunSpec::hash
-//! let goodbye = Goodbye { actor: 3, incarnation: 7, produced: 4096 };
-//! let bytes = codec::encode(run, &goodbye, &[])?;
+//! let leave = Leave { actor: 3, incarnation: 7, produced: 4096 };
+//! let bytes = codec::encode(run, &leave, &[])?;
 //!
-//! let (back, payload) = codec::decode::<Goodbye>(&bytes, Some(run))?;
-//! assert_eq!(back, goodbye);
+//! let (back, payload) = codec::decode::<Leave>(&bytes, Some(run))?;
+//! assert_eq!(back, leave);
 //! assert!(payload.is_empty());
 //!
-//! let another = codec::decode::<Goodbye>(&bytes, Some(run + 1)).unwrap_err();
+//! let another = codec::decode::<Leave>(&bytes, Some(run + 1)).unwrap_err();
 //! assert!(another.to_string().starts_with("the message belongs to run spec 0c6c6069564f3984"));
 //! # Ok::<(), driml_protocol::CodecError>(())
 //! ```
@@ -40,6 +40,7 @@ mod wire;
 
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
+    ack::Ack,
     affinity::AffinityUpdate,
     batch::{Batch, NO_ACTION},
     batch_frames::StackedFrames,
@@ -47,18 +48,17 @@ pub use messages::{
     batch_request::{BatchRequest, Learned, RequestId},
     batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
-    done::Done,
     episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
-    goodbye::Goodbye,
-    hello::Hello,
-    insert_reply::{Claim, InsertReply},
+    insert_reply::{ChunkPoll, InsertReply},
     join::{ActorJoin, JoinReply, LearnerJoin},
-    parts::{LogStatus, PartName, PartStatus, PartsStatus, WARNINGS_MAX},
+    leave::Leave,
     priorities::{Origin, PriorityPart, PriorityUpdate},
+    processes::{LogStatus, ProcessName, ProcessStatus, ProcessesStatus, WARNINGS_MAX},
     recovering::{Recovering, RecoveryProgress},
-    report::{Life, Report, Warning},
+    report::{Participant, Report, Warning},
+    run_info::RunInfo,
+    shard_counts::ShardCounts,
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
-    tally::Tally,
     weights::{
         Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
@@ -66,10 +66,10 @@ pub use messages::{
 };
 pub use process::{
     activity::Activity,
-    end_signs, fault, last_warning, lock_file,
-    seldom::{Seldom, SeldomEach},
-    shutdown::{Shutdown, TwoSteps, join_within},
-    whole_file,
+    atomic_write, fail_point, last_warning, lock_file,
+    log_limiter::{LogLimiter, LogLimiters},
+    shutdown::{GracefulShutdown, Shutdown, join_within},
+    termination,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, TimeoutRule};

@@ -23,7 +23,7 @@ use zenoh::{
 use crate::{
     client::{RunClient, Sealed},
     messages::recovering::Recovering,
-    process::fault,
+    process::fail_point,
     session,
     wire::{
         buffers::{Buffer, BufferPool},
@@ -191,7 +191,7 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
             let (waiting, handle, bytes) = (waiting.clone(), handle.clone(), waiting_bytes.clone());
             let point = name.to_owned();
             let next = move || {
-                fault::point(&point);
+                fail_point::reach(&point);
                 let query = waiting.recv().ok()?;
                 bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
                 Some(query)

@@ -8,8 +8,8 @@ use std::{
 
 use crate::{
     client::RunClient,
-    messages::report::{Life, Report, Warning},
-    process::{activity::Activity, fault, last_warning, shutdown::Shutdown},
+    messages::report::{Participant, Report, Warning},
+    process::{activity::Activity, fail_point, last_warning, shutdown::Shutdown},
 };
 
 /// How often a process reports although nothing has changed.
@@ -20,7 +20,7 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Tells the replay servers of `clients` once that `who`, the learner, has finished the run after so many
 /// updates, whatever comes of it.
-pub fn say_finished(clients: &[RunClient], who: Life, updates: u64) {
+pub fn say_finished(clients: &[RunClient], who: Participant, updates: u64) {
     let finished = Report {
         finished: Some(updates),
         ..report(who, "has finished", Duration::ZERO)
@@ -29,7 +29,7 @@ pub fn say_finished(clients: &[RunClient], who: Life, updates: u64) {
 }
 
 /// What `who` says of itself, and the last warning in the log of this process.
-fn report(who: Life, doing: &str, since: Duration) -> Report {
+fn report(who: Participant, doing: &str, since: Duration) -> Report {
     let warning = last_warning::get();
     let warning = warning.map(|(text, age)| Warning::new(&text, age.as_secs_f64()));
     Report::new(who, doing, since.as_secs_f64(), warning)
@@ -49,14 +49,14 @@ fn send(clients: &[RunClient], report: &Report) {
 /// The operating system gave no thread.
 pub fn start(
     clients: Vec<RunClient>,
-    who: Life,
+    who: Participant,
     activity: Activity,
     shutdown: Shutdown,
 ) -> std::io::Result<JoinHandle<()>> {
     let work = move || {
         let mut said: Option<(String, Instant)> = None;
         loop {
-            fault::point("reporter");
+            fail_point::reach("reporter");
             let (doing, since) = activity.get();
             let is_old = |(said, at): &(String, Instant)| *said != doing || at.elapsed() > PERIOD;
             if said.as_ref().is_none_or(is_old) {

@@ -125,7 +125,7 @@ impl RunSpec {
         u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
     }
 
-    /// The seed of one generator of one part: SHA-256 of the run's seed, the part's name and `index`.
+    /// The seed of one generator of one process: SHA-256 of the run's seed, the part's name and `index`.
     pub fn seed_for(&self, part: &str, index: u64) -> [u8; 32] {
         let mut hasher = Sha256::new();
         hasher.update(self.seed.to_le_bytes());

@@ -138,7 +138,7 @@ impl Config {
         let fits = capacity / u64::from(self.shards) >= window;
         check(fits, "replay.capacity_transitions", capacity, || {
             format!(
-                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each copy of the world"
+                "one sample spans {window} transitions (the longer of n_step and k_max, and the frame stack); hold at least that many in each shard for each environment"
             )
         })?;
         let bytes = capacity.checked_mul(spec.frame_bytes() as u64);

@@ -72,7 +72,7 @@ pub use config::{Compression, Config, Since};
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
 pub use rate_limiter::RateLimiter;
-pub use replay::{Replay, Unready};
+pub use replay::{NotReady, Replay};
 pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,

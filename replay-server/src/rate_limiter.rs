@@ -1,7 +1,7 @@
 //! Holds the replay ratio: it says which side is ahead and has to wait.
 //! It does not wait itself, keep time or know what is stored.
 
-use driml_protocol::{Tally, Waiting};
+use driml_protocol::{ShardCounts, Waiting};
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
@@ -20,16 +20,16 @@ pub struct RateLimiter {
     slack_transitions: u64,
     transitions_max: Option<u64>,
     /// The point from which the ratio holds: no row for the transitions before it beyond those sampled then.
-    since: Tally,
+    since: ShardCounts,
     pub(crate) counts: Counts,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Counts {
-    pub(crate) this_shard: Tally,
+    pub(crate) this_shard: ShardCounts,
     /// What the replay's other shards have counted, as the learner said last.
-    pub(crate) other_shards: Tally,
-    /// Transitions of this shard that filled its memory again after a resume; they are not in its tally.
+    pub(crate) other_shards: ShardCounts,
+    /// Transitions of this shard that filled its memory again after a resume; they are not in its counts.
     pub(crate) refilled: u64,
     /// How many more are to come before rows are sampled.
     pub(crate) refill_left: u64,
@@ -43,7 +43,7 @@ impl RateLimiter {
         slack_transitions: u64,
         transitions_max: Option<u64>,
     ) -> Self {
-        let since = Tally {
+        let since = ShardCounts {
             inserted: warmup_transitions,
             rows_sampled: 0,
         };
@@ -66,7 +66,7 @@ impl RateLimiter {
             config.transitions_max,
         );
         if let Some(since) = config.since {
-            limiter.since = Tally {
+            limiter.since = ShardCounts {
                 inserted: since.transitions,
                 rows_sampled: since.rows,
             };
@@ -76,7 +76,7 @@ impl RateLimiter {
 
     /// The same after so much was counted here and in the replay's other shards.
     #[must_use]
-    pub const fn counting_on(mut self, this_shard: Tally, other_shards: Tally) -> Self {
+    pub const fn counting_on(mut self, this_shard: ShardCounts, other_shards: ShardCounts) -> Self {
         (self.counts.this_shard, self.counts.other_shards) = (this_shard, other_shards);
         self
     }
@@ -96,7 +96,7 @@ impl RateLimiter {
     /// # Errors
     /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person. `held_max` are
     /// the transitions that a shard may store before the others report.
-    pub fn set_other_shards(&mut self, others: Tally, held_max: u64) -> Result<(), String> {
+    pub fn set_other_shards(&mut self, others: ShardCounts, held_max: u64) -> Result<(), String> {
         let before = self.counts.other_shards;
         let max = self.transitions_max.unwrap_or(u64::MAX);
         let most = max.max(before.inserted).saturating_add(held_max);
@@ -182,7 +182,7 @@ impl RateLimiter {
 
     /// The run is resumed after `counted` in this shard, of which nothing is held any more: `refill` transitions come in before the
     /// next row is sampled, unless nothing is left to sample batches of `rows` rows for.
-    pub(crate) fn resume_empty(&mut self, counted: Tally, refill: u64, rows: u32) {
+    pub(crate) fn resume_empty(&mut self, counted: ShardCounts, refill: u64, rows: u32) {
         self.counts.this_shard = counted;
         if !self.finished(rows) {
             self.counts.refill_left = refill;
@@ -190,7 +190,7 @@ impl RateLimiter {
     }
 
     /// What was counted here since the start of the run.
-    pub const fn tally(&self) -> Tally {
+    pub const fn counts(&self) -> ShardCounts {
         self.counts.this_shard
     }
 

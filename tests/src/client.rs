@@ -1,11 +1,11 @@
-//! A client of a run over zenoh, as any part is one: asks, and sends whatever a test wants.
+//! A client of a run over zenoh, as any process is one: asks, and sends whatever a test wants.
 //! It takes no part in the run and keeps nothing.
 
 use std::time::{Duration, Instant};
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
-    ReplayStatus, RunClient, RunSpec, Shutdown, Tally, codec,
+    ReplayStatus, RunClient, RunSpec, ShardCounts, Shutdown, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
@@ -31,7 +31,7 @@ pub struct Client {
     pub config_toml: String,
 }
 
-const NOTHING: Tally = Tally {
+const NOTHING: ShardCounts = ShardCounts {
     inserted: 0,
     rows_sampled: 0,
 };
@@ -63,7 +63,7 @@ pub const fn new_learner(learner: u64) -> LearnerJoin {
         learner,
         run: learner,
         updates: 0,
-        tally: NOTHING,
+        counts: NOTHING,
         other_shards: NOTHING,
         restart: false,
     }
@@ -80,10 +80,10 @@ impl Client {
     /// A client over a session that a test has opened in its own way.
     pub fn over(session: Session) -> Self {
         let keys = Keys::new(NAMESPACE).unwrap();
-        let hello = join::hello(&session, &keys, &Shutdown::default())
+        let run_info = join::run_info(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("this client is not told to stop");
-        let spec = Settings::parse(&hello.config_toml)
+        let spec = Settings::parse(&run_info.config_toml)
             .unwrap()
             .table("run")
             .unwrap();
@@ -91,7 +91,7 @@ impl Client {
             session,
             keys,
             spec,
-            config_toml: hello.config_toml,
+            config_toml: run_info.config_toml,
         }
     }
 

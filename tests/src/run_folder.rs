@@ -59,7 +59,7 @@ pub struct EpisodeRow {
     pub frames: u64,
     pub episode: u64,
     pub actor: u64,
-    pub copy: u64,
+    pub env: u64,
     pub episode_return: Option<f64>,
     pub length: Option<u64>,
 }
@@ -151,7 +151,7 @@ impl RunFolder {
         let text = self.text("episodes.csv");
         let row = |line: &str| {
             let cells: Vec<_> = line.split(',').collect();
-            let [seconds, frames, episode, actor, copy, value, length] = cells[..] else {
+            let [seconds, frames, episode, actor, env, value, length] = cells[..] else {
                 panic!("{line:?} is not a row of episodes");
             };
             let count = |cell: &str| cell.parse().unwrap();
@@ -160,7 +160,7 @@ impl RunFolder {
                 frames: count(frames),
                 episode: count(episode),
                 actor: count(actor),
-                copy: count(copy),
+                env: count(env),
                 episode_return: (!value.is_empty()).then(|| value.parse().unwrap()),
                 length: (!length.is_empty()).then(|| count(length)),
             }
@@ -195,8 +195,8 @@ impl RunFolder {
     }
 
     /// A process's log.
-    pub fn log(&self, part: &str) -> String {
-        self.text(&format!("logs/{part}.log"))
+    pub fn log(&self, process: &str) -> String {
+        self.text(&format!("logs/{process}.log"))
     }
 
     /// The checkpoints, oldest first.

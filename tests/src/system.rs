@@ -8,7 +8,7 @@ use std::{
     sync::atomic::{AtomicU32, AtomicU64, Ordering},
 };
 
-use driml_protocol::fault;
+use driml_protocol::fail_point;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -130,7 +130,7 @@ impl TestSystem {
     fn hold(&self) -> Option<(&'static str, String)> {
         let updates = self.held_at.load(Ordering::Relaxed);
         let go = self.path(GO);
-        (updates != NEVER).then(|| (fault::HOLD, format!("{updates} {}", go.display())))
+        (updates != NEVER).then(|| (fail_point::HOLD, format!("{updates} {}", go.display())))
     }
 
     /// Runs the program to its end.
@@ -151,13 +151,13 @@ impl TestSystem {
     }
 
     /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
-    pub fn start_part(&self, args: &str) -> Process {
+    pub fn start_process(&self, args: &str) -> Process {
         let parent = std::process::id();
         self.start(&format!("{args} --exit-with-parent {parent}"))
     }
 
-    /// [`Self::start_part`] with other words before the program.
-    pub fn start_part_after(&self, words: &[String], args: &str) -> Process {
+    /// [`Self::start_process`] with other words before the program.
+    pub fn start_process_after(&self, words: &[String], args: &str) -> Process {
         let args = format!("{args} --exit-with-parent {}", std::process::id());
         Process::start(args.clone(), self.command_after(words, &args))
     }
@@ -170,23 +170,23 @@ impl TestSystem {
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
     /// asked, as the learner does.
     pub fn start_replay_server(&self, flags: &str) -> Process {
-        self.start_part(&format!(
-            "replay-server --stay --listen {} {flags}",
+        self.start_process(&format!(
+            "replay-server --keep-alive --listen {} {flags}",
             self.endpoint()
         ))
     }
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
-        self.start_part(&format!(
-            "learner --stay --connect {} --run-dir {run_dir}",
+        self.start_process(&format!(
+            "learner --keep-alive --connect {} --run-dir {run_dir}",
             self.endpoint()
         ))
     }
 
     /// Starts an actor.
     pub fn start_actor(&self, id: u32) -> Process {
-        self.start_part(&format!("actor --connect {} --id {id}", self.endpoint()))
+        self.start_process(&format!("actor --connect {} --id {id}", self.endpoint()))
     }
 
     /// A client of the run at this system's endpoint, once its replay server answers.
@@ -221,15 +221,17 @@ impl TestSystem {
         processes.filter_map(survivor).collect()
     }
 
-    /// The process that runs `part` (`learner`, `actor`, `replay-server`), once it is there.
-    pub fn find_part(&self, part: &str) -> Survivor {
-        wait_for(&format!("a process {part}"), || self.find_part_now(part))
+    /// The process that runs `process` (`learner`, `actor`, `replay-server`), once it is there.
+    pub fn find_process(&self, process: &str) -> Survivor {
+        wait_for(&format!("a process {process}"), || {
+            self.find_process_now(process)
+        })
     }
 
-    /// The first process that plays `part`, if there is one now.
-    pub fn find_part_now(&self, part: &str) -> Option<Survivor> {
-        let is_part = |it: &Survivor| it.args.first().is_some_and(|first| first == part);
-        self.survivors().into_iter().find(is_part)
+    /// The first process that plays `process`, if there is one now.
+    pub fn find_process_now(&self, process: &str) -> Option<Survivor> {
+        let is_process = |it: &Survivor| it.args.first().is_some_and(|first| first == process);
+        self.survivors().into_iter().find(is_process)
     }
 
     /// Waits until no process that the program has started here is left.
@@ -240,7 +242,7 @@ impl TestSystem {
     }
 
     /// Kills all processes that the program has started here, however they came about.
-    pub fn kill_parts(&self) {
+    pub fn kill_processes(&self) {
         self.survivors()
             .iter()
             .for_each(|it| it.signal(Signal::SIGKILL));
@@ -251,6 +253,11 @@ impl Survivor {
     /// Sends a signal; a process that has ended meanwhile is ignored.
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);
+    }
+
+    /// Kills each of them.
+    pub fn kill_all(processes: &[Self]) {
+        processes.iter().for_each(|it| it.signal(Signal::SIGKILL));
     }
 }
 

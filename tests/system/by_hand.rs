@@ -10,7 +10,7 @@ use nix::sys::signal::Signal;
 use crate::{LONG, SHORT, system};
 
 #[test]
-fn parts_find_each_other_and_end_in_order() {
+fn processes_find_each_other_and_end_in_order() {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let learner = system.start_learner("run");
@@ -58,7 +58,7 @@ fn parts_find_each_other_and_end_in_order() {
 }
 
 #[test]
-fn parts_end_by_themselves_when_the_run_is_over() {
+fn processes_end_by_themselves_when_the_run_is_over() {
     for shards in [1, 2] {
         let system = system();
         let listen = |shard| {
@@ -69,9 +69,9 @@ fn parts_end_by_themselves_when_the_run_is_over() {
         };
         let endpoints: Vec<_> = (0..shards).map(listen).collect();
         let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
-        let mut parts = Vec::new();
+        let mut processes = Vec::new();
         for (shard, endpoint) in endpoints.iter().enumerate() {
-            parts.push(system.start_part(&format!(
+            processes.push(system.start_process(&format!(
                 "replay-server --listen {endpoint} --shard {shard} {flags}"
             )));
         }
@@ -80,12 +80,12 @@ fn parts_end_by_themselves_when_the_run_is_over() {
             .map(|it| format!("--connect {it}"))
             .collect();
         let learner = format!("learner {} --run-dir run", connect.join(" "));
-        parts.push(system.start_part(&learner));
+        processes.push(system.start_process(&learner));
         for (id, connect) in connect.iter().enumerate() {
-            parts.push(system.start_part(&format!("actor {connect} --id {id}")));
+            processes.push(system.start_process(&format!("actor {connect} --id {id}")));
         }
-        for part in parts {
-            part.wait().expect_code(0);
+        for process in processes {
+            process.wait().expect_code(0);
         }
         assert_eq!(system.survivors(), []);
         system.run_ok("evaluate --run run --episodes 2");
@@ -97,13 +97,13 @@ fn parts_end_by_themselves_when_the_run_is_over() {
 fn a_replay_server_does_not_wait_for_a_frozen_actor_for_ever() {
     let system = system();
     let listen = system.endpoint();
-    let server = system.start_part(&format!(
+    let server = system.start_process(&format!(
         "replay-server --listen {listen} --agent c51 {SHORT}"
     ));
     let mut frozen = system.start_actor(1);
     frozen.wait_for_stderr("waiting for the learner's first weights");
     frozen.signal(Signal::SIGSTOP);
-    let learner = system.start_part(&format!("learner --connect {listen} --run-dir run"));
+    let learner = system.start_process(&format!("learner --connect {listen} --run-dir run"));
     system.start_actor(0).wait().expect_code(0);
     learner.wait().expect_code(0);
     server
@@ -114,13 +114,13 @@ fn a_replay_server_does_not_wait_for_a_frozen_actor_for_ever() {
 }
 
 #[test]
-fn parts_that_are_told_to_stop_lose_nothing() {
+fn processes_that_are_told_to_stop_lose_nothing() {
     let system = system();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let mut learner = system.start_learner("run");
     let mut actors = [system.start_actor(0), system.start_actor(1)];
     for actor in &mut actors {
-        actor.wait_for_stderr("steps 4 copies");
+        actor.wait_for_stderr("steps 4 environments");
     }
     let client = system.connect();
     client.wait_for_updates(100);
@@ -174,7 +174,7 @@ fn an_actor_killed_and_started_again_continues() {
     client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.replay().unwrap();
     assert!(replay.transitions_inserted >= 20_008 && replay.finished);
-    // A killed actor sends no goodbye: what it had and did not deliver was never announced, and is in no count.
+    // A killed actor sends no `Leave`: what it had and did not deliver was never announced, and is in no count.
     assert_eq!(
         (
             replay.transitions_lost,
@@ -188,7 +188,7 @@ fn an_actor_killed_and_started_again_continues() {
 
 /// However it is started, a process has the environment that candle and the C library read; what the user has set stays.
 #[test]
-fn a_part_by_hand_settles_its_environment() {
+fn a_process_by_hand_settles_its_environment() {
     let system = system();
     let flags = format!(
         "replay-server --listen {} --env chain --preset smoke",

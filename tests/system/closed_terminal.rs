@@ -21,7 +21,7 @@ use nix::{
     sys::signal::Signal,
 };
 
-use crate::{LONG, PARTS, launched, system};
+use crate::{LONG, PROCESSES, launched, system};
 
 /// A terminal whose window a test can close. Until then what is written there is read, as a window does it.
 struct Window {
@@ -144,23 +144,23 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
 /// A run of processes started by hand that has learned something: replay server, learner, actor.
 fn by_hand(system: &TestSystem) -> [Process; 3] {
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let parts = [server, system.start_learner("run"), system.start_actor(0)];
+    let processes = [server, system.start_learner("run"), system.start_actor(0)];
     system.connect().wait_for_updates(100);
-    parts
+    processes
 }
 
 /// A closed ssh session.
 #[test]
-fn a_hangup_ends_parts_in_order() {
+fn a_hangup_ends_processes_in_order() {
     let system = system();
     let [server, learner, actor] = by_hand(&system);
-    for (part, says) in [
+    for (role, says) in [
         (actor, "actor 0 leaves"),
         (learner, "finished after"),
         (server, "replay server stops"),
     ] {
-        part.signal(Signal::SIGHUP);
-        part.wait().expect_code(0).expect_said(says);
+        role.signal(Signal::SIGHUP);
+        role.wait().expect_code(0).expect_said(says);
     }
     assert!(!system.run_folder("run").checkpoints().is_empty());
 }
@@ -191,8 +191,8 @@ fn a_run_that_is_to_ignore_hangups_does() {
     let client = system.connect();
     let before = client.wait_for_updates(100);
     process.signal(Signal::SIGHUP);
-    for part in PARTS {
-        system.find_part(part).signal(Signal::SIGHUP);
+    for role in PROCESSES {
+        system.find_process(role).signal(Signal::SIGHUP);
     }
     client.wait_for_updates(before.updates + 500);
     process.stop().expect_code(130);

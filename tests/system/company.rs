@@ -158,7 +158,7 @@ fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
         replay.transitions_inserted > before.transitions_inserted
     });
     first.stop().expect_code(0).expect_said("leaves: ");
-    second.wait_for_stderr("actor 3 steps 4 copies");
+    second.wait_for_stderr("actor 3 steps 4 environments");
     second.stop().expect_code(0);
     let status = client.replay().unwrap();
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));

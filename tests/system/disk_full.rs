@@ -256,7 +256,7 @@ fn a_folder_that_cannot_be_used_is_said() {
     drop(system.connect());
     let other = |flags: &str| {
         let socket = system.path("other").display().to_string();
-        system.start_part(&format!(
+        system.start_process(&format!(
             "replay-server --listen unixsock-stream/{socket} {flags}"
         ))
     };

@@ -9,14 +9,14 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    PARTS, SHORT, launched_with,
+    PROCESSES, SHORT, launched_with,
     numbered::{KILLS, ROWS, SAMPLED, WARMUP, kill_after_rows},
     system,
 };
 
 /// Kills a replay server of a launched run, and waits for its successor, or the end of the run.
 fn kill_server(system: &TestSystem) {
-    let dead = system.find_part("replay-server");
+    let dead = system.find_process("replay-server");
     let servers = |of: &[Survivor]| {
         let all = of.iter().filter(|it| it.args.first() == dead.args.first());
         all.count()
@@ -108,7 +108,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
 /// The processes were started by hand; the server is started again, with the same flags. An actor that starts then has weights although
 /// the learner, which waits for transitions, publishes none.
 #[test]
-fn parts_by_hand_go_on_when_the_server_is_started_again() {
+fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 12800");
     let flags = format!("--agent driml-ada {longer} --replay-dir replay");
@@ -178,12 +178,12 @@ fn a_resumed_run_continues_with_its_replay() {
     let process = launched_with(&system, "--durable --agent driml-ada", 1_000);
     let client = system.connect();
     // All at once, as when the machine stops; but the actor first, so that nothing is made after the last look.
-    let parts = PARTS.map(|part| system.find_part(part));
-    parts[2].signal(Signal::SIGSTOP);
+    let processes = PROCESSES.map(|role| system.find_process(role));
+    processes[2].signal(Signal::SIGSTOP);
     let before = client.replay().unwrap();
     drop(client);
     process.signal(Signal::SIGKILL);
-    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    Survivor::kill_all(&processes);
     process.wait();
 
     let frames = before.transitions_inserted + 2_000;
@@ -223,7 +223,7 @@ fn a_run_whose_launcher_was_killed_continues() {
     let listen = format!("--listen {}", system.endpoint());
     let process = launched_with(&system, "--durable --agent c51", 1_000);
     let client = system.connect();
-    let actor = system.find_part("actor");
+    let actor = system.find_process("actor");
     actor.signal(Signal::SIGSTOP);
     let frames = client.replay().unwrap().transitions_inserted + 20_000;
     drop(client);

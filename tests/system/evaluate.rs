@@ -184,7 +184,7 @@ fn a_finished_run_says_what_its_weights_earn() {
 fn it_plays_checkpoints_while_the_run_continues() {
     let system = system();
     for (name, lockstep, rows_min) in [("processes", "", 1), ("lockstep", "--lockstep", 5)] {
-        let flags = "--agent c51 --evaluate-every 100 --evaluate-episodes 4";
+        let flags = "--agent c51 --eval-interval 100 --eval-episodes 4";
         let ended = system.run_ok(&format!(
             "local {SHORT} {flags} {lockstep} --run-dir {name}"
         ));
@@ -252,7 +252,7 @@ fn an_evaluation_can_be_kept_by_hand() {
         "the updates of a checkpoint",
     );
     system.refuses(
-        &format!("local {SHORT} --evaluate-every 150 --set learner.checkpoint_period_updates=100"),
+        &format!("local {SHORT} --eval-interval 150 --set learner.checkpoint_period_updates=100"),
         "local.evaluation.every_updates = 150: checkpoints are played",
     );
 }
@@ -300,7 +300,7 @@ fn it_plays_in_the_precision_of_the_run() {
     let system = system();
     system
         .run_ok(&format!(
-            "local --lockstep --agent c51 {SHORT} --set learner.publish_as=bf16 --set actor.precision=bf16 --run-dir run"
+            "local --lockstep --agent c51 {SHORT} --set learner.publish_dtype=bf16 --set actor.precision=bf16 --run-dir run"
         ));
     for (flags, words) in [
         ("", "bf16 weights after 540 updates played in bf16"),

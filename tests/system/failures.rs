@@ -9,7 +9,7 @@ use nix::sys::signal::Signal;
 use crate::{LONG, SHORT, launched, system};
 
 #[test]
-fn an_interrupt_saves_and_ends_all_parts() {
+fn an_interrupt_saves_and_ends_all_processes() {
     let system = system();
     let process = launched(&system, 100);
     let ended = process
@@ -27,7 +27,7 @@ fn a_second_interrupt_ends_at_once() {
     let system = system();
     let mut process = launched(&system, 100);
     // A learner that does not answer any more, for which the first interrupt would wait for minutes.
-    system.find_part("learner").signal(Signal::SIGSTOP);
+    system.find_process("learner").signal(Signal::SIGSTOP);
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
     interrupt_until_it_ends(process)
@@ -56,7 +56,7 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
     for _ in 0..3 {
         // In the same folder: nothing was learned in it.
         let process = system.start(&format!("local --agent c51 {SHORT} --run-dir run"));
-        system.find_part("replay-server");
+        system.find_process("replay-server");
         let ended = process.interrupt().expect_code(130);
         assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
         ended.expect_printed("no episode ended");
@@ -74,7 +74,7 @@ fn complete_but_for_a_frozen_actor(system: &TestSystem) -> Process {
     ));
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    system.find_part("actor").signal(Signal::SIGSTOP);
+    system.find_process("actor").signal(Signal::SIGSTOP);
     client.wait_for_learner("the last update", |learner| learner.finished);
     process
 }
@@ -118,15 +118,15 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
 
 #[test]
 fn a_dead_learner_or_replay_server_ends_the_run() {
-    for part in ["learner", "replay-server"] {
+    for role in ["learner", "replay-server"] {
         let system = system();
         let process = launched(&system, 100);
-        system.find_part(part).signal(Signal::SIGKILL);
+        system.find_process(role).signal(Signal::SIGKILL);
         process
             .wait()
             .expect_code(1)
             .expect_said(&format!(
-                "error: {part} was killed by signal 9 SIGKILL (log: "
+                "error: {role} was killed by signal 9 SIGKILL (log: "
             ))
             .expect_said("`driml train --resume run` resumes it");
         assert_eq!(system.survivors(), []);
@@ -150,7 +150,7 @@ fn a_dead_actor_is_started_again() {
         client.wait_for_replay("some transitions", |replay| {
             replay.transitions_inserted > restarts * 500
         });
-        system.find_part("actor").signal(Signal::SIGKILL);
+        system.find_process("actor").signal(Signal::SIGKILL);
         process.wait_for_stderr(&format!(
             "is started again ({restarts} of 16 times in a run)"
         ));
@@ -181,7 +181,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     ));
     let client = system.connect();
     client.wait_for_replay("some transitions", |replay| replay.transitions_inserted > 0);
-    system.find_part("actor").signal(Signal::SIGKILL);
+    system.find_process("actor").signal(Signal::SIGKILL);
     drop(client);
     process
         .wait()
@@ -194,7 +194,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
 
 /// They all notice it at once: the replay server stays until the others have delivered what they have and left.
 #[test]
-fn parts_whose_launcher_died_deliver_what_they_have() {
+fn processes_whose_launcher_died_deliver_what_they_have() {
     /// A launcher of three processes, each with a file for its output.
     const LAUNCHER: &str = "
         driml=$1 endpoint=$2; shift 2
@@ -211,22 +211,22 @@ fn parts_whose_launcher_died_deliver_what_they_have() {
     drop(client);
     launcher.signal(Signal::SIGKILL);
     system.wait_until_all_have_ended();
-    let said = |part: &str| std::fs::read_to_string(system.path(part)).unwrap();
-    for (part, words) in [
+    let said = |role: &str| std::fs::read_to_string(system.path(role)).unwrap();
+    for (role, words) in [
         ("actor", "actor 0 leaves: "),
         ("learner", "finished after "),
         ("server", "this process is to end, and 0 processes are left"),
     ] {
-        assert!(said(part).contains(words), "{}", said(part));
+        assert!(said(role).contains(words), "{}", said(role));
     }
-    assert!(!said("actor").contains("did not receive the goodbye"));
+    assert!(!said("actor").contains("did not receive the leave"));
 }
 
 #[test]
-fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
+fn a_frozen_process_does_not_keep_a_replay_server_whose_launcher_died() {
     let system = system();
     let process = launched(&system, 100);
-    let [server, actor] = ["replay-server", "actor"].map(|part| system.find_part(part));
+    let [server, actor] = ["replay-server", "actor"].map(|role| system.find_process(role));
     actor.signal(Signal::SIGSTOP);
     process.kill();
     wait_for("the replay server's end", || {
@@ -237,7 +237,7 @@ fn a_frozen_part_does_not_keep_a_replay_server_whose_launcher_died() {
 }
 
 #[test]
-fn a_part_whose_launcher_died_before_it_looked_ends() {
+fn a_process_whose_launcher_died_before_it_looked_ends() {
     let mut launcher = Command::new("true").spawn().unwrap();
     launcher.wait().unwrap();
     let system = system();

@@ -12,7 +12,7 @@ fn a_film_changes_nothing_that_is_played() {
         .run_ok("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run");
     let plain = system.run_ok("evaluate run --episodes 3");
     let film =
-        "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-copies 2";
+        "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-envs 2";
     let filmed = system.run_ok(film);
     let said: Vec<_> = filmed.stdout.lines().collect();
     assert_eq!(said[1], "filmed 40 steps: play.gif");

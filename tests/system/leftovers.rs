@@ -6,7 +6,7 @@ use std::{fs, path::PathBuf};
 use driml_tests::{Process, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, PARTS, SHORT, disk_full::NEVER, launched, system};
+use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, launched, system};
 
 /// A run that has learned something and saved nothing, whose temporary folder is `tmp` in the system's; and its processes.
 fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
@@ -17,7 +17,7 @@ fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
     let process = system.start_with("TMPDIR", temporary.to_str().unwrap(), &run);
     let run = system.run_folder("run");
     run.wait_for_updates(100);
-    (process, PARTS.map(|part| system.find_part(part)))
+    (process, PROCESSES.map(|role| system.find_process(role)))
 }
 
 fn temporary(system: &TestSystem) -> Vec<PathBuf> {
@@ -28,8 +28,8 @@ fn temporary(system: &TestSystem) -> Vec<PathBuf> {
 #[test]
 fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     let system = system();
-    let (process, parts) = started(&system);
-    let segments = all_shared_memory_of(&parts);
+    let (process, processes) = started(&system);
+    let segments = all_shared_memory_of(&processes);
     assert_eq!(temporary(&system).len(), 1);
     process.kill();
     system.wait_until_all_have_ended();
@@ -41,10 +41,10 @@ fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
 #[test]
 fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();
-    let (process, parts) = started(&system);
-    let segments = all_shared_memory_of(&parts);
+    let (process, processes) = started(&system);
+    let segments = all_shared_memory_of(&processes);
     process.signal(Signal::SIGKILL);
-    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    Survivor::kill_all(&processes);
     process.wait();
     system.wait_until_all_have_ended();
     assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
@@ -59,18 +59,18 @@ fn the_next_run_sweeps_what_killed_processes_left() {
 }
 
 #[test]
-fn parts_started_by_hand_leave_no_shared_memory() {
+fn processes_started_by_hand_leave_no_shared_memory() {
     let system = system();
     let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
     let client = system.connect();
     client.wait_for_updates(100);
-    let segments = all_shared_memory_of(&PARTS.map(|part| system.find_part(part)));
+    let segments = all_shared_memory_of(&PROCESSES.map(|role| system.find_process(role)));
     // A client may hold what it has seen.
     drop(client);
-    for part in [actor, learner, server] {
-        part.stop().expect_code(0);
+    for process in [actor, learner, server] {
+        process.stop().expect_code(0);
     }
     check_gone(&segments);
 }
@@ -89,19 +89,19 @@ fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
 }
 
 #[test]
-fn shared_memory_of_killed_parts_is_removed() {
+fn shared_memory_of_killed_processes_is_removed() {
     let system = system();
     let process = launched(&system, 100);
-    let parts = PARTS.map(|part| system.find_part(part));
-    let segments = all_shared_memory_of(&parts);
-    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    let processes = PROCESSES.map(|role| system.find_process(role));
+    let segments = all_shared_memory_of(&processes);
+    Survivor::kill_all(&processes);
     process.wait().expect_code(1);
     check_gone(&segments);
 }
 
 /// The shared memory that the processes have open.
-fn all_shared_memory_of(parts: &[Survivor]) -> Vec<PathBuf> {
-    let files = parts.iter().flat_map(|part| shared_memory_of(part.pid));
+fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
+    let files = processes.iter().flat_map(|it| shared_memory_of(it.pid));
     let files: Vec<_> = files.collect();
     assert!(files.len() > 1, "the processes share memory: {files:?}");
     files

@@ -1,4 +1,4 @@
-//! `driml local` with a process for each part: what a run leaves behind, in every world that needs nothing installed.
+//! `driml local` with a process for each role: what a run leaves behind, in every world that needs nothing installed.
 //! How runs end badly is in `failures`.
 
 use std::{
@@ -27,11 +27,11 @@ fn c51_leaves_a_whole_run_folder() {
     for name in columns.split(' ') {
         assert!(!run.column(name).is_empty());
     }
-    for part in ["replay-server", "learner", "actor-0"] {
-        let log = run.log(part);
+    for role in ["replay-server", "learner", "actor-0"] {
+        let log = run.log(role);
         assert!(
             log.contains("INFO") && !log.contains("panicked") && !log.contains("driml_"),
-            "{part}:\n{log}"
+            "{role}:\n{log}"
         );
     }
     let warned = ended
@@ -74,8 +74,8 @@ fn driml_ada_with_two_actors_over_tcp() {
     assert_eq!(summary.replay_ratio, Some(8.0));
     let mean_k = summary.mean_k.expect("driml-ada draws positives");
     assert!(mean_k > 3.0, "{mean_k}");
-    for part in ["actor-0", "actor-1"] {
-        let log = run.log(part);
+    for role in ["actor-0", "actor-1"] {
+        let log = run.log(role);
         assert!(
             log.contains("leaves: ") && !log.contains("leaves: 0 "),
             "{log}"
@@ -95,9 +95,9 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
         "local --agent c51 {LONG} --listen {endpoint} --run-dir run"
     ));
     // All processes of the run meet at this replay server.
-    system.find_part("learner");
-    let mut outside = system.start_part(&format!("actor --connect {endpoint} --id 5"));
-    outside.wait_for_stderr("actor 5 steps 4 copies");
+    system.find_process("learner");
+    let mut outside = system.start_process(&format!("actor --connect {endpoint} --id 5"));
+    outside.wait_for_stderr("actor 5 steps 4 environments");
     wait_for("an episode that it played", || {
         let rows = std::fs::read_to_string(system.path("run/episodes.csv")).ok()?;
         let mut rows = rows.lines();

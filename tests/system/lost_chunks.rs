@@ -12,7 +12,7 @@ use std::{
 
 use driml_actor::DeliveryLimits;
 use driml_protocol::{
-    Chunk, ChunkHeader, Claim, Done, Goodbye, Horizon, InsertReply, Keys, RunClient, RunSpec,
+    Ack, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply, Keys, Leave, RunClient, RunSpec,
     Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
@@ -52,7 +52,7 @@ struct Server {
     replay: Mutex<Replay>,
     loses: Loses,
     messages: AtomicU32,
-    /// How often each actor has said goodbye.
+    /// How often each actor has left.
     goodbyes: Mutex<BTreeMap<u32, u32>>,
     /// What is never answered; a query that is dropped would tell the actor so at once.
     lost: Mutex<Vec<Query>>,
@@ -90,36 +90,36 @@ impl Server {
             };
             session.declare_queryable(key).callback(answer).wait()
         };
-        let goodbye = |server: &Self, payload: &[u8]| {
+        let leave = |server: &Self, payload: &[u8]| {
             let hash = spec().hash();
-            let goodbye = codec::decode::<Goodbye>(payload, Some(hash)).unwrap().0;
-            let tries = server.count_goodbye(goodbye.actor);
+            let leave = codec::decode::<Leave>(payload, Some(hash)).unwrap().0;
+            let tries = server.count_goodbye(leave.actor);
             // The first does not arrive, and the answer to the second does not.
             if tries > 1 {
-                let refused = server.replay.lock().unwrap().goodbye(&goodbye);
+                let refused = server.replay.lock().unwrap().leave(&leave);
                 assert_eq!(refused, None);
             }
-            (tries > 2).then(|| codec::encode(hash, &Done, &[]).unwrap())
+            (tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
         };
         let insert = |server: &Self, payload: &[u8]| {
             let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
             server.lossy(|replay| replay.insert(&chunk))
         };
-        let claim = |server: &Self, payload: &[u8]| {
-            let claim = codec::decode::<Claim>(payload, Some(spec().hash()));
-            let claim = claim.unwrap().0;
-            server.lossy(|replay| replay.claim(&claim).expect("nothing is parked here"))
+        let poll = |server: &Self, payload: &[u8]| {
+            let poll = codec::decode::<ChunkPoll>(payload, Some(spec().hash()));
+            let poll = poll.unwrap().0;
+            server.lossy(|replay| replay.poll(&poll).expect("nothing is parked here"))
         };
         [
             declare(keys.of::<ChunkHeader>(), insert),
-            declare(keys.of::<Claim>(), claim),
-            declare(keys.of::<Goodbye>(), goodbye),
+            declare(keys.of::<ChunkPoll>(), poll),
+            declare(keys.of::<Leave>(), leave),
         ]
         .map(Result::unwrap)
         .into()
     }
 
-    /// Counts a goodbye of this actor; gives how often it has said it.
+    /// Counts a `Leave` of this actor; gives how often it has said it.
     fn count_goodbye(&self, actor: u32) -> u32 {
         let mut goodbyes = self.goodbyes.lock().unwrap();
         let tries = goodbyes.entry(actor).or_default();
@@ -137,7 +137,7 @@ impl Server {
         is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
     }
 
-    /// Checks that each actor has said goodbye until it was answered.
+    /// Checks that each actor has left until it was answered.
     fn check_goodbyes(&self) {
         let goodbyes = self.goodbyes.lock().unwrap();
         assert_eq!(goodbyes.len(), ACTORS as usize, "{goodbyes:?}");

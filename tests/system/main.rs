@@ -53,14 +53,14 @@ fn system() -> TestSystem {
 
 /// A run on the chain that takes about a second: 540 updates of 16 rows, replay ratio 8.
 ///
-/// 1280 frames are whole chunks of one or two actors (4 copies x 8 steps), and (1280 - 200) * 8 / 16 is whole.
+/// 1280 frames are whole chunks of one or two actors (4 environments x 8 steps), and (1280 - 200) * 8 / 16 is whole.
 const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.replay_ratio=8";
 
 /// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";
 
 /// The processes of a run.
-const PARTS: [&str; 3] = ["replay-server", "learner", "actor"];
+const PROCESSES: [&str; 3] = ["replay-server", "learner", "actor"];
 
 /// Rows drawn by priority, with Rainbow's numbers.
 const PRIORITISED: &str =

@@ -1,7 +1,7 @@
-//! A panic in any thread of any process: the process ends, the launcher says which part and thread it was, nothing is left.
+//! A panic in any thread of any process: the process ends, the launcher says which process and thread it was, nothing is left.
 //! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fault`).
 
-use driml_protocol::fault;
+use driml_protocol::fail_point;
 use driml_tests::{Ended, TestSystem};
 
 use crate::{LONG, PRIORITISED, system};
@@ -9,15 +9,15 @@ use crate::{LONG, PRIORITISED, system};
 /// The threads of an ordinary run: the process's name in the launcher, and the point that the thread passes.
 const THREADS: [(&str, &str); 22] = [
     ("replay-server", "insert"),
-    ("replay-server", "claim"),
+    ("replay-server", "poll"),
     ("replay-server", "admit"),
     ("replay-server", "request"),
     ("replay-server", "sample"),
     ("replay-server", "affinity"),
-    ("replay-server", "hello"),
+    ("replay-server", "run-info"),
     ("replay-server", "join-actor"),
     ("replay-server", "join-learner"),
-    ("replay-server", "goodbye"),
+    ("replay-server", "leave"),
     ("replay-server", "weights-upload"),
     ("replay-server", "weights"),
     ("replay-server", "status"),
@@ -42,11 +42,11 @@ const FURTHER_THREADS: [(&str, &str, &str); 3] = [
 /// Runs with a panic at `point`, to the end.
 fn panicking(system: &TestSystem, point: &str, flags: &str) -> Ended {
     let run = format!("local --agent driml-ada {LONG} {flags} --run-dir run");
-    let ended = system.start_with(fault::VARIABLE, point, &run).wait();
+    let ended = system.start_with(fail_point::VARIABLE, point, &run).wait();
     assert_eq!(system.survivors(), [], "{point}");
     let said = format!(": the thread {point}");
     let line = ended.stderr.lines().find(|line| line.contains(&said));
-    let asked = format!(": {}={point}; this is a fault", fault::VARIABLE);
+    let asked = format!(": {}={point}; this is a fault", fail_point::VARIABLE);
     assert!(
         line.is_some_and(|it| it.contains(" panicked at ") && it.contains(&asked)),
         "{point}: {ended:#?}"
@@ -55,11 +55,11 @@ fn panicking(system: &TestSystem, point: &str, flags: &str) -> Ended {
 }
 
 /// A thread that panics at `point`, after which the launcher names the process.
-fn ends_the_run((part, point, flags): (&str, &str, &str)) {
+fn ends_the_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
     let ended = panicking(&system, point, flags);
     assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
-    let said = format!("error: {part} was killed by signal 6 SIGABRT (log: ");
+    let said = format!("error: {process} was killed by signal 6 SIGABRT (log: ");
     assert!(ended.stderr.contains(&said), "{said:?} in {ended:#?}");
     assert_eq!(system.run_folder("run").summary().outcome, "failed");
 }
@@ -73,12 +73,12 @@ fn skipped() -> bool {
 }
 
 #[test]
-fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
+fn a_panic_in_a_process_ends_it_and_the_launcher_names_it() {
     if skipped() {
         return;
     }
     // These runs wait for each other's ends more than they compute.
-    let ordinary = THREADS.map(|(part, point)| (part, point, ""));
+    let ordinary = THREADS.map(|(process, point)| (process, point, ""));
     let all = [&ordinary[..], &FURTHER_THREADS].concat();
     std::thread::scope(|scope| {
         for some in all.chunks(5) {
@@ -87,9 +87,9 @@ fn a_panic_in_a_part_ends_it_and_the_launcher_names_it() {
     });
 }
 
-/// More than one part has these threads, so any may be the first.
+/// More than one process has these threads, so any may be the first.
 #[test]
-fn a_panic_in_a_thread_of_several_parts_ends_the_run() {
+fn a_panic_in_a_thread_of_several_processes_ends_the_run() {
     if skipped() {
         return;
     }
@@ -112,7 +112,7 @@ fn a_panic_in_the_launcher_ends_the_run() {
     for point in ["interrupts", "connect", "log of learner"] {
         let system = system();
         let run = format!("local --agent driml-ada {LONG} --run-dir run");
-        let ended = system.start_with(fault::VARIABLE, point, &run).wait();
+        let ended = system.start_with(fail_point::VARIABLE, point, &run).wait();
         assert_eq!(
             (ended.code, ended.signal),
             (None, Some(6)),

@@ -25,13 +25,13 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
         ));
         let run = system.run_folder("run");
         let summary = run.check("finished");
-        let parts: Vec<String> = match shards {
+        let processes: Vec<String> = match shards {
             1 => vec!["replay-server".into()],
             _ => (0..shards)
                 .map(|shard| format!("replay-server-{shard}"))
                 .collect(),
         };
-        let all = parts.iter().map(|part| said(&run.log(part)));
+        let all = processes.iter().map(|role| said(&run.log(role)));
         let sums = all.fold([0; 3], |sums, counts| {
             std::array::from_fn(|at| sums[at] + counts[at])
         });
@@ -58,7 +58,7 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
     ));
     let client = system.connect();
     client.wait_for_updates(500);
-    system.find_part("replay-server").signal(Signal::SIGKILL);
+    system.find_process("replay-server").signal(Signal::SIGKILL);
     system.let_go();
     drop(client);
     process

@@ -7,7 +7,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use driml_envs::{CorridorWorld, IsingWorld, PacmanWorld, ProcgenWorld};
+use driml_envs::{ChainWorld, IsingWorld, PacmanWorld, ProcgenWorld};
 use driml_learner::{Agent, Compute, checkpoint, insight::Insight};
 use driml_settings::config::RunConfig;
 use driml_tests::{
@@ -160,7 +160,7 @@ fn onnx_runtime_computes_what_driml_does() {
 fn the_page_has_the_actions_in_their_order() {
     let page = fs::read_to_string(root().join("deploy/docs/src/reference/weights.md")).unwrap();
     for (world, names) in [
-        ("chain", &CorridorWorld::ACTION_NAMES[..]),
+        ("chain", &ChainWorld::ACTION_NAMES[..]),
         ("mspacman", &PacmanWorld::ACTION_NAMES),
         ("ising", &IsingWorld::ACTION_NAMES),
         ("procgen:GAME", &ProcgenWorld::ACTION_NAMES),

@@ -4,8 +4,8 @@
 use std::{borrow::Cow, fs, path::Path, time::Duration};
 
 use driml_protocol::{
-    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, Hello, InsertReply, Keys, Learned,
-    ReplayStatus, RequestId, RunClient, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
+    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Keys, Learned, ReplayStatus,
+    RequestId, RunClient, RunInfo, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
     session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
@@ -100,10 +100,10 @@ fn slow_down(server: &mut Process) -> SlowMachine {
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
     let words = ["sh", "-c", "kill -STOP $$; exec \"$@\"", "sh"].map(String::from);
     let serve = format!(
-        "replay-server --stay --listen {} {flags}",
+        "replay-server --keep-alive --listen {} {flags}",
         system.endpoint()
     );
-    system.start_part_after(&words, &serve)
+    system.start_process_after(&words, &serve)
 }
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
@@ -155,7 +155,7 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
         ("a batch", run.ask(&request, answer_max).map(drop)),
         ("an actor", run.ask(&actor, answer_max).map(drop)),
         ("a learner", run.ask(&learner, answer_max).map(drop)),
-        ("settings", run.fetch::<Hello>(answer_max).map(drop)),
+        ("settings", run.fetch::<RunInfo>(answer_max).map(drop)),
         ("a status", run.fetch::<ReplayStatus>(answer_max).map(drop)),
     ];
     for (what, asked) in asked {
@@ -288,7 +288,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));
-    let slow = SlowMachine::for_process(system.find_part("replay-server").pid);
+    let slow = SlowMachine::for_process(system.find_process("replay-server").pid);
     process.wait_for_stderr("replay-server: reads its replay back from disk, ");
     drop(slow);
     process.wait().expect_code(0);
@@ -305,18 +305,18 @@ fn roles_are_told_too() {
     keep_for(&tls.system, "replay");
     let mut server = tls.start_server(&format!("{} --replay-dir replay", flags()));
     let slow = slow_down(&mut server);
-    let mut parts = [
+    let mut processes = [
         tls.start("actor --id 0", "tls"),
-        tls.start("learner --stay --run-dir run", "tls"),
+        tls.start("learner --keep-alive --run-dir run", "tls"),
     ];
-    for part in &mut parts {
-        part.wait_for_stderr(WAITING);
+    for role in &mut processes {
+        role.wait_for_stderr(WAITING);
     }
     let status = format!("status --connect {} --tls-dir tls", tls.endpoint);
     let said = tls.system.run_ok(&status).stdout;
     assert!(said.contains("reads its replay back"), "{said}");
     drop(slow);
-    let [actor, learner] = parts;
+    let [actor, learner] = processes;
     actor.wait().expect_code(0);
     learner.stop().expect_code(0);
     server.stop().expect_code(0);

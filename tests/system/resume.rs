@@ -3,10 +3,10 @@
 use std::fs;
 
 use driml_settings::config::RunConfig;
-use driml_tests::{Summary, TestSystem};
+use driml_tests::{Summary, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 
-use crate::{PARTS, SHORT, launched, system};
+use crate::{PROCESSES, SHORT, launched, system};
 
 /// Updates that a resumed run makes: more than are left for the 256 transitions of slack, a chunk that is on its way and one that
 /// fills the memory again.
@@ -92,9 +92,9 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
 fn a_run_whose_processes_were_all_killed_continues() {
     let system = system();
     let process = launched(&system, 200);
-    let parts = PARTS.map(|part| system.find_part(part));
+    let processes = PROCESSES.map(|role| system.find_process(role));
     process.signal(Signal::SIGKILL);
-    parts.iter().for_each(|part| part.signal(Signal::SIGKILL));
+    Survivor::kill_all(&processes);
     process.wait();
     // A save may have been cut off; what it leaves is not a checkpoint.
     for entry in fs::read_dir(system.path("run/checkpoints")).unwrap() {

@@ -226,19 +226,19 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
             system.wait_until_all_have_ended();
         }
         Stop::KillLearner | Stop::KillServer => {
-            let part = match stop {
+            let role = match stop {
                 Stop::KillLearner => "learner",
                 _ => "replay-server",
             };
             // There is none before the launcher has started it, and after the run's end.
-            if let Some(part) = system.find_part_now(part) {
-                part.signal(Signal::SIGKILL);
+            if let Some(role) = system.find_process_now(role) {
+                role.signal(Signal::SIGKILL);
             }
             process.wait();
             system.wait_until_all_have_ended();
         }
         Stop::KillAll => {
-            system.kill_parts();
+            system.kill_processes();
             process.signal(Signal::SIGKILL);
             process.wait();
         }

@@ -68,15 +68,15 @@ impl Run {
         let endpoint = self.endpoint();
         let args = match machine {
             0 => format!(
-                "replay-server --stay --listen {endpoint} --insecure-network --replay-dir replay {}",
+                "replay-server --keep-alive --listen {endpoint} --allow-insecure --replay-dir replay {}",
                 self.flags
             ),
-            1 => format!("learner --stay --connect {endpoint} --run-dir run"),
+            1 => format!("learner --keep-alive --connect {endpoint} --run-dir run"),
             _ => format!("actor --connect {endpoint} --id {}", machine - 2),
         };
         let words = self.network.on(MACHINES[machine]);
-        let part = self.system.start_part_after(&words, &args);
-        *self.on(machine) = Some(part);
+        let process = self.system.start_process_after(&words, &args);
+        *self.on(machine) = Some(process);
     }
 
     /// The status of the run, fetched from the router; none while no process answers.
@@ -172,17 +172,17 @@ fn a_narrow_link_slows_no_other_process() {
     }
     run.wait_for_frames(20_000);
     let status = wait_for("an answer", || run.status());
-    let parts = status["servers"][0]["parts"]["parts"].as_array().unwrap();
-    for actor in &parts[1..] {
+    let processes = &status["servers"][0]["processes"]["processes"];
+    for actor in &processes.as_array().unwrap()[1..] {
         assert!(actor["last_seen_s"].as_f64().unwrap() < 10.0, "{actor}");
     }
     run.check_end(Duration::from_secs(120));
 }
 
-/// Each part is cut off for 30 s, then for 90 s. By hand: it takes seven minutes.
+/// Each process is cut off for 30 s, then for 90 s. By hand: it takes seven minutes.
 #[test]
 #[ignore = "seven minutes: cargo nextest run --workspace --run-ignored only -E 'test(cut_off_for_long)'"]
-fn each_part_is_cut_off_for_long() {
+fn each_process_is_cut_off_for_long() {
     let Some(run) = Run::start(2, 400_000, 8) else {
         return;
     };
@@ -227,7 +227,7 @@ fn random_faults_lose_nothing() {
         ));
         match kind {
             0 | 3 => {
-                let Some(part) = run.on(machine).take() else {
+                let Some(process) = run.on(machine).take() else {
                     continue;
                 };
                 let signal = if kind == 0 {
@@ -235,15 +235,15 @@ fn random_faults_lose_nothing() {
                 } else {
                     Signal::SIGTERM
                 };
-                part.signal(signal);
-                part.wait();
+                process.signal(signal);
+                process.wait();
                 sleep(pause);
                 run.start_on(machine);
             }
             1 => {
                 let signal = |run: &mut Run, signal| {
-                    if let Some(part) = run.on(machine) {
-                        part.signal(signal);
+                    if let Some(process) = run.on(machine) {
+                        process.signal(signal);
                     }
                 };
                 signal(&mut run, Signal::SIGSTOP);

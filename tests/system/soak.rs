@@ -24,8 +24,8 @@ struct Held {
     threads: u64,
 }
 
-fn held(system: &TestSystem, part: &str) -> Held {
-    let pid = system.find_part(part).pid;
+fn held(system: &TestSystem, process: &str) -> Held {
+    let pid = system.find_process(process).pid;
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
     let number = |name: &str| -> u64 {
         let line = status.lines().find(|line| line.starts_with(name)).unwrap();

@@ -66,10 +66,10 @@ fn missing_processes_are_named_with_what_to_do() {
 
     let ended = system.run(&format!("status --connect {endpoint} --json"));
     let answer: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
-    let parts = &answer["servers"][0]["parts"]["parts"];
-    assert_eq!(parts[0]["who"], "Learner");
-    assert_eq!(parts[0]["connected"], false);
-    assert_eq!(parts[2]["who"]["Actor"], 5);
+    let processes = &answer["servers"][0]["processes"]["processes"];
+    assert_eq!(processes[0]["who"], "Learner");
+    assert_eq!(processes[0]["connected"], false);
+    assert_eq!(processes[2]["who"]["Actor"], 5);
     assert_eq!(answer["to_go_on"].as_array().unwrap().len(), 2);
 
     // A suspended server is reported within seconds, too.
@@ -109,7 +109,7 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
 fn a_run_that_is_ending_is_no_riddle() {
     let system = system();
     let mut process = system.start(&format!(
-        "local --agent c51 {SHORT} --evaluate-every 1000 --evaluate-episodes 1000000 --run-dir run"
+        "local --agent c51 {SHORT} --eval-interval 1000 --eval-episodes 1000000 --run-dir run"
     ));
     process.wait_for_stderr("playing the last checkpoint");
     let ended = system.run_ok("status --run run");

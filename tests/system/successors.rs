@@ -149,7 +149,7 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
         .expect_said("and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints");
     let before = client.replay().unwrap();
     assert!(before.updates > 75, "{before:#?}");
-    let restarted = system.start(&stranger("--stay --restart"));
+    let restarted = system.start(&stranger("--keep-alive --restart"));
     let replay = client.wait_for_replay("updates that are learned again", |replay| {
         replay.updates_relearned > 75
     });

@@ -55,7 +55,7 @@ pub(crate) fn join(replay: &mut Replay, actor: u32) {
     replay.join_actor(join).unwrap();
 }
 
-/// An actor's chunk of `steps` steps of one copy of the world, all zeroes; the ones before it were as long.
+/// An actor's chunk of `steps` steps of one environment, all zeroes; the ones before it were as long.
 pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Chunk {
     Chunk::zeroed(ChunkHeader {
         actor,

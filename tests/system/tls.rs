@@ -46,8 +46,8 @@ impl TlsSystem {
     }
 
     pub(crate) fn start_server(&self, flags: &str) -> Process {
-        let mut server = self.system.start_part(&format!(
-            "replay-server --stay --listen {} --tls-dir tls {flags}",
+        let mut server = self.system.start_process(&format!(
+            "replay-server --keep-alive --listen {} --tls-dir tls {flags}",
             self.endpoint
         ));
         server.wait_for_stderr("replay server listens");
@@ -55,10 +55,10 @@ impl TlsSystem {
     }
 
     /// Starts an actor or a learner with the certificates in `folder`.
-    pub(crate) fn start(&self, part: &str, folder: &str) -> Process {
+    pub(crate) fn start(&self, role: &str, folder: &str) -> Process {
         let endpoint = &self.endpoint;
-        let part = format!("{part} --connect {endpoint} --tls-dir {folder}");
-        self.system.start_part(&part)
+        let role = format!("{role} --connect {endpoint} --tls-dir {folder}");
+        self.system.start_process(&role)
     }
 
     /// A client with the certificate of `role`, as this program opens its sessions.
@@ -80,8 +80,8 @@ impl TlsSystem {
     }
 
     /// A process whose files cannot be used exits before it does anything.
-    fn rejects_own_files(&self, part: &str, folder: &str, words: &str) {
-        let ended = self.start(part, folder).wait();
+    fn rejects_own_files(&self, role: &str, folder: &str, words: &str) {
+        let ended = self.start(role, folder).wait();
         ended.expect_code(64).expect_said(words);
     }
 }
@@ -138,7 +138,7 @@ fn a_run_over_tls() {
     let Some(tls) = TlsSystem::new() else { return };
     let server = tls.start_server(&format!("--agent driml-ada {SHORT}"));
     let observer = tls.client(Role::Observer);
-    let learner = tls.start("learner --stay --run-dir run", "tls");
+    let learner = tls.start("learner --keep-alive --run-dir run", "tls");
     let actors = [
         tls.start("actor --id 0", "tls"),
         tls.start("actor --id 2", "tls"),
@@ -214,7 +214,7 @@ fn own_files_that_cannot_be_used() {
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     std::fs::copy(foreign.path("ca.pem"), spoiled("mixed").path("ca.pem")).unwrap();
     let (actor, learner) = ("actor --id 0", "learner --run-dir run");
-    for (part, folder, words) in [
+    for (role, folder, words) in [
         (
             "actor --id 9",
             "tls",
@@ -255,7 +255,7 @@ fn own_files_that_cannot_be_used() {
             "mixed/learner.pem was not signed by the authority of mixed/ca.pem",
         ),
     ] {
-        tls.rejects_own_files(part, folder, words);
+        tls.rejects_own_files(role, folder, words);
     }
     assert!(!tls.system.path("run").exists(), "nothing was begun");
 
@@ -307,7 +307,7 @@ fn strangers_at_a_replay_server() {
     assert!(started.elapsed() < SECONDS);
 
     // Who is let in is not disturbed.
-    let learner = tls.start("learner --stay --run-dir run", "tls");
+    let learner = tls.start("learner --keep-alive --run-dir run", "tls");
     let actor = tls.start("actor --id 1", "tls");
     observer.wait_for_updates(10);
     actor.stop().expect_code(0);
@@ -338,7 +338,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         ("for another host", Some((&named, server))),
         ("a learner's", Some((&tls.good, "learner"))),
         (
-            "good, and this part's is not to it",
+            "good, and this process's is not to it",
             Some((&unknowing, server)),
         ),
         ("not there, as the port is closed", None),
@@ -347,7 +347,7 @@ fn strangers_in_the_place_of_a_replay_server() {
         let endpoint = format!("quic/127.0.0.1:{}", free_port());
         let listening = stranger.map(|(files, role)| listen_raw(&endpoint, files, role));
         let actor = format!("actor --id 0 --connect {endpoint} --tls-dir tls");
-        let actor = tls.system.start_part(&actor);
+        let actor = tls.system.start_process(&actor);
         (name, endpoint, listening, actor)
     });
     for (name, endpoint, listening, actor) in rows {

@@ -23,11 +23,11 @@ fn watch(system: &TestSystem, flags: &str) -> Process {
 }
 
 fn run(system: &TestSystem, args: &str) -> Process {
-    system.start_part(args)
+    system.start_process(args)
 }
 
 #[test]
-fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
+fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let system = system();
     let endpoint = system.endpoint();
     let flags = "--agent driml-ada --actors 2";
@@ -53,16 +53,16 @@ fn a_run_of_parts_by_hand_leaves_the_folder_of_a_launched_one() {
         .expect_code(0)
         .expect_printed("finished: 1280 frames and 540 updates");
     drop(client);
-    for part in actors.into_iter().chain([learner, server]) {
-        part.wait().expect_code(0);
+    for process in actors.into_iter().chain([learner, server]) {
+        process.wait().expect_code(0);
     }
     let watched = system.run_folder("run");
     let summary = watched.check_finished();
     assert_eq!((summary.frames, summary.updates), (1280, 540));
     // Who played each episode, and that all of each was seen: what is missing to all frames is still being played.
     let episodes = watched.episodes();
-    let who: BTreeSet<_> = episodes.iter().map(|it| (it.actor, it.copy)).collect();
-    let expected = (0..2).flat_map(|actor| (0..4).map(move |copy| (actor, copy)));
+    let who: BTreeSet<_> = episodes.iter().map(|it| (it.actor, it.env)).collect();
+    let expected = (0..2).flat_map(|actor| (0..4).map(move |env| (actor, env)));
     assert_eq!(who, expected.collect());
     let played: u64 = episodes.iter().map(|it| it.length.unwrap()).sum();
     assert!(played <= 1280, "{played}");
@@ -118,11 +118,12 @@ fn a_launched_run_is_watched_and_continues_without() {
 }
 
 #[test]
-fn a_silent_part_is_named_and_a_restarted_server_found_again() {
+fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let system = system();
     let endpoint = system.endpoint();
-    let listen =
-        format!("replay-server --stay --listen {endpoint} --replay-dir replay --agent c51 {LONG}");
+    let listen = format!(
+        "replay-server --keep-alive --listen {endpoint} --replay-dir replay --agent c51 {LONG}"
+    );
     let server = run(&system, &listen);
     let client = system.connect();
     let mut watched = watch(&system, "--run-dir seen");
@@ -180,7 +181,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let ended = system.run(&look).expect_code(1);
     ended
         .expect_said("error: the run needs attention: no learner has joined: start `driml learner");
-    let _parts = [system.start_learner("run"), system.start_actor(0)];
+    let _processes = [system.start_learner("run"), system.start_actor(0)];
     client.wait_for_learner("the end", |it| it.finished);
 
     let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
@@ -229,7 +230,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(of("driml_losses").1["loss"], "dim_4t4");
     let actor = samples
         .iter()
-        .find(|it| it.0 == "driml_part_connected" && it.1["part"] == "actor-0");
+        .find(|it| it.0 == "driml_part_connected" && it.1["process"] == "actor-0");
     assert_eq!(actor.unwrap().2, 0.0, "it has left");
     drop(client);
     drop(server);

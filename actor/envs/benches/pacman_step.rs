@@ -29,7 +29,7 @@ fn config(ising: Option<IsingOverlay>) -> PacmanConfig {
     }
 }
 
-/// Time for one env step with its frame: `NUM_ENVS` copies under uniformly random actions.
+/// Time for one env step with its frame: `NUM_ENVS` environments under uniformly random actions.
 fn steps(criterion: &mut Criterion) {
     let overlay = IsingOverlay {
         temperature: 0.4,

@@ -1,4 +1,4 @@
-//! What a world is: many copies of one game, stepped together, written straight into the caller's buffers.
+//! What a world is: many environments, stepped together, written straight into the caller's buffers.
 //! It does not stack, enlarge or convert frames, and it keeps no statistics; those live where they are used.
 
 use crate::error::EnvError;
@@ -38,10 +38,10 @@ pub enum StepEnd {
     Terminal = 3,
 }
 
-/// Copies of one game, stepped together.
+/// Environments, stepped together.
 ///
 /// Deterministic: the same construction arguments and actions give the same frames, rewards and ends.
-/// A copy that ends resets by itself, so its next frame is the first of another episode (as in gym3 and Procgen).
+/// An environment that ends resets by itself, so its next frame is the first of another episode (as in gym3 and Procgen).
 pub trait Environment: Send {
     /// The shape of one frame.
     fn frame_shape(&self) -> FrameShape;
@@ -49,7 +49,7 @@ pub trait Environment: Send {
     /// Number of actions; valid ones are `0..num_actions`.
     fn num_actions(&self) -> usize;
 
-    /// Number of copies, N.
+    /// Number of environments, N.
     fn num_envs(&self) -> usize;
 
     /// Writes the current frames [N, H, W, C]; the ones in which the next actions are taken.
@@ -66,7 +66,7 @@ pub trait Environment: Send {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError>;
 
-    /// All copies' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it continues
+    /// All environments' complete state, generators included: a world made with the same arguments that [`load`](Self::load)s it continues
     /// exactly as this one does.
     ///
     /// # Errors
@@ -79,7 +79,7 @@ pub trait Environment: Send {
     /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged is the caller's to check.
     ///
     /// # Errors
-    /// Bytes of another world, of other settings or of another number of copies; the world must then not be used any more.
+    /// Bytes of another world, of other settings or of another number of environments; the world must then not be used any more.
     fn load(&mut self, _state: &[u8]) -> Result<(), EnvError> {
         Err(EnvError::NotSaved)
     }

@@ -13,9 +13,11 @@ pub enum EnvError {
     #[error(transparent)]
     Exec(Box<ExecError>),
     /// A step was asked for with an action that the world does not have.
-    #[error("action {action} of copy {env} is out of range: this world has {num_actions} actions")]
+    #[error(
+        "action {action} of environment {env} is out of range: this world has {num_actions} actions"
+    )]
     ActionOutOfRange {
-        /// The copy, counted from 0.
+        /// The environment, counted from 0.
         env: usize,
         /// The action given.
         action: u8,
@@ -29,13 +31,13 @@ pub enum EnvError {
     #[error("no state of this world: {0}")]
     State(String),
     /// A step was asked for with a buffer of the wrong length.
-    #[error("{name} has {got} entries, but the world has {num_envs} copies")]
+    #[error("{name} has {got} entries, but the world has {num_envs} environments")]
     BufferLength {
         /// Which buffer.
         name: &'static str,
         /// Its entries.
         got: usize,
-        /// The world's copies.
+        /// The world's environments.
         num_envs: usize,
     },
 }

@@ -1,4 +1,4 @@
-//! The newest few frames of each copy, as one image with more channels.
+//! The newest few frames of each environment, as one image with more channels.
 //! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
 
 use crate::environment::FrameShape;
@@ -8,7 +8,7 @@ use crate::saved;
 /// Most frames in a stack; more are rejected.
 const STACK_MAX: usize = 64;
 
-/// For each of N copies the newest `stack` frames, [N, H, W, C * stack].
+/// For each of N environments the newest `stack` frames, [N, H, W, C * stack].
 ///
 /// A pixel's channels are those of the oldest frame first: [oldest C, ..., newest C]. At the first frame of an episode or
 /// level every slot holds that frame, so a stack never reaches across an end.
@@ -20,7 +20,7 @@ pub struct FrameStack {
 }
 
 impl FrameStack {
-    /// An empty (all 0) stack of `stack` frames of `shape` for `num_envs` copies; the first push of a copy must be `first`.
+    /// An empty (all 0) stack of `stack` frames of `shape` for `num_envs` environments; the first push of an environment must be `first`.
     ///
     /// # Errors
     /// A stack of 0 or above 64 frames.
@@ -63,12 +63,11 @@ impl FrameStack {
         }
         let channels = self.frame.channels;
         let deep = channels * self.stack;
-        let copies = self
+        let envs = self
             .stacked
             .chunks_exact_mut(self.frame.bytes() * self.stack);
-        for ((stacked, frame), &first) in copies
-            .zip(frames.chunks_exact(self.frame.bytes()))
-            .zip(first)
+        for ((stacked, frame), &first) in
+            envs.zip(frames.chunks_exact(self.frame.bytes())).zip(first)
         {
             let pixels = frame.chunks_exact(channels);
             if first {
@@ -125,7 +124,7 @@ mod tests {
 
     use super::*;
 
-    /// The stack of copy `env` at time `t`, from the whole history: slot j is the frame `stack - 1 - j` back, but no
+    /// The stack of environment `env` at time `t`, from the whole history: slot j is the frame `stack - 1 - j` back, but no
     /// further than the last first frame.
     fn reference(
         history: &[(Vec<u8>, Vec<bool>)],

@@ -1,8 +1,8 @@
 //! The worlds: no network, no tensors, deterministic from a seed.
 //! Stepping policies, recording and statistics live in `driml-actor`.
 //!
-//! Every world is N copies of a game behind one trait, [`Environment`]: `observe` writes the current frames,
-//! `step` takes an action for each copy. A copy that ends starts again by itself.
+//! Every world is N environments behind one trait, [`Environment`]: `observe` writes the current frames,
+//! `step` takes an action for each environment. An environment that ends starts again by itself.
 //!
 //! | name | frame | actions | what for |
 //! | --- | --- | --- | --- |
@@ -16,16 +16,16 @@
 //! [`WorldConfig`] holds the settings of any of them (`kind` says which) and builds it, and [`WorldName`] reads the names
 //! above from a command line. [`FrameStack`] stacks frames without crossing the end of an episode.
 //!
-//! [`PartOfWorld`] is one with fewer actions and smaller frames.
+//! [`RestrictedWorld`] is one with fewer actions and smaller frames.
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
 //! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`], and the world itself,
-//! which implements [`Environment`] (or `Copies`, if its copies are stepped one by one); then give it a line in `registry.rs`.
+//! which implements [`Environment`] (or `Envs`, if its environments are stepped one by one); then give it a line in `registry.rs`.
 //!
 //! ```
-//! use driml_envs::{CorridorConfig, FrameStack, StepEnd, WorldConfig};
+//! use driml_envs::{ChainConfig, FrameStack, StepEnd, WorldConfig};
 //!
-//! let config = WorldConfig::Chain(CorridorConfig {
+//! let config = WorldConfig::Chain(ChainConfig {
 //!     cells: 8, height: 12, width: 12, step_limit: 30, reward_left: 0.1, reward_right: 1.0,
 //! });
 //! let num_envs = 2;
@@ -43,18 +43,18 @@
 //! # Ok::<(), driml_envs::EnvError>(())
 //! ```
 //!
-//! Copy i of a world depends on the seed, i and its own actions only, not on how many copies there are. No numbers that
+//! Environment i of a world depends on the seed, i and its own actions only, not on how many environments there are. No numbers that
 //! affect learning have defaults here: settings are written in full, and unknown keys are rejected.
 
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::print_stdout))]
 
-mod copies;
 mod environment;
+mod envs;
 mod error;
 mod frame_stack;
-mod own;
-mod part;
+mod plugin;
 mod registry;
+mod restricted;
 mod saved;
 mod settings;
 mod worlds;
@@ -62,16 +62,14 @@ mod worlds;
 pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
-pub use own::{OwnWorld, preset as own_preset, register};
-pub use part::{ActionSet, PartOfWorld};
+pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{
     DistributionMode, Engine as ProcgenEngine, Game, InstallError, ProcgenError,
 };
 pub use registry::{WorldConfig, WorldName, WorldNameError};
+pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{Levels, Variants, WorldSettings};
-pub use worlds::corridor::{
-    CorridorConfig, CorridorWorld, optimal_discounted_return, optimal_return,
-};
+pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return, optimal_return};
 pub use worlds::exec::{ExecConfig, ExecError, ExecWorld, declaration as exec_declaration};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};

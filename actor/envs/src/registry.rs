@@ -12,10 +12,10 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::EnvError;
-use crate::own::{self, OwnWorld};
-use crate::part::ActionSet;
+use crate::plugin::{self, CustomWorld};
+use crate::restricted::ActionSet;
 use crate::settings::{Levels, Variants, WorldSettings, no_levels};
-use crate::worlds::corridor::CorridorConfig;
+use crate::worlds::chain::ChainConfig;
 use crate::worlds::exec::ExecConfig;
 use crate::worlds::ising::IsingConfig;
 use crate::worlds::pacman::PacmanConfig;
@@ -31,7 +31,7 @@ macro_rules! worlds {
             $($(#[$doc])* #[serde(rename = $kind)] $World($Settings),)+
             /// One that the program added.
             #[serde(untagged)]
-            Own(OwnWorld),
+            Own(CustomWorld),
         }
 
         /// Those of this crate.
@@ -83,7 +83,7 @@ worlds! {
     /// The Ising patch in noise.
     "ising" Ising(IsingConfig);
     /// The corridor.
-    "chain" Chain(CorridorConfig);
+    "chain" Chain(ChainConfig);
     /// A process that a command starts.
     "exec" Exec(ExecConfig);
 }
@@ -101,7 +101,7 @@ impl<'de> Deserialize<'de> for WorldConfig {
             .get("kind")
             .and_then(toml::Value::as_str)
             .is_some_and(|name| KINDS.iter().any(|(kind, _)| *kind == name));
-        if !ours && let Some(own) = OwnWorld::read(&table) {
+        if !ours && let Some(own) = CustomWorld::read(&table) {
             return own.map(Self::Own).map_err(D::Error::custom);
         }
         let ours: Ours = table
@@ -209,7 +209,7 @@ impl WorldName {
                 library: None,
             })
         });
-        let own = own::kinds().into_iter().map(|kind| WorldName {
+        let own = plugin::kinds().map(|kind| WorldName {
             kind,
             variant: None,
             library: None,
@@ -343,7 +343,7 @@ impl fmt::Display for WorldNameError {
             }
         }
         names.push(format!("{LIBENV}:PATH:GAME"));
-        names.extend(own::kinds().into_iter().map(str::to_owned));
+        names.extend(plugin::kinds().map(str::to_owned));
         write!(f, " (the worlds: {}{variants})", names.join(", "))
     }
 }

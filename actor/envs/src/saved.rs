@@ -24,23 +24,23 @@ pub(crate) fn decode_whole<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EnvEr
     }
 }
 
-/// The state of so many copies that [`encode`] wrote.
+/// The state of so many environments that [`encode`] wrote.
 pub(crate) fn decode<T: DeserializeOwned>(
     bytes: &[u8],
     num_envs: usize,
 ) -> Result<Vec<T>, EnvError> {
-    let copies: Vec<T> = decode_whole(bytes)?;
-    check_copies(copies.len(), num_envs)?;
-    Ok(copies)
+    let envs: Vec<T> = decode_whole(bytes)?;
+    check_env_count(envs.len(), num_envs)?;
+    Ok(envs)
 }
 
-/// An error unless a state is of as many copies as this world has.
-pub(crate) fn check_copies(found: usize, num_envs: usize) -> Result<(), EnvError> {
+/// An error unless a state is of as many environments as this world has.
+pub(crate) fn check_env_count(found: usize, num_envs: usize) -> Result<(), EnvError> {
     if found == num_envs {
         return Ok(());
     }
     Err(EnvError::State(format!(
-        "{found} copies, and this world has {num_envs}"
+        "{found} environments, and this world has {num_envs}"
     )))
 }
 
@@ -59,11 +59,11 @@ pub(crate) mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::worlds::{corridor, ising};
-    use crate::{Environment, IsingConfig, PartOfWorld, StepEnd, WorldConfig};
+    use crate::worlds::{chain, ising};
+    use crate::{Environment, IsingConfig, RestrictedWorld, StepEnd, WorldConfig};
 
-    /// Copies of each world here.
-    const COPIES: usize = 3;
+    /// Environments of each world here.
+    const ENVS: usize = 3;
 
     /// Everything that a world gives in so many steps of actions drawn from `rng`.
     fn trajectory(
@@ -71,14 +71,14 @@ pub(crate) mod tests {
         steps: usize,
         rng: &mut ChaCha8Rng,
     ) -> Vec<(Vec<u8>, Vec<f32>, Vec<StepEnd>)> {
-        let (copies, bytes) = (world.num_envs(), world.frame_shape().bytes());
+        let (envs, bytes) = (world.num_envs(), world.frame_shape().bytes());
         let mut seen = Vec::new();
         for _ in 0..steps {
-            let mut frames = vec![0; copies * bytes];
+            let mut frames = vec![0; envs * bytes];
             world.observe(&mut frames);
             let draw = |_| rng.random_range(0..world.num_actions() as u8);
-            let actions: Vec<u8> = (0..copies).map(draw).collect();
-            let (mut rewards, mut ends) = (vec![0.0; copies], vec![StepEnd::Running; copies]);
+            let actions: Vec<u8> = (0..envs).map(draw).collect();
+            let (mut rewards, mut ends) = (vec![0.0; envs], vec![StepEnd::Running; envs]);
             world.step(&actions, &mut rewards, &mut ends).unwrap();
             seen.push((frames, rewards, ends));
         }
@@ -115,7 +115,7 @@ pub(crate) mod tests {
     }
 
     fn chain() -> WorldConfig {
-        WorldConfig::Chain(corridor::tests::config())
+        WorldConfig::Chain(chain::tests::config())
     }
 
     fn ising(lattice_size: usize) -> WorldConfig {
@@ -130,25 +130,25 @@ pub(crate) mod tests {
     #[test]
     fn worlds_go_on_where_they_were_saved() {
         for (name, config) in [("chain", chain()), ("ising", ising(9))] {
-            assert!(continues(name, 60, || config.build(COPIES, 3, 0).unwrap()) > 3);
+            assert!(continues(name, 60, || config.build(ENVS, 3, 0).unwrap()) > 3);
         }
         let part = || {
-            let whole = chain().build(COPIES, 3, 0).unwrap();
-            PartOfWorld::of(whole, vec![1, 2], (6, 11)).unwrap()
+            let whole = chain().build(ENVS, 3, 0).unwrap();
+            RestrictedWorld::of(whole, vec![1, 2], (6, 11)).unwrap()
         };
         assert!(continues("a part of the chain", 60, part) > 3);
     }
 
     #[test]
     fn a_state_of_another_world_is_refused() {
-        let state = |config: WorldConfig, copies| config.build(copies, 3, 0).unwrap().save();
+        let state = |config: WorldConfig, envs| config.build(envs, 3, 0).unwrap().save();
         for (config, state) in [
             (chain(), state(chain(), 2)),
-            (chain(), state(ising(9), COPIES)),
-            (ising(9), state(ising(10), COPIES)),
-            (ising(9), state(chain(), COPIES)),
+            (chain(), state(ising(9), ENVS)),
+            (ising(9), state(ising(10), ENVS)),
+            (ising(9), state(chain(), ENVS)),
         ] {
-            let mut world = config.build(COPIES, 3, 0).unwrap();
+            let mut world = config.build(ENVS, 3, 0).unwrap();
             let said = world.load(&state.unwrap()).unwrap_err().to_string();
             assert!(said.contains("no state of this world"), "{said}");
         }

@@ -35,7 +35,7 @@ pub trait WorldSettings {
         10.0
     }
 
-    /// Builds `num_envs` copies. Copy i depends on (`seed`, i) and its actions only. `threads` is how many threads
+    /// Builds `num_envs` environments. Environment i depends on (`seed`, i) and its actions only. `threads` is how many threads
     /// the world may start, 0 for none.
     ///
     /// # Errors

@@ -23,7 +23,7 @@ pub enum ProcgenError {
     /// An action, or their number, is not one the engine takes.
     #[error("stepping procgen: {0}")]
     Action(String),
-    /// A state belongs to another game, or a copy's number is out of range.
+    /// A state belongs to another game, or an environment's number is out of range.
     #[error("moving a procgen state: {0}")]
     State(String),
     /// The engine does not describe its buffers as version 0.10.7 does.

@@ -4,9 +4,9 @@
 //! The engine is the published wheel of procgen 0.10.7 (MIT licence, <https://github.com/openai/procgen>).
 //! It is a C++ library that ends the whole process on a bad option, so everything is checked here first.
 //!
-//! Start with [`Engine::install`], which puts the engine into the cache folder once, and [`VecGame`], which steps N copies of a
+//! Start with [`Engine::install`], which puts the engine into the cache folder once, and [`VecGame`], which steps N environments of a
 //! [`Game`] as [`Options`] describe them. A step is one call of [`VecGame::act`]; what came of it is in buffers of the game's own,
-//! one element or frame a copy. `driml-envs` makes a world of it.
+//! one element or frame an environment. `driml-envs` makes a world of it.
 //!
 //! ```no_run
 //! use procgen_sys::{DistributionMode, Engine, FRAME_BYTES, Game, Options, VecGame};
@@ -28,7 +28,7 @@
 //! };
 //! let mut game = VecGame::new(&engine, &options)?;
 //! for _ in 0..100 {
-//!     game.act(&[7, 7])?; // To the right, in both copies.
+//!     game.act(&[7, 7])?; // To the right, in both environments.
 //! }
 //! assert_eq!(game.frames().len(), 2 * FRAME_BYTES);
 //! println!("earned {:?} in levels {:?}", game.rewards(), game.level_seed());

@@ -1,7 +1,7 @@
 //! How long the calling thread leaves the engine's threads alone before it waits for them.
 //! It knows nothing of the engine: it is told how long steps took.
 //!
-//! The engine's `observe` waits for the first copy, then for the second, and is woken whenever *any* of them is done: with 32 copies
+//! The engine's `observe` waits for the first environment, then for the second, and is woken whenever *any* of them is done: with 32 environments
 //! the calling thread wakes about 20 times a step, and each time an engine's thread has to make room for it. A thread that
 //! sleeps through the first half of a step is not there to be woken.
 

@@ -9,7 +9,7 @@ use crate::game::{DistributionMode, Game};
 /// Number of actions; valid ones are `0..15`.
 pub const NUM_ACTIONS: usize = 15;
 
-/// Copies of a game that one handle may hold; more is refused.
+/// Environments that one handle may hold; more is refused.
 pub const NUM_ENVS_MAX: usize = 4096;
 
 /// Threads that one handle may start; more is refused.
@@ -20,7 +20,7 @@ pub const NUM_THREADS_MAX: usize = 256;
 pub struct Options {
     /// The game.
     pub game: Game,
-    /// Copies of the game, stepped together: 1 to `NUM_ENVS_MAX`.
+    /// Environments, stepped together: 1 to `NUM_ENVS_MAX`.
     pub num_envs: usize,
     /// Size of the set from which levels are drawn, `start_level..start_level + num_levels`; 0 means every level, `0..2^31 - 1`.
     pub num_levels: i32,
@@ -65,7 +65,7 @@ impl Options {
             ..
         } = *self;
         let text = if num_envs == 0 || num_envs > NUM_ENVS_MAX {
-            format!("{num_envs} copies of the game; 1 to {NUM_ENVS_MAX} are possible")
+            format!("{num_envs} environments; 1 to {NUM_ENVS_MAX} are possible")
         } else if num_threads > NUM_THREADS_MAX {
             format!("{num_threads} threads; 0 to {NUM_THREADS_MAX} are possible")
         } else if num_levels < 0 || start_level < 0 {
@@ -185,8 +185,8 @@ mod tests {
             let error = options.validate().unwrap_err().to_string();
             assert!(error.contains(text), "{error}");
         };
-        rejected(|o| o.num_envs = 0, "0 copies");
-        rejected(|o| o.num_envs = NUM_ENVS_MAX + 1, "4097 copies");
+        rejected(|o| o.num_envs = 0, "0 environments");
+        rejected(|o| o.num_envs = NUM_ENVS_MAX + 1, "4097 environments");
         rejected(|o| o.num_threads = 1000, "1000 threads");
         rejected(|o| o.num_levels = -1, "num_levels = -1");
         rejected(|o| o.start_level = -1, "start_level = -1");

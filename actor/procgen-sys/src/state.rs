@@ -1,4 +1,4 @@
-//! A copy's complete state: how it is kept outside the engine, and how it is known again.
+//! An environment's complete state: how it is kept outside the engine, and how it is known again.
 //! Getting one from the engine and putting one back is for `vec_game`.
 
 use sha2::{Digest, Sha256};
@@ -9,7 +9,7 @@ use crate::game::Game;
 /// Bytes of the sum before a sealed state.
 const SUM_BYTES: usize = 32;
 
-/// A copy's complete state, as the engine wrote it. The engine trusts what it reads back, so that only it makes one.
+/// An environment's complete state, as the engine wrote it. The engine trusts what it reads back, so that only it makes one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct State {
     game: Game,

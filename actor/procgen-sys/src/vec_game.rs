@@ -1,4 +1,4 @@
-//! Copies of one game, stepped together: the safe face of the engine.
+//! Environments, stepped together: the safe face of the engine.
 //! It passes the engine's flags on as they are and does not say what they mean for episodes.
 
 use std::ffi::c_void;
@@ -27,7 +27,7 @@ pub const RESET: i32 = -1;
 /// fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
 
-/// N copies of one game. One thread at a time may use it; different ones may be used by different threads.
+/// N environments. One thread at a time may use it; different ones may be used by different threads.
 pub struct VecGame {
     api: &'static Api,
     handle: Handle,
@@ -51,7 +51,7 @@ pub struct VecGame {
 unsafe impl Send for VecGame {}
 
 impl VecGame {
-    /// Makes the copies and resets them. The first one in a process reads all pictures (1 to 3 s).
+    /// Makes the environments and resets them. The first one in a process reads all pictures (1 to 3 s).
     ///
     /// # Errors
     /// Settings that the engine does not take, a library that cannot be loaded, or one that is not version 0.10.7.
@@ -105,7 +105,7 @@ impl VecGame {
         self.game
     }
 
-    /// Number of copies, N.
+    /// Number of environments, N.
     pub fn num_envs(&self) -> usize {
         self.num_envs
     }
@@ -145,7 +145,7 @@ impl VecGame {
         unsafe { buffer.as_slice() }
     }
 
-    /// Takes one action in every copy, each in `0..15` or `RESET`, and waits for what comes of it.
+    /// Takes one action in every environment, each in `0..15` or `RESET`, and waits for what comes of it.
     ///
     /// # Errors
     /// Not N actions, or one out of range; nothing was stepped.
@@ -154,7 +154,7 @@ impl VecGame {
         let wrong = |text| Err(ProcgenError::Action(text));
         if actions.len() != n {
             return wrong(format!(
-                "{} actions for {n} copies of {game}",
+                "{} actions for {n} environments of {game}",
                 actions.len()
             ));
         }
@@ -162,7 +162,7 @@ impl VecGame {
         if let Some(env) = actions.iter().position(|action| !valid.contains(action)) {
             let action = actions[env];
             return wrong(format!(
-                "action {action} for copy {env} of {game}; 0 to 14 exist"
+                "action {action} for environment {env} of {game}; 0 to 14 exist"
             ));
         }
         // SAFETY: `act` below is the only call during which the engine reads the actions.
@@ -173,7 +173,7 @@ impl VecGame {
         if let Some(nap) = &self.nap {
             nap.take();
         }
-        // SAFETY: as for `act`. It returns once every copy is stepped, so that nothing is written after this.
+        // SAFETY: as for `act`. It returns once every environment is stepped, so that nothing is written after this.
         unsafe { (self.api.observe)(self.handle) };
         if let Some(nap) = &mut self.nap {
             nap.learn(started.elapsed());
@@ -181,17 +181,17 @@ impl VecGame {
         Ok(())
     }
 
-    /// The complete state of copy `env`: its level, its generators, everything.
+    /// The complete state of environment `env`: its level, its generators, everything.
     ///
     /// # Errors
-    /// No such copy.
+    /// No such environment.
     pub fn state(&mut self, env: usize) -> Result<State, ProcgenError> {
         let index = self.index(env)?;
         let mut bytes = vec![0_u8; self.state_bytes];
         // The engine may write 4 bytes past the length it is told (`write_string` forgets its own prefix).
         let len =
             i32::try_from(self.state_bytes - 8).expect("doubled from 1 MiB with a limit below");
-        // SAFETY: the handle is open, `index` is one of its copies, and `bytes` is longer than `len`.
+        // SAFETY: the handle is open, `index` is one of its environments, and `bytes` is longer than `len`.
         let used =
             unsafe { (self.api.get_state)(self.handle, index, bytes.as_mut_ptr().cast(), len) };
         let used = usize::try_from(used)
@@ -208,21 +208,21 @@ impl VecGame {
         Ok(State::written_by_engine(self.game, bytes))
     }
 
-    /// Puts copy `env` into a state of the same game; its frame, reward and flags become those of that state.
+    /// Puts environment `env` into a state of the same game; its frame, reward and flags become those of that state.
     ///
     /// # Errors
-    /// No such copy, or a state of another game.
+    /// No such environment, or a state of another game.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
         let index = self.index(env)?;
         if state.game() != self.game {
             return Err(ProcgenError::State(format!(
-                "a state of {} for a copy of {}",
+                "a state of {} for an environment of {}",
                 state.game(),
                 self.game
             )));
         }
         let len = i32::try_from(state.bytes().len()).expect("the engine gave its length as an i32");
-        // SAFETY: the handle is open, its buffers are set, `index` is one of its copies, and the bytes are what the
+        // SAFETY: the handle is open, its buffers are set, `index` is one of its environments, and the bytes are what the
         // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
         unsafe {
             (self.api.set_state)(
@@ -238,7 +238,7 @@ impl VecGame {
     fn index(&self, env: usize) -> Result<i32, ProcgenError> {
         if env >= self.num_envs {
             return Err(ProcgenError::State(format!(
-                "copy {env} of {} copies of {}",
+                "environment {env} of {} environments of {}",
                 self.num_envs, self.game
             )));
         }

@@ -106,9 +106,9 @@ fn wrong_actions_are_refused_and_step_nothing() {
     let mut envs = VecGame::new(engine, &options(Game::Coinrun)).unwrap();
     let before = envs.state(0).unwrap();
     for (actions, words) in [
-        (&[0, 0, 15, 0][..], "action 15 for copy 2 of coinrun"),
-        (&[0, 0, 0, -2], "action -2 for copy 3"),
-        (&[0; 3], "3 actions for 4 copies"),
+        (&[0, 0, 15, 0][..], "action 15 for environment 2 of coinrun"),
+        (&[0, 0, 0, -2], "action -2 for environment 3"),
+        (&[0; 3], "3 actions for 4 environments"),
     ] {
         let error = envs.act(actions).unwrap_err().to_string();
         assert!(error.contains(words), "{error}");
@@ -131,7 +131,7 @@ fn settings_that_would_end_the_process_are_errors() {
 }
 
 #[test]
-fn a_state_put_back_repeats_the_trajectory_in_any_copy() {
+fn a_state_put_back_repeats_the_trajectory_in_any_environment() {
     let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let mut envs = VecGame::new(engine, &options(game)).unwrap();
@@ -173,7 +173,7 @@ fn a_state_put_back_repeats_the_trajectory_in_any_copy() {
     let error = coinrun.set_state(0, &state).unwrap_err().to_string();
     assert!(error.contains("a state of maze"), "{error}");
     let error = coinrun.state(4).unwrap_err().to_string();
-    assert!(error.contains("copy 4 of 4"), "{error}");
+    assert!(error.contains("environment 4 of 4"), "{error}");
 }
 
 #[test]

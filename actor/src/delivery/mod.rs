@@ -1,4 +1,4 @@
-//! Brings chunks to the replay server, each exactly once and in order, and says goodbye.
+//! Brings chunks to the replay server, each exactly once and in order, and leaves.
 //! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
 
 mod state;
@@ -85,7 +85,7 @@ impl Delivery {
     }
 
     /// What the next chunk would wait for now; none if it would not.
-    pub fn waits_in_words(&self) -> Option<&'static str> {
+    pub fn describe_wait(&self) -> Option<&'static str> {
         let waiting = *self.state.waiting();
         match self.state.is_held() {
             true if waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
@@ -114,7 +114,7 @@ impl Delivery {
         self.queue.send(chunk).is_ok()
     }
 
-    /// Waits for the last chunk and says goodbye; gives the number of transitions that were not wanted any more.
+    /// Waits for the last chunk and leaves; gives the number of transitions that were not wanted any more.
     ///
     /// # Errors
     /// A chunk that could not be delivered.

@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BufferPool, Chunk, ChunkHeader, Claim, Done, Goodbye, InsertReply, PendingReply, RunClient,
-    Seldom, Shutdown, fault, session::SessionError,
+    Ack, BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
+    RunClient, Shutdown, fail_point, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
@@ -24,10 +24,10 @@ const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often a thread that waits for an answer looks whether the actor is to stop.
 const TICK: Duration = Duration::from_millis(50);
-/// How long the goodbye is tried, without the time in which the replay server reads its replay back.
-const GOODBYE_MAX: Duration = Duration::from_secs(5);
+/// How long leaving is tried, without the time in which the replay server reads its replay back.
+const LEAVE_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its answer: several must fit, as a message may be lost.
-const GOODBYE_TRY_MAX: Duration = Duration::from_secs(1);
+const LEAVE_TRY_MAX: Duration = Duration::from_secs(1);
 
 struct Outgoing {
     header: ChunkHeader,
@@ -35,13 +35,13 @@ struct Outgoing {
     in_shared_memory: bool,
     /// Set while a question about it is on its way.
     asked: Option<PendingReply<InsertReply>>,
-    /// The replay server has it and will store it: a claim is enough.
+    /// The replay server has it and will store it: a poll is enough.
     is_kept: bool,
 }
 
 impl Outgoing {
-    const fn claim(&self) -> Claim {
-        Claim {
+    const fn poll(&self) -> ChunkPoll {
+        ChunkPoll {
             actor: self.header.actor,
             incarnation: self.header.incarnation,
             sequence: self.header.sequence,
@@ -74,8 +74,8 @@ pub(super) struct DeliveryWorker {
     /// When the chunk that waits at the rate limiter began to wait.
     held_since: Option<Instant>,
     draining_since: Option<Instant>,
-    retries_said: Seldom,
-    waiting_said: Seldom,
+    retries_said: LogLimiter,
+    waiting_said: LogLimiter,
 }
 
 impl DeliveryWorker {
@@ -97,8 +97,8 @@ impl DeliveryWorker {
             answered: Instant::now(),
             held_since: None,
             draining_since: None,
-            retries_said: Seldom::default(),
-            waiting_said: Seldom::default(),
+            retries_said: LogLimiter::default(),
+            waiting_said: LogLimiter::default(),
         }
     }
 
@@ -109,9 +109,9 @@ impl DeliveryWorker {
         let mut unwanted = 0;
         let mut outcome = Ok(());
         while let Some(header) = self.first_in_line(chunks) {
-            fault::point("delivery");
+            fail_point::reach("delivery");
             let transitions = header.transitions() as u64;
-            // After a failure the rest is only counted, so that the goodbye tells the truth.
+            // After a failure the rest is only counted, so that `Leave` tells the truth.
             let outcome_of_first = match outcome {
                 Ok(()) => self.settle_first(),
                 Err(_) => Ok(Outcome::Stored),
@@ -131,7 +131,7 @@ impl DeliveryWorker {
             self.state.settle();
         }
         if let Some((actor, incarnation)) = last {
-            self.say_goodbye(Goodbye {
+            self.leave(Leave {
                 actor,
                 incarnation,
                 produced: produced - unwanted,
@@ -328,8 +328,8 @@ impl DeliveryWorker {
             }
             it.header.leaving |= leaving;
             it.asked = Some(if it.is_kept {
-                let claim = self.client.seal(&it.claim())?;
-                self.client.send(claim, timeout)?
+                let poll = self.client.seal(&it.poll())?;
+                self.client.send(poll, timeout)?
             } else {
                 let chunk = self.client.seal_with(&it.header, it.payload.clone())?;
                 let header = &it.header;
@@ -345,12 +345,12 @@ impl DeliveryWorker {
         Ok(())
     }
 
-    fn say_goodbye(&self, goodbye: Goodbye) {
+    fn leave(&self, leave: Leave) {
         let began = Instant::now();
         let mut silent_since = began;
         loop {
-            let e = match self.client.ask(&goodbye, GOODBYE_TRY_MAX) {
-                Ok(Done) => return,
+            let e = match self.client.ask(&leave, LEAVE_TRY_MAX) {
+                Ok(Ack) => return,
                 Err(e) => e,
             };
             // The process that told the actor to stop does not wait for long.
@@ -358,8 +358,8 @@ impl DeliveryWorker {
             if may_wait && matches!(e, SessionError::Recovering(_)) {
                 silent_since = Instant::now();
             }
-            if silent_since.elapsed() > GOODBYE_MAX {
-                tracing::warn!("the replay server did not receive the goodbye: {e}");
+            if silent_since.elapsed() > LEAVE_MAX {
+                tracing::warn!("the replay server did not receive the leave: {e}");
                 return;
             }
             std::thread::sleep(RETRY_PAUSE);

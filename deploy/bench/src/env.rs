@@ -9,23 +9,23 @@ use rand_chacha::ChaCha8Rng;
 use crate::{effort::Effort, report::Measurement, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
-/// Copies of the game.
+/// Environments.
 const ENVS: usize = 32;
-/// The engine's own threads; with 0 the caller's steps every copy.
+/// The engine's own threads; with 0 the caller's steps every environment.
 pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];
 /// Steps of which a call that is timed consists.
 const STEPS: usize = 64;
 
 /// The name of the figure of one of Procgen's games.
 pub(super) fn name(game: &str, threads: usize) -> String {
-    format!("{game}, {ENVS} copies, {threads} engine threads")
+    format!("{game}, {ENVS} environments, {threads} engine threads")
 }
 
-/// Steps a second of some worlds, Procgen's if none is named, each copy's counted.
+/// Steps a second of some worlds, Procgen's if none is named, each environment's counted.
 pub(super) fn measure(worlds: &[String], effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
     let mut cases = Vec::new();
     for world in worlds {
-        cases.push((format!("{world}, {ENVS} copies"), world.clone(), 0));
+        cases.push((format!("{world}, {ENVS} environments"), world.clone(), 0));
     }
     if worlds.is_empty() {
         procgen_sys::Engine::install(&mut console::line)?;

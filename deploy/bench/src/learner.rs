@@ -36,9 +36,9 @@ const REPEATED: [(f64, &str); 3] = [
     (0.38, "38% of states repeat"),
 ];
 /// What is done with equal states.
-const EQUAL_STATES: [(&str, &str); 2] = [
-    ("learner.equal_states=each", "each computed"),
-    ("learner.equal_states=once", "equal ones once"),
+const DEDUPLICATION: [(&str, &str); 2] = [
+    ("learner.deduplicate_states=false", "each computed"),
+    ("learner.deduplicate_states=true", "equal ones once"),
 ];
 /// What grows, and the settings over those of the paper: C51 + global DIM, 256 rows of 64x64x3, 51 atoms, vectors of 512.
 const SIZES: [(&str, &[&str]); 13] = [
@@ -52,9 +52,9 @@ const SIZES: [(&str, &[&str]); 13] = [
     ("104x80", &["input.height=104", "input.width=80"]),
     ("11 atoms", &["model.atoms=11"]),
     ("201 atoms", &["model.atoms=201"]),
-    ("vectors of 64", &["model.rkhs=64"]),
-    ("vectors of 256", &["model.rkhs=256"]),
-    ("vectors of 1024", &["model.rkhs=1024"]),
+    ("vectors of 64", &["model.embedding_dim=64"]),
+    ("vectors of 256", &["model.embedding_dim=256"]),
+    ("vectors of 1024", &["model.embedding_dim=1024"]),
 ];
 /// Updates a second on a device, in each precision; on the CPU also with candle's own operations.
 pub(super) fn measure(
@@ -114,11 +114,11 @@ impl Bench<'_> {
         }
         let (mut names, mut works) = (Vec::new(), Vec::new());
         for (share, repeated) in REPEATED {
-            for (set, equal_states) in EQUAL_STATES {
+            for (set, computed) in DEDUPLICATION {
                 let config = settings::of_run(WORLD, AGENT, "paper", &[set])?;
                 works.push(updates(&config, &self.compute, share)?);
                 names.push(format!(
-                    "C51 + global-global DIM, 60x60x3, {repeated}, {equal_states}"
+                    "C51 + global-global DIM, 60x60x3, {repeated}, {computed}"
                 ));
             }
         }
@@ -131,7 +131,7 @@ impl Bench<'_> {
     /// For each size updates a second, and the arithmetic that this is: the products that `driml inspect` counts.
     fn growth(&mut self) -> anyhow::Result<()> {
         for (name, sets) in SIZES {
-            let sets = [sets, &["learner.equal_states=each"]].concat();
+            let sets = [sets, &["learner.deduplicate_states=false"]].concat();
             let config = settings::of_run(WORLD, AGENT, "paper", &sets)?.with_whole_frames()?;
             let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
             let gflop = UpdateCost::of(&config.model, &shape).total() as f64 / 1e9;
@@ -154,7 +154,7 @@ fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Resu
     rows.repeat(repeated);
     let (model, update) = (config.model.clone(), config.learner.update.clone());
     let agent = Agent::new(model, update, compute, &mut rng)?;
-    let mut agent = agent.with_equal_states(config.learner.equal_states);
+    let mut agent = agent.with_deduplication(config.learner.deduplicate_states);
     Ok(Box::new(move || {
         agent.update(&rows.batch())?;
         Ok(())

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use driml_envs::{ActionSet, PartOfWorld, StepEnd};
+use driml_envs::{ActionSet, RestrictedWorld, StepEnd};
 use driml_launch::console;
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
 use rand::{Rng, SeedableRng};
@@ -14,12 +14,12 @@ use crate::settings;
 
 /// The life of the actor whose chunks are made of it.
 pub(super) const INCARNATION: u64 = 1;
-/// Copies of the game, each a stream of transitions.
+/// Environments, each a stream of transitions.
 const STREAMS: usize = 8;
-/// Steps of each copy; then the recording begins again.
+/// Steps of each environment; then the recording begins again.
 const STEPS: usize = 256;
 
-/// Chunks that are measured. An actor of 16 copies sends the last.
+/// Chunks that are measured. An actor of 16 environments sends the last.
 pub(super) const CHUNKS: [ChunkShape; 4] = [
     ChunkShape::new(4, 1),
     ChunkShape::new(8, 4),
@@ -46,7 +46,7 @@ impl ChunkShape {
     }
 }
 
-/// Transitions of [`STREAMS`] copies of bigfish under a random policy, for [`STEPS`] steps.
+/// Transitions of [`STREAMS`] environments of bigfish under a random policy, for [`STEPS`] steps.
 pub(super) struct Recording {
     frame_bytes: usize,
     /// [STEPS, STREAMS, frame bytes].
@@ -64,7 +64,7 @@ impl Recording {
             config.run.frame_width as usize,
         );
         let whole = config.world.build(STREAMS, 1, 0)?;
-        let mut world = PartOfWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
+        let mut world = RestrictedWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
         let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
         let mut steps = Vec::with_capacity(STEPS * STREAMS);

@@ -15,7 +15,7 @@ use driml_learner::{
     remote::batch_source::{BatchSource, Counters, Next, Requests},
 };
 use driml_protocol::{
-    ActorJoin, Alive, Keys, LearnerJoin, RunClient, Shutdown, Tally, join,
+    ActorJoin, Alive, Keys, LearnerJoin, RunClient, ShardCounts, Shutdown, join,
     session::{self, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
@@ -70,7 +70,7 @@ impl Server {
         let shared_memory = format!("transport.shared_memory={}", wire.shared_memory);
         let held = format!("replay.capacity_transitions={}", wire.held);
         let sets = [&settings::REPLAY[..], &[&*shared_memory, &*held]].concat();
-        let mut args = vec!["replay-server", "--stay", "--listen", &wire.endpoint];
+        let mut args = vec!["replay-server", "--keep-alive", "--listen", &wire.endpoint];
         args.extend(
             wire.folder
                 .iter()
@@ -83,15 +83,15 @@ impl Server {
             let (endpoints, credentials) = (connect(&wire.endpoint), credentials.as_ref());
             session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)
         })?;
-        let hello = join::hello(&session, &keys, &Shutdown::default())?
+        let run_info = join::run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;
         Ok(Self {
             process,
             wire: wire.clone(),
             keys,
             sessions: vec![session],
-            actor: ActorSettings::from_toml(&hello.config_toml)?,
-            learner: LearnerConfig::from_toml(&hello.config_toml)?,
+            actor: ActorSettings::from_toml(&run_info.config_toml)?,
+            learner: LearnerConfig::from_toml(&run_info.config_toml)?,
             actors: 0,
         })
     }
@@ -223,8 +223,8 @@ fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
         learner: LEARNER,
         run: LEARNER,
         updates: 0,
-        tally: Tally::default(),
-        other_shards: Tally::default(),
+        counts: ShardCounts::default(),
+        other_shards: ShardCounts::default(),
         restart: false,
     };
     join::as_learner(client, join, &Shutdown::default())?

@@ -45,7 +45,7 @@ pub(super) fn start(
     let surroundings = Surroundings {
         logs: folder,
         screen: &Screen::plain(),
-        meeting: None,
+        rendezvous: None,
     };
     let args: Vec<_> = args.into_iter().map(String::from).collect();
     ManagedProcess::start(name, &args, 1, surroundings)

@@ -52,18 +52,18 @@ impl WorldSettings for IslandConfig {
         _threads: usize,
     ) -> Result<Box<dyn Environment>, EnvError> {
         self.validate()?;
-        let copies = (0..num_envs).map(|copy| Island::new(seed, copy, self.side));
+        let islands = (0..num_envs).map(|env| Island::new(seed, env, self.side));
         Ok(Box::new(Islands {
             side: self.side,
             step_limit: self.step_limit,
             reward: self.reward,
             shape: self.frame_shape(),
-            copies: copies.collect(),
+            islands: islands.collect(),
         }))
     }
 }
 
-/// One copy: where its agent and its treasure are.
+/// One island: where its agent and its treasure are.
 struct Island {
     rng: ChaCha8Rng,
     agent: (usize, usize),
@@ -72,10 +72,10 @@ struct Island {
 }
 
 impl Island {
-    /// A copy depends on the seed and its own number alone, so that it is the same whatever the others are.
-    fn new(seed: u64, copy: usize, side: usize) -> Self {
+    /// An island depends on the seed and its own number alone, so that it is the same whatever the others are.
+    fn new(seed: u64, env: usize, side: usize) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(copy as u64);
+        rng.set_stream(env as u64);
         let mut island = Self {
             rng,
             agent: (0, 0),
@@ -104,7 +104,7 @@ struct Islands {
     step_limit: u32,
     reward: f32,
     shape: FrameShape,
-    copies: Vec<Island>,
+    islands: Vec<Island>,
 }
 
 impl Environment for Islands {
@@ -117,15 +117,15 @@ impl Environment for Islands {
     }
 
     fn num_envs(&self) -> usize {
-        self.copies.len()
+        self.islands.len()
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
         frames.fill(0);
         let width = self.shape.width;
         let frames = frames.chunks_exact_mut(self.shape.bytes());
-        for (frame, copy) in frames.zip(&self.copies) {
-            for ((row, column), shade) in [(copy.treasure, 128), (copy.agent, 255)] {
+        for (frame, island) in frames.zip(&self.islands) {
+            for ((row, column), shade) in [(island.treasure, 128), (island.agent, 255)] {
                 for row in frame.chunks_exact_mut(width).skip(row * FIELD).take(FIELD) {
                     row[column * FIELD..][..FIELD].fill(shade);
                 }
@@ -140,7 +140,7 @@ impl Environment for Islands {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
         let last = self.side - 1;
-        for (env, (copy, &action)) in self.copies.iter_mut().zip(actions).enumerate() {
+        for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {
             let Some((down, right)) = MOVES.get(usize::from(action)) else {
                 return Err(EnvError::ActionOutOfRange {
                     env,
@@ -148,21 +148,21 @@ impl Environment for Islands {
                     num_actions: MOVES.len(),
                 });
             };
-            let (row, column) = copy.agent;
-            copy.agent = (
+            let (row, column) = island.agent;
+            island.agent = (
                 row.saturating_add_signed(*down).min(last),
                 column.saturating_add_signed(*right).min(last),
             );
-            copy.steps += 1;
-            (rewards[env], ends[env]) = if copy.agent == copy.treasure {
+            island.steps += 1;
+            (rewards[env], ends[env]) = if island.agent == island.treasure {
                 (self.reward, StepEnd::Terminal)
-            } else if copy.steps >= self.step_limit {
+            } else if island.steps >= self.step_limit {
                 (0.0, StepEnd::TimedOut)
             } else {
                 (0.0, StepEnd::Running)
             };
             if ends[env] != StepEnd::Running {
-                copy.begin(self.side);
+                island.begin(self.side);
             }
         }
         Ok(())

@@ -7,13 +7,16 @@ mod slowness;
 
 use std::process::ExitCode;
 
+use driml::Registry;
+
 fn main() -> ExitCode {
-    driml_envs::register::<island::IslandConfig>("island", include_str!("island.toml"));
-    driml_learner::auxiliary::register(&slowness::SLOWNESS);
-    driml_settings::presets::register_agent(
-        "slow",
-        "features that change slowly from one state to the next",
-        include_str!("slow.toml"),
-    );
-    driml::main()
+    let registry = Registry::default()
+        .world::<island::IslandConfig>("island", include_str!("island.toml"))
+        .loss(&slowness::SLOWNESS)
+        .agent(
+            "slow",
+            "features that change slowly from one state to the next",
+            include_str!("slow.toml"),
+        );
+    driml::main_with(registry)
 }

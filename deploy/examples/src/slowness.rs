@@ -12,7 +12,7 @@ use driml_learner::{
 use driml_model::DimHeads;
 use serde::Deserialize;
 
-/// Its line of the menu: `learner.update.objective = "slowness"`, one later state a row, one column `slowness` in `metrics.csv`.
+/// Its line of the menu: `learner.update.auxiliary_loss = "slowness"`, one later state a row, one column `slowness` in `metrics.csv`.
 pub(crate) static SLOWNESS: MenuItem = MenuItem {
     name: "slowness",
     positives: Positives::One,
@@ -33,8 +33,8 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
         Some(SlownessSettings { weight }) if weight > 0.0 && weight.is_finite() => {
             Ok(Box::new(Slowness { weight }))
         }
-        _ => Err(UpdateError::Objective(
-            "objective = slowness needs a weight above 0: --set learner.update.slowness.weight=0.01".into(),
+        _ => Err(UpdateError::AuxiliaryLoss(
+            "auxiliary_loss = slowness needs a weight above 0: --set learner.update.slowness.weight=0.01".into(),
         )),
     }
 }

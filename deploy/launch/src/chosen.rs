@@ -71,7 +71,7 @@ pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<
         let best = checkpoint::list(&folder.best())?.pop();
         return best.map(|(_, path)| path).with_context(|| {
             usage!(
-                "{run} has no best checkpoint: none was evaluated. Train with --evaluate-every UPDATES, or evaluate one \
+                "{run} has no best checkpoint: none was evaluated. Train with --eval-interval UPDATES, or evaluate one \
                  with `driml evaluate {run} --checkpoint UPDATES --keep`"
             )
         });

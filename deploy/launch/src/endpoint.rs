@@ -20,8 +20,8 @@ pub(crate) const SOCKET_PATH_MAX: usize = 107;
 pub struct Guard {
     /// `--tls-dir`: there are certificates.
     pub tls: bool,
-    /// `--insecure-network`: every client that can connect is trusted.
-    pub insecure_network: bool,
+    /// `--allow-insecure`: every client that can connect is trusted.
+    pub allow_insecure: bool,
 }
 
 /// Refuses endpoints to connect to that zenoh could not open, or that do not fit `--tls-dir`.
@@ -44,15 +44,15 @@ pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> 
         if !is_open(endpoint) {
             continue;
         }
-        if !guard.insecure_network {
+        if !guard.allow_insecure {
             return Err(usage!(
                 "{endpoint} can be reached from other machines, and anyone who reaches it can read, change and stop the run. \
                  Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, if you trust every machine \
-                 that can connect, add --insecure-network"
+                 that can connect, add --allow-insecure"
             ));
         }
         tracing::warn!(
-            "--insecure-network: anyone who reaches {endpoint} can read, change and stop the run"
+            "--allow-insecure: anyone who reaches {endpoint} can read, change and stop the run"
         );
     }
     Ok(())
@@ -132,10 +132,10 @@ mod tests {
         check_listening(&[endpoint.into()], guard).map_err(|e| e.to_string())
     }
 
-    const fn guard(tls: bool, insecure_network: bool) -> Guard {
+    const fn guard(tls: bool, allow_insecure: bool) -> Guard {
         Guard {
             tls,
-            insecure_network,
+            allow_insecure,
         }
     }
     const TLS: Guard = guard(true, false);
@@ -229,7 +229,7 @@ mod tests {
             let said = listening(open, nothing).unwrap_err();
             let words = [
                 "--tls-dir DIR",
-                "--insecure-network",
+                "--allow-insecure",
                 "change and stop the run",
             ];
             assert!(words.iter().all(|it| said.contains(it)), "{said}");

@@ -6,7 +6,7 @@ use std::{ops::ControlFlow, path::Path};
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_actor::{Evaluation, NetworkPolicy, Policy, RandomPolicy, Step, Watch, episode_returns};
-use driml_envs::{PartOfWorld, WorldConfig};
+use driml_envs::{RestrictedWorld, WorldConfig};
 use driml_learner::{
     Compute, UpdateError, checkpoint,
     insight::{Insight, Seen},
@@ -25,9 +25,9 @@ use crate::{
 /// Probability of a random action where none is asked for. Source: section 2 of the project's specification, after rlpyt.
 pub const EPSILON: f64 = 0.001;
 const COPIES_MAX: usize = 32;
-/// Steps of each copy after which an evaluation is given up; Procgen's longest episode has 6,000.
+/// Steps of each environment after which an evaluation is given up; Procgen's longest episode has 6,000.
 const STEPS_A_ROUND_MAX: u64 = 20_000;
-/// The stream of the exploring policy's generator. A world seeded alike gives its copies streams that count from 0.
+/// The stream of the exploring policy's generator. A world seeded alike gives its environments streams that count from 0.
 const POLICY_STREAM: u64 = u64::MAX;
 
 /// Which levels to play.
@@ -83,7 +83,7 @@ impl Player {
         let mut agent = loaded.agent;
         let is_averaged = weights == Weights::Average && agent.take_average()?;
         Ok(Self {
-            weights: agent.weights_as(config.learner.publish_as)?,
+            weights: agent.weights_as(config.learner.publish_dtype)?,
             network: agent.online().clone(),
             updates: agent.updates(),
             is_averaged,
@@ -103,7 +103,7 @@ impl Player {
     /// The same with f32 weights and arithmetic, whatever the actors of the run have.
     pub fn exact(mut self) -> anyhow::Result<Self> {
         self.weights = self.network.without_dim()?.to_safetensors(|_| true)?;
-        self.config.learner.publish_as = StoredAs::F32;
+        self.config.learner.publish_dtype = StoredAs::F32;
         self.config.actor.precision = Precision::F32;
         Ok(self)
     }
@@ -153,8 +153,8 @@ impl Player {
         play_with(config, policy, world, episodes, epsilon, seed, watch)
     }
 
-    /// Copies of the world that play so many episodes.
-    pub fn copies(episodes: usize) -> usize {
+    /// Environments that play so many episodes.
+    pub fn envs(episodes: usize) -> usize {
         episodes.min(COPIES_MAX)
     }
 
@@ -205,15 +205,15 @@ fn play_with(
     seed: u64,
     watch: Watch<'_>,
 ) -> anyhow::Result<Vec<f64>> {
-    let copies = Player::copies(episodes);
+    let envs = Player::envs(episodes);
     let evaluation = Evaluation {
         frame_stack: config.run.frame_stack as usize,
         epsilon,
         episodes,
-        steps_max: episodes.div_ceil(copies) as u64 * STEPS_A_ROUND_MAX,
+        steps_max: episodes.div_ceil(envs) as u64 * STEPS_A_ROUND_MAX,
     };
     let actions = world.actions(config.actor.actions);
-    let world = PartOfWorld::of(world.build(copies, seed, 0)?, actions, sent(config))?;
+    let world = RestrictedWorld::of(world.build(envs, seed, 0)?, actions, sent(config))?;
     let rng = policy_rng(seed);
     episode_returns(world, policy, evaluation, rng, watch)
         .with_context(|| format!("playing {}", config.run.world))
@@ -248,7 +248,7 @@ impl Viewer {
     }
 }
 
-/// What the policy explores with: other numbers than those of any copy of the world, which has the same seed.
+/// What the policy explores with: other numbers than those of any environment, which has the same seed.
 fn policy_rng(seed: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(POLICY_STREAM);
@@ -290,7 +290,7 @@ mod tests {
     fn exploration_and_the_world_do_not_share_random_numbers() {
         for seed in [0, 1, u64::MAX] {
             let first = policy_rng(seed).random::<u64>();
-            // The streams of a world's copies: two for each.
+            // The streams of a world's environments: two for each.
             for stream in 0..2 * COPIES_MAX as u64 {
                 let mut copy = ChaCha8Rng::seed_from_u64(seed);
                 copy.set_stream(stream);

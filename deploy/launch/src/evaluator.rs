@@ -181,7 +181,7 @@ impl Evaluator {
         let surroundings = Surroundings {
             logs: &self.run_dir.logs(),
             screen,
-            meeting: None,
+            rendezvous: None,
         };
         ManagedProcess::start("evaluation", &args, 1, surroundings)
     }

@@ -7,8 +7,8 @@ use std::{
 };
 
 use driml_protocol::{
-    TwoSteps,
-    end_signs::{self, EndSign},
+    GracefulShutdown,
+    termination::{self, EndSign},
 };
 
 /// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
@@ -16,7 +16,7 @@ const ONE_WISH: Duration = Duration::from_millis(300);
 
 /// A shared count of interrupts, up to two.
 #[derive(Clone, Debug, Default)]
-pub struct Interrupts(TwoSteps);
+pub struct Interrupts(GracefulShutdown);
 
 impl Interrupts {
     /// Starts to listen for signs that this process should end, for the rest of its life; the death of the process `parent` is
@@ -24,7 +24,7 @@ impl Interrupts {
     pub fn listen(parent: Option<u32>) -> std::io::Result<Self> {
         let this = Self::default();
         let (counted, mut first) = (this.clone(), None);
-        end_signs::listen("interrupts", parent, move |sign| {
+        termination::listen("interrupts", parent, move |sign| {
             counted.note(sign, &mut first, Instant::now());
             ControlFlow::Continue(())
         })?;

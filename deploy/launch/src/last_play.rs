@@ -17,7 +17,7 @@ use crate::{
     run_folder::{Earned, LastPlay, RunFolder, Summary},
 };
 
-/// Episodes that are played at once, one in each copy of the world. They count together, so that long ones are not left out.
+/// Episodes that are played at once, one in each environment. They count together, so that long ones are not left out.
 const BATCH: usize = 20;
 const BATCHES_MAX: u32 = 5;
 /// How long all of it may take; the first batch may take longer.

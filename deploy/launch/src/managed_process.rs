@@ -15,7 +15,7 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::{console::Screen, meeting::Meeting, process_log::ProcessLog};
+use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
 
 /// A process that ends with an error within this time of its start would do so again.
 const AT_ONCE: Duration = Duration::from_secs(10);
@@ -40,7 +40,7 @@ pub struct Surroundings<'a> {
     /// Where their warnings are shown.
     pub screen: &'a Screen,
     /// Where they meet, if it is to stay there as long as any of them lives.
-    pub meeting: Option<&'a Meeting>,
+    pub rendezvous: Option<&'a Rendezvous>,
 }
 
 /// The variable that says how many threads a process has for arithmetic.
@@ -63,7 +63,7 @@ impl ManagedProcess {
     ) -> anyhow::Result<Self> {
         let log = ProcessLog::open(name, surroundings.logs)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
-        let held = surroundings.meeting.map(Meeting::hold).transpose();
+        let held = surroundings.rendezvous.map(Rendezvous::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program);

@@ -100,7 +100,7 @@ fn processes(config: &RunConfig, lockstep: bool) -> String {
     };
     let (count, envs) = (config.local.actors, config.actor.envs);
     let actors = if count == 1 { "actor" } else { "actors" };
-    format!("{servers}; learner {learner}; {count} {actors} with {envs} copies of the world each")
+    format!("{servers}; learner {learner}; {count} {actors} with {envs} environments each")
 }
 
 /// Bytes in a unit that fits them.
@@ -141,10 +141,11 @@ mod tests {
         expect![[r#"
             trains      driml-fix on procgen:bigfish, seed 1, from preset paper
             frames      200000 in all, with 6218 updates of 256 rows (replay ratio 8)
-            processes   replay server; learner with 2 threads; 1 actor with 16 copies of the world each
+            processes   replay server; learner with 2 threads; 1 actor with 16 environments each
             replay      the newest 200000 transitions, up to 2.3 GiB of memory
             run folder  runs/x
-        "#]].assert_eq(&plan);
+        "#]]
+        .assert_eq(&plan);
     }
 
     #[test]

@@ -87,7 +87,7 @@ fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
         })?;
     let settings = format!("the settings in {name}");
     let mut config = RunConfig::parse(&settings, &exported.settings)?;
-    config.learner.publish_as = StoredAs::F16;
+    config.learner.publish_dtype = StoredAs::F16;
     // It was chosen for the machine that trained.
     if !is_bf16_fast() {
         config.actor.precision = Precision::F32;

@@ -10,7 +10,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::fault;
+use driml_protocol::fail_point;
 
 use crate::{console::Screen, run_folder::AppendLog};
 
@@ -62,7 +62,7 @@ impl ProcessLog {
         let carry = move || {
             let point = format!("log of {name}");
             for line in BufReader::new(pipe).split(b'\n') {
-                fault::point(&point);
+                fail_point::reach(&point);
                 let Ok(line) = line else { return };
                 let line = String::from_utf8_lossy(&line).into_owned();
                 let shown = is_warning(&line).then(|| format!("{name}: {line}"));

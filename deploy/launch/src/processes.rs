@@ -10,7 +10,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
 use driml_protocol::{
-    fault,
+    fail_point,
     session::{self, Endpoints},
 };
 use nix::sys::signal::Signal;
@@ -120,7 +120,7 @@ pub(crate) fn connect(
     // Opening may take seconds, in which the replay server may end: so it runs on another thread.
     let open = move || {
         loop {
-            fault::point("connect");
+            fail_point::reach("connect");
             let opened = session::open(&endpoints);
             let is_open = opened.is_ok();
             // The receiver is gone if the run has ended meanwhile.

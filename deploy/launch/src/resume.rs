@@ -22,7 +22,7 @@ use driml_settings::{
 };
 
 use crate::{
-    console, meeting,
+    console, rendezvous,
     run_folder::{Outcome, ResumePoint, RunFolder, Summary},
 };
 
@@ -89,8 +89,8 @@ pub fn wait_until_free(folder: &RunFolder) -> anyhow::Result<()> {
     }
     // The replay server is the last: it holds its replay, and where it listens.
     let is_left = || {
-        let place = std::fs::read(folder.meeting());
-        let is_used = |place: Vec<u8>| meeting::is_used(Path::new(OsStr::from_bytes(&place)));
+        let place = std::fs::read(folder.rendezvous());
+        let is_used = |place: Vec<u8>| rendezvous::is_used(Path::new(OsStr::from_bytes(&place)));
         Ok(!place.is_ok_and(is_used))
     };
     let why = format!("processes of the run in {} still end", folder.display());

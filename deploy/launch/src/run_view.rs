@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_actor::Schedule;
-use driml_protocol::{LearnerStatus, PartsStatus, RecoveryProgress, ReplayStatus, Waiting};
+use driml_protocol::{LearnerStatus, ProcessesStatus, RecoveryProgress, ReplayStatus, Waiting};
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
@@ -46,7 +46,7 @@ impl Plan {
             actors_planned: config.local.actors,
             // Without a ladder it is every actor's.
             epsilon: Schedule::new(&config.actor, 0).ok().filter(|_| is_common),
-            losses: config.learner.update.objective.losses(),
+            losses: config.learner.update.auxiliary_loss.losses(),
         }
     }
 }
@@ -109,7 +109,7 @@ pub(crate) struct ServerAnswer {
     /// Its counts; none if it does not answer, or not yet.
     pub(crate) replay: Option<ReplayStatus>,
     /// Who takes part; none if it does not answer, or not yet.
-    pub(crate) parts: Option<PartsStatus>,
+    pub(crate) processes: Option<ProcessesStatus>,
     /// How far it is with reading its replay back from disk, before which it can answer nothing else.
     pub(crate) recovering: Option<RecoveryProgress>,
     pub(crate) error: Option<String>,
@@ -235,8 +235,8 @@ impl RunView {
 
     /// Seconds since the run began, by its replay servers.
     pub(crate) fn up_s(&self) -> Option<f64> {
-        let parts = self.servers.iter().filter_map(|it| it.parts.as_ref());
-        parts.map(|it| it.up_s).reduce(f64::max)
+        let processes = self.servers.iter().filter_map(|it| it.processes.as_ref());
+        processes.map(|it| it.up_s).reduce(f64::max)
     }
 
     /// The learner's status: its answer, or its last one where no process is left to be asked.

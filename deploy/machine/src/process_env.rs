@@ -19,7 +19,7 @@ const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 pub enum Purpose {
     /// A replay server.
     ReplayServer,
-    /// Any other part or command, which needs what all need.
+    /// Any other process or command, which needs what all need.
     Other,
 }
 

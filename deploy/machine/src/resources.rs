@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::kib;
 
-/// Copies of the world in one actor: enough for batched inference, few enough for a quick round of chunks.
+/// Environments in one actor: enough for batched inference, few enough for a quick round of chunks.
 pub const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
@@ -16,7 +16,7 @@ const REPLAY_SHARE_MAX: f64 = 0.9;
 
 /// What a learner takes on Procgen (266 MiB measured), and some room.
 const LEARNER_BYTES: u64 = 512 << 20;
-/// What an actor of 16 copies takes on Procgen, whose engine holds its pictures (410 to 423 MiB measured), and elsewhere (97 MiB
+/// What an actor of 16 environments takes on Procgen, whose engine holds its pictures (410 to 423 MiB measured), and elsewhere (97 MiB
 /// on Ms. PacMan).
 const ACTOR_BYTES: (u64, u64) = (430 << 20, 100 << 20);
 

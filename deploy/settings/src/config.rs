@@ -1,4 +1,4 @@
-//! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
+//! The resolved settings of a run: one TOML with a table for each process, checked as a whole.
 //! It fills in no number: `resolve` does.
 
 use driml_envs::WorldConfig;
@@ -108,7 +108,7 @@ pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Re
     derived::optional(table, name)?.ok_or_else(|| usage!("the settings have no [{name}] table"))
 }
 
-/// Reads every table as its part will.
+/// Reads every table as its process will.
 pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
     let tables = "run, world, input, actor, replay, learner, model, transport, local";
     let is_known = |key: &&String| tables.split(", ").any(|it| it == **key);
@@ -135,7 +135,7 @@ impl RunConfig {
     /// Bytes of a version of the weights as the learner publishes it.
     pub fn weights_bytes(&self) -> driml_model::Result<usize> {
         let published = self.model.without_dim();
-        published.weights_bytes(self.learner.publish_as)
+        published.weights_bytes(self.learner.publish_dtype)
     }
 
     pub(crate) fn from_table(table: &Table) -> Result<Self, Usage> {
@@ -151,7 +151,7 @@ impl RunConfig {
         Self::from_table(&table).map_err(|e| usage!("{name}: {e}"))
     }
 
-    /// The settings as every part reads them, sorted by name.
+    /// The settings as every process reads them, sorted by name.
     pub fn to_toml(&self) -> String {
         toml::to_string(&self.to_table()).expect("a table of plain values is TOML")
     }
@@ -244,7 +244,7 @@ impl RunConfig {
         }
         let device = local.learner_device.check(learner.precision);
         device.map_err(said)?;
-        self.check_objective()?;
+        self.check_auxiliary_loss()?;
         let rng = &mut ChaCha8Rng::seed_from_u64(0);
         let affinity = learner.affinity.estimator(self.model.num_actions, rng);
         affinity.map_err(said)?;
@@ -261,10 +261,10 @@ impl RunConfig {
         }
     }
 
-    /// The replay serves what the auxiliary objective needs and no more.
-    fn check_objective(&self) -> Result<(), Usage> {
-        let objective = self.learner.update.objective;
-        let positives = objective.positives();
+    /// The replay serves what the auxiliary loss needs and no more.
+    fn check_auxiliary_loss(&self) -> Result<(), Usage> {
+        let auxiliary_loss = self.learner.update.auxiliary_loss;
+        let positives = auxiliary_loss.positives();
         let served = self.run.horizon.positives();
         if positives.served().contains(&served) {
             return Ok(());
@@ -275,10 +275,10 @@ impl RunConfig {
             states => format!("{states} later states"),
         };
         Err(usage!(
-            "run.horizon serves {} a row, but learner.update.objective = {} looks at {}: --set 'run.horizon={}', or take another --agent",
+            "run.horizon serves {} a row, but learner.update.auxiliary_loss = {} looks at {}: --set 'run.horizon={}', or take another --agent",
             later,
-            objective.name(),
-            positives.served_words(),
+            auxiliary_loss.name(),
+            positives.describe_served(),
             positives.horizon()
         ))
     }

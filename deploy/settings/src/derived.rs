@@ -5,7 +5,7 @@ use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
 use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, TorsoName};
-use driml_protocol::config::in_words;
+use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
@@ -324,5 +324,5 @@ fn table_at<T: DeserializeOwned>(table: &Table, path: &str) -> Result<T, Usage> 
 /// What is set at a dotted path, if anything is.
 pub(crate) fn optional<T: DeserializeOwned>(table: &Table, path: &str) -> Result<Option<T>, Usage> {
     let read = find(table, path).cloned().map(Value::try_into).transpose();
-    read.map_err(|e| usage!("in the settings' [{path}] table: {}", in_words(&e)))
+    read.map_err(|e| usage!("in the settings' [{path}] table: {}", describe(&e)))
 }

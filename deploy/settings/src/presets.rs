@@ -4,7 +4,7 @@
 #[cfg(test)]
 mod pinned;
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::OnceLock;
 
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
@@ -148,24 +148,34 @@ agents! {
     "curl": "two augmentations of the same state, the second one seen by a moving average of the network";
 }
 
-static OWN_AGENTS: Mutex<Vec<&'static Agent>> = Mutex::new(Vec::new());
+static CUSTOM: OnceLock<Vec<Agent>> = OnceLock::new();
 
-/// Makes an agent known, before anything else is done: `--agent NAME` takes it from then on. `layer` is its settings, TOML as in
-/// `presets/agent/`. A name that is known already keeps its agent.
-pub fn register_agent(name: &'static str, about: &'static str, layer: &'static str) {
-    let agent = Agent {
-        name,
-        about,
-        layer: Layer { name, text: layer },
-    };
-    let mut own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
-    own.push(Box::leak(Box::new(agent)));
+impl Agent {
+    /// An agent that a program adds: `--agent NAME` takes it. `layer` is its settings, TOML as in `presets/agent/`.
+    pub const fn new(name: &'static str, about: &'static str, layer: &'static str) -> Self {
+        Self {
+            name,
+            about,
+            layer: Layer { name, text: layer },
+        }
+    }
+}
+
+/// Makes agents known, before anything else is done. A name that is known already keeps its agent.
+///
+/// # Panics
+/// If it was called before.
+pub fn register(agents: Vec<Agent>) {
+    let first = CUSTOM.set(agents);
+    first.expect("a program registers its agents once");
 }
 
 /// Every agent, with those that the program added.
 pub(crate) fn agents() -> Vec<&'static Agent> {
-    let own = OWN_AGENTS.lock().unwrap_or_else(PoisonError::into_inner);
-    AGENTS.iter().chain(own.iter().copied()).collect()
+    AGENTS
+        .iter()
+        .chain(CUSTOM.get().into_iter().flatten())
+        .collect()
 }
 
 /// One for each kind of world in the registry of worlds.
@@ -180,7 +190,7 @@ const WORLDS: &[Layer] = &[
 fn world_layer(world: WorldName) -> Layer {
     let name = format!("world/{}", world.kind());
     let found = WORLDS.iter().find(|layer| layer.name == name).copied();
-    let own = driml_envs::own_preset(world.kind()).map(|text| Layer {
+    let own = driml_envs::custom_preset(world.kind()).map(|text| Layer {
         name: world.kind(),
         text,
     });

@@ -36,7 +36,7 @@ pub struct Flags {
     /// Replay servers, each with a share of the actors and memory [default: 1]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub replay_shards: Option<u32>,
-    /// Copies of the world per actor [default: as the preset says]
+    /// Environments per actor [default: as the preset says]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub envs: Option<u32>,
     /// Frames of the run; it is finished when they are stored and their updates are done

@@ -17,7 +17,7 @@ pub(crate) struct ActorArgs {
     /// env:JOB_COMPLETION_INDEX
     #[arg(long, value_name = "N", default_value = "0", value_parser = actor_id)]
     pub(crate) id: u32,
-    /// Copies of the world [default: from the run's settings]
+    /// Environments [default: from the run's settings]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub(crate) envs: Option<u32>,
     /// Command or library of the run's world on this machine, if it is exec:COMMAND or libenv:PATH:GAME; an actor never runs what

@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 use driml_launch::{
     endpoint::{Guard, NAMESPACE},
-    meeting, shared_memory,
+    rendezvous, shared_memory,
 };
 use driml_machine::error::Usage;
 use driml_protocol::{
@@ -27,10 +27,10 @@ pub(crate) struct JoinFlags {
 
 /// When a replay server or a learner ends.
 #[derive(Debug, Args)]
-pub(crate) struct StayFlag {
+pub(crate) struct KeepAliveFlag {
     /// After the run, keep answering until Ctrl-C or a signal
-    #[arg(long)]
-    pub(super) stay: bool,
+    #[arg(long, alias = "stay")]
+    pub(super) keep_alive: bool,
 }
 
 /// With which certificate a process takes part.
@@ -47,8 +47,8 @@ pub(crate) struct TlsFlags {
 #[derive(Debug, Args)]
 pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
-    #[arg(long)]
-    pub(crate) insecure_network: bool,
+    #[arg(long, alias = "insecure-network")]
+    pub(crate) allow_insecure: bool,
 }
 
 impl NetworkFlag {
@@ -56,7 +56,7 @@ impl NetworkFlag {
     pub(super) const fn guard(&self, tls: &TlsFlags) -> Guard {
         Guard {
             tls: tls.is_set(),
-            insecure_network: self.insecure_network,
+            allow_insecure: self.allow_insecure,
         }
     }
 }
@@ -88,7 +88,7 @@ pub(super) fn join<T>(
 
 /// What a process does when it has ended, well or not: nothing of it is left outside the run folder.
 pub(super) fn clean_up_after(ran: anyhow::Result<()>) -> anyhow::Result<()> {
-    meeting::leave();
+    rendezvous::leave();
     shared_memory::remove_own();
     ran
 }

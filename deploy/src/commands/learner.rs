@@ -7,7 +7,7 @@ use driml_launch::endpoint::check_endpoints;
 use driml_machine::device::{DeviceFlag, ready_for};
 use driml_protocol::{Shutdown, tls::Role};
 
-use super::join::{JoinFlags, StayFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, KeepAliveFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct LearnerArgs {
@@ -23,7 +23,7 @@ pub(crate) struct LearnerArgs {
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
     #[command(flatten)]
-    pub(crate) until: StayFlag,
+    pub(crate) until: KeepAliveFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -42,7 +42,7 @@ pub(crate) fn run(args: LearnerArgs) -> anyhow::Result<()> {
         run_dir: args.run_dir,
         device: args.on.device,
         restart: args.restart,
-        stay: args.until.stay,
+        keep_alive: args.until.keep_alive,
     };
     clean_up_after(driml_learner::run(run, &shutdown))
 }

@@ -8,10 +8,10 @@ use driml_launch::{
     open_files,
 };
 use driml_machine::{error::usage, resources::Machine};
-use driml_protocol::{TwoSteps, tls::Role};
+use driml_protocol::{GracefulShutdown, tls::Role};
 use driml_settings::flags::{self, RunFlags};
 
-use super::join::{JoinFlags, NetworkFlag, StayFlag, TlsFlags, clean_up_after, join};
+use super::join::{JoinFlags, KeepAliveFlag, NetworkFlag, TlsFlags, clean_up_after, join};
 
 #[derive(Debug, Args)]
 pub(crate) struct ReplayServerArgs {
@@ -31,7 +31,7 @@ pub(crate) struct ReplayServerArgs {
     #[command(flatten)]
     pub(crate) run: RunFlags,
     #[command(flatten)]
-    pub(crate) until: StayFlag,
+    pub(crate) until: KeepAliveFlag,
     #[command(flatten)]
     pub(crate) tls: TlsFlags,
     #[command(flatten)]
@@ -50,7 +50,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         let checked = config.replay.check_in_memory("--replay-dir DIR");
         checked.map_err(|e| usage!("{e}"))?;
     }
-    let TwoSteps { ending, now } = join(&args.join, TwoSteps::on_signals)?;
+    let GracefulShutdown { ending, now } = join(&args.join, GracefulShutdown::on_signals)?;
     for note in &config.notes {
         tracing::warn!("{note}");
     }
@@ -63,7 +63,7 @@ pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
         shard: args.shard,
         weights_bytes_max: config.weights_bytes()?,
         dir: args.replay_dir,
-        stay: args.until.stay,
+        keep_alive: args.until.keep_alive,
         ending,
         config_toml: config.to_toml(),
     };

@@ -60,12 +60,12 @@ pub(crate) struct TrainArgs {
     pub(crate) tensorboard: bool,
     /// Play a checkpoint every so many updates, in a separate process that takes a core, and keep the best; writes evaluations.csv.
     /// `driml evaluate RUN --checkpoint best` plays it
-    #[arg(long, value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
-    pub(crate) evaluate_every: Option<u64>,
+    #[arg(long, alias = "evaluate-every", value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
+    pub(crate) eval_interval: Option<u64>,
     /// Episodes per evaluation
-    #[arg(long, value_name = "N", default_value_t = 20, requires = "evaluate_every", allow_negative_numbers = true,
+    #[arg(long, alias = "evaluate-episodes", value_name = "N", default_value_t = 20, requires = "eval_interval", allow_negative_numbers = true,
           value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    pub(crate) evaluate_episodes: u32,
+    pub(crate) eval_episodes: u32,
     /// Skip the greedy episodes after the run, which take about 30 s
     #[arg(long)]
     pub(crate) no_play: bool,
@@ -96,8 +96,8 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     ] {
         sets.extend(is_set.then(|| set.to_owned()));
     }
-    if let Some(every) = args.evaluate_every {
-        let episodes = args.evaluate_episodes;
+    if let Some(every) = args.eval_interval {
+        let episodes = args.eval_episodes;
         // Before what the user sets: checkpoints may be more frequent.
         sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
         sets.push(format!(
@@ -162,7 +162,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
         let outside = launcher::Outside {
             listen: args.listen,
             tls_dir: args.tls.tls_dir,
-            insecure_network: args.network.insecure_network,
+            allow_insecure: args.network.allow_insecure,
         };
         let parent = args.exit_with_parent;
         launcher::run(&config, &run_dir, resume_point, outside, parent)

@@ -54,7 +54,7 @@ pub struct ModelConfig {
     /// Width of the fully connected layer f4.
     pub hidden: usize,
     /// Width of the space in which DIM scores are dot products, and of its heads' hidden layers.
-    pub rkhs: usize,
+    pub embedding_dim: usize,
     /// Width of the embedded action.
     pub action_embed: usize,
     /// Which DIM heads exist.
@@ -112,7 +112,7 @@ impl ModelConfig {
             ("num_actions", self.num_actions),
             ("atoms", self.atoms),
             ("hidden", self.hidden),
-            ("rkhs", self.rkhs),
+            ("embedding_dim", self.embedding_dim),
             ("action_embed", self.action_embed),
         ];
         for (name, size) in sizes {
@@ -318,7 +318,7 @@ impl ModelConfig {
         ];
         for (exists, name, input, initial) in heads {
             if exists {
-                block(name, input, self.rkhs, false, initial);
+                block(name, input, self.embedding_dim, false, initial);
             }
         }
         layers
@@ -347,7 +347,7 @@ impl ModelConfig {
             channels: vec![],
             scale_blocks: false,
             hidden: 7,
-            rkhs: 8,
+            embedding_dim: 8,
             action_embed: 2,
             dim: DimHeads {
                 psi3: true,

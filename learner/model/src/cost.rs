@@ -58,7 +58,7 @@ impl ModelConfig {
             } else if is_of("dim.psi3.") || is_of("dim.phi3.") {
                 let joined = layer.weight[1].saturating_sub(channels) * outputs;
                 let features = weight_len - joined;
-                // `out` follows on `hidden`, which is as wide as rkhs and has nothing joined to it.
+                // `out` follows on `hidden`, which is as wide as embedding_dim and has nothing joined to it.
                 if is_of("dim.psi3.out") || is_of("dim.phi3.out") {
                     height * width * weight_len
                 } else {

@@ -34,7 +34,7 @@ impl Encoder {
         })
     }
 
-    /// psi_4(f4) [B, rkhs] of `frames` [B, H, W, C] u8, cut off from any graph.
+    /// psi_4(f4) [B, embedding_dim] of `frames` [B, H, W, C] u8, cut off from any graph.
     pub fn encode(&self, frames: &Tensor) -> Result<Tensor> {
         let (_, f4) = self.torso.features(frames, false)?;
         Ok(self.psi4.forward(&f4.detach(), None)?.detach())

@@ -17,7 +17,7 @@
 //!     height: 8, width: 8, input_channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
 //!     torso: TorsoName::Nature, conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
 //!     channels: vec![], scale_blocks: false,
-//!     hidden: 8, rkhs: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
+//!     hidden: 8, embedding_dim: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
@@ -62,9 +62,9 @@ pub use heads::noise::HeadNoise;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};
+pub use kernels::isa::{describe_kernels, is_bf16_fast};
 pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
-pub use kernels::units::{is_bf16_fast, kernels_in_words};
 pub use network::{Features, Network};
 pub use parameters::Parameters;
 pub use policy::PolicyNetwork;

@@ -139,13 +139,13 @@ impl Network {
         self.head.q_values(logits)
     }
 
-    /// Psi_3 [B, h * w, rkhs] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
+    /// Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = self.psi3.as_ref().ok_or(ModelError::NoHead("psi3"))?;
         by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
     }
 
-    /// Phi_3 [B, h * w, rkhs] of `f3` [B, h, w, c].
+    /// Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
         by_location(
             self.phi3
@@ -155,13 +155,13 @@ impl Network {
         )
     }
 
-    /// Psi_4 [B, rkhs] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
+    /// Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
     pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let head = self.psi4.as_ref().ok_or(ModelError::NoHead("psi4"))?;
         head.forward(f4, self.embedded(actions)?.as_ref())
     }
 
-    /// Phi_4 [B, rkhs] of `f4` [B, hidden].
+    /// Phi_4 [B, embedding_dim] of `f4` [B, hidden].
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
         self.phi4
             .as_ref()
@@ -177,7 +177,7 @@ impl Network {
     }
 }
 
-/// [B, h, w, rkhs] as [B, h * w, rkhs].
+/// [B, h, w, embedding_dim] as [B, h * w, embedding_dim].
 fn by_location(maps: Tensor) -> Result<Tensor> {
     Ok(maps.flatten(1, 2)?)
 }

@@ -16,8 +16,8 @@ use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::{Dense, activate};
+use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{AnyUnit, Element, Unit, on_unit};
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
@@ -139,7 +139,7 @@ impl fmt::Debug for PolicyNetwork {
     }
 }
 
-/// Weights as one unit's kernels want them.
+/// Weights as one instruction set's kernels want them.
 trait Weights: Send + Sync {
     /// Expected returns of any number of frames, on the calling thread.
     fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]);
@@ -148,29 +148,29 @@ trait Weights: Send + Sync {
     fn set_noise(&mut self, noise: Option<&HeadNoise>);
 }
 
-/// The weights in a safetensors file, for the fastest unit of this processor.
+/// The weights in a safetensors file, for the fastest instruction set of this processor.
 fn weights(
     config: &ModelConfig,
     safetensors: &[u8],
     precision: Precision,
 ) -> Result<Box<dyn Weights>> {
-    Ok(on_unit!(AnyUnit::of(precision), unit => {
-        Box::new(UnitWeights::decode(unit, config, safetensors, precision)?)
+    Ok(with_simd!(AnySimd::of(precision), simd => {
+        Box::new(UnitWeights::decode(simd, config, safetensors, precision)?)
     }))
 }
 
-struct UnitWeights<U: Unit> {
-    unit: U,
+struct UnitWeights<S: Simd> {
+    simd: S,
     frame_len: usize,
     torso: Box<dyn ActingTorso>,
-    head: Dense<U>,
+    head: Dense<S>,
     /// What `head` is made of, with every noise anew; there if it is noisy.
     noisy: Option<ActingHead>,
 }
 
-impl<U: Unit> UnitWeights<U> {
+impl<S: Simd> UnitWeights<S> {
     fn decode(
-        unit: U,
+        simd: S,
         config: &ModelConfig,
         safetensors: &[u8],
         precision: Precision,
@@ -188,10 +188,10 @@ impl<U: Unit> UnitWeights<U> {
         });
         let head = ActingHead::new(config, &mut take);
         Ok(Self {
-            unit,
+            simd,
             frame_len: config.frame_len(),
             torso: torso.acting(precision, of_torso),
-            head: dense(unit, &head.layer(None)),
+            head: dense(simd, &head.layer(None)),
             noisy: config.head.noisy_sigma.map(|_| head),
         })
     }
@@ -200,19 +200,19 @@ impl<U: Unit> UnitWeights<U> {
         let count = values.len() * support.len() / self.head.outputs();
         let hidden = self.torso.f4(frames);
         let width = self.head.inputs();
-        let stride = width.next_multiple_of(U::Element::DEPTH);
-        let mut active = Buffer::<U::Element>::new(count * stride);
-        activate(self.unit, &hidden, width, &mut active);
-        let logits = self.head.forward(self.unit, &active, count);
+        let stride = width.next_multiple_of(S::Element::DEPTH);
+        let mut active = Buffer::<S::Element>::new(count * stride);
+        activate(self.simd, &hidden, width, &mut active);
+        let logits = self.head.forward(self.simd, &active, count);
         expected_returns(&logits, support, values);
     }
 }
 
-fn dense<U: Unit>(unit: U, layer: &InputsFirst) -> Dense<U> {
-    Dense::new(unit, &layer.weight, layer.bias.clone())
+fn dense<S: Simd>(simd: S, layer: &InputsFirst) -> Dense<S> {
+    Dense::new(simd, &layer.weight, layer.bias.clone())
 }
 
-impl<U: Unit> Weights for UnitWeights<U> {
+impl<S: Simd> Weights for UnitWeights<S> {
     fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
         let actions = self.head.outputs() / support.len();
         let tiles = frames
@@ -225,7 +225,7 @@ impl<U: Unit> Weights for UnitWeights<U> {
 
     fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         if let Some(noisy) = &self.noisy {
-            self.head = dense(self.unit, &noisy.layer(noise));
+            self.head = dense(self.simd, &noisy.layer(noise));
         }
     }
 }

@@ -13,9 +13,9 @@ use super::{
 };
 use crate::{
     batch::Batch,
+    deduplicate::State,
     error::UpdateError,
     losses::{info_nce::info_nce_loss, scores::Dots},
-    repeats::State,
 };
 
 /// Its line of the menu.
@@ -33,7 +33,7 @@ pub const CPC: MenuItem = MenuItem {
 /// What each pair's loss is reported as, in the order of `settings::PAIRS`.
 const NAMES: [&str; 4] = ["cpc_3t3", "cpc_3t4", "cpc_4t3", "cpc_4t4"];
 
-/// The CPC objective's settings: those of the pairs of levels.
+/// The CPC loss's settings: those of the pairs of levels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Cpc {
     /// Weights of the pairs, and how dot products become scores.
@@ -80,7 +80,7 @@ impl AuxiliaryLoss for Cpc {
             let all = vec![1; rows];
             for ((sum, all_dots), dots) in sums.iter_mut().zip(&mut all_dots).zip(dots) {
                 if let Some(dots) = dots {
-                    let scores = self.pairs.scores(dots.rkhs);
+                    let scores = self.pairs.scores(dots.width);
                     let loss = info_nce_loss(&dots.dots, &all, scores, online.kernels())?;
                     *sum = Some(match sum.take() {
                         Some(sum) => (sum + loss)?,

@@ -41,7 +41,8 @@ pub struct CurlSettings {
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     settings.check_weighted()?;
-    let fault = |what: &str| Err(UpdateError::Objective(format!("objective = curl {what}")));
+    let said = |what: &str| format!("auxiliary_loss = curl {what}");
+    let fault = |what: &str| Err(UpdateError::AuxiliaryLoss(said(what)));
     if settings.lambda.wanted() != [false, false, false, true] {
         return fault("compares whole states, so lambda.4t4 alone may be above 0");
     }
@@ -102,7 +103,7 @@ impl AuxiliaryLoss for Curl {
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
         let dots = dim::dots_of(inputs.online.kernels(), &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
-        let scores = Scores::new(dots.rkhs, self.tanh_clip);
+        let scores = Scores::new(dots.width, self.tanh_clip);
         let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;
         Ok(vec![WeightedLoss {
             name: "curl",

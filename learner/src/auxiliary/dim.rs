@@ -11,12 +11,12 @@ use super::{
 };
 use crate::{
     batch::Batch,
+    deduplicate::State,
     error::UpdateError,
     losses::{
         info_nce::info_nce_loss,
         scores::{Dots, Scores},
     },
-    repeats::State,
 };
 
 /// Its line of the menu.
@@ -33,7 +33,7 @@ pub const DIM: MenuItem = MenuItem {
 /// What each pair's loss is reported as, in the order of `settings::PAIRS`.
 const NAMES: [&str; 4] = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"];
 
-/// The DIM objective's settings.
+/// The DIM loss's settings.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dim {
     /// Weights of the pairs.
@@ -43,7 +43,7 @@ pub struct Dim {
 }
 
 impl Dim {
-    /// The objective of these settings.
+    /// The auxiliary loss of these settings.
     pub const fn new(settings: &AuxiliarySettings<'_>) -> Self {
         Self {
             lambda: settings.lambda,
@@ -76,16 +76,16 @@ impl Dim {
 
     fn info_nce(
         &self,
-        Dots { dots, rkhs }: &Dots,
+        Dots { dots, width }: &Dots,
         valid: &[u8],
         network: &Network,
     ) -> candle_core::Result<Tensor> {
-        info_nce_loss(dots, valid, self.scores(*rkhs), network.kernels())
+        info_nce_loss(dots, valid, self.scores(*width), network.kernels())
     }
 
-    /// How dot products of vectors of `rkhs` numbers become scores.
-    pub fn scores(&self, rkhs: usize) -> Scores {
-        Scores::new(rkhs, self.tanh_clip)
+    /// How dot products of vectors of `width` numbers become scores.
+    pub fn scores(&self, width: usize) -> Scores {
+        Scores::new(width, self.tanh_clip)
     }
 }
 
@@ -195,7 +195,7 @@ impl Vectors {
 pub fn dots_of(kernels: Kernels, psi: &Tensor, phi: &Tensor) -> candle_core::Result<Dots> {
     Ok(Dots {
         dots: kernels.dot_products(psi, phi)?,
-        rkhs: psi.dims()[psi.rank() - 1],
+        width: psi.dims()[psi.rank() - 1],
     })
 }
 

@@ -42,7 +42,7 @@ impl KeyEncoder {
         &self.parameters
     }
 
-    /// Keys [B, rkhs] of `frames` [B, H, W, C] u8, without a gradient.
+    /// Keys [B, embedding_dim] of `frames` [B, H, W, C] u8, without a gradient.
     pub fn keys(&self, frames: &Tensor) -> Result<Tensor, UpdateError> {
         Ok(self.encoder.encode(frames)?)
     }

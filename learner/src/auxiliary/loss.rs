@@ -13,16 +13,16 @@ use super::{
 };
 use crate::{
     batch::Batch,
+    deduplicate::{self, Distinct, State, one_after_another},
     error::UpdateError,
     losses::scores::Dots,
-    repeats::{Distinct, EqualStates, State, one_after_another},
     tensors::states,
 };
 
 /// An item of the menu: what is known of a loss before its settings are read.
 #[derive(Debug)]
 pub struct MenuItem {
-    /// Its name, as `learner.update.objective` has it.
+    /// Its name, as `learner.update.auxiliary_loss` has it.
     pub name: &'static str,
     /// What it compares s_t with.
     pub positives: Positives,
@@ -122,7 +122,7 @@ impl OnlineFeatures {
         model: &ModelConfig,
         loss: &dyn AuxiliaryLoss,
         batch: &Batch<'_>,
-        equal_states: EqualStates,
+        deduplicate: bool,
         device: &Device,
     ) -> Result<Self, UpdateError> {
         let len = model.frame_len();
@@ -133,7 +133,7 @@ impl OnlineFeatures {
         all.extend(loss.later_states(batch, len));
 
         if anchors == 0
-            && equal_states.once_by(network.kernels())
+            && deduplicate::applies(deduplicate, network.kernels())
             && let Some(distinct) = Distinct::of(&all)
         {
             let features = network.features(&states(model, distinct.gather(&all, len), device)?)?;
@@ -186,7 +186,7 @@ pub struct LossInputs<'a> {
 }
 
 impl LossInputs<'_> {
-    /// The key encoder's vectors [B, rkhs] of the batch's positives, without a gradient.
+    /// The key encoder's vectors [B, embedding_dim] of the batch's positives, without a gradient.
     ///
     /// # Panics
     /// If the loss has no [`AuxiliaryLoss::key_tau`].

@@ -13,11 +13,7 @@ pub mod none;
 pub mod positives;
 pub mod settings;
 
-use std::{
-    fmt,
-    str::FromStr,
-    sync::{Mutex, PoisonError},
-};
+use std::{fmt, str::FromStr, sync::OnceLock};
 
 use loss::{AuxiliaryLoss, MenuItem};
 use positives::Positives;
@@ -30,31 +26,35 @@ use crate::error::UpdateError;
 pub const MENU: &[&MenuItem] = &[&none::NONE, &dim::DIM, &cpc::CPC, &curl::CURL];
 
 /// Those that the program added.
-static OWN: Mutex<Vec<&'static MenuItem>> = Mutex::new(Vec::new());
+static CUSTOM: OnceLock<Vec<&'static MenuItem>> = OnceLock::new();
 
-/// Adds a loss to the menu, before anything else is done: `learner.update.objective` takes its name from then on. A name that is
-/// in the menu already keeps its loss.
-pub fn register(item: &'static MenuItem) {
-    let mut own = OWN.lock().unwrap_or_else(PoisonError::into_inner);
-    own.push(item);
+/// Adds losses to the menu, before anything else is done: `learner.update.auxiliary_loss` takes their names from then on. A name
+/// that is in the menu already keeps its loss.
+///
+/// # Panics
+/// If it was called before.
+pub fn register(items: Vec<&'static MenuItem>) {
+    let first = CUSTOM.set(items);
+    first.expect("a program registers its losses once");
 }
 
 /// The menu, with what the program added.
-fn all() -> Vec<&'static MenuItem> {
-    let own = OWN.lock().unwrap_or_else(PoisonError::into_inner);
-    MENU.iter().chain(own.iter()).copied().collect()
+fn all() -> impl Iterator<Item = &'static MenuItem> {
+    MENU.iter()
+        .chain(CUSTOM.get().into_iter().flatten())
+        .copied()
 }
 
 /// The auxiliary loss of an agent: an item of the [`MENU`] or one that was [`register`]ed, by its name in settings.
 #[derive(Clone, Copy, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "&'static str")]
-pub struct Objective(&'static MenuItem);
+pub struct AuxiliaryKind(&'static MenuItem);
 
-impl Objective {
+impl AuxiliaryKind {
     /// No auxiliary loss: the agent learns the return alone.
     pub const NONE: Self = Self(&none::NONE);
 
-    /// The objective of this item of the menu.
+    /// The auxiliary loss of this item of the menu.
     pub const fn of(item: &'static MenuItem) -> Self {
         Self(item)
     }
@@ -81,8 +81,8 @@ impl Objective {
     ) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
         let loss = (self.0.make)(settings)?;
         match settings.own.keys().find(|other| *other != self.name()) {
-            Some(other) => Err(UpdateError::Objective(format!(
-                "objective = {} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}",
+            Some(other) => Err(UpdateError::AuxiliaryLoss(format!(
+                "auxiliary_loss = {} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}",
                 self.name()
             ))),
             None => Ok(loss),
@@ -90,28 +90,27 @@ impl Objective {
     }
 }
 
-impl PartialEq for Objective {
+impl PartialEq for AuxiliaryKind {
     fn eq(&self, other: &Self) -> bool {
         self.name() == other.name()
     }
 }
 
-impl Eq for Objective {}
+impl Eq for AuxiliaryKind {}
 
-impl fmt::Debug for Objective {
+impl fmt::Debug for AuxiliaryKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
 }
 
-impl FromStr for Objective {
+impl FromStr for AuxiliaryKind {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let all = all();
-        let item = all.iter().copied().find(|item| item.name == name);
+        let item = all().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
-            let known: Vec<_> = all.iter().map(|item| format!("`{}`", item.name)).collect();
+            let known: Vec<_> = all().map(|item| format!("`{}`", item.name)).collect();
             format!(
                 "unknown variant `{name}`, expected one of {}",
                 known.join(", ")
@@ -120,7 +119,7 @@ impl FromStr for Objective {
     }
 }
 
-impl TryFrom<String> for Objective {
+impl TryFrom<String> for AuxiliaryKind {
     type Error = String;
 
     fn try_from(name: String) -> Result<Self, String> {
@@ -128,8 +127,8 @@ impl TryFrom<String> for Objective {
     }
 }
 
-impl From<Objective> for &'static str {
-    fn from(objective: Objective) -> Self {
-        objective.name()
+impl From<AuxiliaryKind> for &'static str {
+    fn from(auxiliary_loss: AuxiliaryKind) -> Self {
+        auxiliary_loss.name()
     }
 }

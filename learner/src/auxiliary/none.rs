@@ -20,8 +20,8 @@ pub const NONE: MenuItem = MenuItem {
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     let wanted = settings.lambda.wanted();
     match PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted) {
-        Some((pair, _)) => Err(UpdateError::Objective(format!(
-            "objective = none computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
+        Some((pair, _)) => Err(UpdateError::AuxiliaryLoss(format!(
+            "auxiliary_loss = none computes no auxiliary loss, but lambda.{pair} is above 0: set it to 0, or take another agent"
         ))),
         None => Ok(Box::new(ReturnAlone)),
     }

@@ -27,7 +27,7 @@ impl Positives {
     }
 
     /// [`Positives::served`] in words.
-    pub const fn served_words(self) -> &'static str {
+    pub const fn describe_served(self) -> &'static str {
         match self {
             Self::None | Self::OtherView => "no later state",
             Self::One => "one later state",
@@ -55,7 +55,7 @@ impl Positives {
     }
 
     /// What [`Positives::fit`] asks of a batch, in words.
-    pub const fn wanted_words(self) -> &'static str {
+    pub const fn describe_wanted(self) -> &'static str {
         match self {
             Self::None => "any number",
             Self::One => "one",

@@ -83,7 +83,7 @@ impl Lambda {
 #[derive(Clone, Copy, Debug)]
 pub struct AuxiliarySettings<'a> {
     /// The loss's name in the menu.
-    pub objective: &'static str,
+    pub auxiliary_loss: &'static str,
     /// Weights of the losses between pairs of levels.
     pub lambda: Lambda,
     /// Whether Psi is given a_t.
@@ -97,13 +97,13 @@ pub struct AuxiliarySettings<'a> {
 impl AuxiliarySettings<'_> {
     /// The loss's own table; `None` if it is not there.
     pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
-        let Some(table) = self.own.get(self.objective) else {
+        let Some(table) = self.own.get(self.auxiliary_loss) else {
             return Ok(None);
         };
         let own = table.clone().try_into();
         own.map(Some).map_err(|e| {
             let why = e.to_string();
-            UpdateError::Objective(format!("{}: {}", self.objective, why.trim_end()))
+            UpdateError::AuxiliaryLoss(format!("{}: {}", self.auxiliary_loss, why.trim_end()))
         })
     }
 
@@ -112,9 +112,9 @@ impl AuxiliarySettings<'_> {
         if self.lambda.wanted().contains(&true) {
             return Ok(());
         }
-        let name = self.objective;
-        Err(UpdateError::Objective(format!(
-            "objective = {name}, but all lambdas are 0: set one above 0, or take the agent c51"
+        let name = self.auxiliary_loss;
+        Err(UpdateError::AuxiliaryLoss(format!(
+            "auxiliary_loss = {name}, but all lambdas are 0: set one above 0, or take the agent c51"
         )))
     }
 }

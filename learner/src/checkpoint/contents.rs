@@ -14,7 +14,7 @@ use crate::{
 pub(super) const FORMAT: u32 = 3;
 pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
-/// CURL's key encoder; there for that objective alone.
+/// CURL's key encoder; there for that auxiliary loss alone.
 pub(super) const KEY: &str = "key.safetensors";
 /// The averaged network; there if the settings ask for one.
 pub const AVERAGE: &str = "average.safetensors";

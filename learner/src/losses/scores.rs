@@ -21,23 +21,23 @@ pub struct Dots {
     /// [L, B, B]: location, anchor, candidate; L = 1 where both features are global.
     pub dots: Tensor,
     /// Numbers in each vector.
-    pub rkhs: usize,
+    pub width: usize,
 }
 
 /// How dot products become scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scores {
-    /// Factor on the dot products: `1 / sqrt(rkhs)`.
+    /// Factor on the dot products: `1 / sqrt(width)`.
     pub scale: f64,
     /// Bound c of the soft clip `c * tanh(x / c)`, in units of score, above 0.
     pub tanh_clip: f64,
 }
 
 impl Scores {
-    /// Scores of dot products of vectors of `rkhs` numbers.
-    pub fn new(rkhs: usize, tanh_clip: f64) -> Self {
+    /// Scores of dot products of vectors of `width` numbers.
+    pub fn new(width: usize, tanh_clip: f64) -> Self {
         Self {
-            scale: 1.0 / (rkhs as f64).sqrt(),
+            scale: 1.0 / (width as f64).sqrt(),
             tanh_clip,
         }
     }

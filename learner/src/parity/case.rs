@@ -15,7 +15,7 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use crate::{
-    auxiliary::{Objective, dim::DIM, positives::Positives, settings::Lambda},
+    auxiliary::{AuxiliaryKind, dim::DIM, positives::Positives, settings::Lambda},
     batch::Batch,
     error::UpdateError,
     noise::UpdateNoise,
@@ -72,14 +72,15 @@ struct Config {
     v_max: f32,
     double_dqn: bool,
     /// Not there: DIM, or none if all lambdas are 0.
-    objective: Option<Objective>,
+    #[serde(rename = "objective")]
+    auxiliary_loss: Option<AuxiliaryKind>,
     /// Not there: with the action, where there is DIM.
     condition_on_action: Option<bool>,
     lambda: Lambda,
     tanh_clip: f64,
     max_grad_norm: f64,
     adam: AdamSettings,
-    /// Pace of the key encoder; not there for an objective without one.
+    /// Pace of the key encoder; not there for an auxiliary loss without one.
     key_tau: Option<f64>,
     model: Sizes,
     /// Not there: one linear layer.
@@ -104,7 +105,8 @@ struct Sizes {
     #[serde(default)]
     channels: Vec<usize>,
     hidden: usize,
-    rkhs: usize,
+    #[serde(rename = "rkhs")]
+    embedding_dim: usize,
     action_embed: usize,
 }
 
@@ -172,7 +174,7 @@ impl Case {
             channels: it.model.channels.clone(),
             scale_blocks: false,
             hidden: it.model.hidden,
-            rkhs: it.model.rkhs,
+            embedding_dim: it.model.embedding_dim,
             action_embed: it.model.action_embed,
             dim,
             head: it.head,
@@ -271,19 +273,19 @@ impl Case {
 impl Config {
     fn settings(&self) -> LearnerSettings {
         let by_lambda = if self.lambda.wanted().contains(&true) {
-            Objective::of(&DIM)
+            AuxiliaryKind::of(&DIM)
         } else {
-            Objective::NONE
+            AuxiliaryKind::NONE
         };
-        let objective = self.objective.unwrap_or(by_lambda);
+        let auxiliary_loss = self.auxiliary_loss.unwrap_or(by_lambda);
         // The one setting that only this loss has.
         let own = self.key_tau.map(|key_tau| {
             let table = toml::Table::from_iter([("key_tau".to_owned(), key_tau.into())]);
-            (objective.name().to_owned(), table.into())
+            (auxiliary_loss.name().to_owned(), table.into())
         });
         LearnerSettings {
             double_dqn: self.double_dqn,
-            objective,
+            auxiliary_loss,
             condition_on_action: self.condition_on_action.unwrap_or(true),
             lambda: self.lambda,
             tanh_clip: self.tanh_clip,
@@ -309,17 +311,18 @@ impl Inputs {
         let bytes = |name: &str, shape: &[usize]| tensors.read::<u8>(name, DType::U8, shape);
         let floats = |name: &str| tensors.read::<f32>(name, DType::F32, &[rows]);
         let mut anchors = None;
-        let (states_k, positive_valid) = if settings.objective.positives() == Positives::OtherView {
-            anchors = Some(bytes("input.view_query", &state)?);
-            (bytes("input.view_key", &state)?, vec![1; rows])
-        } else {
-            // [B] where a row has one positive, else [P, B].
-            let dims = tensors.get("input.positive_valid")?.dims();
-            let several = if dims.len() > 1 { &dims[..1] } else { &[] };
-            let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
-            let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
-            (states_k, valid)
-        };
+        let (states_k, positive_valid) =
+            if settings.auxiliary_loss.positives() == Positives::OtherView {
+                anchors = Some(bytes("input.view_query", &state)?);
+                (bytes("input.view_key", &state)?, vec![1; rows])
+            } else {
+                // [B] where a row has one positive, else [P, B].
+                let dims = tensors.get("input.positive_valid")?.dims();
+                let several = if dims.len() > 1 { &dims[..1] } else { &[] };
+                let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
+                let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
+                (states_k, valid)
+            };
         let actions = tensors.read::<i64>("input.action", DType::I64, &[rows])?;
         let narrow = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
         let action: Option<Vec<u8>> = actions.iter().map(narrow).collect();

@@ -20,7 +20,7 @@ use tolerance::Tolerances;
 use crate::{
     agent::{Agent, NetworkParameters},
     auxiliary::{
-        Objective,
+        AuxiliaryKind,
         dim::DIM,
         key_encoder::KeyEncoder,
         loss::{LossInputs, OnlineFeatures},
@@ -28,7 +28,6 @@ use crate::{
     },
     evaluation::Evaluation,
     losses::scores::{Dots, Scores},
-    repeats::EqualStates,
 };
 
 /// One tensor group's comparison.
@@ -259,7 +258,7 @@ fn agent_of(case: &Case, compute: &Compute) -> Result<Agent, ParityError> {
     )?)
 }
 
-/// The parameters of the case's key encoder, if its objective has one.
+/// The parameters of the case's key encoder, if its auxiliary loss has one.
 fn key_parameters(
     case: &Case,
     model: &ModelConfig,
@@ -284,18 +283,18 @@ struct Forward {
 /// The auxiliary losses of all pairs that the case speaks of, forward only and untouched by lambda.
 fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, ParityError> {
     let settings = &case.settings;
-    let objective = if settings.objective == Objective::NONE {
-        Objective::of(&DIM)
+    let kind = if settings.auxiliary_loss == AuxiliaryKind::NONE {
+        AuxiliaryKind::of(&DIM)
     } else {
-        settings.objective
+        settings.auxiliary_loss
     };
     let every = AuxiliarySettings {
-        objective: objective.name(),
+        auxiliary_loss: kind.name(),
         lambda: Lambda::EVERY,
         ..settings.auxiliary_settings()
     };
     // A loss that does not take every pair is used unchanged.
-    let loss = objective.loss(&every).or_else(|_| settings.auxiliary())?;
+    let loss = kind.loss(&every).or_else(|_| settings.auxiliary())?;
     let model = case.model(loss.heads(settings.condition_on_action));
     let (device, kernels) = (&compute.device, compute.kernels);
     let named = case.parameters("online.", &model);
@@ -306,7 +305,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         _ => None,
     };
     let batch = case.batch();
-    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, EqualStates::Each, device)?;
+    let features = OnlineFeatures::new(&online, &model, &*loss, &batch, false, device)?;
     let losses = loss.losses(&LossInputs {
         online: &online,
         model: &model,
@@ -315,9 +314,12 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
         key: key.as_ref(),
         device,
     })?;
-    let saturates = |Dots { dots, rkhs }: &Dots| -> Result<bool, ParityError> {
-        let scores = Scores::new(*rkhs, settings.tanh_clip);
-        let largest = values(dots)?.into_iter().map(f64::abs).fold(0.0, f64::max);
+    let saturates = |it: &Dots| -> Result<bool, ParityError> {
+        let scores = Scores::new(it.width, settings.tanh_clip);
+        let largest = values(&it.dots)?
+            .into_iter()
+            .map(f64::abs)
+            .fold(0.0, f64::max);
         Ok(largest * scores.scale > scores.tanh_clip)
     };
     let mut forward = Vec::new();

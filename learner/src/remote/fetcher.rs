@@ -11,8 +11,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, Learned, PendingReply, ReplayStatus, RequestId,
-    RunClient, Seldom, Shutdown, Tally, Waiting, fault, session::SessionError,
+    Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, PendingReply, ReplayStatus,
+    RequestId, RunClient, ShardCounts, Shutdown, Waiting, fail_point, session::SessionError,
     shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
@@ -144,7 +144,7 @@ pub(super) struct Fetcher {
     rng: ChaCha8Rng,
     /// Whether batches may come through shared memory.
     trust: Trust,
-    said: Seldom,
+    said: LogLimiter,
 }
 
 impl Fetcher {
@@ -156,14 +156,14 @@ impl Fetcher {
             id: RequestId::first(rng.random()),
             rng,
             trust: Trust::default(),
-            said: Seldom::default(),
+            said: LogLimiter::default(),
         }
     }
 
     pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
         let mut answered = Instant::now();
         while !self.shared.shutdown.is_set() {
-            fault::point("batches");
+            fail_point::reach("batches");
             let fetched = match self.fetch() {
                 Ok(None) => {
                     answered = Instant::now();
@@ -233,7 +233,7 @@ impl Fetcher {
         ServedPart {
             shard,
             rows,
-            inserted: part.header.tally.inserted,
+            inserted: part.header.counts.inserted,
         }
     }
 
@@ -290,7 +290,7 @@ impl Fetcher {
             match answer {
                 Answer::Batch(mut part) => {
                     counts[shard] = Count {
-                        tally: part.header.tally,
+                        counts: part.header.counts,
                         held: part.header.held,
                         last_seen: Some(Instant::now()),
                     };
@@ -352,7 +352,7 @@ impl Fetcher {
             }
             let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
             *count = Count {
-                tally: Tally {
+                counts: ShardCounts {
                     inserted: status.transitions_inserted,
                     rows_sampled: status.rows_sampled,
                 },
@@ -370,7 +370,7 @@ impl Fetcher {
         shard: usize,
         id: RequestId,
         rows: u32,
-        other_shards: Option<Tally>,
+        other_shards: Option<ShardCounts>,
     ) -> Result<(PendingReply<BatchReply>, bool), BatchError> {
         let request = BatchRequest {
             learner: self.shared.requests.learner,

@@ -12,8 +12,8 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, CodecError, Done, LearnerStatus, PriorityUpdate, QueryWorkers, Request,
-    Responder, RunClient, Sampling, Sealed, Seldom, Shutdown, Weights, WeightsUpload, fault,
+    Ack, AffinityUpdate, CodecError, LearnerStatus, LogLimiter, PriorityUpdate, QueryWorkers,
+    Request, Responder, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload, fail_point,
     session::SessionError,
 };
 use zenoh::query::Queryable;
@@ -31,8 +31,8 @@ const RECOVERY_PAUSE: Duration = Duration::from_secs(2);
 /// How often a thread that has nothing to send looks whether it should end.
 const TICK: Duration = Duration::from_millis(200);
 
-/// The learner's outlets; dropping it closes them.
-pub(crate) struct Outlets {
+/// The learner's publisher; dropping it closes them.
+pub(crate) struct Publisher {
     learner: u64,
     status: Arc<Mutex<LearnerStatus>>,
     fetched: Arc<AtomicBool>,
@@ -89,7 +89,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Outlets {
+impl Publisher {
     /// Declares the status in every session, and starts the threads that send weights and affinity as those of `learner`.
     pub(crate) fn open(
         clients: &[RunClient],
@@ -128,7 +128,7 @@ impl Outlets {
             clients: clients.to_vec(),
             timeout,
             shutdown: shutdown.clone(),
-            said: Seldom::default(),
+            said: LogLimiter::default(),
         };
         let weights = to_all("weights", WEIGHTS_TIMEOUT);
         weights.start(this.weights.clone(), move |weights| {
@@ -200,12 +200,12 @@ struct Sender {
     clients: Vec<RunClient>,
     timeout: Duration,
     shutdown: Shutdown,
-    said: Seldom,
+    said: LogLimiter,
 }
 
 impl Sender {
     /// Starts a thread that sends until the shutdown; `message` makes the bytes of what is sent.
-    fn start<T: Send + 'static, R: Request<Reply = Done>>(
+    fn start<T: Send + 'static, R: Request<Reply = Ack>>(
         mut self,
         newest: Arc<Newest<T>>,
         message: impl Fn(&T) -> Result<Sealed<R>, CodecError> + Send + 'static,
@@ -214,7 +214,7 @@ impl Sender {
         let thread = std::thread::Builder::new().name(name.clone());
         thread.spawn(move || {
             while !self.shutdown.is_set() {
-                fault::point(&name);
+                fail_point::reach(&name);
                 let Some(value) = newest.take() else { continue };
                 match message(&value) {
                     Ok(message) => self.send_to_all(&message, || newest.is_full()),
@@ -225,7 +225,7 @@ impl Sender {
         Ok(())
     }
 
-    fn send_to_all<R: Request<Reply = Done>>(
+    fn send_to_all<R: Request<Reply = Ack>>(
         &mut self,
         message: &Sealed<R>,
         is_old: impl Fn() -> bool,

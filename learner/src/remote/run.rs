@@ -10,13 +10,13 @@ use std::{
 use anyhow::Context;
 use driml_model::DeviceName;
 use driml_protocol::{
-    Activity, BatchHeader, Keys, Life, ReplayStatus, Shutdown, reporter, shared_memory,
-    tls::Credentials, whole_file,
+    Activity, BatchHeader, Keys, Participant, ReplayStatus, Shutdown, atomic_write, reporter,
+    shared_memory, tls::Credentials,
 };
 
 use super::{
     batch_source::{BatchSource, Counters, Next, Requests, Served},
-    publish::Outlets,
+    publish::Publisher,
     shards::Shards,
 };
 use crate::{
@@ -50,7 +50,7 @@ pub struct RunArgs {
     /// Begin the run again from the first update, where an earlier learner has learned and this one has no checkpoint of it.
     pub restart: bool,
     /// Stay when the run is over, to be asked, until `shutdown`.
-    pub stay: bool,
+    pub keep_alive: bool,
 }
 
 /// Runs the learner until the run has no more batches, or `shutdown`. Whatever ends it, it saves what it has learned.
@@ -100,25 +100,25 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         progress.run = rand::random();
     }
     let progress = (updates, &*progress);
-    let part_in_run =
+    let process_in_run =
         shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
-    let Some(membership) = part_in_run else {
+    let Some(membership) = process_in_run else {
         return Ok(());
     };
     learner.publish_above(membership.weights_version);
     keep_settings(&args.run_dir, &shards.config_toml)?;
-    let outlets = Outlets::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
-    outlets.publish(learner.next_weights()?);
+    let publisher = Publisher::open(&clients, spec_hash, requests.learner, &sampling, shutdown)?;
+    publisher.publish(learner.next_weights()?);
     if updates > 0 {
-        outlets.with_status(|status| status.updates = updates);
-        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
-            outlets.send_affinity(affinity);
+        publisher.with_status(|status| status.updates = updates);
+        if let Some(affinity) = learner.affinity_update(publisher.learner()) {
+            publisher.send_affinity(affinity);
         }
     }
     let activity = Activity::new("waits for its first batch");
     reporter::start(
         clients.clone(),
-        Life::Learner(requests.learner),
+        Participant::Learner(requests.learner),
         activity.clone(),
         shutdown.clone(),
     )?;
@@ -129,12 +129,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         args.device,
     );
 
-    let mut saving = Saving::new(folder, counters.clone());
+    let mut checkpointer = Checkpointer::new(folder, counters.clone());
     let learned = learn(
         &mut learner,
         &mut batches,
-        &outlets,
-        &mut saving,
+        &publisher,
+        &mut checkpointer,
         &activity,
         shutdown,
     );
@@ -151,21 +151,21 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             Err(e) => tracing::debug!("the last count of shard {shard}: {e}"),
         }
     }
-    let saved = saving.finish(&learner);
+    let saved = checkpointer.finish(&learner);
     if learned.is_ok() && !learner.publication_is_due() {
-        outlets.publish(learner.next_weights()?);
+        publisher.publish(learner.next_weights()?);
     }
     learned.and(saved.map_err(Into::into))?;
-    outlets.with_status(|status| status.finished = true);
+    publisher.with_status(|status| status.finished = true);
     tracing::info!("finished after {} updates", learner.updates());
-    if args.stay {
+    if args.keep_alive {
         activity.begin("has finished and stays to be asked");
         shutdown.wait();
     }
-    outlets.wait_until_heard(LAST_WORD_MAX);
+    publisher.wait_until_heard(LAST_WORD_MAX);
     if !shutdown.is_set() {
         let updates = learner.updates();
-        reporter::say_finished(&clients, Life::Learner(requests.learner), updates);
+        reporter::say_finished(&clients, Participant::Learner(requests.learner), updates);
     }
     drop(membership);
     let closed = shards.close();
@@ -177,8 +177,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
 fn learn(
     learner: &mut Learner,
     batches: &mut BatchSource,
-    outlets: &Outlets,
-    saving: &mut Saving,
+    publisher: &Publisher,
+    checkpointer: &mut Checkpointer,
     activity: &Activity,
     shutdown: &Shutdown,
 ) -> anyhow::Result<()> {
@@ -204,28 +204,28 @@ fn learn(
         let started = Instant::now();
         let report = learner.update(&batch)?;
         learner.progress_mut().note(&parts);
-        let counters = &saving.counters;
+        let counters = &checkpointer.counters;
         counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which no life of the learner counts backwards.
-        let (by, number) = (outlets.learner(), learner.updates());
+        let (by, number) = (publisher.learner(), learner.updates());
         if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
-            outlets.send_priorities(priorities);
+            publisher.send_priorities(priorities);
         }
-        if let Some(affinity) = learner.affinity_update(outlets.learner()) {
-            outlets.send_affinity(affinity);
+        if let Some(affinity) = learner.affinity_update(publisher.learner()) {
+            publisher.send_affinity(affinity);
         }
         if learner.publication_is_due() {
-            outlets.publish(learner.next_weights()?);
+            publisher.publish(learner.next_weights()?);
         }
         let ended = Instant::now();
-        outlets.with_status(|status| {
+        publisher.with_status(|status| {
             learner.note(&report, status);
             status.waiting_s += (started - waiting_since).as_secs_f64();
             status.computing_s += (ended - started).as_secs_f64();
         });
         waiting_since = ended;
         if learner.checkpoint_is_due() {
-            saving.save(learner);
+            checkpointer.save(learner);
         }
     }
     Ok(())
@@ -233,7 +233,7 @@ fn learn(
 
 /// Keeps checkpoints of one learner. A disk that refuses does not end the training: the next period tries again, and only what
 /// cannot be saved in the end is an error.
-struct Saving {
+struct Checkpointer {
     folder: PathBuf,
     counters: Arc<Counters>,
     /// Updates and frames in the newest checkpoint that was saved here.
@@ -242,7 +242,7 @@ struct Saving {
     failed: Option<LearnerError>,
 }
 
-impl Saving {
+impl Checkpointer {
     const fn new(folder: PathBuf, counters: Arc<Counters>) -> Self {
         Self {
             folder,
@@ -290,6 +290,6 @@ fn keep_settings(run_dir: &Path, config_toml: &str) -> anyhow::Result<()> {
         return Ok(());
     }
     std::fs::create_dir_all(run_dir)
-        .and_then(|()| whole_file::write(&path, config_toml.as_bytes()))
+        .and_then(|()| atomic_write::write(&path, config_toml.as_bytes()))
         .with_context(|| format!("writing {}", path.display()))
 }

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Alive, Batch, Hello, Keys, LearnerJoin, RequestId, RunClient, Shutdown, Tally, join,
+    Alive, Batch, Keys, LearnerJoin, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, join,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -43,7 +43,7 @@ impl Shards {
         shutdown: &Shutdown,
     ) -> anyhow::Result<Option<Self>> {
         let mut sessions = Vec::new();
-        let mut hellos = Vec::new();
+        let mut run_infos = Vec::new();
         for endpoint in connect {
             let endpoints = Endpoints {
                 listen: Vec::new(),
@@ -54,13 +54,13 @@ impl Shards {
             let Some(session) = opened else {
                 return Ok(None);
             };
-            let Some(hello) = join::hello(&session, keys, shutdown)? else {
+            let Some(run_info) = join::run_info(&session, keys, shutdown)? else {
                 return Ok(None);
             };
             sessions.push(session);
-            hellos.push(hello);
+            run_infos.push(run_info);
         }
-        let config_toml = one_run(connect, &hellos)?.config_toml.clone();
+        let config_toml = one_run(connect, &run_infos)?.config_toml.clone();
         Ok(Some(Self {
             sessions,
             config_toml,
@@ -96,7 +96,7 @@ impl Shards {
                 learner,
                 run: progress.run,
                 updates,
-                tally: progress.shards[shard],
+                counts: progress.shards[shard],
                 other_shards: progress.other_shards(shard),
                 restart,
             };
@@ -122,18 +122,18 @@ impl Shards {
 }
 
 /// What the shards say of the one run that they all belong to.
-fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a Hello> {
-    let first = hellos
+fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&'a RunInfo> {
+    let first = run_infos
         .first()
         .context("no endpoint of a replay server was given")?;
-    for (at, hello) in hellos.iter().enumerate() {
-        let (endpoint, shard) = (&connect[at], hello.shard.0);
+    for (at, run_info) in run_infos.iter().enumerate() {
+        let (endpoint, shard) = (&connect[at], run_info.shard.0);
         ensure!(
-            hello.config_toml == first.config_toml,
+            run_info.config_toml == first.config_toml,
             "{endpoint} and {} are replay servers of runs with different settings: start both with the same",
             connect[0]
         );
-        if let Some(earlier) = hellos[..at].iter().position(|it| it.shard.0 == shard) {
+        if let Some(earlier) = run_infos[..at].iter().position(|it| it.shard.0 == shard) {
             anyhow::bail!(
                 "{} and {endpoint} are both shard {shard}: start each replay server with its own --shard, and give each endpoint once",
                 connect[earlier]
@@ -142,16 +142,16 @@ fn one_run<'a>(connect: &[String], hellos: &'a [Hello]) -> anyhow::Result<&'a He
     }
     let count = first.shard.1 as usize;
     ensure!(
-        hellos.len() == count,
+        run_infos.len() == count,
         "the run's replay has {count} shards, {} endpoints were given: give --connect once for each shard",
-        hellos.len()
+        run_infos.len()
     );
     Ok(first)
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Count {
-    pub(crate) tally: Tally,
+    pub(crate) counts: ShardCounts,
     pub(crate) held: u64,
     /// When it said so; none before it is asked first.
     pub(crate) last_seen: Option<Instant>,
@@ -199,16 +199,16 @@ pub(crate) fn shares(counts: &[Count]) -> Vec<f64> {
 }
 
 /// What all shards but `this` will have counted once each has given its `pending` rows.
-pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> Tally {
+pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> ShardCounts {
     let others = counts.iter().zip(pending).enumerate();
     others.filter(|(at, _)| *at != this).fold(
-        Tally::default(),
+        ShardCounts::default(),
         |sum, (_, (count, &rows_sampled))| {
-            let pending = Tally {
+            let pending = ShardCounts {
                 inserted: 0,
                 rows_sampled: rows_sampled.into(),
             };
-            sum + count.tally + pending
+            sum + count.counts + pending
         },
     )
 }
@@ -254,7 +254,7 @@ mod tests {
 
     fn count(held: u64, inserted: u64, rows_sampled: u64) -> Count {
         Count {
-            tally: Tally {
+            counts: ShardCounts {
                 inserted,
                 rows_sampled,
             },
@@ -316,14 +316,14 @@ mod tests {
         let told = |this| other_shards(&counts, &[5, 6, 7], this);
         assert_eq!(
             told(1),
-            Tally {
+            ShardCounts {
                 inserted: 40,
                 rows_sampled: 412
             }
         );
         assert_eq!(
             told(2),
-            Tally {
+            ShardCounts {
                 inserted: 30,
                 rows_sampled: 311
             }
@@ -332,7 +332,7 @@ mod tests {
 
     #[test]
     fn shards_that_do_not_make_one_replay_are_refused() {
-        let hello = |config: &str, shard| Hello {
+        let run_info = |config: &str, shard| RunInfo {
             config_toml: config.into(),
             inserted_total: 0,
             has_learner: false,
@@ -341,12 +341,14 @@ mod tests {
             shared_memory: true,
         };
         let connect = ["a".to_owned(), "b".to_owned()];
-        let said = |hellos: &[Hello]| one_run(&connect, hellos).unwrap_err().to_string();
-        assert!(said(&[hello("x", (0, 2)), hello("y", (1, 2))]).contains("different settings"));
-        assert!(said(&[hello("x", (1, 2)), hello("x", (1, 2))]).contains("both shard 1"));
-        assert!(said(&[hello("x", (0, 3)), hello("x", (1, 3))]).contains("has 3 shards"));
-        assert!(said(&[hello("x", (0, 2))]).contains("has 2 shards"));
-        let whole = [hello("x", (1, 2)), hello("x", (0, 2))];
+        let said = |run_infos: &[RunInfo]| one_run(&connect, run_infos).unwrap_err().to_string();
+        assert!(
+            said(&[run_info("x", (0, 2)), run_info("y", (1, 2))]).contains("different settings")
+        );
+        assert!(said(&[run_info("x", (1, 2)), run_info("x", (1, 2))]).contains("both shard 1"));
+        assert!(said(&[run_info("x", (0, 3)), run_info("x", (1, 3))]).contains("has 3 shards"));
+        assert!(said(&[run_info("x", (0, 2))]).contains("has 2 shards"));
+        let whole = [run_info("x", (1, 2)), run_info("x", (0, 2))];
         assert_eq!(one_run(&connect, &whole).unwrap().config_toml, "x");
     }
 }

@@ -2,13 +2,13 @@
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
 use driml_learner::{
-    Agent, Batch, Lambda, LearnerSettings, NetworkParameters, Objective, UpdateError,
+    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, NetworkParameters, UpdateError,
 };
 use driml_model::{Compute, ModelConfig, Parameters};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, Values, model, settings, values};
+use crate::synthetic::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, Values, model, settings, values};
 
 pub(crate) const GLOBAL: Lambda = Lambda {
     l4t4: 1.0,
@@ -32,11 +32,11 @@ fn only(losses: &Losses) -> f32 {
     losses[0].1
 }
 
-pub(crate) fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
+pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, LearnerSettings) {
     let settings = LearnerSettings {
-        objective,
+        auxiliary_loss: kind,
         condition_on_action: false,
-        own: curl_table((objective == CURL).then_some(KEY_TAU)),
+        own: curl_table((kind == CURL).then_some(KEY_TAU)),
         ..settings(lambda)
     };
     let model = ModelConfig {
@@ -46,8 +46,8 @@ pub(crate) fn of(objective: Objective, lambda: Lambda) -> (ModelConfig, LearnerS
     (model, settings)
 }
 
-fn agent(objective: Objective, lambda: Lambda) -> Agent {
-    let (model, settings) = of(objective, lambda);
+fn agent(kind: AuxiliaryKind, lambda: Lambda) -> Agent {
+    let (model, settings) = of(kind, lambda);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     Agent::new(model, settings, &Compute::CPU, rng).unwrap()
 }
@@ -121,8 +121,8 @@ fn positives_that_are_missing_change_nothing() {
     rows.positive_valid = vec![1, 0, 1, 1, 0, 1];
     let several = later(&rows);
     let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-    for (objective, whole) in [(DIM, rows.batch()), (CPC, cpc(&rows, &several, &valid))] {
-        let agent = agent(objective, ALL_DIM);
+    for (kind, whole) in [(DIM, rows.batch()), (CPC, cpc(&rows, &several, &valid))] {
+        let agent = agent(kind, ALL_DIM);
         let before = agent.evaluate(&whole).unwrap();
         let mut states_k = whole.states_k.to_vec();
         let bytes = states_k.len() / whole.positive_valid.len();
@@ -149,13 +149,17 @@ fn packed(states: &[u8], there: &[bool]) -> Vec<u8> {
 
 #[test]
 fn states_that_rows_do_not_have_may_be_left_out() {
-    for (objective, lambda) in [(Objective::NONE, NO_DIM), (DIM, ALL_DIM), (CPC, ALL_DIM)] {
+    for (kind, lambda) in [
+        (AuxiliaryKind::NONE, NO_DIM),
+        (DIM, ALL_DIM),
+        (CPC, ALL_DIM),
+    ] {
         let mut rows = Rows::random(6, 4);
         rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
         rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
         let several = later(&rows);
         let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-        let whole = if objective == CPC {
+        let whole = if kind == CPC {
             cpc(&rows, &several, &valid)
         } else {
             rows.batch()
@@ -175,11 +179,11 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         };
         assert!(states_k.len() < whole.states_k.len() && states_n.len() < whole.states_n.len());
         let learned = [whole, parts].map(|batch| {
-            let mut agent = agent(objective, lambda);
+            let mut agent = agent(kind, lambda);
             let reports = [agent.update(&batch).unwrap(), agent.update(&batch).unwrap()];
             (reports, values(agent.online()))
         });
-        assert!(learned[0] == learned[1], "{objective:?}");
+        assert!(learned[0] == learned[1], "{kind:?}");
 
         for (states_k, states_n, what) in [
             (&states_k[1..], &states_n[..], "states_k"),
@@ -190,7 +194,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
                 states_n,
                 ..whole
             };
-            let error = agent(objective, lambda).evaluate(&batch).unwrap_err();
+            let error = agent(kind, lambda).evaluate(&batch).unwrap_err();
             assert!(error.to_string().contains(what), "{error}");
         }
     }
@@ -214,14 +218,14 @@ fn without_any_positive_cpc_learns_the_return() {
 fn cpc_and_curl_bring_their_losses_down() {
     let rows = Rows::random(16, 6);
     let (states_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
-    for (objective, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
-        let mut agent = agent(objective, GLOBAL);
+    for (kind, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
+        let mut agent = agent(kind, GLOBAL);
         let first = only(&agent.update(&batch).unwrap().losses);
         for _ in 0..80 {
             agent.update(&batch).unwrap();
         }
         let last = only(&agent.update(&batch).unwrap().losses);
-        assert!(last < 0.7 * first, "{objective:?}: {first} to {last}");
+        assert!(last < 0.7 * first, "{kind:?}: {first} to {last}");
     }
 }
 
@@ -291,19 +295,19 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
 #[test]
 fn c51_s_target_network_is_the_same_for_every_agent() {
     let rows = Rows::random(6, 8);
-    for (objective, lambda) in [
-        (Objective::NONE, NO_DIM),
+    for (kind, lambda) in [
+        (AuxiliaryKind::NONE, NO_DIM),
         (DIM, GLOBAL),
         (CPC, GLOBAL),
         (CURL, GLOBAL),
     ] {
-        let mut agent = agent(objective, lambda);
-        assert_eq!(agent.key().is_some(), objective == CURL);
+        let mut agent = agent(kind, lambda);
+        assert_eq!(agent.key().is_some(), kind == CURL);
         let online =
             |agent: &Agent| part_of(&values(agent.online()), |name| !name.starts_with("dim."));
         let start = online(&agent);
-        assert_eq!(values(agent.target()), start, "{objective:?}");
-        let batch = match objective.name() {
+        assert_eq!(values(agent.target()), start, "{kind:?}");
+        let batch = match kind.name() {
             "none" => Batch {
                 positives: 0,
                 states_k: &[],
@@ -364,8 +368,8 @@ fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
 fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = Rows::random(5, 9);
     let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
-    let said = |objective, batch: &Batch<'_>| {
-        let error = agent(objective, GLOBAL).evaluate(batch).unwrap_err();
+    let said = |kind, batch: &Batch<'_>| {
+        let error = agent(kind, GLOBAL).evaluate(batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
         error.to_string()
     };
@@ -386,25 +390,25 @@ fn batches_that_an_agent_cannot_use_are_refused() {
 }
 
 #[test]
-fn objectives_at_odds_with_their_settings_are_refused() {
-    let with = |objective, lambda, condition_on_action, key_tau: Option<f64>| LearnerSettings {
-        objective,
+fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
+    let with = |kind, lambda, condition_on_action, key_tau: Option<f64>| LearnerSettings {
+        auxiliary_loss: kind,
         condition_on_action,
         own: curl_table(key_tau),
         ..settings(lambda)
     };
-    let said = |objective, lambda, condition_on_action| {
-        let settings = with(objective, lambda, condition_on_action, Some(0.1));
+    let said = |kind, lambda, condition_on_action| {
+        let settings = with(kind, lambda, condition_on_action, Some(0.1));
         settings.validate().unwrap_err().to_string()
     };
-    assert!(said(Objective::NONE, GLOBAL, false).contains("but lambda.4t4 is above 0"));
-    for objective in [DIM, CPC, CURL] {
-        assert!(said(objective, NO_DIM, false).contains("but all lambdas are 0"));
+    assert!(said(AuxiliaryKind::NONE, GLOBAL, false).contains("but lambda.4t4 is above 0"));
+    for kind in [DIM, CPC, CURL] {
+        assert!(said(kind, NO_DIM, false).contains("but all lambdas are 0"));
     }
     assert!(said(CURL, ALL_DIM, false).contains("lambda.4t4 alone"));
     assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
     assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
-    assert!(said(Objective::NONE, NO_DIM, true).contains("has no use for the table curl"));
+    assert!(said(AuxiliaryKind::NONE, NO_DIM, true).contains("has no use for the table curl"));
     let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
     let missing = curl(None).unwrap_err().to_string();
     assert!(

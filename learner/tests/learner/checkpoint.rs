@@ -11,12 +11,12 @@ use driml_learner::{
     checkpoint::{self, CheckpointError, RunState, list, load_latest, lock, save},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
-use driml_protocol::Tally;
+use driml_protocol::ShardCounts;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
-use crate::made_up::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings};
+use crate::synthetic::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings};
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -116,13 +116,13 @@ impl Run {
 }
 
 pub(crate) fn progress() -> Progress {
-    let tally = |inserted, rows_sampled| Tally {
+    let counts = |inserted, rows_sampled| ShardCounts {
         inserted,
         rows_sampled,
     };
     Progress {
         run: u64::MAX,
-        shards: vec![tally(100, 200), tally(7, 0)],
+        shards: vec![counts(100, 200), counts(7, 0)],
     }
 }
 

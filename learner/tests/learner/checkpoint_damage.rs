@@ -11,7 +11,7 @@ use driml_model::Compute;
 use crate::{
     checkpoint::{DESCRIPTION, Folder, Run, change_state, load, sha256},
     errors::diverged,
-    made_up::{ACTIONS, CANDLE},
+    synthetic::{ACTIONS, CANDLE},
 };
 
 #[test]

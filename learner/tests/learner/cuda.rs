@@ -6,7 +6,7 @@ use driml_model::{ModelConfig, TorsoName};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{ALL_DIM, Rows, model, settings};
+use crate::synthetic::{ALL_DIM, Rows, model, settings};
 
 /// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had a stream, most updates
 /// after the first computed with states that were not there yet. Batches have to be large for that to show.

@@ -9,7 +9,7 @@ use driml_model::Compute;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{
+use crate::synthetic::{
     ALL_DIM, CANDLE, NO_DIM, Rows, agent, agent_on, changed, model, settings, values,
 };
 

@@ -9,10 +9,10 @@ mod checkpoint;
 mod checkpoint_damage;
 #[cfg(feature = "cuda")]
 mod cuda;
-mod equal_states;
+mod deduplicate;
 mod errors;
-mod made_up;
 mod ranges;
 mod served;
 mod stacked;
+mod synthetic;
 mod update;

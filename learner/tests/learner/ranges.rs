@@ -3,7 +3,7 @@
 
 use driml_learner::LearnerSettings;
 
-use crate::made_up::{ALL_DIM, settings};
+use crate::synthetic::{ALL_DIM, settings};
 
 /// A setting's name, values that are refused, and values that are not.
 const RANGES: &str = "

@@ -4,8 +4,7 @@
 use std::fs;
 
 use driml_learner::{
-    AffinityConfig, AugmentSettings, Config, EqualStates, EstimatorKind, Learner, LearnerConfig,
-    Objective,
+    AffinityConfig, AugmentSettings, AuxiliaryKind, Config, EstimatorKind, Learner, LearnerConfig,
 };
 use driml_model::{Compute, DimHeads, InputSize};
 use driml_protocol::{
@@ -19,14 +18,17 @@ use crate::{
     agents,
     augment::{NOTHING, PAPER},
     checkpoint::Folder,
-    made_up::{CPC, CURL, DIM},
+    synthetic::{CPC, CURL, DIM},
 };
 
 const STATE: usize = 20 * 24 * 2;
 
-pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> LearnerConfig {
-    let (model, update) = agents::of(objective, agents::GLOBAL);
-    let horizon = match objective.name() {
+pub(crate) fn config(
+    auxiliary_loss: AuxiliaryKind,
+    augment: Option<AugmentSettings>,
+) -> LearnerConfig {
+    let (model, update) = agents::of(auxiliary_loss, agents::GLOBAL);
+    let horizon = match auxiliary_loss.name() {
         "cpc" => Horizon::All { k_max: 3 },
         "dim" => Horizon::Fixed { k: 1 },
         _ => Horizon::None,
@@ -34,7 +36,7 @@ pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> 
     LearnerConfig {
         spec: RunSpec {
             world: "test".into(),
-            agent: objective.name().into(),
+            agent: auxiliary_loss.name().into(),
             seed: 5,
             frame_height: 20,
             frame_width: 24,
@@ -53,9 +55,9 @@ pub(crate) fn config(objective: Objective, augment: Option<AugmentSettings>) -> 
         },
         model,
         learner: Config {
-            equal_states: EqualStates::Once,
+            deduplicate_states: true,
             precision: Default::default(),
-            publish_as: Default::default(),
+            publish_dtype: Default::default(),
             batch_size: 6,
             batches_in_flight: 1,
             publish_period_updates: 2,
@@ -122,9 +124,9 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
 
 #[test]
 fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
-    for objective in [DIM, CPC] {
+    for auxiliary_loss in [DIM, CPC] {
         let report = |augment| {
-            let config = config(objective, augment);
+            let config = config(auxiliary_loss, augment);
             let batch = served(&config, 1);
             Learner::new(config, &Compute::CPU)
                 .unwrap()
@@ -146,9 +148,9 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
 /// The draws and the key encoder are part of a checkpoint: half a run and the other half are the run.
 #[test]
 fn an_augmenting_run_resumes_bit_for_bit() {
-    for objective in [CURL, DIM] {
-        let folder = Folder::new(&format!("augmenting-{}", objective.name()));
-        let config = config(objective, Some(PAPER));
+    for auxiliary_loss in [CURL, DIM] {
+        let folder = Folder::new(&format!("augmenting-{}", auxiliary_loss.name()));
+        let config = config(auxiliary_loss, Some(PAPER));
         let learn = |learner: &mut Learner, updates: std::ops::Range<u64>| {
             for seed in updates {
                 learner.update(&served(&config, seed)).unwrap();
@@ -170,13 +172,13 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             "target.safetensors",
             "optimizer.safetensors",
         ];
-        if objective == CURL {
+        if auxiliary_loss == CURL {
             files.push("key.safetensors");
         }
         for file in files {
             let [a, b] = [&a, &b]
                 .map(|folder| fs::read(folder.join("checkpoint-000000000008").join(file)).unwrap());
-            assert!(a == b, "{objective:?}: {file}");
+            assert!(a == b, "{auxiliary_loss:?}: {file}");
         }
     }
 }
@@ -218,9 +220,9 @@ fn a_refused_batch_draws_nothing() {
 }
 
 #[test]
-fn augmentation_and_objective_belong_together() {
-    let said = |objective, augment| {
-        config(objective, augment)
+fn augmentation_and_auxiliary_loss_belong_together() {
+    let said = |auxiliary_loss, augment| {
+        config(auxiliary_loss, augment)
             .learner
             .validate()
             .unwrap_err()
@@ -228,7 +230,7 @@ fn augmentation_and_objective_belong_together() {
     };
     assert!(said(CURL, None).contains("take the agent curl"));
     let mut c51 = config(DIM, Some(PAPER)).learner;
-    c51.update.objective = Objective::NONE;
+    c51.update.auxiliary_loss = AuxiliaryKind::NONE;
     assert!(
         c51.validate()
             .unwrap_err()

@@ -1,6 +1,6 @@
 //! Batches whose states are stacks of frames that travel once: a learner learns from them what it learns from whole states.
 
-use driml_learner::{Learner, LearnerConfig, Objective};
+use driml_learner::{AuxiliaryKind, Learner, LearnerConfig};
 use driml_model::Compute;
 use driml_protocol::{Batch, BatchHeader, Buffer, RowScalars, StackedFrames};
 use rand::{Rng, SeedableRng};
@@ -8,8 +8,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     augment::PAPER,
-    made_up::{CPC, DIM},
     served::config,
+    synthetic::{CPC, DIM},
 };
 
 const ROWS: usize = 6;
@@ -18,8 +18,8 @@ const STACK: usize = 2;
 const FRAMES: usize = 11;
 
 /// A run whose states are stacks of two frames of this size, of one channel.
-fn stacked(objective: Objective, (height, width): (u32, u32)) -> LearnerConfig {
-    let mut config = config(objective, None);
+fn stacked(auxiliary_loss: AuxiliaryKind, (height, width): (u32, u32)) -> LearnerConfig {
+    let mut config = config(auxiliary_loss, None);
     let spec = &mut config.spec;
     (spec.frame_height, spec.frame_width) = (height, width);
     (spec.frame_channels, spec.frame_stack) = (1, STACK as u32);
@@ -76,12 +76,12 @@ fn batches(config: &LearnerConfig, seed: u64) -> [Batch; 2] {
 /// Of plain frames, of frames that are enlarged, and of augmented ones: states, losses and weights are the same, to the last bit.
 #[test]
 fn frames_that_travel_once_change_no_bit() {
-    for (objective, size, augment) in [
+    for (auxiliary_loss, size, augment) in [
         (DIM, (20, 24), None),
         (CPC, (10, 8), None),
         (DIM, (10, 12), Some(PAPER)),
     ] {
-        let mut config = stacked(objective, size);
+        let mut config = stacked(auxiliary_loss, size);
         config.learner.augment = augment;
         let learner = || Learner::new(config.clone(), &Compute::CPU).unwrap();
         let [mut of_once, mut of_whole] = [learner(), learner()];

@@ -8,7 +8,7 @@ use driml_protocol::NO_ACTION;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::made_up::{
+use crate::synthetic::{
     ALL_DIM, CANDLE, DUELING, NO_DIM, NOISY, NOISY_DUELING, Rows, Values, agent, agent_on,
     agent_with, changed, model, settings, values,
 };

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
 
-use super::done::Done;
+use super::ack::Ack;
 use crate::wire::{
     error::CodecError,
     message::{Keyed, Kind, Message, Request},
@@ -33,7 +33,7 @@ impl Keyed for AffinityUpdate {
 }
 
 impl Request for AffinityUpdate {
-    type Reply = Done;
+    type Reply = Ack;
 }
 
 impl AffinityUpdate {

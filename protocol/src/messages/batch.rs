@@ -9,7 +9,7 @@ use super::{
     batch_layout::Column,
     batch_rows::{BatchStatesMut, RowScalars},
     priorities::{Origin, PriorityPart, PriorityUpdate},
-    tally::Tally,
+    shard_counts::ShardCounts,
 };
 use crate::wire::{buffers::Buffer, error::CodecError};
 
@@ -123,7 +123,7 @@ impl Batch {
     pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
         let mut merged = parts.first()?.header;
         let mut age_total = 0.0;
-        (merged.rows, merged.tally, merged.held) = (0, Tally::default(), 0);
+        (merged.rows, merged.counts, merged.held) = (0, ShardCounts::default(), 0);
         (merged.states_k, merged.states_n) = (0, 0);
         let without_frames = |stacked: StackedFrames| StackedFrames {
             frames: 0,
@@ -137,7 +137,7 @@ impl Batch {
             state_bytes,
             states_k,
             states_n,
-            tally,
+            counts,
             held,
             mean_age,
             weights_versions: (newest, oldest),
@@ -157,7 +157,7 @@ impl Batch {
             merged.rows += rows;
             merged.states_k += states_k;
             merged.states_n += states_n;
-            merged.tally = merged.tally + tally;
+            merged.counts = merged.counts + counts;
             merged.held += held;
             age_total += mean_age * f64::from(rows);
             let (a, b) = merged.weights_versions;

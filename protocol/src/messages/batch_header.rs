@@ -7,8 +7,8 @@ use super::{
     batch_frames::StackedFrames,
     batch_layout::{BatchLayout, Column},
     priorities::Origin,
+    shard_counts::ShardCounts,
     status::Waiting,
-    tally::Tally,
 };
 use crate::{
     run_spec::RunSpec,
@@ -38,7 +38,7 @@ pub struct BatchHeader {
     /// States s_{t+n} that travel: one for each row that bootstraps, at most B.
     pub states_n: u32,
     /// What the replay server that drew this had counted then, this batch included.
-    pub tally: Tally,
+    pub counts: ShardCounts,
     /// Transitions that it held.
     pub held: u64,
     /// Mean age of the rows, in transitions stored since.
@@ -65,7 +65,7 @@ impl BatchHeader {
             state_bytes: spec.state_bytes() as u32,
             states_k: rows.saturating_mul(positives),
             states_n: rows,
-            tally: Tally::default(),
+            counts: ShardCounts::default(),
             held: 0,
             mean_age: 0.0,
             weights_versions: (0, u64::MAX),

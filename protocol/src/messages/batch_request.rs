@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{batch_header::BatchReply, tally::Tally};
+use super::{batch_header::BatchReply, shard_counts::ShardCounts};
 use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// The learner's request.
@@ -20,7 +20,7 @@ pub struct BatchRequest {
     /// What the learner has done so far.
     pub learned: Learned,
     /// Where the replay has several shards: what all the others have counted together, and these rows are part of a batch.
-    pub other_shards: Option<Tally>,
+    pub other_shards: Option<ShardCounts>,
 }
 
 /// How far a learner is. It alone knows; a replay server that was started again learns it from here.

@@ -64,7 +64,7 @@ pub struct ChunkHeader {
     pub weights_version: u64,
     /// The actor was told to stop and sends what it has left: the rate limiter lets it pass.
     pub leaving: bool,
-    /// Copies of the world, one stream each.
+    /// Environments, one stream each.
     pub streams: u32,
     /// Consecutive steps of each stream in this chunk.
     pub steps: u32,
@@ -102,11 +102,11 @@ impl Request for ChunkHeader {
     type Reply = InsertReply;
 }
 
-/// Transitions that a chunk of any run may have: an actor may step so many copies of the world, whatever the settings say.
+/// Transitions that a chunk of any run may have: an actor may step so many environments, whatever the settings say.
 const TRANSITIONS_LEAST: u64 = 4096;
 
 /// Transitions that the longest chunk of a run has, by its settings `actor.envs`, `steps_per_chunk` and `round_transitions_max`;
-/// at least 4,096, as an actor may step up to so many copies (`--envs`).
+/// at least 4,096, as an actor may step up to so many environments (`--envs`).
 pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: Option<u64>) -> u64 {
     let envs = u64::from(envs);
     let whole = envs.saturating_mul(steps_per_chunk.into());

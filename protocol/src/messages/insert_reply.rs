@@ -7,7 +7,7 @@ use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Claim {
+pub struct ChunkPoll {
     /// The actor's number in the run.
     pub actor: u32,
     /// Which life of that actor.
@@ -18,24 +18,24 @@ pub struct Claim {
     pub leaving: bool,
 }
 
-impl Message for Claim {
-    const KIND: Kind = Kind::Claim;
+impl Message for ChunkPoll {
+    const KIND: Kind = Kind::ChunkPoll;
 
     fn actor(&self) -> Option<u32> {
         Some(self.actor)
     }
 }
 
-impl Keyed for Claim {
-    const KEY: &'static str = "claim";
+impl Keyed for ChunkPoll {
+    const KEY: &'static str = "poll";
     const BY_ACTOR: bool = true;
 }
 
-impl Request for Claim {
+impl Request for ChunkPoll {
     type Reply = InsertReply;
 }
 
-/// The replay server's answer to a chunk or a claim.
+/// The replay server's answer to a chunk or a poll.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum InsertReply {
     /// Stored, now or by an earlier try: the actor may forget it.
@@ -51,7 +51,7 @@ pub enum InsertReply {
     Wait {
         /// Transitions that the run has stored.
         inserted_total: u64,
-        /// Whether the replay server keeps the chunk and will store it: then a [`Claim`] is enough, else it must be sent again.
+        /// Whether the replay server keeps the chunk and will store it: then a [`ChunkPoll`] is enough, else it must be sent again.
         kept: bool,
     },
     /// Not stored: chunks before it are missing; send from this sequence number on.

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::tally::Tally;
+use super::shard_counts::ShardCounts;
 use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
@@ -42,9 +42,9 @@ pub struct LearnerJoin {
     /// Updates in its checkpoint; 0 without one.
     pub updates: u64,
     /// What this shard had counted at the checkpoint: transitions stored, and rows that the learner learned from.
-    pub tally: Tally,
+    pub counts: ShardCounts,
     /// The same of all other shards together.
-    pub other_shards: Tally,
+    pub other_shards: ShardCounts,
     /// Begin again from the first update, where an earlier learner of the run has learned already.
     pub restart: bool,
 }

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
 
-use super::done::Done;
+use super::ack::Ack;
 use crate::wire::{
     error::CodecError,
     message::{Keyed, Kind, Message, Request, no_payload},
@@ -78,5 +78,5 @@ impl Keyed for PriorityUpdate {
 }
 
 impl Request for PriorityUpdate {
-    type Reply = Done;
+    type Reply = Ack;
 }

@@ -45,7 +45,7 @@ impl fmt::Display for RecoveryProgress {
 pub struct Recovering {
     /// How far it is.
     pub progress: RecoveryProgress,
-    /// The run's resolved settings, TOML, if the question was for [`Hello`](super::hello::Hello): with them a status says which run it
+    /// The run's resolved settings, TOML, if the question was for [`RunInfo`](super::run_info::RunInfo): with them a status says which run it
     /// is.
     pub config_toml: Option<String>,
 }

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::done::Done;
+use super::ack::Ack;
 use crate::wire::{
     error::CodecError,
     keys::Alive,
@@ -17,7 +17,7 @@ const WARNING_MAX: usize = 400;
 
 /// One incarnation of a process, by the number that only it and the replay server know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Life {
+pub enum Participant {
     /// Of an actor.
     Actor {
         /// The actor's number in the run.
@@ -29,7 +29,7 @@ pub enum Life {
     Learner(u64),
 }
 
-impl Life {
+impl Participant {
     /// How others see that it is connected.
     pub fn alive(self) -> Alive {
         match self {
@@ -43,7 +43,7 @@ impl Life {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// Whose it is.
-    pub who: Life,
+    pub who: Participant,
     /// What it does, such as `plays`; at most 80 bytes.
     pub doing: String,
     /// For how long, seconds.
@@ -75,7 +75,7 @@ impl Warning {
 
 impl Report {
     /// Cut to what may be sent.
-    pub fn new(who: Life, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
+    pub fn new(who: Participant, doing: &str, since_s: f64, last_warning: Option<Warning>) -> Self {
         Self {
             who,
             doing: cut(doing, DOING_MAX),
@@ -118,8 +118,8 @@ impl Message for Report {
 
     fn actor(&self) -> Option<u32> {
         match self.who {
-            Life::Actor { actor, .. } => Some(actor),
-            Life::Learner(_) => None,
+            Participant::Actor { actor, .. } => Some(actor),
+            Participant::Learner(_) => None,
         }
     }
 }
@@ -130,7 +130,7 @@ impl Keyed for Report {
 }
 
 impl Request for Report {
-    type Reply = Done;
+    type Reply = Ack;
 }
 
 #[cfg(test)]
@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn what_is_too_long_or_no_time_is_refused() {
         let report = |doing: &str, since_s, warning: Option<(&str, f64)>| Report {
-            who: Life::Learner(1),
+            who: Participant::Learner(1),
             doing: doing.into(),
             since_s,
             last_warning: warning.map(|(text, age_s)| Warning {
@@ -172,7 +172,12 @@ mod tests {
             assert!(bad.validate(&[]).is_err(), "{bad:?}");
         }
         assert!(report("plays", 1.0, None).validate(&[1]).is_err());
-        let cut = Report::new(Life::Learner(1), &long, 0.0, Some(Warning::new(&long, 0.0)));
+        let cut = Report::new(
+            Participant::Learner(1),
+            &long,
+            0.0,
+            Some(Warning::new(&long, 0.0)),
+        );
         assert!(cut.validate(&[]).is_ok());
     }
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use zenoh::qos::Priority;
 
-use super::done::Done;
+use super::ack::Ack;
 use crate::wire::{
     codec::PAYLOAD_BYTES_MAX,
     error::CodecError,
@@ -76,7 +76,7 @@ impl Keyed for WeightsUpload {
 }
 
 impl Request for WeightsUpload {
-    type Reply = Done;
+    type Reply = Ack;
 }
 
 /// An actor's question.

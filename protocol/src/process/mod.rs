@@ -2,10 +2,10 @@
 //! It sends nothing.
 
 pub(crate) mod activity;
-pub mod end_signs;
-pub mod fault;
+pub mod atomic_write;
+pub mod fail_point;
 pub mod last_warning;
 pub mod lock_file;
-pub(crate) mod seldom;
+pub(crate) mod log_limiter;
 pub(crate) mod shutdown;
-pub mod whole_file;
+pub mod termination;

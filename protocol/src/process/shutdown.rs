@@ -1,5 +1,5 @@
 //! The flag by which the threads of a process learn that it should stop.
-//! Draining and saving are each part's own; what raises the flag from outside is in `end_signs`.
+//! Draining and saving are each part's own; what raises the flag from outside is in `termination`.
 
 use std::{
     ops::ControlFlow,
@@ -9,8 +9,8 @@ use std::{
 };
 
 use super::{
-    end_signs::{self, EndSign},
-    fault,
+    fail_point,
+    termination::{self, EndSign},
 };
 
 /// How often it is looked whether the flag is raised, where something else is waited for too.
@@ -68,7 +68,7 @@ impl Shutdown {
         let (tell, told) = mpsc::channel();
         let thread = std::thread::Builder::new().name(name.into());
         thread.spawn(move || {
-            fault::point(name);
+            fail_point::reach(name);
             // The receiver is gone if the flag was raised meanwhile.
             let _ = tell.send(work());
         })?;
@@ -85,11 +85,11 @@ impl Shutdown {
     /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
     ///
     /// # Errors
-    /// As [`end_signs::listen`].
+    /// As [`termination::listen`].
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let shutdown = Self::default();
         let raised = shutdown.clone();
-        end_signs::listen("signals", parent, move |_| {
+        termination::listen("signals", parent, move |_| {
             raised.set();
             ControlFlow::Break(())
         })?;
@@ -99,23 +99,23 @@ impl Shutdown {
 
 /// When a process that others need while they end is to end itself.
 #[derive(Clone, Debug, Default)]
-pub struct TwoSteps {
+pub struct GracefulShutdown {
     /// Raised when it should end as soon as the others have left.
     pub ending: Shutdown,
     /// Raised when it should end without waiting for the others.
     pub now: Shutdown,
 }
 
-impl TwoSteps {
+impl GracefulShutdown {
     /// The first flag is raised at any reason to exit, the second at SIGINT and SIGTERM, and without a `parent` at any reason. With a
     /// parent, its death, SIGHUP or a closed stderr raise only the first: the other processes exit then, too.
     ///
     /// # Errors
-    /// As [`end_signs::listen`].
+    /// As [`termination::listen`].
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let steps = Self::default();
         let raised = steps.clone();
-        end_signs::listen("signals", parent, move |sign| {
+        termination::listen("signals", parent, move |sign| {
             raised.ending.set();
             if sign == EndSign::Abandoned && parent.is_some() {
                 return ControlFlow::Continue(());

@@ -8,13 +8,13 @@ use crate::{
         batch_request::BatchRequest,
         chunk::ChunkHeader,
         episodes::EpisodesRequest,
-        goodbye::Goodbye,
-        hello::Hello,
-        insert_reply::Claim,
+        insert_reply::ChunkPoll,
         join::{ActorJoin, LearnerJoin},
-        parts::PartsStatus,
+        leave::Leave,
         priorities::PriorityUpdate,
+        processes::ProcessesStatus,
         report::Report,
+        run_info::RunInfo,
         status::{LearnerStatus, ReplayStatus},
         weights::{WeightsRequest, WeightsUpload, WeightsVersion},
     },
@@ -32,15 +32,15 @@ struct Grant {
 
 /// What a role may do in the run whose keys these are; nothing for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
-    let (mut asks, mut answers) = (vec![keys.of::<Hello>()], Vec::new());
+    let (mut asks, mut answers) = (vec![keys.of::<RunInfo>()], Vec::new());
     let (mut subscribes, mut lives) = (Vec::new(), Vec::new());
     match role {
         Role::Actor(actor) => {
             asks.extend([
                 keys.of_actor::<ActorJoin>(actor),
                 keys.of_actor::<ChunkHeader>(actor),
-                keys.of_actor::<Claim>(actor),
-                keys.of_actor::<Goodbye>(actor),
+                keys.of_actor::<ChunkPoll>(actor),
+                keys.of_actor::<Leave>(actor),
                 keys.of_actor::<Report>(actor),
                 keys.of::<WeightsRequest>(),
             ]);
@@ -63,7 +63,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
         Role::Observer => {
             asks.extend([
                 keys.of::<ReplayStatus>(),
-                keys.of::<PartsStatus>(),
+                keys.of::<ProcessesStatus>(),
                 keys.of::<LearnerStatus>(),
                 keys.of::<EpisodesRequest>(),
             ]);
@@ -181,11 +181,11 @@ mod tests {
         assert_eq!(
             all(&of(Role::Actor(3))),
             [
-                "d/hello",
+                "d/run-info",
                 "d/join/actor/3",
                 "d/ingest/3",
-                "d/claim/3",
-                "d/goodbye/3",
+                "d/poll/3",
+                "d/leave/3",
                 "d/report/3",
                 "d/weights",
                 "d/weights-version",
@@ -195,7 +195,7 @@ mod tests {
         assert_eq!(
             all(&of(Role::Learner)),
             [
-                "d/hello",
+                "d/run-info",
                 "d/join/learner",
                 "d/batch",
                 "d/affinity",
@@ -210,9 +210,9 @@ mod tests {
         assert_eq!(
             all(&of(Role::Observer)),
             [
-                "d/hello",
+                "d/run-info",
                 "d/status/replay",
-                "d/status/parts",
+                "d/status/processes",
                 "d/status/learner",
                 "d/episodes",
             ]

@@ -1,4 +1,4 @@
-//! The files of one part in a folder of certificates, read and checked before anything is sent.
+//! The files of one process in a folder of certificates, read and checked before anything is sent.
 //! The other side's files are checked there, before its start.
 
 use std::{
@@ -282,7 +282,7 @@ fn check_signed(
     chain: &[CertificateDer<'static>],
     role: Role,
 ) -> Result<(), String> {
-    let in_words = |e: rustls::Error| match e {
+    let describe = |e: rustls::Error| match e {
         rustls::Error::InvalidCertificate(
             CertificateError::InvalidPurpose | CertificateError::InvalidPurposeContext { .. },
         ) => "it is made for the other side of a connection".into(),
@@ -292,16 +292,16 @@ fn check_signed(
     let (provider, now) = (provider(), UnixTime::now());
     if role == Role::ReplayServer {
         let algorithms = provider.signature_verification_algorithms.all;
-        let own = ParsedCertificate::try_from(own).map_err(in_words)?;
+        let own = ParsedCertificate::try_from(own).map_err(describe)?;
         return verify_server_cert_signed_by_trust_anchor(&own, roots, others, now, algorithms)
-            .map_err(in_words);
+            .map_err(describe);
     }
     let verifier =
         WebPkiClientVerifier::builder_with_provider(roots.clone().into(), provider.into())
             .build()
             .map_err(|e| e.to_string())?;
     let verified = verifier.verify_client_cert(own, others, now);
-    verified.map(drop).map_err(in_words)
+    verified.map(drop).map_err(describe)
 }
 
 /// The names and addresses that a certificate is for.

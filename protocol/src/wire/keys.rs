@@ -145,19 +145,19 @@ fn mark(number: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::messages::{affinity::AffinityUpdate, goodbye::Goodbye, report::Report};
+    use crate::messages::{affinity::AffinityUpdate, leave::Leave, report::Report};
 
     #[test]
     fn what_an_actor_says_stands_under_its_number() {
         let keys = Keys::new("a/7").unwrap();
-        assert_eq!(keys.of::<Goodbye>(), "a/7/goodbye/*");
-        assert_eq!(keys.of_actor::<Goodbye>(7), "a/7/goodbye/7");
+        assert_eq!(keys.of::<Leave>(), "a/7/leave/*");
+        assert_eq!(keys.of_actor::<Leave>(7), "a/7/leave/7");
         assert_eq!(keys.of_actor::<AffinityUpdate>(7), "a/7/affinity");
         assert_eq!(keys.of_learner::<AffinityUpdate>(), "a/7/affinity");
         assert_eq!(keys.of_learner::<Report>(), "a/7/report/learner");
         assert_eq!(Keys::actor("a/7/report/learner"), None);
-        assert_eq!(Keys::actor("a/7/goodbye/7"), Some(7));
-        for foreign in ["a/7/goodbye/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
+        assert_eq!(Keys::actor("a/7/leave/7"), Some(7));
+        for foreign in ["a/7/leave/*", "a/7/affinity", "", "a/4294967296", "a/-1"] {
             assert_eq!(Keys::actor(foreign), None, "{foreign}");
         }
     }

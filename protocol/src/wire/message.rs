@@ -71,15 +71,15 @@ pub enum Kind {
     /// "Newer weights exist", replay server to actors.
     WeightsVersion = 7,
     /// An actor's last word.
-    Goodbye = 8,
+    Leave = 8,
     /// The replay server's account of itself.
     ReplayStatus = 9,
     /// The learner's account of itself.
     LearnerStatus = 10,
     /// What a joining part needs to know.
-    Hello = 11,
+    RunInfo = 11,
     /// "Understood"; carries nothing.
-    Done = 12,
+    Ack = 12,
     /// An actor that starts.
     ActorJoin = 13,
     /// A learner that starts.
@@ -87,7 +87,7 @@ pub enum Kind {
     /// The answer to a process that starts.
     JoinReply = 15,
     /// What became of a chunk, actor to replay server.
-    Claim = 16,
+    ChunkPoll = 16,
     /// New weights, learner to replay server.
     WeightsUpload = 17,
     /// A request for a piece of the newest weights, actor to replay server.
@@ -95,7 +95,7 @@ pub enum Kind {
     /// The state of an actor or the learner, to the replay server.
     Report = 19,
     /// The replay server's account of who takes part.
-    PartsStatus = 20,
+    ProcessesStatus = 20,
     /// Priorities of the rows of a batch, learner to replay server.
     Priorities = 21,
     /// A request for the episodes that ended.

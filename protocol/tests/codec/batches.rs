@@ -2,7 +2,7 @@
 
 use driml_protocol::{
     Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, PriorityUpdate, RowScalars,
-    StackedFrames, Tally, codec,
+    ShardCounts, StackedFrames, codec,
 };
 
 use crate::samples::{
@@ -126,9 +126,9 @@ fn parts_of_stacks_are_merged() {
             ..STACKED
         }),
     ] {
-        let mut other_part = part.clone();
-        other_part.header.stacked = other;
-        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
+        let mut other_process = part.clone();
+        other_process.header.stacked = other;
+        assert_eq!(Batch::merged_header(&[part.clone(), other_process]), None);
     }
 }
 
@@ -255,7 +255,7 @@ fn parts_are_merged_row_by_row() {
         state_bytes: 3,
         states_k: 0,
         states_n: 0,
-        tally: Tally {
+        counts: ShardCounts {
             inserted: 10,
             rows_sampled: 1,
         },
@@ -300,7 +300,7 @@ fn parts_are_merged_row_by_row() {
     let merged = Batch::merge(&parts, Buffer::from(vec![0xAB; whole.payload_bytes()]));
     let expected = part(whole, 0..8);
     assert_eq!((whole.mean_age, whole.weights_versions), (1.75, (9, 3)));
-    assert_eq!((whole.tally.inserted, whole.held), (30, 15));
+    assert_eq!((whole.counts.inserted, whole.held), (30, 15));
     assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
     assert_eq!(

@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
-    EndedEpisode, EpisodesReply, Hello, Kind, PROTOCOL_VERSION, Played, WeightsHeader,
+    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Played, RunInfo, WeightsHeader,
     WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
@@ -25,7 +25,7 @@ fn episodes_that_did_not_end_are_refused() {
     let most = EndedEpisode {
         frames: u64::MAX,
         actor: u32::MAX,
-        copy: u32::MAX,
+        env: u32::MAX,
         played: Some(Played {
             episode_return: f64::MAX,
             steps: u64::MAX,
@@ -120,7 +120,7 @@ fn each_mismatch_has_its_own_error() {
         ours: PROTOCOL_VERSION,
     };
     assert_eq!(read(&newer, Some(SPEC)), Err(version));
-    for kind in [0, Kind::Goodbye as u16, 13, u16::MAX] {
+    for kind in [0, Kind::Leave as u16, 13, u16::MAX] {
         let other = forge(PROTOCOL_VERSION, kind, (1, 0), &header, &[]);
         let refused = CodecError::Kind {
             theirs: kind,
@@ -171,12 +171,12 @@ fn huge_lengths_are_refused_without_taking_memory() {
         assert_eq!(read(lengths), expected);
     }
     // A header that claims more elements than any header has room for.
-    let claim = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
-    let bytes = forge_whole(Kind::Affinity, &claim, &[]);
+    let poll = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
+    let bytes = forge_whole(Kind::Affinity, &poll, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.
-    let hello = Hello {
+    let run_info = RunInfo {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
         inserted_total: 0,
         has_learner: false,
@@ -184,7 +184,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let refused = codec::seal(SPEC, &hello, &[]).unwrap_err();
+    let refused = codec::seal(SPEC, &run_info, &[]).unwrap_err();
     let max = HEADER_BYTES_MAX;
     let is_too_large = matches!(refused, CodecError::TooLarge { max: m, .. } if m == max);
     assert!(is_too_large, "{refused}");

@@ -4,13 +4,13 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
-    ChunkHeader, Claim, CodecError, Done, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    Goodbye, Hello, InsertReply, JoinReply, Kind, Learned, LearnerJoin, LearnerStatus, Life,
-    LogStatus, Message, NO_ACTION, Origin, PartName, PartStatus, PartsStatus, Played, PriorityPart,
-    PriorityUpdate, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId, Returns,
-    RowScalars, StackedFrames, Tally, Waiting, Warning, WeightsHeader, WeightsReply,
-    WeightsRequest, WeightsUpload, WeightsVersion,
+    Ack, ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
+    ChunkHeader, ChunkPoll, CodecError, End, EndedEpisode, EpisodesReply, EpisodesRequest,
+    InsertReply, JoinReply, Kind, Learned, LearnerJoin, LearnerStatus, Leave, LogStatus, Message,
+    NO_ACTION, Origin, Participant, Played, PriorityPart, PriorityUpdate, ProcessName,
+    ProcessStatus, ProcessesStatus, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
+    Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Waiting, Warning, WeightsHeader,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
     codec::{self},
 };
 
@@ -116,7 +116,7 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
         state_bytes: 4,
         states_k: 2,
         states_n: 1,
-        tally: Tally {
+        counts: ShardCounts {
             inserted: 99,
             rows_sampled: 12,
         },
@@ -189,8 +189,8 @@ pub(crate) fn weights() -> Vec<u8> {
     codec::encode(SPEC, &upload, &payload).unwrap()
 }
 
-pub(crate) fn parts_status() -> PartsStatus {
-    PartsStatus {
+pub(crate) fn processes_status() -> ProcessesStatus {
+    ProcessesStatus {
         up_s: 60.0,
         waiting: Waiting::ActorsWaitForLearner,
         waiting_s: 2.5,
@@ -208,8 +208,8 @@ pub(crate) fn parts_status() -> PartsStatus {
             unwritten_bytes: 40,
         }),
         last_warning: None,
-        parts: vec![PartStatus {
-            who: PartName::Actor(3),
+        processes: vec![ProcessStatus {
+            who: ProcessName::Actor(3),
             connected: true,
             since_s: 50.0,
             lives: 2,
@@ -227,7 +227,7 @@ pub(crate) fn episodes() -> EpisodesReply {
     let whole = EndedEpisode {
         frames: 1 << 20,
         actor: 3,
-        copy: 15,
+        env: 15,
         played: Some(Played {
             episode_return: 2.5,
             steps: 99,
@@ -308,7 +308,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         num_actions: 3,
         matrix: [0.25, 0.5, 0.25].repeat(3),
     };
-    let hello = Hello {
+    let run_info = RunInfo {
         config_toml: "[run]\nseed = 1\n".into(),
         inserted_total: 12,
         has_learner: true,
@@ -324,7 +324,7 @@ pub(crate) fn samples() -> Vec<Sample> {
         },
         config_toml: Some("[run]\nseed = 1\n".into()),
     };
-    let goodbye = Goodbye {
+    let leave = Leave {
         actor: 1,
         incarnation: 2,
         produced: 3,
@@ -354,16 +354,16 @@ pub(crate) fn samples() -> Vec<Sample> {
                 saved_updates: 2,
                 rows_received: 64,
             },
-            other_shards: Some(Tally::default()),
+            other_shards: Some(ShardCounts::default()),
         }),
         Sample::of(&affinity),
         Sample::of(&priority_update()),
         Sample::of(&WeightsVersion { version: 9 }),
-        Sample::of(&goodbye),
+        Sample::of(&leave),
         Sample::of(&ReplayStatus::default()),
         Sample::of(&replay),
         Sample::of(&learner),
-        Sample::of(&hello),
+        Sample::of(&run_info),
         Sample::of(&recovering),
         Sample::of(&ActorJoin {
             actor: 1,
@@ -373,14 +373,14 @@ pub(crate) fn samples() -> Vec<Sample> {
             learner: 5,
             run: 1 << 60,
             updates: 9,
-            tally: Tally {
+            counts: ShardCounts {
                 inserted: 7,
                 rows_sampled: 8,
             },
-            other_shards: Tally::default(),
+            other_shards: ShardCounts::default(),
             restart: true,
         }),
-        Sample::of(&Claim {
+        Sample::of(&ChunkPoll {
             actor: 1,
             incarnation: 2,
             sequence: 3,
@@ -398,14 +398,14 @@ pub(crate) fn samples() -> Vec<Sample> {
             bytes: 5,
             offset: 0,
         }),
-        Sample::of(&Done),
+        Sample::of(&Ack),
         Sample::of(&Report::new(
-            Life::Learner(5),
+            Participant::Learner(5),
             "learns",
             1.5,
             Some(Warning::new("a chunk was refused", 3.0)),
         )),
-        Sample::of(&parts_status()),
+        Sample::of(&processes_status()),
         Sample::of(&EpisodesRequest { since: 7 }),
         Sample::of(&episodes()),
     ]);

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use driml_protocol::{ActorJoin, ChunkHeader, Claim, Goodbye, Played};
+use driml_protocol::{ActorJoin, ChunkHeader, ChunkPoll, Leave, Played};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::ring::Link;
@@ -15,7 +15,7 @@ pub const STREAMS_MAX: u32 = 4096;
 /// Past lives remembered for each actor; what an older one still says is ignored.
 const PAST_INCARNATIONS_MAX: usize = 64;
 
-/// One copy of an actor's world.
+/// One environment of an actor's world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Stream {
     /// How its next transition hangs together with the last.
@@ -156,7 +156,7 @@ impl Actors {
             return Ok(Verdict::Retried);
         }
         if actor.current.said_goodbye {
-            return Err(format!("actor {number} said goodbye before this chunk"));
+            return Err(format!("actor {number} said leave before this chunk"));
         }
         if header.sequence > expected {
             return Ok(Verdict::OutOfOrder { expected });
@@ -226,9 +226,9 @@ impl Actors {
     }
 
     /// Whether a chunk is stored; an error says why it is not of a life that counts.
-    pub(crate) fn is_stored(&self, claim: &Claim) -> Result<bool, String> {
-        let actor = self.living(claim.actor, claim.incarnation)?;
-        Ok(claim.sequence < actor.expected)
+    pub(crate) fn is_stored(&self, poll: &ChunkPoll) -> Result<bool, String> {
+        let actor = self.living(poll.actor, poll.incarnation)?;
+        Ok(poll.sequence < actor.expected)
     }
 
     /// Counts a chunk that was judged `Next`; gives its streams, and how its own count of what came before differs.
@@ -259,14 +259,14 @@ impl Actors {
         (&mut actor.streams, difference)
     }
 
-    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second goodbye
+    /// Takes the last word of a life that counts or has counted, and gives the difference that it reveals; a second `Leave`
     /// reveals nothing. A life that never joined is an error: the reason, for a person.
-    pub(crate) fn goodbye(&mut self, goodbye: &Goodbye) -> Result<Difference, String> {
-        let &Goodbye {
+    pub(crate) fn leave(&mut self, leave: &Leave) -> Result<Difference, String> {
+        let &Leave {
             actor,
             incarnation,
             produced,
-        } = goodbye;
+        } = leave;
         let known = self.actors.get_mut(&actor).into_iter();
         let mut lives = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == incarnation);

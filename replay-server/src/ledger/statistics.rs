@@ -168,7 +168,7 @@ mod tests {
             statistics.episode_ended(EndedEpisode {
                 frames,
                 actor: 0,
-                copy: 0,
+                env: 0,
                 played: None,
             });
         };

@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{lock_file, whole_file};
+use driml_protocol::{atomic_write, lock_file};
 use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
@@ -165,7 +165,7 @@ impl LogFolder {
         let text = toml::to_string(id).expect("a struct of numbers is TOML");
         let text =
             format!("# The replay that a replay server of driml keeps in this folder.\n{text}");
-        whole_file::write(&path, text.as_bytes()).map_err(io_error("writing", &path))
+        atomic_write::write(&path, text.as_bytes()).map_err(io_error("writing", &path))
     }
 
     /// Checks that `found` is the log of the run and shard of `ours`.

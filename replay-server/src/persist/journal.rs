@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{LogStatus, Seldom, codec};
+use driml_protocol::{LogLimiter, LogStatus, codec};
 
 use super::{
     folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader, io_error},
@@ -59,7 +59,7 @@ struct Failing {
     since: Instant,
     /// What it said last.
     why: String,
-    said: Seldom,
+    said: LogLimiter,
 }
 
 /// The writing side of a log.
@@ -214,7 +214,7 @@ impl Journal {
         let failing = self.failing.get_or_insert_with(|| Failing {
             since: Instant::now(),
             why: String::new(),
-            said: Seldom::default(),
+            said: LogLimiter::default(),
         });
         failing.why = e.to_string();
         if let Some(more) = failing.said.due() {

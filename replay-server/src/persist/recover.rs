@@ -313,7 +313,7 @@ impl Reader<'_> {
             RecordKind::Note => {
                 match codec::decode_value(record.body).map_err(|e| e.to_string())? {
                     Note::ActorJoined(join) => self.replay.join_actor(join).map(drop),
-                    Note::Goodbye(goodbye) => self.replay.goodbye(&goodbye).map_or(Ok(()), Err),
+                    Note::Leave(leave) => self.replay.leave(&leave).map_or(Ok(()), Err),
                     Note::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
                 }
             }

@@ -1,7 +1,7 @@
 //! All of the replay but the transitions themselves, as a value that is written and taken back, and what changes it between two chunks.
 //! When one is written is for the facade; where it lies, for `journal`.
 
-use driml_protocol::{ActorJoin, Goodbye, Learned, LearnerJoin, RunSpec};
+use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -23,7 +23,7 @@ const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Note {
     ActorJoined(ActorJoin),
-    Goodbye(Goodbye),
+    Leave(Leave),
     LearnerJoined(LearnerJoin),
 }
 

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{Seldom, Shutdown, fault};
+use driml_protocol::{LogLimiter, Shutdown, fail_point};
 
 /// Segments that wait to be flushed; with one more they are flushed before anything else is written.
 const WAITING_MAX: usize = 32;
@@ -154,9 +154,9 @@ impl Drop for Syncer {
 }
 
 fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
-    let mut said = Seldom::default();
+    let mut said = LogLimiter::default();
     while !stop.wait_timeout(period) {
-        fault::point("replay-fsync");
+        fail_point::reach("replay-fsync");
         if let Err(e) = shared.flush()
             && let Some(more) = said.due()
         {

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{Chunk, ChunkHeader, CodecError, End, Tally, codec};
+use driml_protocol::{Chunk, ChunkHeader, CodecError, End, ShardCounts, codec};
 
 use super::{
     folder::{Mark, PersistError},
@@ -181,7 +181,7 @@ impl Replay {
             mut counts, state, ..
         } = self.snapshot();
         counts.this_shard.rows_sampled = 0;
-        counts.other_shards = Tally::default();
+        counts.other_shards = ShardCounts::default();
         codec::encode_value(&Snapshot {
             counts,
             rows: RowsState::Uniform { are_listed: false },

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::{ActorJoin, Chunk, Claim, EndedEpisode, Goodbye, InsertReply, Played};
+use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Leave, Played};
 
 use super::Replay;
 use crate::{
@@ -100,8 +100,8 @@ impl Replay {
     }
 
     /// What became of a chunk: stored, not wanted any more, or never to be stored; none where it is still to come.
-    pub fn claim(&mut self, claim: &Claim) -> Option<InsertReply> {
-        match self.state.actors.is_stored(claim) {
+    pub fn poll(&mut self, poll: &ChunkPoll) -> Option<InsertReply> {
+        match self.state.actors.is_stored(poll) {
             Ok(true) => Some(self.stored()),
             Ok(false) => self.limiter.all_in().then(|| self.run_is_full()),
             Err(why) => Some(self.refused(why)),
@@ -212,7 +212,7 @@ impl Replay {
                     statistics.episode_ended(EndedEpisode {
                         frames,
                         actor: header.actor,
-                        copy: number as u32,
+                        env: number as u32,
                         played: stream.episode.replace(Played::default()),
                     });
                 }
@@ -234,18 +234,18 @@ impl Replay {
 
     /// Takes an actor's last word; what it produced and is not stored counts as lost, the reverse as stored twice. One of a life
     /// that never joined, or with a count that no run reaches, is refused: gives the reason.
-    pub fn goodbye(&mut self, goodbye: &Goodbye) -> Option<String> {
-        let said = match goodbye.produced {
-            0..=TRANSITIONS_MAX => self.state.actors.goodbye(goodbye),
+    pub fn leave(&mut self, leave: &Leave) -> Option<String> {
+        let said = match leave.produced {
+            0..=TRANSITIONS_MAX => self.state.actors.leave(leave),
             produced => Err(format!(
                 "actor {} says it produced {produced} transitions, a count that no run reaches",
-                goodbye.actor
+                leave.actor
             )),
         };
         match said {
             Ok(difference) => {
-                self.count(goodbye.actor, difference);
-                self.note(Note::Goodbye(*goodbye));
+                self.count(leave.actor, difference);
+                self.note(Note::Leave(*leave));
                 None
             }
             Err(why) => {

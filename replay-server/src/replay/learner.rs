@@ -3,10 +3,10 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, PriorityUpdate, RequestId,
-    Tally, Waiting,
+    ShardCounts, Waiting,
 };
 
-use super::{Replay, Unready};
+use super::{NotReady, Replay};
 use crate::{
     config,
     ledger::requests::Requests,
@@ -29,14 +29,14 @@ impl Replay {
     /// # Errors
     /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
     pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
-        let Tally {
+        let ShardCounts {
             inserted,
             rows_sampled,
-        } = join.tally + join.other_shards;
+        } = join.counts + join.other_shards;
         if join.updates.max(inserted).max(rows_sampled) > LEARNED_MAX {
             return Err(format!(
                 "a learner after {} updates, {:?} and {:?}: counts that no run reaches",
-                join.updates, join.tally, join.other_shards
+                join.updates, join.counts, join.other_shards
             ));
         }
         let done = self.state.learned.updates;
@@ -53,8 +53,8 @@ impl Replay {
             }
             None => self.resume_empty(&join),
         }
-        let learned = join.tally.rows_sampled;
-        let unlearned = self.tally().rows_sampled.saturating_sub(learned);
+        let learned = join.counts.rows_sampled;
+        let unlearned = self.counts().rows_sampled.saturating_sub(learned);
         let again = done.saturating_sub(join.updates);
         self.limiter.refund(unlearned);
         self.set_rows_sampled(learned);
@@ -85,16 +85,16 @@ impl Replay {
         // All shards' credit decides whether anything is left to fill it for.
         self.limiter.counts.other_shards = join.other_shards;
         self.limiter
-            .resume_empty(join.tally, refill, self.batch_size);
-        self.state.inserted_before = join.tally.inserted;
-        self.state.rows_before = join.tally.rows_sampled as i64;
+            .resume_empty(join.counts, refill, self.batch_size);
+        self.state.inserted_before = join.counts.inserted;
+        self.state.rows_before = join.counts.rows_sampled as i64;
         self.state.resumed_after = join.updates;
         self.state.draw_anew(self.origin.shard, join.updates);
     }
 
     /// So many rows were sampled here, whatever was counted.
     fn set_rows_sampled(&mut self, rows: u64) {
-        let counted = self.tally().rows_sampled;
+        let counted = self.counts().rows_sampled;
         self.state.rows_before += rows as i64 - counted as i64;
         self.limiter.counts.this_shard.rows_sampled = rows;
     }
@@ -178,7 +178,7 @@ impl Replay {
     ///
     /// # Errors
     /// As [`Replay::draw`].
-    pub fn sample(&mut self, rows: u32) -> Result<Batch, Unready> {
+    pub fn sample(&mut self, rows: u32) -> Result<Batch, NotReady> {
         self.draw(rows, Buffer::zeroed).map(PackedBatch::unpack)
     }
 
@@ -192,9 +192,9 @@ impl Replay {
         id: RequestId,
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
-    ) -> Result<PackedBatch, Unready> {
+    ) -> Result<PackedBatch, NotReady> {
         let Some(lost) = self.requests.begin(id) else {
-            return Err(Unready::Wait(self.limiter.waiting(rows)));
+            return Err(NotReady::Wait(self.limiter.waiting(rows)));
         };
         if !lost.is_empty() {
             tracing::warn!("a batch of {} rows did not reach the learner", lost.len());
@@ -216,7 +216,7 @@ impl Replay {
         &mut self,
         rows: u32,
         memory: impl FnOnce(usize) -> Buffer,
-    ) -> Result<PackedBatch, Unready> {
+    ) -> Result<PackedBatch, NotReady> {
         let rows_max = config::rows_max(&self.spec, &self.config.sampling);
         let rows_max = rows_max.min(self.limiter.rows_max());
         if rows == 0 || rows > rows_max {
@@ -224,13 +224,13 @@ impl Replay {
             let why = format!(
                 "a batch of {rows} rows; this run serves 1 to {rows_max}: change the batch size, or raise slack_transitions"
             );
-            return Err(Unready::Refused { why });
+            return Err(NotReady::Refused { why });
         }
         if self.limiter.finished(rows) {
-            return Err(Unready::Finished);
+            return Err(NotReady::Finished);
         }
         if !self.limiter.may_sample(rows) {
-            return Err(Unready::Wait(self.limiter.waiting(rows)));
+            return Err(NotReady::Wait(self.limiter.waiting(rows)));
         }
         let is_prioritised = self.config.sampling.is_prioritised();
         let held = self.ring.inserted() - self.ring.oldest();
@@ -245,15 +245,15 @@ impl Replay {
         let Some(mut drawn) = drawn else {
             if self.limiter.all_in() {
                 let why = format!(
-                    "none of the {held} transitions held can be sampled, and no more will come: every copy of the world needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer copies"
+                    "none of the {held} transitions held can be sampled, and no more will come: every environment needs n_step or k_max consecutive ones; raise capacity_transitions or transitions_max, or use fewer environments"
                 );
-                return Err(Unready::Refused { why });
+                return Err(NotReady::Refused { why });
             }
             state.starving = true;
-            return Err(Unready::Wait(Waiting::LearnerWaitsForActors));
+            return Err(NotReady::Wait(Waiting::LearnerWaitsForActors));
         };
         self.limiter.sampled(rows);
-        drawn.batch.header.tally = self.limiter.tally();
+        drawn.batch.header.counts = self.limiter.counts();
         state.statistics.counted.mean_age = drawn.batch.header.mean_age;
         state.statistics.served(&drawn.ks);
         state.starving = false;

@@ -6,7 +6,7 @@ mod actors;
 mod learner;
 
 use driml_protocol::{
-    BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, Tally, Waiting,
+    BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, ShardCounts, Waiting,
     config::{ConfigError, check},
 };
 
@@ -21,7 +21,7 @@ use crate::{
 
 /// Why there is no batch.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Unready {
+pub enum NotReady {
     /// Not yet: who waits for what.
     Wait(Waiting),
     /// Never again: all transitions are in and sampled.
@@ -33,12 +33,12 @@ pub enum Unready {
     },
 }
 
-impl From<Unready> for BatchReply {
-    fn from(unready: Unready) -> Self {
+impl From<NotReady> for BatchReply {
+    fn from(unready: NotReady) -> Self {
         match unready {
-            Unready::Wait(waiting) => Self::Wait(waiting),
-            Unready::Finished => Self::Finished,
-            Unready::Refused { why } => Self::Refused { why },
+            NotReady::Wait(waiting) => Self::Wait(waiting),
+            NotReady::Finished => Self::Finished,
+            NotReady::Refused { why } => Self::Refused { why },
         }
     }
 }
@@ -134,15 +134,15 @@ impl Replay {
     }
 
     /// What was counted here since the start of the run.
-    pub const fn tally(&self) -> Tally {
-        self.limiter.tally()
+    pub const fn counts(&self) -> ShardCounts {
+        self.limiter.counts()
     }
 
     /// Takes what the replay's other shards have counted.
     ///
     /// # Errors
     /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
-    pub fn set_other_shards(&mut self, other_shards: Tally) -> Result<(), String> {
+    pub fn set_other_shards(&mut self, other_shards: ShardCounts) -> Result<(), String> {
         let held_max = self.config.capacity_transitions;
         self.limiter.set_other_shards(other_shards, held_max)
     }

@@ -3,13 +3,13 @@
 
 use std::time::Instant;
 
-use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fault};
+use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fail_point};
 
 use super::{
     parked::{ParkedRequest, park_request},
     server::{Service, State},
 };
-use crate::{replay::Unready, sampling::packed_batch::PackedBatch};
+use crate::{replay::NotReady, sampling::packed_batch::PackedBatch};
 
 /// A request that waits, and who for.
 type Parked = ParkedRequest<Responder<BatchReply>>;
@@ -31,7 +31,7 @@ impl Service {
             return responder.reply(&BatchReply::Refused { why });
         }
         let learner = Alive::learner(request.learner);
-        state.accounts.seen(learner, None, Instant::now());
+        state.participants.seen(learner, None, Instant::now());
         let parked = ParkedRequest {
             request,
             question: responder,
@@ -68,7 +68,7 @@ impl Service {
     /// Serves parked requests as the limiter allows them. The thread's whole work until the end of the process.
     pub(super) fn serve_parked(&self) {
         while !self.shutdown.is_set() {
-            fault::point("sample");
+            fail_point::reach("sample");
             let mut state = self.state();
             let now = Instant::now();
             let Some((parked, drawn)) = state.next_answer(now, |bytes, shared| match shared {
@@ -101,7 +101,7 @@ impl State {
         &mut self,
         now: Instant,
         memory: impl Fn(usize, bool) -> Buffer,
-    ) -> Option<(Parked, Result<PackedBatch, Unready>)> {
+    ) -> Option<(Parked, Result<PackedBatch, NotReady>)> {
         for at in 0..self.requests.len() {
             let parked = &self.requests[at];
             let BatchRequest {
@@ -112,7 +112,7 @@ impl State {
             } = parked.request;
             let memory = |bytes| memory(bytes, shared_memory);
             let drawn = self.replay.draw_for(id, rows, memory);
-            if !matches!(drawn, Err(Unready::Wait(_))) || parked.left(now).is_zero() {
+            if !matches!(drawn, Err(NotReady::Wait(_))) || parked.left(now).is_zero() {
                 let parked = self.requests.remove(at);
                 return parked.map(|parked| (parked, drawn));
             }

@@ -3,7 +3,9 @@
 
 use std::{borrow::Cow, time::Instant};
 
-use driml_protocol::{Alive, Chunk, ChunkHeader, Claim, CodecError, Incoming, InsertReply, fault};
+use driml_protocol::{
+    Alive, Chunk, ChunkHeader, ChunkPoll, CodecError, Incoming, InsertReply, fail_point,
+};
 
 use super::{
     parked::ParkedChunk,
@@ -54,14 +56,14 @@ impl Service {
         Err(CodecError::Header(why))
     }
 
-    pub(super) fn claim(&self, incoming: Incoming<Claim>) {
+    pub(super) fn poll(&self, incoming: Incoming<ChunkPoll>) {
         let arrived = Instant::now();
-        let Some(claim) = self.read(&incoming) else {
+        let Some(poll) = self.read(&incoming) else {
             return;
         };
         let responder = incoming.into_responder();
         let question = Question { responder, arrived };
-        let answers = self.state().take_claim(&claim, question);
+        let answers = self.state().take_claim(&poll, question);
         self.changed.notify_all();
         self.answer_all(answers);
     }
@@ -70,7 +72,7 @@ impl Service {
     /// whole work until the end of the process.
     pub(super) fn admit_parked(&self) {
         while !self.shutdown.is_set() {
-            fault::point("admit");
+            fail_point::reach("admit");
             let mut state = self.state();
             let now = Instant::now();
             let mut answers = state.admit(now);
@@ -102,7 +104,7 @@ impl State {
         let header = packed.chunk.header;
         let (version, arrived) = (header.weights_version, question.arrived);
         let actor = Alive::actor(header.actor, header.incarnation);
-        self.accounts.seen(actor, Some(version), arrived);
+        self.participants.seen(actor, Some(version), arrived);
         let reply = match self.replay.settle(&packed) {
             Some(reply) => reply,
             // Those that came before go first.
@@ -137,23 +139,23 @@ impl State {
     }
 
     /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
-    fn take_claim(&mut self, claim: &Claim, question: Question) -> Answers {
-        if let Some(reply) = self.replay.claim(claim) {
+    fn take_claim(&mut self, poll: &ChunkPoll, question: Question) -> Answers {
+        if let Some(reply) = self.replay.poll(poll) {
             if let InsertReply::Refused { why } = &reply {
-                self.say("claim", &format!("a claim was refused: {why}"));
+                self.say("poll", &format!("a poll was refused: {why}"));
             }
             return vec![(question, reply)];
         }
-        let Some(parked) = self.chunks.claimed(claim) else {
+        let Some(parked) = self.chunks.claimed(poll) else {
             return vec![(question, self.replay.wait(false))];
         };
         // An older question about it was given up.
         (parked.asked, parked.question) = (question.arrived, Some(question));
-        if !claim.leaving {
+        if !poll.leaving {
             return Answers::new();
         }
         parked.chunk.chunk.to_mut().header.leaving = true;
-        let parked = self.chunks.take(claim.actor);
+        let parked = self.chunks.take(poll.actor);
         let answer = parked.and_then(|parked| {
             let reply = self.replay.insert_packed(&parked.chunk);
             self.leave_line(parked, reply)

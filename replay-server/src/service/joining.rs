@@ -1,10 +1,10 @@
 //! Processes that join: what they learn about the run, and whether they are admitted.
-//! `accounts` knows which are connected.
+//! `participants` knows which are connected.
 
 use std::time::Instant;
 
 use driml_protocol::{
-    ActorJoin, Alive, Hello, Incoming, JoinReply, LearnerJoin, Request, Responder,
+    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, Responder, RunInfo,
 };
 use zenoh::sample::SampleKind;
 
@@ -17,18 +17,18 @@ impl Service {
     pub(super) fn note_alive(&self, who: Alive, kind: SampleKind) {
         let (mut state, now) = (self.state(), Instant::now());
         let is_connected = kind == SampleKind::Put;
-        state.accounts.note_connected(who, is_connected, now);
+        state.participants.note_connected(who, is_connected, now);
         // A process that joined this server's predecessor, whose replay it has, does not join again.
         if state.takes_part(who) {
-            state.accounts.joined(who, now);
+            state.participants.joined(who, now);
         }
         state.count_actors();
     }
 
-    pub(super) fn hello(&self, responder: Responder<Hello>) {
+    pub(super) fn run_info(&self, responder: Responder<RunInfo>) {
         let state = self.state();
-        let lives = state.accounts.actor_lives();
-        let hello = Hello {
+        let lives = state.participants.actor_lives();
+        let run_info = RunInfo {
             config_toml: self.config_toml.clone(),
             inserted_total: state.replay.inserted_total(),
             has_learner: state.replay.learner().is_some(),
@@ -37,7 +37,7 @@ impl Service {
             shared_memory: self.shared_memory && lives < SHARED_LIVES_MAX,
         };
         drop(state);
-        responder.reply(&hello);
+        responder.reply(&run_info);
     }
 
     pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {
@@ -86,7 +86,7 @@ fn refused(why: String) -> JoinReply {
 
 impl State {
     fn count_actors(&mut self) {
-        self.replay.counted().actors = self.accounts.actors_connected();
+        self.replay.counted().actors = self.participants.actors_connected();
     }
 
     /// Whether this incarnation of a process is the one that has joined.
@@ -117,8 +117,8 @@ impl State {
         let ActorJoin { actor, incarnation } = join;
         let known = self.replay.actor_incarnation(actor);
         let other = known.filter(|&other| other != incarnation);
-        let accounts = &mut self.accounts;
-        let is_connected = |actor, life| accounts.is_connected(Alive::actor(actor, life));
+        let participants = &mut self.participants;
+        let is_connected = |actor, life| participants.is_connected(Alive::actor(actor, life));
         if other.is_some_and(|life| is_connected(actor, life)) {
             let why = format!(
                 "another process is actor {actor} of this run: give each actor another number (--id)"
@@ -128,7 +128,7 @@ impl State {
         // Else a process that joins under one number after the other would use them up.
         self.replay.state.actors.forget_absent(is_connected);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
-        accounts.joined(Alive::actor(actor, incarnation), Instant::now());
+        participants.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();
         if other.is_some() {
             // A chunk that was left behind.
@@ -141,13 +141,13 @@ impl State {
         let (learner, updates) = (join.learner, join.updates);
         let served = self.replay.learner();
         let other = served.filter(|&other| other != learner);
-        if other.is_some() && self.accounts.is_over() {
+        if other.is_some() && self.participants.is_over() {
             let done = self.replay.status().updates;
             return Err(refused(format!(
                 "the run is finished, with {done} updates; to train on, resume it with more --frames"
             )));
         }
-        if other.is_some_and(|other| self.accounts.is_connected(Alive::learner(other))) {
+        if other.is_some_and(|other| self.participants.is_connected(Alive::learner(other))) {
             let why = "another learner takes part in this run, which has one alone".into();
             return Err(JoinReply::Taken { why });
         }
@@ -160,7 +160,7 @@ impl State {
         if served != Some(learner) {
             let requests = &mut self.requests;
             requests.retain(|it| it.request.learner == learner);
-            self.accounts
+            self.participants
                 .joined(Alive::learner(learner), Instant::now());
         }
         Ok(0)

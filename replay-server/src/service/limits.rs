@@ -71,7 +71,7 @@ impl Limits {
     }
 }
 
-/// One whole number of another part's settings.
+/// One whole number of another process's settings.
 pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> anyhow::Result<u32> {
     let values: toml::Table = settings.table(table)?;
     let value = values.get(key).and_then(toml::Value::as_integer);

@@ -4,12 +4,12 @@
 //! No thread that answers waits for the limiter: a chunk or a request that is too early is parked, and a thread that does
 //! nothing else deals with it when the limiter opens. Compressing and unpacking frames is done outside the lock on the core.
 
-mod accounts;
 mod batches;
 mod chunks;
 mod joining;
 mod limits;
 mod parked;
+mod participants;
 mod run;
 mod server;
 mod status;

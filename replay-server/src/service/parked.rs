@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_protocol::{BatchRequest, ChunkHeader, Claim};
+use driml_protocol::{BatchRequest, ChunkHeader, ChunkPoll};
 
 use crate::storage::frame_store::PackedChunk;
 
@@ -23,7 +23,7 @@ const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 /// A chunk that is stored as soon as the limiter lets it pass.
 pub(super) struct ParkedChunk<Q> {
     pub(super) chunk: PackedChunk<'static>,
-    /// Where the answer goes; none between a `Wait` and the actor's claim.
+    /// Where the answer goes; none between a `Wait` and the actor's poll.
     pub(super) question: Option<Q>,
     pub(super) arrived: Instant,
     /// When the question came.
@@ -87,10 +87,10 @@ impl<Q> ParkedChunks<Q> {
         Ok(())
     }
 
-    /// The parked chunk that `claim` is about.
-    pub(super) fn claimed(&mut self, claim: &Claim) -> Option<&mut ParkedChunk<Q>> {
+    /// The parked chunk that `poll` is about.
+    pub(super) fn claimed(&mut self, poll: &ChunkPoll) -> Option<&mut ParkedChunk<Q>> {
         let of = |it: &ChunkHeader| (it.actor, it.incarnation, it.sequence);
-        let claimed = (claim.actor, claim.incarnation, claim.sequence);
+        let claimed = (poll.actor, poll.incarnation, poll.sequence);
         self.line.iter_mut().find(|it| of(it.header()) == claimed)
     }
 
@@ -176,8 +176,8 @@ mod tests {
         packer.pack(Cow::Owned(chunk))
     }
 
-    fn claim(actor: u32, sequence: u64) -> Claim {
-        Claim {
+    fn poll(actor: u32, sequence: u64) -> ChunkPoll {
+        ChunkPoll {
             actor,
             incarnation: 9,
             sequence,
@@ -195,10 +195,10 @@ mod tests {
         }
         let first = parked.line[0].question;
         assert_eq!(first, Some("a again"), "its place is kept");
-        for other in [claim(1, 1), claim(3, 0)] {
+        for other in [poll(1, 1), poll(3, 0)] {
             assert!(parked.claimed(&other).is_none(), "{other:?}");
         }
-        assert!(parked.claimed(&claim(1, 0)).is_some());
+        assert!(parked.claimed(&poll(1, 0)).is_some());
         // Of another actor, of an earlier one, and it.
         for (actor, sequence, copy) in [(3, 0, None), (4, 6, None), (4, 7, Some("d"))] {
             let taken = parked.take_copy(&chunk(actor, sequence, 1).chunk.header);

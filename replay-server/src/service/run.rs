@@ -10,8 +10,8 @@ use std::{
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keyed, Keys, POOL_BATCHES, QueryWorkers, Request, Responder,
-    RunClient, RunSpec, Sampling, SeldomEach, Shutdown,
+    BatchHeader, BufferPool, Incoming, Keyed, Keys, LogLimiters, POOL_BATCHES, QueryWorkers,
+    Request, Responder, RunClient, RunSpec, Sampling, Shutdown,
     config::{Settings, TransportConfig},
     join_within,
     session::{self, Endpoints},
@@ -21,10 +21,10 @@ use driml_protocol::{
 use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
 
 use super::{
-    accounts::Accounts,
     limits::{Limits, number, shared_memory_bytes},
     parked::ParkedChunks,
-    server::{Entrance, Service, State},
+    participants::Participants,
+    server::{Admission, Service, State},
     timings::Timings,
     weights_store::WeightsStore,
 };
@@ -67,7 +67,7 @@ pub struct RunArgs {
     /// The folder in which the replay is kept, if it is kept on disk. Each of several shards has its own folder in it.
     pub dir: Option<PathBuf>,
     /// Stay when the run is over, to be asked, until `ending` or `shutdown`.
-    pub stay: bool,
+    pub keep_alive: bool,
     /// Raised when this process is to exit once the other processes have delivered what they have and left: its launcher has died,
     /// which ends them too. It waits for them no longer than 10 s. To end it at once, raise this and `shutdown`.
     pub ending: Shutdown,
@@ -127,7 +127,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let client = RunClient::new(session, keys, spec.hash());
     let declaring =
         |e: zenoh::Error| anyhow::anyhow!("declaring what the replay server answers: {e}");
-    let entrance = Arc::new(Entrance {
+    let admission = Arc::new(Admission {
         service: OnceLock::new(),
         reading: Reading::begin(args.ending.clone()),
         config_toml: args.config_toml.clone(),
@@ -136,14 +136,14 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         queryables,
         mut threads,
         ..
-    } = Answers::declare(&client, &entrance, limits, &config.sampling).map_err(declaring)?;
+    } = Answers::declare(&client, &admission, limits, &config.sampling).map_err(declaring)?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
         client.spec_hash()
     );
     let read = match kept {
-        Some(kept) => read(kept, empty, &entrance.reading, spec.hash()),
+        Some(kept) => read(kept, empty, &admission.reading, spec.hash()),
         None => Ok((empty, WeightsStore::default())),
     };
     let (mut replay, weights) = match read {
@@ -173,11 +173,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         packer: replay.packer(),
         state: Mutex::new(State {
             replay,
-            accounts: Accounts::new(Instant::now()),
+            participants: Participants::new(Instant::now()),
             chunks: ParkedChunks::new(),
             requests: VecDeque::new(),
             timings: Timings::default(),
-            said: SeldomEach::default(),
+            said: LogLimiters::default(),
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),
@@ -186,10 +186,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     });
     let _alive = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
-    let opened = entrance.service.set(service.clone());
+    let opened = admission.service.set(service.clone());
     assert!(opened.is_ok(), "a replay is read back once");
     threads.extend(service.clone().start_working()?);
-    service.wait_until_over(&args.ending, args.stay);
+    service.wait_until_over(&args.ending, args.keep_alive);
     // Its threads wait for that.
     shutdown.set();
     service.changed.notify_all();
@@ -263,7 +263,7 @@ type Threads = Vec<JoinHandle<()>>;
 /// Everything that the replay server answers: each kind of message by separate threads.
 struct Answers<'a> {
     client: &'a RunClient,
-    entrance: &'a Arc<Entrance>,
+    admission: &'a Arc<Admission>,
     limits: Limits,
     /// Dropping them ends the answers, and with them the threads.
     queryables: Queryables,
@@ -271,37 +271,37 @@ struct Answers<'a> {
 }
 
 impl<'a> Answers<'a> {
-    /// Declares all of it, where rows are drawn by `sampling`. Until the entrance is open every query is answered with "retry".
+    /// Declares all of it, where rows are drawn by `sampling`. Until the admission is open every query is answered with "retry".
     fn declare(
         client: &'a RunClient,
-        entrance: &'a Arc<Entrance>,
+        admission: &'a Arc<Admission>,
         limits: Limits,
         sampling: &Sampling,
     ) -> zenoh::Result<Self> {
         let mut this = Self {
             client,
-            entrance,
+            admission,
             limits,
             queryables: Vec::new(),
             threads: Threads::new(),
         };
         let small = limits.small;
         this.answer("insert", 1, limits.chunk, Service::insert)?;
-        this.answer("claim", 1, small, Service::claim)?;
+        this.answer("poll", 1, small, Service::poll)?;
         this.answer("request", 1, small, Service::request)?;
         this.answer("affinity", 1, limits.affinity, Service::affinity)?;
         if sampling.is_prioritised() {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
-        this.offer("hello", Service::hello)?;
+        this.offer("run-info", Service::run_info)?;
         this.answer("join-actor", 1, small, Service::join_actor)?;
         this.answer("join-learner", 1, small, Service::join_learner)?;
-        this.answer("goodbye", 1, small, Service::goodbye)?;
+        this.answer("leave", 1, small, Service::leave)?;
         this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
         this.answer("weights", WEIGHTS_THREADS, small, Service::give_weights)?;
         this.answer("report", 1, small, Service::report)?;
         this.offer("status", Service::status)?;
-        this.offer("parts", Service::parts)?;
+        this.offer("processes", Service::processes)?;
         this.answer("episodes", 1, small, Service::episodes)?;
         Ok(this)
     }
@@ -314,10 +314,10 @@ impl<'a> Answers<'a> {
         bytes_max: usize,
         answer: fn(&Service, Incoming<R>),
     ) -> zenoh::Result<()> {
-        let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
-        let answer = move |incoming: Incoming<R>| match entrance.service.get() {
+        let (admission, spec_hash) = (self.admission.clone(), self.client.spec_hash());
+        let answer = move |incoming: Incoming<R>| match admission.service.get() {
             Some(service) => answer(service, incoming),
-            None => incoming.into_responder().put_off(&entrance.put_off()),
+            None => incoming.into_responder().put_off(&admission.put_off()),
         };
         let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
         self.add(name, bytes_max, workers)
@@ -329,10 +329,10 @@ impl<'a> Answers<'a> {
         name: &'static str,
         give: fn(&Service, Responder<M>),
     ) -> zenoh::Result<()> {
-        let (entrance, spec_hash) = (self.entrance.clone(), self.client.spec_hash());
-        let give = move |responder: Responder<M>| match entrance.service.get() {
+        let (admission, spec_hash) = (self.admission.clone(), self.client.spec_hash());
+        let give = move |responder: Responder<M>| match admission.service.get() {
             Some(service) => give(service, responder),
-            None => responder.put_off(&entrance.put_off()),
+            None => responder.put_off(&admission.put_off()),
         };
         let workers = QueryWorkers::offer(name, 1, spec_hash, give)?;
         self.add(name, self.limits.small, workers)
@@ -344,8 +344,8 @@ impl<'a> Answers<'a> {
         bytes_max: usize,
         workers: QueryWorkers<M>,
     ) -> zenoh::Result<()> {
-        let entrance = self.entrance.clone();
-        let refused = move |bytes| match entrance.service.get() {
+        let admission = self.admission.clone();
+        let refused = move |bytes| match admission.service.get() {
             Some(service) => service.refuse_long(name, bytes, bytes_max),
             None => tracing::debug!("a message of {bytes} bytes to {name:?} is too long"),
         };

@@ -8,14 +8,14 @@ use std::{
 };
 
 use driml_protocol::{
-    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, Recovering, Request,
-    Responder, SeldomEach, Shutdown, WeightsVersion,
+    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiters, Recovering,
+    Request, Responder, Shutdown, WeightsVersion,
 };
 
 use super::{
-    accounts::Accounts,
     limits::Limits,
     parked::{ParkedChunks, ParkedRequest},
+    participants::Participants,
     timings::Timings,
     weights_store::WeightsStore,
 };
@@ -49,13 +49,13 @@ pub(super) struct Service {
 /// What changes, under one lock.
 pub(super) struct State {
     pub(super) replay: Replay,
-    pub(super) accounts: Accounts,
+    pub(super) participants: Participants,
     pub(super) chunks: ParkedChunks<Question>,
     /// At most one a client: the newest attempt.
     pub(super) requests: VecDeque<ParkedRequest<Responder<BatchReply>>>,
     pub(super) timings: Timings,
     /// Lines about what was refused, which a stranger could make come at any rate.
-    pub(super) said: SeldomEach,
+    pub(super) said: LogLimiters,
 }
 
 /// Who asks about a chunk, and since when.
@@ -103,7 +103,7 @@ impl State {
     /// Notes which side waits now.
     fn note_waiting(&mut self, now: Instant) {
         let waiting = self.replay.waiting();
-        self.accounts.note_waiting(waiting, now);
+        self.participants.note_waiting(waiting, now);
     }
 
     /// Whether a chunk or a request waits for what the replay holds; if not, the threads that serve them have nothing to look at, and
@@ -128,7 +128,7 @@ impl State {
 }
 
 /// Admits queries to the service: until the replay is read back from disk each is answered with the progress.
-pub(super) struct Entrance {
+pub(super) struct Admission {
     /// Set once the replay is there.
     pub(super) service: OnceLock<Arc<Service>>,
     /// How far the reading is.
@@ -136,7 +136,7 @@ pub(super) struct Entrance {
     pub(super) config_toml: String,
 }
 
-impl Entrance {
+impl Admission {
     /// The answer to a request until the service is there, with the run's settings.
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {

@@ -1,4 +1,4 @@
-//! The smaller messages: an actor's goodbye, the learner's affinity, reports and the status.
+//! The smaller messages: an actor's leave, the learner's affinity, reports and the status.
 
 use std::{
     collections::HashSet,
@@ -6,8 +6,8 @@ use std::{
 };
 
 use driml_protocol::{
-    AffinityUpdate, Done, EpisodesRequest, Goodbye, Incoming, PartName, PartsStatus,
-    PriorityUpdate, ReplayStatus, Report, Request, Responder, Shutdown, Warning, fault,
+    Ack, AffinityUpdate, EpisodesRequest, Incoming, Leave, PriorityUpdate, ProcessName,
+    ProcessesStatus, ReplayStatus, Report, Request, Responder, Shutdown, Warning, fail_point,
     last_warning,
 };
 
@@ -24,17 +24,17 @@ const ABANDONED_MAX: Duration = Duration::from_secs(10);
 const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
-    pub(super) fn goodbye(&self, incoming: Incoming<Goodbye>) {
-        if let Some(goodbye) = self.read(&incoming) {
+    pub(super) fn leave(&self, incoming: Incoming<Leave>) {
+        if let Some(leave) = self.read(&incoming) {
             let mut state = self.state();
-            if let Some(why) = state.replay.goodbye(&goodbye) {
-                state.say("goodbye", &format!("a goodbye was refused: {why}"));
+            if let Some(why) = state.replay.leave(&leave) {
+                state.say("leave", &format!("a message `Leave` was refused: {why}"));
             }
             let is_ready = state.replay.is_ready();
             drop(state);
             // Also if it was refused: the actor ends.
             if is_ready {
-                incoming.into_responder().reply(&Done);
+                incoming.into_responder().reply(&Ack);
             }
         }
     }
@@ -62,7 +62,7 @@ impl Service {
     }
 
     /// Takes what the learner tells, or counts and logs why not.
-    fn take<R: Request<Reply = Done>>(
+    fn take<R: Request<Reply = Ack>>(
         &self,
         incoming: Incoming<R>,
         what: &str,
@@ -76,7 +76,7 @@ impl Service {
             return state.refuse(what, &format!("{what} refused: {why}"));
         }
         drop(state);
-        incoming.into_responder().reply(&Done);
+        incoming.into_responder().reply(&Ack);
     }
 
     pub(super) fn report(&self, incoming: Incoming<Report>) {
@@ -86,25 +86,25 @@ impl Service {
         let mut state = self.state();
         let finished = report.finished;
         // Otherwise its process has been replaced, or is about to join.
-        if state.accounts.reported(report, Instant::now()) {
+        if state.participants.reported(report, Instant::now()) {
             state.replay.note_updates(finished.unwrap_or(0));
         } else {
             tracing::debug!("a report of a process that has not joined");
         }
         drop(state);
-        incoming.into_responder().reply(&Done);
+        incoming.into_responder().reply(&Ack);
     }
 
-    pub(super) fn parts(&self, responder: Responder<PartsStatus>) {
+    pub(super) fn processes(&self, responder: Responder<ProcessesStatus>) {
         let weights_version = self.weights().version();
         let (state, now) = (self.state(), Instant::now());
-        let (waiting, waiting_s) = state.accounts.waiting(now);
-        let (up_s, weights_age_s) = state.accounts.ages(now);
+        let (waiting, waiting_s) = state.participants.waiting(now);
+        let (up_s, weights_age_s) = state.participants.ages(now);
         let held_since = |who| match who {
-            PartName::Actor(actor) => state.chunks.arrived(actor),
-            PartName::Learner => state.requests.iter().map(|it| it.arrived).min(),
+            ProcessName::Actor(actor) => state.chunks.arrived(actor),
+            ProcessName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
-        let status = PartsStatus {
+        let status = ProcessesStatus {
             up_s,
             waiting,
             waiting_s,
@@ -116,7 +116,7 @@ impl Service {
             log: state.replay.log.as_ref().map(Journal::status),
             last_warning: last_warning::get()
                 .map(|(text, age)| Warning::new(&text, age.as_secs_f64())),
-            parts: state.accounts.parts(now, held_since),
+            processes: state.participants.processes(now, held_since),
         };
         drop(state);
         responder.reply(&status);
@@ -128,9 +128,9 @@ impl Service {
         // Which, since when, and after how long it is logged next.
         let mut missing: Option<(&str, Instant, Duration)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
-            fault::point("missing");
+            fail_point::reach("missing");
             let state = self.state();
-            let now = state.accounts.missing(state.replay.limiter.all_in());
+            let now = state.participants.missing(state.replay.limiter.all_in());
             drop(state);
             if now != missing.map(|(before, ..)| before) {
                 missing = now.map(|now| (now, Instant::now(), SILENT_MAX));
@@ -147,15 +147,16 @@ impl Service {
 
     /// Waits until the run is over or this process `ending`, and the other processes have left; or for a shutdown. With `stay` the end
     /// of the run does not end it.
-    pub(super) fn wait_until_over(&self, ending: &Shutdown, stay: bool) {
+    pub(super) fn wait_until_over(&self, ending: &Shutdown, keep_alive: bool) {
         let mut waits: Option<(bool, Instant)> = None;
         while !self.shutdown.wait_timeout(LOOK) {
             // Read once, as it may be raised at any moment.
             let is_ending = ending.is_set();
             let state = self.state();
-            let (is_over, connected) = (state.accounts.is_over(), state.accounts.connected());
+            let (is_over, connected) =
+                (state.participants.is_over(), state.participants.connected());
             drop(state);
-            if !is_ending && (stay || !is_over) {
+            if !is_ending && (keep_alive || !is_over) {
                 waits = None;
                 continue;
             }
@@ -187,7 +188,7 @@ impl Service {
     pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
-        status.learner_finished = state.accounts.is_over();
+        status.learner_finished = state.participants.is_over();
         // Actors of which a chunk has come, those that have ended too.
         let mut acting: HashSet<u32> = state.replay.state.actors.delivered().collect();
         acting.extend(state.chunks.line.iter().map(|it| it.header().actor));

@@ -6,7 +6,7 @@ use std::{
 };
 
 use driml_protocol::{
-    BufferPool, Done, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
+    Ack, BufferPool, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
     WeightsVersion,
 };
 use zenoh::bytes::ZBytes;
@@ -36,14 +36,14 @@ impl Service {
                     let now = Instant::now();
                     let mut state = self.state();
                     state.timings.weights_came(&weights, now);
-                    state.accounts.weights_came(now);
+                    state.participants.weights_came(now);
                     drop(state);
                     let version = weights.version;
                     if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
                         tracing::warn!("weights {version} were not announced: {why}");
                     }
                 }
-                incoming.into_responder().reply(&Done);
+                incoming.into_responder().reply(&Ack);
             }
             Err(why) => {
                 let line = format!("weights were refused: {why}");

@@ -6,7 +6,7 @@ use std::collections::{HashMap, HashSet};
 use driml_protocol::{
     Batch, BatchHeader, Chunk, ChunkHeader, Horizon, InsertReply, RunSpec, TimeoutRule, Waiting,
 };
-use driml_replay_server::{Compression, PackedBatch, Replay, Unready};
+use driml_replay_server::{Compression, NotReady, PackedBatch, Replay};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -22,7 +22,7 @@ pub(crate) fn check_batch(batch: &Batch, history: &History) {
     assert_eq!(batch.header.mean_age, mean_age);
     assert_eq!(batch.header.weights_versions, versions);
     assert_eq!(
-        (batch.header.tally.inserted, batch.header.held),
+        (batch.header.counts.inserted, batch.header.held),
         (history.inserted, history.inserted.min(history.capacity))
     );
 }
@@ -225,7 +225,7 @@ proptest! {
                         rows_sampled += 8;
                     }
                     Err(unready) => {
-                        prop_assert_eq!(unready, Unready::Wait(Waiting::LearnerWaitsForActors));
+                        prop_assert_eq!(unready, NotReady::Wait(Waiting::LearnerWaitsForActors));
                         prop_assert!(history.valid_anchors().is_empty());
                     }
                 },
@@ -233,7 +233,7 @@ proptest! {
             replay.check_valid();
         }
         for (actor, _) in known.values().filter(|(it, _)| it.next.sequence > 0) {
-            replay.goodbye(&actor.last_word());
+            replay.leave(&actor.last_word());
         }
         let status = replay.status();
         let (episodes, mean_return) = history.episodes();

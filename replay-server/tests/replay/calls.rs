@@ -1,8 +1,8 @@
 //! What tests say to a replay, and its answers.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Goodbye, Horizon, InsertReply, Learned,
-    LearnerJoin, RunSpec, Tally,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Horizon, InsertReply, Learned, LearnerJoin,
+    Leave, RunSpec, ShardCounts,
 };
 use driml_replay_server::{Config, Replay};
 
@@ -56,7 +56,7 @@ impl Actor {
         sent
     }
 
-    pub(crate) const fn last_word(&self) -> Goodbye {
+    pub(crate) const fn last_word(&self) -> Leave {
         let ChunkHeader {
             actor,
             incarnation,
@@ -75,8 +75,8 @@ pub(crate) fn join(replay: &mut Replay, actor: u32, incarnation: u64) {
     replay.join_actor(life(actor, incarnation)).unwrap();
 }
 
-pub(crate) const fn last_word(actor: u32, incarnation: u64, produced: u64) -> Goodbye {
-    Goodbye {
+pub(crate) const fn last_word(actor: u32, incarnation: u64, produced: u64) -> Leave {
+    Leave {
         actor,
         incarnation,
         produced,
@@ -139,14 +139,14 @@ pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> L
         learner,
         run: 1,
         updates,
-        tally: tally(inserted, rows),
-        other_shards: Tally::default(),
+        counts: counts(inserted, rows),
+        other_shards: ShardCounts::default(),
         restart: false,
     }
 }
 
-pub(crate) const fn tally(inserted: u64, rows_sampled: u64) -> Tally {
-    Tally {
+pub(crate) const fn counts(inserted: u64, rows_sampled: u64) -> ShardCounts {
+    ShardCounts {
         inserted,
         rows_sampled,
     }

@@ -2,8 +2,10 @@
 //! their answers.
 //! It does not look at rows.
 
-use driml_protocol::{Buffer, ChunkHeader, Claim, Horizon, InsertReply, LearnerJoin, RequestId};
-use driml_replay_server::{Config, Replay, Unready};
+use driml_protocol::{
+    Buffer, ChunkHeader, ChunkPoll, Horizon, InsertReply, LearnerJoin, RequestId,
+};
+use driml_replay_server::{Config, NotReady, Replay};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -60,7 +62,7 @@ proptest! {
         }
         let produced: Vec<u64> = (0..actors).map(|actor| first(actor, chunks)).collect();
         for (actor, &produced) in produced.iter().enumerate() {
-            replay.goodbye(&last_word(actor as u32, 9, produced));
+            replay.leave(&last_word(actor as u32, 9, produced));
         }
         let status = replay.status();
         prop_assert_eq!(status.transitions_inserted, produced.iter().sum::<u64>());
@@ -107,7 +109,7 @@ proptest! {
                     asked[id.client_id as usize] = id.next();
                 }
                 Ok(_) => lost += 1,
-                Err(Unready::Finished | Unready::Wait(_)) => {}
+                Err(NotReady::Finished | NotReady::Wait(_)) => {}
                 Err(refused) => panic!("{refused:?}"),
             }
         }
@@ -167,7 +169,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
             match *said {
                 Joins(actor, life) => join(&mut replay, actor, life),
                 Leaves(actor, life, produced) => {
-                    replay.goodbye(&last_word(actor, life, produced));
+                    replay.leave(&last_word(actor, life, produced));
                 }
                 Sends(actor, life, sequence, first) => {
                     insert(&mut replay, header(actor, life, sequence, first));
@@ -188,13 +190,13 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
 fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     let mut replay = small(&unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
-    replay.goodbye(&last_word(0, 1, 6));
+    replay.leave(&last_word(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert!(is_refused(&insert(&mut replay, header(0, 1, 1, 6))));
     let unknown = insert(&mut replay, header(0, 2, 0, 0));
     assert!(is_refused(&unknown), "a life that has not joined");
-    // Nor does its goodbye make it one.
-    replay.goodbye(&last_word(0, 2, 6));
+    // Nor does its `Leave` make it one.
+    replay.leave(&last_word(0, 2, 6));
     join(&mut replay, 0, 2);
     let early = insert(&mut replay, header(0, 2, 1, 6));
     assert_eq!(early, InsertReply::OutOfOrder { expected: 0 });
@@ -207,7 +209,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     assert!(back.is_err(), "and it does not come back");
     let status = replay.status();
     assert_eq!((status.chunks_retried, status.transitions_lost), (1, 0));
-    assert_eq!(status.messages_refused, 4, "three chunks and a goodbye");
+    assert_eq!(status.messages_refused, 4, "three chunks and a leave");
 }
 
 #[test]
@@ -216,21 +218,21 @@ fn a_claim_says_what_became_of_a_chunk() {
         transitions_max: Some(12),
         ..unlimited(1000)
     });
-    let claim = |incarnation, sequence| Claim {
+    let poll = |incarnation, sequence| ChunkPoll {
         actor: 0,
         incarnation,
         sequence,
         leaving: false,
     };
-    let unknown = replay.claim(&claim(1, 0)).unwrap();
+    let unknown = replay.poll(&poll(1, 0)).unwrap();
     assert!(is_refused(&unknown), "{unknown:?}");
     insert(&mut replay, header(0, 1, 0, 0));
-    assert_eq!(replay.claim(&claim(1, 0)), Some(stored(6)));
-    assert_eq!(replay.claim(&claim(1, 1)), None, "it is still to come");
+    assert_eq!(replay.poll(&poll(1, 0)), Some(stored(6)));
+    assert_eq!(replay.poll(&poll(1, 1)), None, "it is still to come");
     insert(&mut replay, header(0, 1, 1, 6));
     let finished = InsertReply::Finished { inserted_total: 12 };
-    assert_eq!(replay.claim(&claim(1, 2)), Some(finished));
-    assert_eq!(replay.claim(&claim(1, 1)), Some(stored(12)));
+    assert_eq!(replay.poll(&poll(1, 2)), Some(finished));
+    assert_eq!(replay.poll(&poll(1, 1)), Some(stored(12)));
     assert_eq!(replay.status().chunks_retried, 0, "nothing was sent twice");
 }
 
@@ -256,7 +258,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
     for _ in 0..9 {
         replay.sample(8).unwrap();
     }
-    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    assert_eq!(replay.sample(8), Err(NotReady::Finished));
     let affinity = |version, p| affinity(version, 5, vec![p; 25]);
     replay.set_affinity(&affinity(9, 0.5)).unwrap();
     replay.note_learned(learned(8, 5, 72)).unwrap();
@@ -274,7 +276,7 @@ fn rows_that_were_not_learned_from_do_not_count() {
     for _ in 0..4 {
         replay.sample(8).unwrap();
     }
-    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    assert_eq!(replay.sample(8), Err(NotReady::Finished));
     replay.check_valid();
 }
 
@@ -311,10 +313,10 @@ fn a_learner_needs_a_checkpoint_of_the_run_or_the_word_to_restart() {
         let joined = replay.join_learner(join);
         assert_eq!(joined, expected.map_err(String::from), "a learner {which}");
         let rows = match (joined.is_ok(), join.learner) {
-            (true, 2) => join.tally.rows_sampled,
+            (true, 2) => join.counts.rows_sampled,
             _ => 64,
         };
-        assert_eq!(replay.tally().rows_sampled, rows, "a learner {which}");
+        assert_eq!(replay.counts().rows_sampled, rows, "a learner {which}");
         replay.check_valid();
     }
 }

@@ -3,14 +3,14 @@
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Waiting};
 use driml_replay_server::{
-    ACTORS_MAX, Compression, Config, RateLimiter, Replay, STREAMS_MAX, Unready,
+    ACTORS_MAX, Compression, Config, NotReady, RateLimiter, Replay, STREAMS_MAX,
 };
 use proptest::prelude::*;
 
 use crate::{
     calls::{
-        affinity, header, insert, is_refused, is_stored, join, last_word, life, small, small_spec,
-        stored, tally, wait,
+        affinity, counts, header, insert, is_refused, is_stored, join, last_word, life, small,
+        small_spec, stored, wait,
     },
     history::{spec, unlimited},
 };
@@ -76,7 +76,7 @@ fn actors_and_streams_are_bounded() {
     assert!(replay.join_actor(life(one_more, 1)).is_err());
     let reply = replay.insert(&Chunk::zeroed(header(one_more, 1, 0, 0)));
     assert!(is_refused(&reply), "{reply:?}");
-    replay.goodbye(&last_word(one_more, 1, 6));
+    replay.leave(&last_word(one_more, 1, 6));
     assert_eq!(replay.status().transitions_lost, 0);
     let last = insert(&mut replay, header(one_more - 1, 1, 1, 6));
     assert!(is_stored(&last), "the known ones continue");
@@ -99,9 +99,9 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     });
     let warm_up = Waiting::WarmUp { have: 0, need: 6 };
     assert_eq!(replay.waiting(), warm_up);
-    assert_eq!(replay.sample(8), Err(Unready::Wait(warm_up)));
+    assert_eq!(replay.sample(8), Err(NotReady::Wait(warm_up)));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
-    assert_eq!(replay.sample(8), Err(Unready::Wait(HUNGRY)));
+    assert_eq!(replay.sample(8), Err(NotReady::Wait(HUNGRY)));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), stored(12));
     // 6 ahead, of a slack of 6.
     assert_eq!(insert(&mut replay, header(1, 1, 0, 0)), stored(18));
@@ -115,11 +115,11 @@ fn the_run_ends_when_all_is_in_and_sampled() {
     for _ in 0..6 {
         replay.sample(8).unwrap();
     }
-    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    assert_eq!(replay.sample(8), Err(NotReady::Finished));
     assert_eq!(replay.waiting(), Waiting::Finished);
     // 48 rows of 12 transitions after the warm-up.
     assert_eq!(replay.status().replay_ratio(), Some(4.0));
-    replay.goodbye(&last_word(0, 1, 12));
+    replay.leave(&last_word(0, 1, 12));
     assert_eq!(replay.status().transitions_lost, 0);
 }
 
@@ -138,7 +138,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     // None, and more than slack * ratio.
     for rows in [0, 9] {
         let drawn = replay.sample(rows);
-        assert!(matches!(drawn, Err(Unready::Refused { .. })), "{drawn:?}");
+        assert!(matches!(drawn, Err(NotReady::Refused { .. })), "{drawn:?}");
     }
     let leaving = ChunkHeader {
         leaving: true,
@@ -177,11 +177,11 @@ fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
         let drawn = replay.sample(64);
         if total < 60 {
             assert_eq!(next, wait(total));
-            assert_eq!(drawn, Err(Unready::Wait(HUNGRY)));
+            assert_eq!(drawn, Err(NotReady::Wait(HUNGRY)));
             assert_eq!(replay.waiting(), HUNGRY);
         } else {
             assert_eq!(next, InsertReply::Finished { inserted_total: 60 });
-            assert!(matches!(drawn, Err(Unready::Refused { .. })), "{drawn:?}");
+            assert!(matches!(drawn, Err(NotReady::Refused { .. })), "{drawn:?}");
         }
     }
 }
@@ -199,18 +199,18 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     // Rows: 4 for each of the 106 transitions that are stored, of a capacity of 1000 and of a slack of 100.
     for (lie, bound) in [
-        (tally(6001, 0), "at most 6000"),
-        (tally(u64::MAX, u64::MAX), "at most 6000"),
-        (tally(100, 4825), "at most 4824"),
-        (tally(100, u64::MAX), "at most 4824"),
+        (counts(6001, 0), "at most 6000"),
+        (counts(u64::MAX, u64::MAX), "at most 6000"),
+        (counts(100, 4825), "at most 4824"),
+        (counts(100, u64::MAX), "at most 4824"),
     ] {
         let why = replay.set_other_shards(lie).unwrap_err();
         assert!(why.contains(bound), "{why}");
     }
-    replay.set_other_shards(tally(100, 400)).unwrap();
+    replay.set_other_shards(counts(100, 400)).unwrap();
     replay.sample(8).expect("of the lies nothing was counted");
-    replay.set_other_shards(tally(100, 4824)).unwrap();
-    assert_eq!(replay.sample(8), Err(Unready::Wait(HUNGRY)));
+    replay.set_other_shards(counts(100, 4824)).unwrap();
+    assert_eq!(replay.sample(8), Err(NotReady::Wait(HUNGRY)));
     replay.check_valid();
 }
 
@@ -283,7 +283,7 @@ proptest! {
             }
         }
         prop_assert!(allowed - (sampled as f64) < f64::from(rows) + 1e-6, "less than a batch is left");
-        prop_assert_eq!(limiter.tally().rows_sampled, sampled);
+        prop_assert_eq!(limiter.counts().rows_sampled, sampled);
     }
 }
 

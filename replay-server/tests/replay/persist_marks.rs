@@ -8,7 +8,7 @@ use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
     history::unlimited,
-    persist::{Life, ROWS, copy, open, segments, test_spec},
+    persist::{Participant, ROWS, copy, open, segments, test_spec},
     rows::prioritised,
 };
 
@@ -22,7 +22,7 @@ fn next_draws(replay: &mut Replay) -> Vec<Batch> {
         let batch = replay.sample(ROWS).unwrap();
         let found: Vec<f32> = batch.states_t().iter().map(|&byte| byte.into()).collect();
         let found = &found[..ROWS as usize];
-        let number = replay.tally().rows_sampled;
+        let number = replay.counts().rows_sampled;
         if let Some(update) = batch.priority_update(77, number, found) {
             replay.set_priorities(&update).unwrap();
         }
@@ -32,15 +32,15 @@ fn next_draws(replay: &mut Replay) -> Vec<Batch> {
 }
 
 /// A life whose ring of 60 is smaller than what is stored, and whose segments are full after a few chunks.
-fn begin(folder: &Path, config: Config, seed: u64) -> Life {
-    let mut life = Life::begin(folder, config, 600, seed);
+fn begin(folder: &Path, config: Config, seed: u64) -> Participant {
+    let mut life = Participant::begin(folder, config, 600, seed);
     for _ in 0..30 {
         life.act();
     }
     life
 }
 
-fn store_some(life: &mut Life) {
+fn store_some(life: &mut Participant) {
     for _ in 0..12 {
         life.store(0);
         life.store(1);

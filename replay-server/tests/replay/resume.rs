@@ -2,10 +2,10 @@
 //! Resuming all processes together is an end-to-end test.
 
 use driml_protocol::LearnerJoin;
-use driml_replay_server::{Config, Replay, Since, Unready};
+use driml_replay_server::{Config, NotReady, Replay, Since};
 
 use crate::{
-    calls::{header, insert, is_stored, learner, small_spec, tally},
+    calls::{counts, header, insert, is_stored, learner, small_spec},
     history::unlimited,
 };
 
@@ -25,8 +25,8 @@ fn play(replay: &mut Replay, rows: u32) -> (u64, u64) {
     loop {
         match replay.sample(rows) {
             Ok(_) => batches += 1,
-            Err(Unready::Finished) => return (sequence, batches),
-            Err(Unready::Wait(_)) => {
+            Err(NotReady::Finished) => return (sequence, batches),
+            Err(NotReady::Wait(_)) => {
                 let reply = insert(replay, header(0, 1, sequence, 6 * sequence));
                 assert!(is_stored(&reply), "{reply:?}");
                 sequence += 1;
@@ -73,9 +73,9 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         let status = replay.status();
         let stored = 6 * expected.0;
         assert_eq!(status.transitions_refilled, refilled, "{what}");
-        let inserted = join.tally.inserted + stored - refilled;
+        let inserted = join.counts.inserted + stored - refilled;
         assert_eq!(status.transitions_inserted, inserted, "{what}");
-        let served = join.tally.rows_sampled + expected.1 * u64::from(rows);
+        let served = join.counts.rows_sampled + expected.1 * u64::from(rows);
         assert_eq!(status.rows_sampled, served, "{what}");
         assert_eq!(status.transitions_held, stored, "{what}");
         assert_eq!(replay.resumed_after(), join.updates, "{what}");
@@ -93,8 +93,8 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         let mut replay = Replay::shard(&small_spec(), &config, 8, shard).unwrap();
         let counted = 30 + u64::from(shard);
         let join = LearnerJoin {
-            tally: tally(counted, 80),
-            other_shards: tally(120 - counted, 152),
+            counts: counts(counted, 80),
+            other_shards: counts(120 - counted, 152),
             ..learner(1, 29, 0, 0)
         };
         replay.join_learner(join).unwrap();
@@ -122,17 +122,17 @@ fn what_another_shard_had_given_to_a_learner_that_died_is_forgotten() {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));
     }
     // All rows of 90 + 90 transitions were given by the other shard; the learner saved after 200 of them.
-    replay.set_other_shards(tally(90, 480)).unwrap();
-    assert_eq!(replay.sample(8), Err(Unready::Finished));
+    replay.set_other_shards(counts(90, 480)).unwrap();
+    assert_eq!(replay.sample(8), Err(NotReady::Finished));
     let join = LearnerJoin {
-        other_shards: tally(80, 200),
+        other_shards: counts(80, 200),
         ..learner(2, 25, 0, 90)
     };
     replay.join_learner(join).unwrap();
-    replay.set_other_shards(tally(90, 200)).unwrap();
+    replay.set_other_shards(counts(90, 200)).unwrap();
     let mut batches = 0;
     while replay.sample(8).is_ok() {
         batches += 1;
     }
-    assert_eq!((batches, replay.sample(8)), (35, Err(Unready::Finished)));
+    assert_eq!((batches, replay.sample(8)), (35, Err(NotReady::Finished)));
 }

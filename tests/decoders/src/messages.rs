@@ -3,11 +3,11 @@
 use std::fmt::Debug;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Batch, BatchReply, BatchRequest, BufferPool, Chunk, ChunkHeader,
-    Claim, CodecError, Done, EpisodesReply, EpisodesRequest, Goodbye, Hello, InsertReply,
-    JoinReply, Kind, LearnerJoin, LearnerStatus, Message, PROTOCOL_VERSION, PartsStatus,
-    PriorityUpdate, Recovering, ReplayStatus, Report, WeightsReply, WeightsRequest, WeightsUpload,
-    WeightsVersion, codec,
+    Ack, ActorJoin, AffinityUpdate, Batch, BatchReply, BatchRequest, BufferPool, Chunk,
+    ChunkHeader, ChunkPoll, CodecError, EpisodesReply, EpisodesRequest, InsertReply, JoinReply,
+    Kind, LearnerJoin, LearnerStatus, Leave, Message, PROTOCOL_VERSION, PriorityUpdate,
+    ProcessesStatus, Recovering, ReplayStatus, Report, RunInfo, WeightsReply, WeightsRequest,
+    WeightsUpload, WeightsVersion, codec,
 };
 
 /// The hash of the run that these messages are of.
@@ -84,19 +84,19 @@ const KINDS: [(Kind, Read); 24] = [
     (Kind::Affinity, read_affinity),
     (Kind::Weights, read::<WeightsReply>),
     (Kind::WeightsVersion, read::<WeightsVersion>),
-    (Kind::Goodbye, read::<Goodbye>),
+    (Kind::Leave, read::<Leave>),
     (Kind::ReplayStatus, read_status),
     (Kind::LearnerStatus, read::<LearnerStatus>),
-    (Kind::Hello, read::<Hello>),
-    (Kind::Done, read::<Done>),
+    (Kind::RunInfo, read::<RunInfo>),
+    (Kind::Ack, read::<Ack>),
     (Kind::ActorJoin, read::<ActorJoin>),
     (Kind::LearnerJoin, read::<LearnerJoin>),
     (Kind::JoinReply, read::<JoinReply>),
-    (Kind::Claim, read::<Claim>),
+    (Kind::ChunkPoll, read::<ChunkPoll>),
     (Kind::WeightsUpload, read::<WeightsUpload>),
     (Kind::WeightsRequest, read::<WeightsRequest>),
     (Kind::Report, read::<Report>),
-    (Kind::PartsStatus, read::<PartsStatus>),
+    (Kind::ProcessesStatus, read::<ProcessesStatus>),
     (Kind::EpisodesRequest, read::<EpisodesRequest>),
     (Kind::EpisodesReply, read::<EpisodesReply>),
     (Kind::Priorities, read::<PriorityUpdate>),

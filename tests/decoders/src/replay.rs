@@ -1,9 +1,9 @@
 //! Well-formed messages in any order and with any numbers, to the core of a replay server: none breaks what it holds.
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, Claim, End, Goodbye, Horizon, InsertReply,
-    Learned, LearnerJoin, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling,
-    Tally, TimeoutRule,
+    ActorJoin, AffinityUpdate, Chunk, ChunkHeader, ChunkPoll, End, Horizon, InsertReply, Learned,
+    LearnerJoin, Leave, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling,
+    ShardCounts, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 
@@ -126,21 +126,21 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
             }
         }
         3 => {
-            let goodbye = Goodbye {
+            let leave = Leave {
                 actor: numbers.actor()?,
                 incarnation: numbers.count()?,
                 produced: numbers.count()?,
             };
-            replay.goodbye(&goodbye);
+            replay.leave(&leave);
         }
         4 => {
-            let claim = Claim {
+            let poll = ChunkPoll {
                 actor: numbers.actor()?,
                 incarnation: numbers.count()?,
                 sequence: numbers.count()?,
                 leaving: numbers.byte()? % 2 == 0,
             };
-            let _ = replay.claim(&claim);
+            let _ = replay.poll(&poll);
         }
         5 => {
             let id = RequestId {
@@ -169,7 +169,7 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
         _ => {
             let byte = numbers.byte()?;
             if byte % 2 == 0 {
-                let tally = |inserted, rows_sampled| Tally {
+                let counts = |inserted, rows_sampled| ShardCounts {
                     inserted,
                     rows_sampled,
                 };
@@ -177,8 +177,8 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                     learner: numbers.count()?,
                     run: numbers.byte()?.into(),
                     updates: numbers.count()?,
-                    tally: tally(numbers.count()?, numbers.count()?),
-                    other_shards: tally(numbers.count()?, numbers.count()?),
+                    counts: counts(numbers.count()?, numbers.count()?),
+                    other_shards: counts(numbers.count()?, numbers.count()?),
                     restart: byte % 8 == 0,
                 });
                 let _ = replay.note_learned(Learned {
@@ -203,11 +203,11 @@ fn message(replay: &mut Replay, numbers: &mut Numbers<'_>) -> Option<()> {
                 };
                 let _ = replay.set_priorities(&update);
             } else {
-                let tally = Tally {
+                let counts = ShardCounts {
                     inserted: numbers.count()?,
                     rows_sampled: numbers.count()?,
                 };
-                let _ = replay.set_other_shards(tally);
+                let _ = replay.set_other_shards(counts);
             }
         }
     }

@@ -9,8 +9,8 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, Goodbye, InsertReply, LearnerJoin,
-    RequestId, RunSpec, Sampling, Tally, codec,
+    ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, InsertReply, LearnerJoin, Leave,
+    RequestId, RunSpec, Sampling, ShardCounts, codec,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
 
@@ -297,8 +297,8 @@ fn log(chunks: u64) -> Vec<u8> {
         learner: 7,
         run: 7,
         updates: 0,
-        tally: Tally::default(),
-        other_shards: Tally::default(),
+        counts: ShardCounts::default(),
+        other_shards: ShardCounts::default(),
         restart: false,
     };
     replay.join_learner(join).unwrap();
@@ -321,7 +321,7 @@ fn log(chunks: u64) -> Vec<u8> {
             affinity.version += 1;
         }
     }
-    let refused = replay.goodbye(&Goodbye {
+    let refused = replay.leave(&Leave {
         actor: 1,
         incarnation: 1,
         produced: 0,

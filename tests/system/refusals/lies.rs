@@ -10,15 +10,15 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, Alive, BatchRequest, Chunk, ChunkHeader, Claim, Goodbye, Origin, PriorityPart,
-    PriorityUpdate, ReplayStatus, RequestId, Tally, WeightsRequest, WeightsUpload, WeightsVersion,
-    session,
+    ActorJoin, Alive, BatchRequest, Chunk, ChunkHeader, ChunkPoll, Leave, Origin, PriorityPart,
+    PriorityUpdate, ReplayStatus, RequestId, ShardCounts, WeightsRequest, WeightsUpload,
+    WeightsVersion, session,
 };
 use driml_tests::{Client, Process, TestSystem, check_nothing_lost, new_learner, wait_for};
 use zenoh::{Wait, query::Query};
 
 use super::{
-    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, goodbye, sealed, send, upload,
+    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, leave, sealed, send, upload,
 };
 use crate::{PRIORITISED, launched_with, system};
 
@@ -96,7 +96,7 @@ fn of_each_kind_of_message() {
     let (client, keys) = (&lied.client, &lied.client.keys);
     let joins = [0, 1 << 60, u64::MAX].map(|rows_sampled| {
         let mut join = new_learner(LEARNER);
-        join.tally.rows_sampled = rows_sampled;
+        join.counts.rows_sampled = rows_sampled;
         Row::of(client, &join, "Taken {")
     });
     lied.sends(joins, 0);
@@ -108,17 +108,17 @@ fn of_each_kind_of_message() {
     lied.sends((0..4).map(|_| Row::new(&key, &*bytes, SILENCE)), 4);
 
     client.join_as_actor(STRANGER, LIFE);
-    let row = |goodbye| Row::of(client, &goodbye, "Done");
+    let row = |leave| Row::of(client, &leave, "Ack");
     let goodbyes = [
-        goodbye(0, LIFE, 0),
-        goodbye(0, LIFE, u64::MAX),
-        goodbye(0, u64::MAX, 1000),
-        goodbye(STRANGER, LIFE + 1, 1000),
-        goodbye(STRANGER, LIFE, 1 << 60),
-        goodbye(STRANGER + 1, LIFE, 1 << 60),
+        leave(0, LIFE, 0),
+        leave(0, LIFE, u64::MAX),
+        leave(0, u64::MAX, 1000),
+        leave(STRANGER, LIFE + 1, 1000),
+        leave(STRANGER, LIFE, 1 << 60),
+        leave(STRANGER + 1, LIFE, 1 << 60),
     ];
     lied.sends(goodbyes.map(row), 6);
-    lied.sends((0..1000).map(|_| row(goodbye(0, LIFE, 1))), 1000);
+    lied.sends((0..1000).map(|_| row(leave(0, LIFE, 1))), 1000);
 
     let chunk = |change: &dyn Fn(&mut ChunkHeader), expected| {
         let mut header = chunk_header(client, STRANGER, LIFE);
@@ -128,7 +128,7 @@ fn of_each_kind_of_message() {
         Row::new(key, client.seal(&Chunk::zeroed(header)), expected)
     };
     let (no_run, newest) = ("counts that no run reaches", "acted, and the newest are");
-    let claim = Claim {
+    let poll = ChunkPoll {
         actor: 0,
         incarnation: LIFE,
         sequence: u64::MAX,
@@ -142,16 +142,16 @@ fn of_each_kind_of_message() {
             chunk(&|it| it.first_transition = u64::MAX - 1, no_run),
             chunk(&|it| it.weights_version = 1 << 60, newest),
             chunk(&|it| it.weights_version = u64::MAX, newest),
-            Row::of(client, &claim, "Refused {"),
+            Row::of(client, &poll, "Refused {"),
         ],
         7,
     );
 
-    let tally = Tally {
+    let counts = ShardCounts {
         inserted: u64::MAX,
         rows_sampled: u64::MAX,
     };
-    let batches = [(16, None), (u32::MAX, None), (16, Some(tally)), (0, None)];
+    let batches = [(16, None), (u32::MAX, None), (16, Some(counts)), (0, None)];
     let batches = batches.map(|(rows, other_shards)| {
         let request = BatchRequest {
             id: RequestId::first(u64::MAX),
@@ -242,8 +242,8 @@ fn of_4096_strangers() {
     actor.stop().expect_code(0).expect_said("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
     // Those who were forgotten, and who say what they will.
-    let goodbye = goodbye(STRANGER, LIFE, 1 << 60);
-    lied.sends([Row::of(client, &goodbye, "Done")], 1);
+    let leave = leave(STRANGER, LIFE, 1 << 60);
+    lied.sends([Row::of(client, &leave, "Ack")], 1);
     lied.continues();
 }
 
@@ -272,7 +272,7 @@ fn of_priorities() {
 fn of_half_a_gigabyte() {
     let lied = lied();
     let client = &lied.client;
-    let server = lied.system.find_part("replay-server").pid;
+    let server = lied.system.find_process("replay-server").pid;
     let peak_mib = || {
         let status = fs::read_to_string(format!("/proc/{server}/status")).unwrap();
         let mut lines = status.lines();
@@ -283,7 +283,7 @@ fn of_half_a_gigabyte() {
     let long: [String; 4] = [
         keys.of_actor::<ChunkHeader>(0),
         keys.of::<WeightsUpload>(),
-        keys.of_actor::<Goodbye>(0),
+        keys.of_actor::<Leave>(0),
         keys.of::<ReplayStatus>(),
     ];
     let rows = long[1..].iter();
@@ -314,7 +314,7 @@ fn of_processes_whose_number_can_be_read() {
         let shown = client.keys.alive(token.key_expr().as_str()).unwrap();
         // The mark is of no use in the place of the number.
         rows.push(match shown {
-            Alive::Actor { actor, mark } => Row::of(client, &goodbye(actor, mark, 0), "Done"),
+            Alive::Actor { actor, mark } => Row::of(client, &leave(actor, mark, 0), "Ack"),
             Alive::Learner { mark } => {
                 let bytes = upload(client.spec.hash(), mark, 1 << 19, b"w");
                 Row::new(client.keys.of::<WeightsUpload>(), bytes, SILENCE)

@@ -2,11 +2,11 @@
 //! Each is counted once and stores nothing, and the server continues to store.
 
 use driml_protocol::{
-    AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, Goodbye, InsertReply, codec,
+    AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, codec,
 };
 use driml_tests::{Client, Process, TestSystem};
 
-use super::{Row, SILENCE, affinity, batch_request, chunk_header, goodbye, newer, sealed, send};
+use super::{Row, SILENCE, affinity, batch_request, chunk_header, leave, newer, sealed, send};
 use crate::{LONG, system};
 
 /// A replay server and a client of it.
@@ -104,20 +104,20 @@ fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
         .seal(hash ^ 1)
         .map(|(a, b)| (a, b.to_vec()))
         .unwrap();
-    let goodbye = sealed(&served.client, &goodbye(0, INCARNATION, 0));
+    let leave = sealed(&served.client, &leave(0, INCARNATION, 0));
     let mut huge = whole.clone();
     huge[20..28].copy_from_slice(&u64::MAX.to_le_bytes());
     let web = b"GET / HTTP/1.1\r\nHost: replay\r\nAccept: */*\r\n\r\n";
     served.refuses_chunks([
         (
             [head, payload].concat(),
-            "start every part with the same settings",
+            "start every process with the same settings",
         ),
         (
             newer(whole.clone()),
             "run the same build of driml everywhere",
         ),
-        (goodbye, "a message of kind 8 came where kind 1 is expected"),
+        (leave, "a message of kind 8 came where kind 1 is expected"),
         (web.to_vec(), "does not start with DRML"),
         (huge, "more than the"),
         ([&whole[..], &[0]].concat(), "cut off or padded"),
@@ -189,13 +189,13 @@ fn everything_else_that_a_replay_server_takes() {
     let (client, hash) = (&served.client, served.client.spec.hash());
     let garbage = b"DRML and then nothing that makes sense".to_vec();
     let batch = |rows| batch_request(LEARNER, rows);
-    let goodbye = goodbye(0, INCARNATION, 1000);
+    let leave = leave(0, INCARNATION, 1000);
     let affinity = affinity(LEARNER, 1, 2);
     let batches = client.keys.of::<BatchRequest>();
-    let goodbyes = client.keys.of_actor::<Goodbye>(0);
+    let goodbyes = client.keys.of_actor::<Leave>(0);
     let affinities = client.keys.of::<AffinityUpdate>();
     let foreign_batch = codec::encode(hash ^ 1, &batch(16), &[]).unwrap();
-    let foreign_goodbye = codec::encode(hash ^ 1, &goodbye, &[]).unwrap();
+    let foreign_goodbye = codec::encode(hash ^ 1, &leave, &[]).unwrap();
     served.refuses([
         // Requests are answered with the reason.
         Row::new(&batches, garbage.clone(), "Refused {"),

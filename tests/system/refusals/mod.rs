@@ -11,8 +11,8 @@ mod wrong_place;
 use std::time::Duration;
 
 use driml_protocol::{
-    ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, Done, Goodbye, InsertReply,
-    JoinReply, Keyed, Learned, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply,
+    Ack, ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply,
+    Keyed, Learned, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply,
     WeightsUpload, codec, session,
 };
 use driml_tests::Client;
@@ -49,8 +49,8 @@ impl Row {
     }
 }
 
-const fn goodbye(actor: u32, incarnation: u64, produced: u64) -> Goodbye {
-    Goodbye {
+const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
+    Leave {
         actor,
         incarnation,
         produced,
@@ -126,7 +126,7 @@ fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
         };
         let bytes = bytes.into();
         let said = match session::ask(&client.session, &key, bytes, Priority::Data, wait_max) {
-            Ok(answer) => in_words(&answer.to_bytes()),
+            Ok(answer) => describe(&answer.to_bytes()),
             Err(_) => SILENCE.to_owned(),
         };
         assert!(
@@ -137,7 +137,7 @@ fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
 }
 
 /// An answer of any kind.
-fn in_words(bytes: &[u8]) -> String {
+fn describe(bytes: &[u8]) -> String {
     fn read<M: Message + std::fmt::Debug>(bytes: &[u8]) -> Option<String> {
         let (message, _) = codec::decode::<M>(bytes, None).ok()?;
         Some(format!("{message:?}"))
@@ -146,6 +146,6 @@ fn in_words(bytes: &[u8]) -> String {
         .or_else(|| read::<BatchReply>(bytes))
         .or_else(|| read::<JoinReply>(bytes))
         .or_else(|| read::<WeightsReply>(bytes))
-        .or_else(|| read::<Done>(bytes))
+        .or_else(|| read::<Ack>(bytes))
         .unwrap_or_else(|| "an answer of another kind".into())
 }

@@ -7,14 +7,14 @@ use std::sync::{
 };
 
 use driml_protocol::{
-    ActorJoin, Alive, Chunk, ChunkHeader, Claim, Goodbye, Hello, LearnerStatus, ReplayStatus,
+    ActorJoin, Alive, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, ReplayStatus, RunInfo,
     WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
 use driml_tests::{Client, Process, new_learner};
 use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
-    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, goodbye, sealed, send, upload,
+    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, leave, sealed, send, upload,
 };
 use crate::{LONG, tls::TlsSystem};
 
@@ -23,15 +23,15 @@ struct Guarded {
     tls: TlsSystem,
     observer: Client,
     _server: Process,
-    _parts: [Process; 2],
+    _processes: [Process; 2],
 }
 
 impl Guarded {
     fn new() -> Option<Self> {
         let tls = TlsSystem::new()?;
         let server = tls.start_server(&format!("--agent driml-ada {LONG}"));
-        let parts = [
-            tls.start("learner --stay --run-dir run", "tls"),
+        let processes = [
+            tls.start("learner --keep-alive --run-dir run", "tls"),
             tls.start("actor --id 0", "tls"),
         ];
         let observer = tls.client(Role::Observer);
@@ -40,7 +40,7 @@ impl Guarded {
             tls,
             observer,
             _server: server,
-            _parts: parts,
+            _processes: processes,
         })
     }
 
@@ -63,9 +63,9 @@ fn an_actor_asks_for_nothing_but_its_own() {
     let one = &run.tls.client(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
-    let goodbye = goodbye(other, incarnation, 0);
+    let leave = leave(other, incarnation, 0);
     let join = actor_join(other, incarnation);
-    let claim = Claim {
+    let poll = ChunkPoll {
         actor: other,
         incarnation,
         sequence: 0,
@@ -80,10 +80,10 @@ fn an_actor_asks_for_nothing_but_its_own() {
             Row::of(one, &new_learner(1), SILENCE),
             Row::new(keys.of::<WeightsUpload>(), weights, SILENCE),
             Row::of(one, &join, SILENCE),
-            Row::of(one, &goodbye, SILENCE),
-            Row::of(one, &claim, SILENCE),
+            Row::of(one, &leave, SILENCE),
+            Row::of(one, &poll, SILENCE),
             Row::new(keys.of_actor::<ChunkHeader>(other), [0; 100], SILENCE),
-            Row::new(keys.of::<Goodbye>(), sealed(one, &goodbye), SILENCE),
+            Row::new(keys.of::<Leave>(), sealed(one, &leave), SILENCE),
             Row::new(keys.of::<ReplayStatus>(), [], SILENCE),
             Row::new(keys.of::<LearnerStatus>(), [], SILENCE),
             Row::new("driml/**", [], SILENCE),
@@ -95,9 +95,9 @@ fn an_actor_asks_for_nothing_but_its_own() {
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
     let rows = [
         (keys.of_actor::<ChunkHeader>(1), one.seal(&chunk)),
-        (keys.of_actor::<Goodbye>(1), sealed(one, &goodbye)),
+        (keys.of_actor::<Leave>(1), sealed(one, &leave)),
         (keys.of_actor::<ActorJoin>(1), sealed(one, &join)),
-        (keys.of_actor::<Claim>(1), sealed(one, &claim)),
+        (keys.of_actor::<ChunkPoll>(1), sealed(one, &poll)),
     ];
     let expected = ["speaks for actor 0 at the key", SILENCE, SILENCE, SILENCE];
     let rows = rows.into_iter().zip(expected);
@@ -118,7 +118,7 @@ fn an_actor_declares_nothing_but_its_own() {
     let asked = Arc::<AtomicUsize>::default();
     let mut declared = Vec::new();
     for key in [
-        keys.of::<Hello>(),
+        keys.of::<RunInfo>(),
         keys.of::<WeightsRequest>(),
         keys.of::<ReplayStatus>(),
         keys.of::<LearnerStatus>(),

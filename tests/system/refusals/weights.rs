@@ -2,7 +2,7 @@
 //! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
-use driml_protocol::{Hello, Keys, WeightsUpload, WeightsVersion, codec, session};
+use driml_protocol::{Keys, RunInfo, WeightsUpload, WeightsVersion, codec, session};
 use driml_tests::{Client, listen};
 use zenoh::Wait;
 
@@ -105,10 +105,10 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
 }
 
 #[test]
-fn parts_of_another_protocol_version_do_not_join() {
+fn processes_of_another_protocol_version_do_not_join() {
     let system = system();
     let server = listen(&system.endpoint());
-    let hello = Hello {
+    let run_info = RunInfo {
         config_toml: String::new(),
         inserted_total: 0,
         has_learner: true,
@@ -116,16 +116,16 @@ fn parts_of_another_protocol_version_do_not_join() {
         shard: (0, 1),
         shared_memory: false,
     };
-    let whole = codec::encode(0, &hello, &[]).unwrap();
+    let whole = codec::encode(0, &run_info, &[]).unwrap();
     let greetings = [
         (
             newer(whole.clone()),
             "run the same build of driml everywhere",
         ),
-        (b"hello?".to_vec(), "it was cut off or padded"),
+        (b"run_info?".to_vec(), "it was cut off or padded"),
         (whole, "the settings that the replay server sent"),
     ];
-    let key = Keys::new("driml").unwrap().of::<Hello>();
+    let key = Keys::new("driml").unwrap().of::<RunInfo>();
     for (bytes, reason) in greetings {
         let answer = move |query| session::answer(&query, bytes.clone().into());
         let queryable = server

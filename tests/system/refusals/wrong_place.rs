@@ -99,11 +99,11 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let (endpoint, listener) = listener();
     drop(listener);
     let _router = driml_tests::listen(&endpoint);
-    let words = "a process listens there, but does not answer at driml/hello";
+    let words = "a process listens there, but does not answer at driml/run-info";
     for command in [COMMANDS[0], COMMANDS[1]] {
         let started = Instant::now();
-        let mut part = system.start_part(&format!("{command} {endpoint}"));
-        part.wait_for_stderr(words);
+        let mut role = system.start_process(&format!("{command} {endpoint}"));
+        role.wait_for_stderr(words);
         assert!(started.elapsed() < Duration::from_secs(30));
     }
     for command in [COMMANDS[2], COMMANDS[3]] {
@@ -115,21 +115,21 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
 
 /// Soon, and as one that plays or learns: with exit code 0.
 #[test]
-fn a_part_that_waits_for_its_server_ends_when_it_is_told_to() {
+fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
     for command in [COMMANDS[0], COMMANDS[1]] {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
-            let mut part = system.start(&format!("{command} {}", system.endpoint()));
-            part.wait_for_stderr("waiting for 10 s: nothing listens on ");
-            part.signal(signal);
-            part.wait().expect_code(0);
+            let mut role = system.start(&format!("{command} {}", system.endpoint()));
+            role.wait_for_stderr("waiting for 10 s: nothing listens on ");
+            role.signal(signal);
+            role.wait().expect_code(0);
             // Something listens, and sends nothing.
             let (endpoint, listener) = listener();
-            let part = system.start(&format!("{command} {endpoint}"));
+            let role = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();
-            part.signal(signal);
-            part.wait().expect_code(0);
+            role.signal(signal);
+            role.wait().expect_code(0);
             drop(connection);
         }
     }

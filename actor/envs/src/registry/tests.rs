@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::environment::{Environment, FrameShape};
-use crate::worlds::{corridor, exec, ising, pacman, procgen};
+use crate::plugin::CustomKind;
+use crate::worlds::{chain, exec, ising, pacman, procgen};
 
 #[test]
 fn names_go_there_and_back() {
@@ -135,9 +136,9 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     }
     let text = "kind = 'flat'\nreward = 3.5\n";
     assert!(toml::from_str::<WorldConfig>(text).is_err());
-    own::register::<Flat>("flat", "# preset");
     // The name of one of ours stays ours.
-    own::register::<Flat>("chain", "");
+    let kinds = ["flat", "chain"].map(|name| CustomKind::of::<Flat>(name, "# preset"));
+    plugin::register(kinds.into());
     let config: WorldConfig = toml::from_str(text).unwrap();
     assert_eq!(config.name(), "flat".parse().unwrap());
     assert_eq!(config.frame_shape().height, 3);
@@ -145,7 +146,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
     check_round_trip(&config);
     assert!(config.with_levels(Levels::Train).is_ok());
     assert!(config.with_levels(Levels::Unseen).is_err());
-    assert_eq!(own::preset("flat"), Some("# preset"));
+    assert_eq!(plugin::preset("flat"), Some("# preset"));
     let error = toml::from_str::<WorldConfig>(&text.replace("3.5", "3.5\ncolour = 1"));
     assert!(error.unwrap_err().to_string().contains("colour"));
     assert!(WorldName::all().any(|name| name.to_string() == "flat"));
@@ -192,7 +193,7 @@ fn configs() -> [WorldConfig; 4] {
     let numbered = exec::tests::numbered("");
     [
         WorldConfig::Exec(exec::tests::config(numbered)),
-        WorldConfig::Chain(corridor::tests::config()),
+        WorldConfig::Chain(chain::tests::config()),
         WorldConfig::Ising(ising::tests::paper()),
         WorldConfig::MsPacman(pacman::tests::config()),
     ]
@@ -212,7 +213,7 @@ fn shapes_and_actions_are_those_of_the_built_world() {
 }
 
 #[test]
-fn no_copies_and_wrong_buffers_are_errors() {
+fn no_environments_and_wrong_buffers_are_errors() {
     for config in configs() {
         assert!(config.build(0, 1, 0).is_err());
         let mut world = config.build(2, 1, 0).unwrap();
@@ -221,7 +222,10 @@ fn no_copies_and_wrong_buffers_are_errors() {
             .step(&[0], &mut rewards, &mut ends)
             .unwrap_err()
             .to_string();
-        assert_eq!(error, "actions has 1 entries, but the world has 2 copies");
+        assert_eq!(
+            error,
+            "actions has 1 entries, but the world has 2 environments"
+        );
         assert!(world.step(&[0; 2], &mut rewards[..1], &mut ends).is_err());
         assert!(world.step(&[0; 2], &mut rewards, &mut ends[..1]).is_err());
         assert!(world.step(&[0, 200], &mut rewards, &mut ends).is_err());
@@ -268,7 +272,7 @@ fn unseen_levels_are_none_of_those_trained_on() {
 fn levels_that_a_world_does_not_have_are_refused() {
     let all = procgen(0, 0).with_levels(Levels::Unseen).unwrap_err();
     assert!(all.to_string().contains("none is unseen"), "{all}");
-    let chain = WorldConfig::Chain(CorridorConfig {
+    let chain = WorldConfig::Chain(ChainConfig {
         cells: 8,
         height: 12,
         width: 12,

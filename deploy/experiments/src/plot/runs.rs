@@ -13,7 +13,7 @@ pub(super) const SPREAD_OF_K: &str = "sd_k";
 /// The column before those of the auxiliary losses, and the one after them.
 pub(super) const C51_LOSS: &str = "c51_kl";
 const TOTAL_LOSS: &str = "total_loss";
-/// Table of `metrics.csv` that hold words.
+/// Columns of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
 /// The metrics of one run, and its settings.

@@ -10,7 +10,7 @@ mod small;
 
 use anyhow::ensure;
 use driml_machine::resources;
-use driml_model::{Precision, kernels_in_words};
+use driml_model::{Precision, describe_kernels};
 use indicatif::HumanCount;
 use minijinja::{Value, context};
 use rand::SeedableRng;
@@ -62,7 +62,10 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         rows.extend(of_property);
     }
     session.csv("promises", &table_of(&rows))?;
-    session.figure("worst", &figure::figure(&rows, &HumanCount(cases(&rows)).to_string()))?;
+    session.figure(
+        "worst",
+        &figure::figure(&rows, &HumanCount(cases(&rows)).to_string()),
+    )?;
     let page = session.folder().join("README.md");
     session.finish(include_str!("page.md.j2"), values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
@@ -138,7 +141,7 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
         broken => broken.collect::<Vec<_>>(),
         nearest => nearest.join(", "),
         processor => resources::processor(),
-        kernels => Precision::ALL.map(kernels_in_words).join("; "),
+        kernels => Precision::ALL.map(describe_kernels).join("; "),
         draws => HumanCount(settings.draws).to_string(),
         seeds => settings.seeds,
     }

@@ -33,7 +33,7 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
         channels: vec![],
         scale_blocks: false,
         hidden,
-        rkhs: 1,
+        embedding_dim: 1,
         action_embed: 1,
         dim: DimHeads::NONE,
         head: HeadConfig::PLAIN,

@@ -1,4 +1,4 @@
-//! A network with the objective DIM alone and its optimiser, which are the learner's: what both studies train.
+//! A network with the auxiliary loss DIM alone and its optimiser, which are the learner's: what both studies train.
 //! It has neither returns nor actions nor a replay.
 
 use candle_core::{DType, Device, Tensor};
@@ -72,7 +72,7 @@ impl DimLearner {
         let found = dots(&self.network, now, next, &action, wanted)?;
         let found = found.into_iter().flatten().next();
         let found = found.expect("a pair is wanted");
-        let scores = self.dim.scores(found.rkhs);
+        let scores = self.dim.scores(found.width);
         let values = found.dots.flatten_all()?.to_vec1::<f32>()?;
         Ok(values.iter().map(|&dot| scores.score(dot)).collect())
     }

@@ -5,7 +5,7 @@
 mod dials;
 mod exactness;
 mod figures;
-mod held;
+mod fixed_batch;
 mod plan;
 mod report;
 mod results;

@@ -74,7 +74,10 @@ impl Inspection {
             );
             let sum = is_summed.then(|| sum("all", lines));
             for line in lines.iter().chain(&sum) {
-                text += &row(&line.what, [line.is, line.everything].map(|count| HumanCount(count).to_string()));
+                text += &row(
+                    &line.what,
+                    [line.is, line.everything].map(|count| HumanCount(count).to_string()),
+                );
             }
         }
         format!("{text}\neverything: {}\n", self.everything)

@@ -85,7 +85,11 @@ fn a_line_a_world_has_the_sums() {
 /// Every agent in every kind of world, with a small network.
 #[test]
 fn what_is_counted_is_what_is_built() {
-    let small = ["model.hidden=16", "model.rkhs=8", "learner.batch_size=4"];
+    let small = [
+        "model.hidden=16",
+        "model.embedding_dim=8",
+        "learner.batch_size=4",
+    ];
     for world in ["procgen:bigfish", "mspacman", "ising", "chain"] {
         for agent in AGENTS.iter().map(|agent| agent.name) {
             let config = config("smoke", world, agent, &small);

@@ -2,7 +2,7 @@
 //! order.
 //! Each is a `managed_process`; `view` asks how they are and shows it, and `run_folder` keeps it.
 
-mod parts;
+mod processes;
 
 use std::{
     path::PathBuf,
@@ -20,10 +20,9 @@ use crate::{
     endpoint::NAMESPACE,
     evaluator::Evaluator,
     interrupts::Interrupts,
-    last_play,
-    meeting::Meeting,
-    open_files,
+    last_play, open_files,
     processes::{Processes, Revived, connect, stop},
+    rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView},
@@ -52,7 +51,7 @@ pub struct Outside {
     /// The folder of certificates.
     pub tls_dir: Option<PathBuf>,
     /// Whether every client that can connect is trusted.
-    pub insecure_network: bool,
+    pub allow_insecure: bool,
 }
 
 /// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
@@ -78,14 +77,17 @@ pub fn run(
     let mut recorder = RunRecorder::open(run_dir, config, process_names(config), resumed)?;
     let resume_point = resumed.unwrap_or_default();
     let evaluator = Evaluator::new(config, run_dir)?;
-    let meeting = Meeting::create()?;
-    let mut endpoints: Vec<_> = servers.iter().map(|name| meeting.endpoint(name)).collect();
+    let rendezvous = Rendezvous::create()?;
+    let mut endpoints: Vec<_> = servers
+        .iter()
+        .map(|name| rendezvous.endpoint(name))
+        .collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
         endpoints[0].clone_from(listen);
     }
     write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
-    let place = meeting.path().as_os_str().as_encoded_bytes();
-    write_whole(&run_dir.meeting(), place)?;
+    let place = rendezvous.path().as_os_str().as_encoded_bytes();
+    write_whole(&run_dir.rendezvous(), place)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let display = Display::new(screen.clone(), Instant::now(), resume_point.updates);
     // What killed processes left is room again.
@@ -103,7 +105,7 @@ pub fn run(
         servers,
         endpoints,
         outside,
-        meeting,
+        rendezvous,
         screen,
         display,
         interrupts,
@@ -126,7 +128,7 @@ pub fn run(
         evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
     }
     // No process is left that could be reached by them; where these files stay behind, locks show it.
-    for path in [run_dir.endpoints(), run_dir.meeting()] {
+    for path in [run_dir.endpoints(), run_dir.rendezvous()] {
         if let Err(e) = std::fs::remove_file(&path) {
             tracing::debug!("removing {}: {e}", path.display());
         }
@@ -168,7 +170,7 @@ struct Launch<'a> {
     servers: Vec<String>,
     endpoints: Vec<String>,
     outside: Outside,
-    meeting: Meeting,
+    rendezvous: Rendezvous,
     screen: Screen,
     display: Display,
     interrupts: Interrupts,

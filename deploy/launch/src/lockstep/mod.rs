@@ -3,7 +3,7 @@
 //!
 //! A resumed run continues as if it had not been interrupted: each checkpoint holds the state of worlds, actors and replay.
 
-mod parts;
+mod processes;
 #[cfg(test)]
 mod tests;
 
@@ -25,7 +25,7 @@ use crate::{
     run_view::{Plan, RunView},
     view::{Display, TEMPLATE},
 };
-use parts::Lockstep;
+use processes::Lockstep;
 
 const POLL: Duration = Duration::from_secs(1);
 /// Rows of metrics that even the shortest run has, evenly over its frames: it may last no second.

@@ -2,8 +2,8 @@
 //! Each shard's replay server is asked for the episodes that ended; what an episode is, is theirs to say.
 //!
 //! Columns: `seconds` of the run when the episode was received, up to a second after it ended (empty where it had ended before the
-//! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `copy`, who
-//! played it, and in which copy of its world; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
+//! run was watched); `frames`, the run's count with the chunk that held its end; `episode`, its number; `actor` and `env`, who
+//! played it, and in which environment; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
 //! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
 
 use std::{collections::VecDeque, fmt::Display};
@@ -20,7 +20,7 @@ use crate::{metrics::rounded, run_view::Episodes};
 /// Answers that are asked of one shard at a time; what they do not hold comes the next time.
 const ASKS_MAX: usize = 16;
 
-const HEADER: &str = "seconds,frames,episode,actor,copy,return,length";
+const HEADER: &str = "seconds,frames,episode,actor,env,return,length";
 
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
@@ -191,7 +191,7 @@ impl TrainingEpisodes {
             self.frames.to_string(),
             self.episode.to_string(),
             ended.actor.to_string(),
-            ended.copy.to_string(),
+            ended.env.to_string(),
             of_whole(|it| it.episode_return.to_string()),
             of_whole(|it| it.steps.to_string()),
         ]

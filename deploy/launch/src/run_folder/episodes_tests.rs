@@ -36,7 +36,7 @@ impl Shard {
         let episode = |n| EndedEpisode {
             frames: self.frames,
             actor: 4,
-            copy: 2,
+            env: 2,
             played: Some(Played {
                 episode_return: (self.first + n) as f64,
                 steps: 9,

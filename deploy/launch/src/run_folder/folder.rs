@@ -67,8 +67,8 @@ impl RunFolder {
     }
 
     /// The folder in which the processes of `driml train` meet, while it runs here.
-    pub(crate) fn meeting(&self) -> PathBuf {
-        self.path.join("meeting")
+    pub(crate) fn rendezvous(&self) -> PathBuf {
+        self.path.join("rendezvous")
     }
 
     /// What checkpoints earned when they were played.
@@ -119,7 +119,7 @@ impl RunFolder {
         let others = [
             self.summary(),
             self.endpoints(),
-            self.meeting(),
+            self.rendezvous(),
             self.logs(),
             self.path.join(LOCK),
         ];

@@ -86,7 +86,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let episode = EndedEpisode {
         frames: 2_000,
         actor: 0,
-        copy: 0,
+        env: 0,
         played: Some(Played {
             episode_return: 0.5,
             steps: 9,
@@ -190,7 +190,7 @@ fn a_resumed_run_continues_in_its_metrics() {
 /// aside, and the seconds that it took count.
 #[test]
 fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
-    let episodes = "seconds,frames,episode,actor,copy,return,length\n1.0,900,1,0,0,1,3\n2.0,2000,2,0,1,1,3\n3.0,2400,3,0,2,1,3\n";
+    let episodes = "seconds,frames,episode,actor,env,return,length\n1.0,900,1,0,0,1,3\n2.0,2000,2,0,1,1,3\n3.0,2400,3,0,2,1,3\n";
     let metrics = "seconds,frames,updates,episodes,rss_mib_actor_7\n1.0,900,10,1,5\n2.5,2000,31,2,5\n29.7,2400,50,3,5\n";
     let cases = [
         ("both", Some(metrics), 29.0, 2),

@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::Context;
 use csv::StringRecord;
-use driml_protocol::whole_file;
+use driml_protocol::atomic_write;
 
 use crate::console;
 
@@ -22,7 +22,7 @@ const WAITING_MAX: usize = 100_000;
 
 /// Writes a file whole or not at all.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    whole_file::write(path, bytes).with_context(|| format!("writing {}", path.display()))
+    atomic_write::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
 /// The whole rows of a file that a run writes.

@@ -4,7 +4,9 @@
 use std::time::{Duration, Instant};
 
 use driml_machine::units::duration;
-use driml_protocol::{PartName, PartStatus, PartsStatus, RecoveryProgress, Waiting, session};
+use driml_protocol::{
+    ProcessName, ProcessStatus, ProcessesStatus, RecoveryProgress, Waiting, session,
+};
 
 use crate::run_view::{RunView, ServerAnswer};
 
@@ -16,25 +18,29 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 
 /// The endpoint and the account of each replay server that answered.
-fn accounts(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &PartsStatus)> {
+fn participants(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
-    answered.filter_map(|server| Some((server, server.parts.as_ref()?)))
+    answered.filter_map(|server| Some((server, server.processes.as_ref()?)))
 }
 
 /// The learner's account, and all actors', each with the server that they are connected to.
-fn parts(view: &RunView) -> impl Iterator<Item = (&str, &PartStatus)> {
-    accounts(view)
-        .flat_map(|(server, account)| account.parts.iter().map(|part| (&*server.endpoint, part)))
+fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
+    participants(view).flat_map(|(server, account)| {
+        account
+            .processes
+            .iter()
+            .map(|process| (&*server.endpoint, process))
+    })
 }
 
 /// Which side waits at the rate limiter and since when.
 pub(super) fn waits(view: &RunView) -> Vec<String> {
-    let limiter = |(_, account): (_, &PartsStatus)| match account.waiting {
+    let limiter = |(_, account): (_, &ProcessesStatus)| match account.waiting {
         Waiting::Neither => None,
         Waiting::Finished => Some(account.waiting.to_string()),
         waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
     };
-    let mut waits: Vec<_> = accounts(view).filter_map(limiter).collect();
+    let mut waits: Vec<_> = participants(view).filter_map(limiter).collect();
     waits.dedup();
     waits
 }
@@ -43,8 +49,8 @@ pub(super) fn waits(view: &RunView) -> Vec<String> {
 pub(crate) fn needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
     let mut needed: Vec<_> = servers.filter_map(of_server).collect();
-    needed.extend(accounts(view).filter_map(of_disk));
-    if !view.is_over() && accounts(view).next().is_some() {
+    needed.extend(participants(view).filter_map(of_disk));
+    if !view.is_over() && participants(view).next().is_some() {
         needed.extend(of_learner(view));
         if !view.replay.finished {
             needed.extend(of_actors(view));
@@ -71,7 +77,7 @@ fn of_server(server: &ServerAnswer) -> Option<String> {
     })
 }
 
-fn of_disk((server, account): (&ServerAnswer, &PartsStatus)) -> Option<String> {
+fn of_disk((server, account): (&ServerAnswer, &ProcessesStatus)) -> Option<String> {
     let log = account.log.as_ref()?;
     let (since, why) = log.refused.as_ref()?;
     Some(format!(
@@ -90,7 +96,7 @@ fn of_learner(view: &RunView) -> Option<String> {
         .collect();
     let tls = certificates(&view.servers[0].endpoint);
     let command = format!("`driml learner{connects}{tls} --run-dir DIR`");
-    match parts(view).find(|(_, part)| part.who == PartName::Learner) {
+    match processes(view).find(|(_, process)| process.who == ProcessName::Learner) {
         None => Some(format!("no learner has joined: start {command}")),
         Some((_, learner)) if !learner.connected => Some(format!(
             "the learner disconnected {} ago: restart it with the same --run-dir, and it resumes from its newest checkpoint: {command}",
@@ -104,9 +110,9 @@ fn of_learner(view: &RunView) -> Option<String> {
 }
 
 fn of_actors(view: &RunView) -> Vec<String> {
-    let is_actor = |(_, part): &(_, &PartStatus)| part.who != PartName::Learner;
-    let actors: Vec<_> = parts(view).filter(is_actor).collect();
-    if !actors.iter().any(|(_, part)| part.connected) {
+    let is_actor = |(_, process): &(_, &ProcessStatus)| process.who != ProcessName::Learner;
+    let actors: Vec<_> = processes(view).filter(is_actor).collect();
+    if !actors.iter().any(|(_, process)| process.connected) {
         let endpoint = &view.servers[0].endpoint;
         let what = match actors.is_empty() {
             true => "no actor has joined",
@@ -117,17 +123,17 @@ fn of_actors(view: &RunView) -> Vec<String> {
             "{what}: start `driml actor --connect {endpoint}{flags} --id N`, each with another number"
         )];
     }
-    let of_actor = |(endpoint, part): &(&str, &PartStatus)| {
-        let PartName::Actor(id) = part.who else {
+    let of_actor = |(endpoint, process): &(&str, &ProcessStatus)| {
+        let ProcessName::Actor(id) = process.who else {
             return None;
         };
-        if !part.connected {
-            let (since, tls) = (seconds(part.since_s), certificates(endpoint));
+        if !process.connected {
+            let (since, tls) = (seconds(process.since_s), certificates(endpoint));
             return Some(format!(
                 "actor-{id} disconnected {since} ago; the run continues without it. Restart it with `driml actor --connect {endpoint}{tls} --id {id}`"
             ));
         }
-        let silent = seconds(silent_for(part)?);
+        let silent = seconds(silent_for(process)?);
         Some(format!(
             "actor-{id} is connected but has sent nothing for {silent}: its process may be suspended"
         ))
@@ -153,8 +159,9 @@ pub(crate) fn notes(view: &RunView) -> Vec<String> {
     if let Some(replay) = silence("replay server", view.replay_last_seen) {
         return vec![replay];
     }
-    let is_known = accounts(view).next().is_some();
-    let has_joined = |learner| parts(view).any(|it| (it.1.who == PartName::Learner) == learner);
+    let is_known = participants(view).next().is_some();
+    let has_joined =
+        |learner| processes(view).any(|it| (it.1.who == ProcessName::Learner) == learner);
     let learner = match view.learner.finished {
         true => None,
         false if is_known && !has_joined(true) => Some("no learner has joined yet".to_owned()),
@@ -177,25 +184,36 @@ fn silence(process: &str, last_seen: Instant) -> Option<String> {
     (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
 }
 
-/// For how many seconds a connected part has said nothing, where that is worth a sentence.
-fn silent_for(part: &PartStatus) -> Option<f64> {
-    let silent = part.last_seen_s.unwrap_or(part.since_s);
-    let doing = part.doing.as_ref();
+/// For how many seconds a connected process has said nothing, where that is worth a sentence.
+fn silent_for(process: &ProcessStatus) -> Option<f64> {
+    let silent = process.last_seen_s.unwrap_or(process.since_s);
+    let doing = process.doing.as_ref();
     let says = doing.map_or(f64::INFINITY, |(_, _, said)| *said);
-    (part.connected && silent > UNRESPONSIVE_S && says > UNRESPONSIVE_S && part.held_s.is_none())
-        .then_some(silent)
+    (process.connected
+        && silent > UNRESPONSIVE_S
+        && says > UNRESPONSIVE_S
+        && process.held_s.is_none())
+    .then_some(silent)
 }
 
 /// Actors that are gone or unresponsive, a few words each; the first of them.
 fn unresponsive_actors(view: &RunView) -> Vec<String> {
-    let words = |part: &PartStatus| match silent_for(part) {
-        _ if part.who == PartName::Learner => None,
-        _ if !part.connected && view.replay.finished => None,
-        _ if !part.connected => Some(format!("{}: gone for {}", part.who, seconds(part.since_s))),
-        Some(silent) => Some(format!("{}: no answer for {}", part.who, seconds(silent))),
+    let words = |process: &ProcessStatus| match silent_for(process) {
+        _ if process.who == ProcessName::Learner => None,
+        _ if !process.connected && view.replay.finished => None,
+        _ if !process.connected => Some(format!(
+            "{}: gone for {}",
+            process.who,
+            seconds(process.since_s)
+        )),
+        Some(silent) => Some(format!(
+            "{}: no answer for {}",
+            process.who,
+            seconds(silent)
+        )),
         None => None,
     };
-    let mut words: Vec<_> = parts(view).filter_map(|it| words(it.1)).collect();
+    let mut words: Vec<_> = processes(view).filter_map(|it| words(it.1)).collect();
     let more = words.len().saturating_sub(NAMED_MAX);
     if more > 0 {
         words.truncate(NAMED_MAX);

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{LearnerStatus, PartStatus, ReplayStatus, whole_file};
+use driml_protocol::{LearnerStatus, ProcessStatus, ReplayStatus, atomic_write};
 use serde::Serialize;
 
 use super::advice::{needed, waits};
@@ -65,7 +65,7 @@ impl PrometheusFile {
 
     /// Writes it, whole or not at all. A warning is returned the first time that it cannot be written.
     pub(crate) fn write(&mut self, view: &RunView) -> Option<String> {
-        let failed = whole_file::write(&self.path, prometheus(view).as_bytes()).err()?;
+        let failed = atomic_write::write(&self.path, prometheus(view).as_bytes()).err()?;
         (!std::mem::replace(&mut self.has_warned, true))
             .then(|| format!("{} cannot be written: {failed}", self.path.display()))
     }
@@ -153,26 +153,28 @@ impl Page {
     }
 
     fn processes(&mut self, view: &RunView) {
-        let accounts = view.servers.iter().filter_map(|it| it.parts.as_ref());
+        let participants = view.servers.iter().filter_map(|it| it.processes.as_ref());
         // With several shards the learner takes part in each.
         let mut seen = BTreeSet::new();
-        let parts = accounts.flat_map(|it| &it.parts);
-        let parts: Vec<_> = parts.filter(|it| seen.insert(it.who)).collect();
-        let mut each = |kind, name, help, value: fn(&PartStatus) -> Option<f64>| {
-            let known = parts.iter();
+        let processes = participants.flat_map(|it| &it.processes);
+        let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();
+        let mut each = |kind, name, help, value: fn(&ProcessStatus) -> Option<f64>| {
+            let known = processes.iter();
             let known = known.filter_map(|it| Some((it.who.to_string(), value(it)?)));
-            self.metric(kind, name, help, "part", &known.collect::<Vec<_>>());
+            self.metric(kind, name, help, "process", &known.collect::<Vec<_>>());
         };
         let connected = "Whether a process that has joined the run is connected.";
-        each("gauge", "part_connected", connected, |it| {
+        each("gauge", "process_connected", connected, |it| {
             Some(it.connected.into())
         });
         let joined = "How often a process has joined the run.";
-        each("counter", "part_joined_total", joined, |it| {
+        each("counter", "process_joined_total", joined, |it| {
             Some(it.lives.into())
         });
         let silent = "Seconds since the last chunk or request for a batch of a process.";
-        each("gauge", "part_silent_seconds", silent, |it| it.last_seen_s);
+        each("gauge", "process_silent_seconds", silent, |it| {
+            it.last_seen_s
+        });
     }
 }
 

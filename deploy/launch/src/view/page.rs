@@ -1,6 +1,6 @@
 //! A run as a page of text: `driml status` and `driml watch --once`.
 
-use driml_protocol::{LogStatus, PartStatus, Waiting, Warning};
+use driml_protocol::{LogStatus, ProcessStatus, Waiting, Warning};
 
 use super::{
     advice::{needed, seconds, waits},
@@ -48,17 +48,20 @@ pub(crate) fn page(view: &RunView) -> String {
     let mut notes = Vec::new();
     for server in &view.servers {
         rows.push(server_row(server, view.servers.len()));
-        let Some(account) = &server.parts else {
+        let Some(account) = &server.processes else {
             continue;
         };
         let log = account.log.as_ref();
         notes.extend(log.map(|log| log_line(server, log, view.servers.len())));
         notes.extend(warning("replay-server", account.last_warning.as_ref()));
-        for part in account.parts.iter().take(ACTORS_MAX + 1) {
-            rows.push(part_row(part));
-            notes.extend(warning(&part.who.to_string(), part.last_warning.as_ref()));
+        for process in account.processes.iter().take(ACTORS_MAX + 1) {
+            rows.push(process_row(process));
+            notes.extend(warning(
+                &process.who.to_string(),
+                process.last_warning.as_ref(),
+            ));
         }
-        if let more @ 1.. = account.parts.len().saturating_sub(ACTORS_MAX + 1) {
+        if let more @ 1.. = account.processes.len().saturating_sub(ACTORS_MAX + 1) {
             rows.push(vec![format!("and {more} more actors")]);
         }
     }
@@ -127,7 +130,7 @@ fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
     if let Some(progress) = server.recovering {
         return vec![name, "reads its replay back".into(), progress.to_string()];
     }
-    let Some(account) = &server.parts else {
+    let Some(account) = &server.processes else {
         let state = match server.is_gone {
             true => "has ended",
             false => "does not answer",
@@ -147,13 +150,13 @@ fn server_row(server: &ServerAnswer, of: usize) -> Vec<String> {
     vec![name, state, does, String::new(), String::new(), weights]
 }
 
-fn part_row(part: &PartStatus) -> Vec<String> {
-    let state = match part.connected {
-        true => format!("there for {}", seconds(part.since_s)),
-        false => format!("GONE for {}", seconds(part.since_s)),
+fn process_row(process: &ProcessStatus) -> Vec<String> {
+    let state = match process.connected {
+        true => format!("there for {}", seconds(process.since_s)),
+        false => format!("GONE for {}", seconds(process.since_s)),
     };
     let ago = |age: Option<f64>| age.map_or("-".into(), |age| format!("{} ago", seconds(age)));
-    let doing = part.doing.as_ref();
+    let doing = process.doing.as_ref();
     let doing = doing.map_or("-".into(), |(doing, since, said)| {
         let doing = format!("{doing} since {}", seconds(*since));
         match *said > REPORT_AGE_MAX {
@@ -162,12 +165,14 @@ fn part_row(part: &PartStatus) -> Vec<String> {
         }
     });
     vec![
-        part.who.to_string(),
+        process.who.to_string(),
         state,
         doing,
-        ago(part.last_seen_s),
-        part.held_s.map_or("-".into(), seconds),
-        part.weights_version.map_or("-".into(), |it| it.to_string()),
-        part.lives.to_string(),
+        ago(process.last_seen_s),
+        process.held_s.map_or("-".into(), seconds),
+        process
+            .weights_version
+            .map_or("-".into(), |it| it.to_string()),
+        process.lives.to_string(),
     ]
 }

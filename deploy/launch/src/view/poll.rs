@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use driml_machine::error::usage;
 use driml_protocol::{
-    CodecError, EpisodesReply, EpisodesRequest, Hello, Keys, LearnerStatus, PartsStatus,
-    Recovering, ReplayStatus, RunClient, join, reach,
+    CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, Recovering,
+    ReplayStatus, RunClient, RunInfo, join, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
@@ -98,8 +98,8 @@ impl Poller {
         let first = first.filter(|_| servers[0].replay.is_some());
         let view = &mut self.view;
         if let (None, Some(first)) = (view.after_updates, first) {
-            let hello = first.client.fetch::<Hello>(ANSWER_MAX);
-            let known = hello.ok().filter(|it| it.has_learner);
+            let run_info = first.client.fetch::<RunInfo>(ANSWER_MAX);
+            let known = run_info.ok().filter(|it| it.has_learner);
             view.after_updates = known.map(|it| it.after_updates);
         }
         let learner = first.and_then(|it| it.client.fetch(ANSWER_MAX).ok());
@@ -152,14 +152,17 @@ impl Poller {
 impl Reached {
     fn ask(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
-        let answers = replay.and_then(|it| Ok((it, self.client.fetch::<PartsStatus>(ANSWER_MAX)?)));
+        let answers =
+            replay.and_then(|it| Ok((it, self.client.fetch::<ProcessesStatus>(ANSWER_MAX)?)));
         let mut answer = ServerAnswer {
             name: self.name.clone(),
             endpoint: self.endpoint.clone(),
             ..ServerAnswer::default()
         };
         match answers {
-            Ok((replay, parts)) => (answer.replay, answer.parts) = (Some(replay), Some(parts)),
+            Ok((replay, processes)) => {
+                (answer.replay, answer.processes) = (Some(replay), Some(processes))
+            }
             Err(SessionError::Recovering(it)) => answer.recovering = Some(it.progress),
             Err(e) => {
                 answer.is_another_run = matches!(
@@ -186,10 +189,10 @@ fn greeting(
     endpoint: &str,
     namespace: &str,
 ) -> anyhow::Result<Greeting> {
-    let (config_toml, after_updates) = match join::hello_within(session, keys, ANSWER_MAX) {
-        Ok(hello) => {
-            let after_updates = hello.has_learner.then_some(hello.after_updates);
-            (hello.config_toml, after_updates)
+    let (config_toml, after_updates) = match join::run_info_within(session, keys, ANSWER_MAX) {
+        Ok(run_info) => {
+            let after_updates = run_info.has_learner.then_some(run_info.after_updates);
+            (run_info.config_toml, after_updates)
         }
         Err(SessionError::Recovering(Recovering {
             config_toml: Some(config_toml),

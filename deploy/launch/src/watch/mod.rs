@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::{Seldom, reach};
+use driml_protocol::{LogLimiter, reach};
 
 pub use self::watched::Outputs;
 use self::watched::Watched;
@@ -85,7 +85,7 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
 fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-    let (mut last_seen, mut said) = (Instant::now(), Seldom::default());
+    let (mut last_seen, mut said) = (Instant::now(), LogLimiter::default());
     loop {
         let view = poller.ask();
         if view.is_answered() && view.after_updates.is_some() {

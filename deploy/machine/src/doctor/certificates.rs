@@ -11,7 +11,7 @@ use super::fact::Fact;
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
 const DAY_S: u64 = 24 * 3600;
 
-/// What there is to say of `folder`: a line for each part that has a file there, and one for all actors that are well.
+/// What there is to say of `folder`: a line for each process that has a file there, and one for all actors that are well.
 pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     let dir = folder.display();
     let entries = match fs::read_dir(folder) {
@@ -76,8 +76,8 @@ fn complaint(credentials: &Credentials) -> Option<String> {
         ))
     } else if left < EXPIRES_SOON {
         Some(format!(
-            "good for {} days more, then its part is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
-             start that part again",
+            "good for {} days more, then its process is cut off: remove {role}.pem and {role}.key, let deploy/certs.sh make new ones, and \
+             start that process again",
             left.as_secs() / DAY_S
         ))
     } else if role == Role::ReplayServer && credentials.hosts().is_empty() {
@@ -121,7 +121,7 @@ fn all_well(actors: &[(u32, Credentials)]) -> Option<Fact> {
     Some(Fact::ok("tls actors", text))
 }
 
-/// What is to be said of the authority: its certificate is checked with each part's.
+/// What is to be said of the authority: its certificate is checked with each process's.
 fn authority(folder: &Path) -> Option<Fact> {
     let key = tls::authority_path(folder).with_extension("key");
     key.exists().then(|| {

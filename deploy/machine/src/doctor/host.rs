@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use driml_model::{Precision, kernels_in_words};
+use driml_model::{Precision, describe_kernels};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
@@ -84,7 +84,7 @@ fn vectors(at_once: Option<u32>) -> Fact {
 
 /// What the network's products run on, in either precision.
 fn kernels() -> Fact {
-    let [f32, bf16] = Precision::ALL.map(kernels_in_words);
+    let [f32, bf16] = Precision::ALL.map(describe_kernels);
     let text = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
     Fact::ok("kernels", text)
 }

@@ -1,4 +1,4 @@
-//! A film of what the agent plays: which copies, for how long, and what stands beside each frame.
+//! A film of what the agent plays: which environments, for how long, and what stands beside each frame.
 //! It watches: nothing that is played depends on it.
 
 use std::{collections::VecDeque, path::PathBuf};
@@ -15,7 +15,7 @@ use driml_protocol::Horizon;
 
 use super::tile::{Layout, Look, Shot};
 
-/// Times as long as others that the last picture of an episode is shown, where one copy is.
+/// Times as long as others that the last picture of an episode is shown, where one environment is.
 const PAUSE: f64 = 8.0;
 
 #[derive(Debug, Args)]
@@ -26,10 +26,10 @@ pub(crate) struct RecordArgs {
     /// Show beside each frame the value, C51's distribution, the action and the scores of local DIM
     #[arg(long, requires = "record")]
     pub(crate) overlay: bool,
-    /// Copies of the world to film, side by side
-    #[arg(long, value_name = "N", default_value_t = 1, requires = "record", value_parser = clap::value_parser!(u32).range(1..=8))]
-    pub(crate) record_copies: u32,
-    /// Episodes to film per copy; fewer if fewer are played
+    /// Environments to film, side by side
+    #[arg(long, alias = "record-copies", value_name = "N", default_value_t = 1, requires = "record", value_parser = clap::value_parser!(u32).range(1..=8))]
+    pub(crate) record_envs: u32,
+    /// Episodes to film per environment; fewer if fewer are played
     #[arg(long, value_name = "N", default_value_t = 2, requires = "record", value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub(crate) record_episodes: u32,
     /// Steps to film at most; a Procgen frame takes 5 to 10 kB
@@ -42,7 +42,7 @@ pub(crate) struct Recording {
     film: Film,
     layout: Layout,
     overlay: Option<Overlay>,
-    copies: Vec<Copy>,
+    envs: Vec<Filmed>,
     episodes_max: u32,
     steps_max: u32,
     steps: u32,
@@ -58,9 +58,9 @@ struct Overlay {
     local_k: Option<usize>,
 }
 
-/// One filmed copy of the world.
+/// One filmed environment.
 #[derive(Clone, Default)]
-struct Copy {
+struct Filmed {
     episode: u32,
     step: u32,
     total: f64,
@@ -68,11 +68,11 @@ struct Copy {
     over: Option<Shot>,
 }
 
-/// One step of all copies.
+/// One step of all environments.
 struct Moment {
     shots: Vec<Shot>,
     seen: Option<Seen>,
-    /// Of all copies of the world, if local DIM is asked.
+    /// Of all environments, if local DIM is asked.
     actions: Vec<u8>,
     ends: Vec<StepEnd>,
 }
@@ -87,8 +87,8 @@ impl Recording {
         let Some(path) = &args.record else {
             return Ok(None);
         };
-        let played = Player::copies(episodes as usize);
-        let copies = (args.record_copies as usize).min(played);
+        let played = Player::envs(episodes as usize);
+        let envs = (args.record_envs as usize).min(played);
         let viewer = args.overlay.then(|| player.viewer()).transpose()?;
         let overlay = viewer.map(|viewer| {
             let ahead = match player.config.run.horizon {
@@ -101,7 +101,7 @@ impl Recording {
         });
         let shown = overlay.as_ref();
         let local = shown.and_then(|it| it.local_k.zip(it.viewer.insight.local_shape()));
-        let layout = Layout::new(&player.config, copies, overlay.is_some(), local, played);
+        let layout = Layout::new(&player.config, envs, overlay.is_some(), local, played);
         let rate = player.config.world.steps_per_second();
         let film = Film::create(path, layout.size(), rate).map_err(cannot)?;
         Ok(Some(Self {
@@ -109,7 +109,7 @@ impl Recording {
             film,
             layout,
             overlay,
-            copies: vec![Copy::default(); copies],
+            envs: vec![Filmed::default(); envs],
             episodes_max: args.record_episodes,
             steps_max: args.record_steps,
             steps: 0,
@@ -121,7 +121,7 @@ impl Recording {
     fn is_over(&self) -> bool {
         self.failed.is_some()
             || self.steps >= self.steps_max
-            || self.copies.iter().all(|copy| copy.over.is_some())
+            || self.envs.iter().all(|env| env.over.is_some())
     }
 
     /// Films a step. [`finish`](Self::finish) returns the errors.
@@ -136,10 +136,10 @@ impl Recording {
     fn add(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let played = step.actions.len();
         let frame_bytes = step.frames.len() / played;
-        let mut shots = Vec::with_capacity(self.copies.len());
-        for (i, copy) in self.copies.iter_mut().enumerate() {
+        let mut shots = Vec::with_capacity(self.envs.len());
+        for (i, env) in self.envs.iter_mut().enumerate() {
             let frame = &step.frames[i * frame_bytes..][..frame_bytes];
-            shots.push(copy.take(frame, step, i, self.episodes_max));
+            shots.push(env.take(frame, step, i, self.episodes_max));
         }
         let mut moment = Moment {
             shots,
@@ -149,8 +149,8 @@ impl Recording {
         };
         let mut ahead = 0;
         if let Some(Overlay { viewer, local_k }) = &mut self.overlay {
-            // Other copies than the filmed are what local DIM tells a state from.
-            let looked_at = local_k.map_or(self.copies.len(), |_| played);
+            // Other environments than the filmed are what local DIM tells a state from.
+            let looked_at = local_k.map_or(self.envs.len(), |_| played);
             let states = &step.states[..step.states.len() / played * looked_at];
             moment.seen = Some(viewer.look(states)?);
             moment.actions = step.actions.to_vec();
@@ -223,8 +223,8 @@ impl Recording {
     }
 }
 
-impl Copy {
-    /// What is shown of copy `i` in this step.
+impl Filmed {
+    /// What is shown of environment `i` in this step.
     fn take(&mut self, frame: &[u8], step: &Step<'_>, i: usize, episodes_max: u32) -> Shot {
         if let Some(shot) = &self.over {
             return Shot {

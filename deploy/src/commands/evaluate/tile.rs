@@ -1,4 +1,4 @@
-//! One filmed copy in a picture: its frame, enlarged, and beside it what the network makes of it. Where things stand, and their words.
+//! One filmed environment in a picture: its frame, enlarged, and beside it what the network makes of it. Where things stand, and their words.
 //! It asks no network: it is told.
 
 use driml_figure::{Area, Image, Ink, Picture};
@@ -43,7 +43,7 @@ pub(super) struct Look<'a> {
 pub(super) struct Layout {
     frame: (usize, usize, usize),
     zoom: usize,
-    copies: usize,
+    envs: usize,
     has_panel: bool,
     local: Option<Local>,
     action_names: Vec<String>,
@@ -59,10 +59,10 @@ struct Local {
 }
 
 impl Layout {
-    /// Of `copies` filmed out of `candidates` copies played; `local` is k and the shape of the local features, if they are asked.
+    /// Of `envs` filmed out of `candidates` environments played; `local` is k and the shape of the local features, if they are asked.
     pub(super) fn new(
         config: &RunConfig,
-        copies: usize,
+        envs: usize,
         has_panel: bool,
         local: Option<(usize, (usize, usize))>,
         candidates: usize,
@@ -73,7 +73,7 @@ impl Layout {
         Self {
             frame: (height, width, spec.frame_channels as usize),
             zoom: ((FRAME_SIDE + longer / 2) / longer).max(1),
-            copies,
+            envs,
             has_panel,
             local: local.map(|(k, (rows, columns))| Local {
                 k,
@@ -105,7 +105,7 @@ impl Layout {
     pub(super) fn size(&self) -> (usize, usize) {
         let (width, height) = self.tile();
         let columns = self.columns();
-        let rows = self.copies.div_ceil(columns);
+        let rows = self.envs.div_ceil(columns);
         let along = |count: usize, side: usize| MARGIN + count * (side + MARGIN);
         (along(columns, width), along(rows, height))
     }
@@ -113,8 +113,8 @@ impl Layout {
     /// Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
     fn columns(&self) -> usize {
         match self.has_panel {
-            false => self.copies.clamp(1, 4),
-            true => self.copies.div_ceil(4).max(1),
+            false => self.envs.clamp(1, 4),
+            true => self.envs.div_ceil(4).max(1),
         }
     }
 

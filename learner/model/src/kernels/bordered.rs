@@ -7,9 +7,9 @@ use crate::kernels::convolution::{
     Convolution, gradient_panels, multiply_windows, weight_gradient,
 };
 use crate::kernels::images::{Images, Room};
+use crate::kernels::isa::{Element, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_of;
 use crate::kernels::rounding::{store, store_bytes};
-use crate::kernels::units::{Element, Mode, Unit, vectorized};
 
 /// Maps [height, width, channels] with a border of zeros, a pixel wide.
 #[derive(Clone, Copy)]
@@ -61,15 +61,15 @@ impl Border {
     }
 
     /// Writes the zeros, and `inside` between them.
-    pub(crate) fn put<U: Unit>(self, unit: U, inside: Inside<'_>, room: &mut [U::Element]) {
+    pub(crate) fn put<S: Simd>(self, simd: S, inside: Inside<'_>, room: &mut [S::Element]) {
         self.clear(room);
         let len = self.width * self.channels;
         for y in 0..self.height {
             let (from, to) = (y * len..(y + 1) * len, &mut room[self.line(y)]);
             match inside {
-                Inside::Bytes(bytes) => store_bytes(unit, &bytes[from], to),
-                Inside::Maps(maps) => store(unit, &maps[from], to),
-                Inside::Active(maps) => store_active(unit, &maps[from], to),
+                Inside::Bytes(bytes) => store_bytes(simd, &bytes[from], to),
+                Inside::Maps(maps) => store(simd, &maps[from], to),
+                Inside::Active(maps) => store_active(simd, &maps[from], to),
             }
         }
     }
@@ -77,9 +77,9 @@ impl Border {
 
 vectorized! {
     /// Rounds max(x, 0) of `floats` into `values`, which is as long.
-    fn store_active<U>(unit, floats: &'a [f32], values: &'a mut [U::Element]) {
+    fn store_active<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
         for (value, &float) in values.iter_mut().zip(floats) {
-            *value = U::Element::of(relu_of(float));
+            *value = S::Element::of(relu_of(float));
         }
     }
 }
@@ -94,8 +94,8 @@ pub(crate) struct BorderedConvolution<E: Element> {
 impl<E: Element> BorderedConvolution<E> {
     /// `shape` is one of [`ConvShape::bordered`], `weight` [out, in, 3, 3], `bias` [out]; `backward` says whether its input will need
     /// a gradient.
-    pub(crate) fn new<U: Unit<Element = E>>(
-        unit: U,
+    pub(crate) fn new<S: Simd<Element = E>>(
+        simd: S,
         shape: ConvShape,
         weight: &[f32],
         bias: &[f32],
@@ -108,10 +108,10 @@ impl<E: Element> BorderedConvolution<E> {
                 ..shape
             };
             let bias = vec![0.0; shape.channels_in];
-            Convolution::new(unit, of, &turned(&shape, weight), &bias, false)
+            Convolution::new(simd, of, &turned(&shape, weight), &bias, false)
         });
         Self {
-            forward: Convolution::new(unit, shape, weight, bias, false),
+            forward: Convolution::new(simd, shape, weight, bias, false),
             backward: turned,
         }
     }
@@ -129,23 +129,23 @@ impl<E: Element> BorderedConvolution<E> {
     }
 
     /// Convolves an image in its border, row by row: `then` gets the number of each row and its sums [width, out], without bias.
-    pub(crate) fn forward<U: Unit<Element = E>>(
+    pub(crate) fn forward<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         image: &[E],
         then: impl FnMut(usize, &mut [f32]),
     ) {
         let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_out);
-        multiply_windows(unit, &self.forward, image, &mut row, then);
+        multiply_windows(simd, &self.forward, image, &mut row, then);
     }
 
     /// The gradient of an image, row by row as [`BorderedConvolution::forward`], for that of its map, `grad_map` [height, width, out].
     ///
     /// # Panics
     /// If it was not made for that.
-    pub(crate) fn image_gradient<U: Unit<Element = E>>(
+    pub(crate) fn image_gradient<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         grad_map: &[f32],
         then: impl FnMut(usize, &mut [f32]),
     ) {
@@ -153,16 +153,16 @@ impl<E: Element> BorderedConvolution<E> {
         let backward = backward.expect("a convolution whose input has a gradient is made for it");
         let border = Border::of_input(&backward.shape);
         let mut room = Buffer::new(border.len::<E>());
-        border.put(unit, Inside::Maps(grad_map), &mut room);
+        border.put(simd, Inside::Maps(grad_map), &mut room);
         let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_in);
-        multiply_windows(unit, backward, &room, &mut row, then);
+        multiply_windows(simd, backward, &room, &mut row, then);
     }
 
     /// Adds the gradients of weight [3, 3, in, out] and bias [out] for an image in its border, whose scale the weight's does not have
     /// yet, and the gradient of its map.
-    pub(crate) fn parameter_gradients<U: Unit<Element = E>>(
+    pub(crate) fn parameter_gradients<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         image: &[E],
         grad_map: &[f32],
         weight: &mut [f32],
@@ -170,11 +170,11 @@ impl<E: Element> BorderedConvolution<E> {
     ) {
         let shape = self.shape();
         let (len, shift) = (shape.image_len(), shape.shift());
-        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels::<U>(shape));
+        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels::<S>(shape));
         let images = Images::Maps(&image[..len]);
-        let steps = images.steps(unit, 0, (len, shift), &mut rooms);
-        weight_gradient(unit, shape, steps, grad_map, &mut panels, weight, Mode::Add);
-        add_locations(unit, grad_map, bias);
+        let steps = images.steps(simd, 0, (len, shift), &mut rooms);
+        weight_gradient(simd, shape, steps, grad_map, &mut panels, weight, Mode::Add);
+        add_locations(simd, grad_map, bias);
     }
 }
 
@@ -192,7 +192,7 @@ fn turned(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
 
 vectorized! {
     /// Adds each location of `map` [locations, out] to `sums` [out].
-    fn add_locations<U>(unit, map: &'a [f32], sums: &'a mut [f32]) {
+    fn add_locations<S>(simd, map: &'a [f32], sums: &'a mut [f32]) {
         for location in map.chunks_exact(sums.len()) {
             for (sum, value) in sums.iter_mut().zip(location) {
                 *sum += value;

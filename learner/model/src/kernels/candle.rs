@@ -150,8 +150,8 @@ fn local_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
 
 /// `psi` [B, L, R], `phi` [B, R].
 fn local_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    let (rows, locations, rkhs) = psi.dims3()?;
-    let dots = psi.reshape((rows * locations, rkhs))?.matmul(&phi.t()?)?;
+    let (rows, locations, width) = psi.dims3()?;
+    let dots = psi.reshape((rows * locations, width))?.matmul(&phi.t()?)?;
     dots.reshape((rows, locations, rows))?
         .transpose(0, 1)?
         .contiguous()
@@ -159,8 +159,8 @@ fn local_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
 
 /// `psi` [B, R], `phi` [B, L, R].
 fn global_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    let (rows, locations, rkhs) = phi.dims3()?;
-    let dots = phi.reshape((rows * locations, rkhs))?.matmul(&psi.t()?)?;
+    let (rows, locations, width) = phi.dims3()?;
+    let dots = phi.reshape((rows * locations, width))?.matmul(&psi.t()?)?;
     dots.reshape((rows, locations, rows))?
         .permute((1, 2, 0))?
         .contiguous()

@@ -14,6 +14,7 @@ use crate::geometry::{ConvLayer, ConvShape};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::images::Pixels;
+use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::linear::add_in_order;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::transpose;
@@ -21,7 +22,6 @@ use crate::kernels::stack::{
     SavedActivations, layers, parameters_len, stack_backward, stack_forward, unpacked,
 };
 use crate::kernels::tensors::{cpu, floats, values_of};
-use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 16;
@@ -54,8 +54,8 @@ pub fn conv_stack(
 ) -> Result<Tensor> {
     let (shapes, parameters) = stack_of(images, layers)?;
     let images = images.contiguous()?;
-    on_unit!(AnyUnit::of(precision), unit => {
-        images.apply_op2(&parameters, ConvStack::new(unit, shapes))
+    with_simd!(AnySimd::of(precision), simd => {
+        images.apply_op2(&parameters, ConvStack::new(simd, shapes))
     })
 }
 
@@ -94,18 +94,18 @@ pub(crate) fn stack_of(
 }
 
 /// Convolutions of one pass, forward and then backward, on slices.
-pub(crate) struct ConvStack<U: Unit> {
-    unit: U,
+pub(crate) struct ConvStack<S: Simd> {
+    simd: S,
     shapes: Vec<ConvShape>,
     /// Of each task, the maps of all layers but the last: what the forward pass leaves to the backward pass.
-    saved: OnceLock<Vec<SavedActivations<U::Element>>>,
+    saved: OnceLock<Vec<SavedActivations<S::Element>>>,
 }
 
-impl<U: Unit> ConvStack<U> {
+impl<S: Simd> ConvStack<S> {
     /// One that has not passed anything yet; `shapes` has a layer at least.
-    pub(crate) fn new(unit: U, shapes: Vec<ConvShape>) -> Self {
+    pub(crate) fn new(simd: S, shapes: Vec<ConvShape>) -> Self {
         Self {
-            unit,
+            simd,
             shapes,
             saved: OnceLock::new(),
         }
@@ -138,7 +138,7 @@ impl<U: Unit> ConvStack<U> {
         room: &mut [f32],
         then: &(dyn Fn(&[f32], &mut [f32]) + Sync),
     ) {
-        let layers = layers(self.unit, &self.shapes, parameters, false, false);
+        let layers = layers(self.simd, &self.shapes, parameters, false, false);
         let task_len = TASK_IMAGES * self.last().map_len();
         let mut rooms = room.chunks_mut(task_len);
         let tasks: Vec<_> = maps
@@ -150,7 +150,7 @@ impl<U: Unit> ConvStack<U> {
             .enumerate()
             .with_max_len(1)
             .map(|(task, (maps, room))| {
-                let saved = stack_forward(self.unit, &layers, self.task_images(images, task), maps);
+                let saved = stack_forward(self.simd, &layers, self.task_images(images, task), maps);
                 then(maps, room);
                 saved
             })
@@ -171,7 +171,7 @@ impl<U: Unit> ConvStack<U> {
         grad_images: &mut [f32],
     ) -> Vec<f32> {
         let wanted = !grad_images.is_empty();
-        let layers = layers(self.unit, &self.shapes, parameters, true, wanted);
+        let layers = layers(self.simd, &self.shapes, parameters, true, wanted);
         let saved = self.saved.get().expect("a forward pass came before");
         let mut grad_parts = grad_images.chunks_mut(TASK_IMAGES * self.first().image_len());
         let grad_parts: Vec<Option<&mut [f32]>> = saved.iter().map(|_| grad_parts.next()).collect();
@@ -194,7 +194,7 @@ impl<U: Unit> ConvStack<U> {
                     }
                 };
                 stack_backward(
-                    self.unit,
+                    self.simd,
                     &layers,
                     images,
                     saved,
@@ -212,7 +212,7 @@ impl<U: Unit> ConvStack<U> {
     pub(crate) fn flatten(&self, maps: &[f32], flat: &mut [f32]) {
         let (last, len) = (self.last(), self.last().map_len());
         for (maps, flat) in maps.chunks_exact(len).zip(flat.chunks_exact_mut(len)) {
-            transpose(self.unit, maps, last.locations(), last.channels_out, flat);
+            transpose(self.simd, maps, last.locations(), last.channels_out, flat);
         }
     }
 
@@ -221,7 +221,7 @@ impl<U: Unit> ConvStack<U> {
         let (last, len) = (self.last(), self.last().map_len());
         let mut maps = Buffer::new(flat.len());
         for (maps, flat) in maps.chunks_exact_mut(len).zip(flat.chunks_exact(len)) {
-            transpose(self.unit, flat, last.channels_out, last.locations(), maps);
+            transpose(self.simd, flat, last.channels_out, last.locations(), maps);
         }
         maps
     }
@@ -236,7 +236,7 @@ pub(crate) enum GradLayout {
     Flat,
 }
 
-impl<U: Unit> CustomOp2 for ConvStack<U> {
+impl<S: Simd> CustomOp2 for ConvStack<S> {
     fn name(&self) -> &'static str {
         "conv-stack"
     }

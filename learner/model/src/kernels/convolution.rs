@@ -8,12 +8,12 @@
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::images::{Images, Room};
+use crate::kernels::isa::{
+    Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
+};
 use crate::kernels::linear::{relu_gradient, relu_of};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::rounding::write_rows;
-use crate::kernels::units::{
-    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
-};
 
 impl ConvShape {
     /// Scalars in a row of an image.
@@ -72,8 +72,8 @@ pub(crate) struct Convolution<E: Element> {
 
 impl<E: Element> Convolution<E> {
     /// `weight` [out, in, k, k], `bias` [out]; `backward` says whether images will need a gradient.
-    pub(crate) fn new<U: Unit<Element = E>>(
-        unit: U,
+    pub(crate) fn new<S: Simd<Element = E>>(
+        simd: S,
         shape: ConvShape,
         weight: &[f32],
         bias: &[f32],
@@ -91,11 +91,11 @@ impl<E: Element> Convolution<E> {
         let rows = packed.chunks_exact(run * out).filter(|_| backward);
         let backward = rows.map(|row| {
             let matrix = Matrix::new(row, run, out).transposed();
-            Panels::pack(unit, matrix, Threads::Caller)
+            Panels::pack(simd, matrix, Threads::Caller)
         });
         Self {
             shape,
-            forward: Panels::pack(unit, matrix, Threads::Caller),
+            forward: Panels::pack(simd, matrix, Threads::Caller),
             backward: backward.collect(),
             bias: bias.to_vec(),
         }
@@ -103,23 +103,23 @@ impl<E: Element> Convolution<E> {
 }
 
 /// maps = relu(conv(images, weight) + bias), as `maps` [n, out_height, out_width, out] stores them.
-pub(crate) fn forward<U: Unit, M: Element>(
-    unit: U,
-    layer: &Convolution<U::Element>,
-    images: Images<'_, U::Element>,
+pub(crate) fn forward<S: Simd, M: Element>(
+    simd: S,
+    layer: &Convolution<S::Element>,
+    images: Images<'_, S::Element>,
     maps: &mut [M],
 ) {
     let shape = &layer.shape;
     let (out_width, out) = (shape.out_width(), shape.channels_out);
     let (mut room, mut row) = (Room::new(), Buffer::new(out_width * out));
     // Where a run is odd, the last step of the last window reads one scalar further, times 0.
-    let len = (shape.image_len(), shape.run() % U::Element::DEPTH);
+    let len = (shape.image_len(), shape.run() % S::Element::DEPTH);
     for (index, maps) in maps.chunks_exact_mut(shape.map_len()).enumerate() {
-        let image = images.image(unit, index, len, &mut room);
+        let image = images.image(simd, index, len, &mut room);
         let mut lines = maps.chunks_exact_mut(out_width * out);
-        multiply_windows(unit, layer, image, &mut row, |_, row| {
+        multiply_windows(simd, layer, image, &mut row, |_, row| {
             if let Some(maps) = lines.next() {
-                finish_row(unit, row, &layer.bias, images.scale(), maps);
+                finish_row(simd, row, &layer.bias, images.scale(), maps);
             }
         });
     }
@@ -128,29 +128,29 @@ pub(crate) fn forward<U: Unit, M: Element>(
 /// Multiplies the windows of one image by the weight, row by row: `then` gets the number of each row of the map and its sums
 /// [out_width, out], which are in `row`. Where a run is odd, an image may have to have a scalar more.
 #[inline(always)]
-pub(crate) fn multiply_windows<U: Unit>(
-    unit: U,
-    layer: &Convolution<U::Element>,
-    image: &[U::Element],
+pub(crate) fn multiply_windows<S: Simd>(
+    simd: S,
+    layer: &Convolution<S::Element>,
+    image: &[S::Element],
     row: &mut [f32],
     mut then: impl FnMut(usize, &mut [f32]),
 ) {
     let shape = &layer.shape;
     for y in 0..shape.out_height() {
-        for (x, windows) in row_tiles::<U>(shape.out_width(), layer.forward.vecs()) {
+        for (x, windows) in row_tiles::<S>(shape.out_width(), layer.forward.vecs()) {
             let left = Left {
                 values: image,
                 start: y * shape.stride * shape.line() + x * shape.shift(),
                 row_stride: shape.shift(),
-                step: U::Element::DEPTH,
-                steps: shape.run().div_ceil(U::Element::DEPTH),
+                step: S::Element::DEPTH,
+                steps: shape.run().div_ceil(S::Element::DEPTH),
                 run_stride: shape.line(),
                 runs: shape.kernel,
             };
             let to = &mut row[x * shape.channels_out..];
             layer
                 .forward
-                .multiply(unit, windows, left, Mode::Replace, to);
+                .multiply(simd, windows, left, Mode::Replace, to);
         }
         then(y, row);
     }
@@ -158,8 +158,8 @@ pub(crate) fn multiply_windows<U: Unit>(
 
 vectorized! {
     /// relu(scale * row + bias) for each location of `row` [locations, out], there and rounded into `maps`.
-    pub(crate) fn finish_row<U, M>(
-        unit,
+    pub(crate) fn finish_row<S, M>(
+        simd,
         row: &'a mut [f32],
         bias: &'a [f32],
         scale: f32,
@@ -170,7 +170,7 @@ vectorized! {
                 *value = relu_of(*value * scale + bias);
             }
         }
-        M::store(unit, row, maps);
+        M::store(simd, row, maps);
     }
 }
 
@@ -205,16 +205,16 @@ impl<'a> ConvGradients<'a> {
 
 /// The gradients of `forward` for `grad_maps` [n, out_h, out_w, out], one image or more, whose entries count only where `maps` is above
 /// 0, as in PyTorch. The weight's is still to be multiplied by the images' scale.
-pub(crate) fn backward<U: Unit, M: Element>(
-    unit: U,
-    layer: &Convolution<U::Element>,
-    images: Images<'_, U::Element>,
+pub(crate) fn backward<S: Simd, M: Element>(
+    simd: S,
+    layer: &Convolution<S::Element>,
+    images: Images<'_, S::Element>,
     maps: &[M],
     grad_maps: &[f32],
     mut grads: ConvGradients<'_>,
 ) {
     let shape = &layer.shape;
-    let mut masked = Masked::new::<U>(shape);
+    let mut masked = Masked::new::<S>(shape);
     grads.bias.fill(0.0);
     let (len, mut rooms) = (shape.image_len(), [Room::new(), Room::new()]);
     for (image, (maps, grad_maps)) in maps
@@ -222,15 +222,15 @@ pub(crate) fn backward<U: Unit, M: Element>(
         .zip(grad_maps.chunks_exact(shape.map_len()))
         .enumerate()
     {
-        masked.mask(unit, maps, grad_maps, grads.bias);
-        let steps = images.steps(unit, image, (len, shape.shift()), &mut rooms);
+        masked.mask(simd, maps, grad_maps, grads.bias);
+        let steps = images.steps(simd, image, (len, shape.shift()), &mut rooms);
         let mode = if image == 0 { Mode::Replace } else { Mode::Add };
         let (values, panels) = (&masked.values, &mut masked.panels);
-        weight_gradient(unit, shape, steps, values, panels, grads.packed, mode);
+        weight_gradient(simd, shape, steps, values, panels, grads.packed, mode);
         if let Some(grad_images) = &mut grads.images {
-            masked.write_rows(unit, shape.channels_out);
+            masked.write_rows(simd, shape.channels_out);
             let pixels = &mut grad_images[image * len..(image + 1) * len];
-            image_gradient(unit, layer, &masked.rows, pixels);
+            image_gradient(simd, layer, &masked.rows, pixels);
         }
     }
 }
@@ -246,34 +246,34 @@ struct Masked<E: Element> {
 }
 
 impl<E: Element> Masked<E> {
-    fn new<U: Unit<Element = E>>(shape: &ConvShape) -> Self {
+    fn new<S: Simd<Element = E>>(shape: &ConvShape) -> Self {
         let out = shape.channels_out;
         Self {
             values: Buffer::new(shape.map_len()),
             rows: Buffer::new(shape.locations() * out.next_multiple_of(E::DEPTH)),
-            panels: gradient_panels::<U>(shape),
+            panels: gradient_panels::<S>(shape),
         }
     }
 
     /// Masks one image's gradients, and adds them to the bias's.
-    fn mask<U: Unit, M: Element>(
+    fn mask<S: Simd, M: Element>(
         &mut self,
-        unit: U,
+        simd: S,
         maps: &[M],
         grad_maps: &[f32],
         bias: &mut [f32],
     ) {
-        mask(unit, maps, grad_maps, bias, &mut self.values);
+        mask(simd, maps, grad_maps, bias, &mut self.values);
     }
 
-    fn write_rows<U: Unit<Element = E>>(&mut self, unit: U, out: usize) {
-        write_rows(unit, &self.values, out, &mut self.rows);
+    fn write_rows<S: Simd<Element = E>>(&mut self, simd: S, out: usize) {
+        write_rows(simd, &self.values, out, &mut self.rows);
     }
 }
 
 vectorized! {
-    fn mask<U, M>(
-        unit,
+    fn mask<S, M>(
+        simd,
         maps: &'a [M],
         grad_maps: &'a [f32],
         bias: &'a mut [f32],
@@ -293,15 +293,15 @@ vectorized! {
 }
 
 vectorized! {
-    fn write_panels<U>(
-        unit,
+    fn write_panels<S>(
+        simd,
         values: &'a [f32],
         shape: ConvShape,
         width: usize,
-        panels: &'a mut [U::Element],
+        panels: &'a mut [S::Element],
     ) {
-        let (out, out_width, depth) = (shape.channels_out, shape.out_width(), U::Element::DEPTH);
-        let panels = panels.chunks_exact_mut(panel_len::<U::Element>(&shape, width));
+        let (out, out_width, depth) = (shape.channels_out, shape.out_width(), S::Element::DEPTH);
+        let panels = panels.chunks_exact_mut(panel_len::<S::Element>(&shape, width));
         for (index, panel) in panels.enumerate() {
             let cols = index * width..out.min((index + 1) * width);
             let mut steps = panel.chunks_exact_mut(width * depth);
@@ -310,7 +310,7 @@ vectorized! {
                     let second = windows.get(out..).unwrap_or_default();
                     let second = second.get(cols.clone()).unwrap_or_default();
                     if let Some(step) = steps.next() {
-                        U::Element::join(unit, &windows[cols.clone()], second, step);
+                        S::Element::join(simd, &windows[cols.clone()], second, step);
                     }
                 }
             }
@@ -325,31 +325,31 @@ fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
 }
 
 /// Memory for the panels of an image's gradients.
-pub(crate) fn gradient_panels<U: Unit>(shape: &ConvShape) -> Buffer<U::Element> {
-    let width = tile_vecs::<U>(shape.channels_out) * LANES;
+pub(crate) fn gradient_panels<S: Simd>(shape: &ConvShape) -> Buffer<S::Element> {
+    let width = tile_vecs::<S>(shape.channels_out) * LANES;
     let panels = shape.channels_out.div_ceil(width);
-    Buffer::new(panel_len::<U::Element>(shape, width) * panels)
+    Buffer::new(panel_len::<S::Element>(shape, width) * panels)
 }
 
 /// One image's part of the weight's gradient: windows, transposed, times the gradients `grad_map` [locations, out], for which `panels`
 /// is room from [`gradient_panels`]. `image` is from [`Images::steps`].
-pub(crate) fn weight_gradient<U: Unit>(
-    unit: U,
+pub(crate) fn weight_gradient<S: Simd>(
+    simd: S,
     shape: &ConvShape,
-    image: &[U::Element],
+    image: &[S::Element],
     grad_map: &[f32],
-    panels: &mut [U::Element],
+    panels: &mut [S::Element],
     packed: &mut [f32],
     mode: Mode,
 ) {
-    let (depth, out) = (U::Element::DEPTH, shape.channels_out);
-    let vecs = tile_vecs::<U>(out);
+    let (depth, out) = (S::Element::DEPTH, shape.channels_out);
+    let vecs = tile_vecs::<S>(out);
     let width = vecs * LANES;
-    write_panels(unit, grad_map, *shape, width, panels);
+    write_panels(simd, grad_map, *shape, width, panels);
     let steps = shape.out_width().div_ceil(depth);
     for kernel_y in 0..shape.kernel {
         let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
-        for (first, count) in row_tiles::<U>(shape.run(), vecs) {
+        for (first, count) in row_tiles::<S>(shape.run(), vecs) {
             let left = Left {
                 values: image,
                 start: (kernel_y * shape.line() + first) * depth,
@@ -359,7 +359,7 @@ pub(crate) fn weight_gradient<U: Unit>(
                 run_stride: shape.stride * shape.line() * depth,
                 runs: shape.out_height(),
             };
-            let panels = panels.chunks_exact(panel_len::<U::Element>(shape, width));
+            let panels = panels.chunks_exact(panel_len::<S::Element>(shape, width));
             for (index, panel) in panels.enumerate() {
                 let col = index * width;
                 let columns = Columns {
@@ -369,40 +369,40 @@ pub(crate) fn weight_gradient<U: Unit>(
                     vecs,
                     mode,
                 };
-                multiply_tile(unit, count, left, panel, columns);
+                multiply_tile(simd, count, left, panel, columns);
             }
         }
     }
 }
 
 /// Adds the gradient of one image: masked gradients times the weight, each to the window it belongs to.
-fn image_gradient<U: Unit>(
-    unit: U,
-    layer: &Convolution<U::Element>,
-    grad_rows: &[U::Element],
+fn image_gradient<S: Simd>(
+    simd: S,
+    layer: &Convolution<S::Element>,
+    grad_rows: &[S::Element],
     image: &mut [f32],
 ) {
     let shape = &layer.shape;
-    let stride = shape.channels_out.next_multiple_of(U::Element::DEPTH);
+    let stride = shape.channels_out.next_multiple_of(S::Element::DEPTH);
     let left = Left {
         values: grad_rows,
         start: 0,
         row_stride: stride,
-        step: U::Element::DEPTH,
-        steps: stride / U::Element::DEPTH,
+        step: S::Element::DEPTH,
+        steps: stride / S::Element::DEPTH,
         run_stride: 0,
         runs: 1,
     };
     for y in 0..shape.out_height() {
         for (kernel_y, panels) in layer.backward.iter().enumerate() {
             let line = (y * shape.stride + kernel_y) * shape.line();
-            for (x, windows) in row_tiles::<U>(shape.out_width(), panels.vecs()) {
+            for (x, windows) in row_tiles::<S>(shape.out_width(), panels.vecs()) {
                 let left = Left {
                     start: (y * shape.out_width() + x) * stride,
                     ..left
                 };
                 let out = &mut image[line + x * shape.shift()..];
-                panels.multiply_apart(unit, windows, left, Mode::Add, out, shape.shift());
+                panels.multiply_apart(simd, windows, left, Mode::Add, out, shape.shift());
             }
         }
     }

@@ -2,24 +2,24 @@
 //! It has no gradient; `linear` is the layer with one.
 
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::{Element, Left, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_of;
 use crate::kernels::panels::{Matrix, Panels, Threads};
-use crate::kernels::units::{Element, Left, Mode, Unit, vectorized};
 
-pub(crate) struct Dense<U: Unit> {
+pub(crate) struct Dense<S: Simd> {
     /// Of [in, out].
-    weight: Panels<U::Element>,
+    weight: Panels<S::Element>,
     bias: Vec<f32>,
     inputs: usize,
 }
 
-impl<U: Unit> Dense<U> {
+impl<S: Simd> Dense<S> {
     /// `weight` [in, out], `bias` [out].
-    pub(crate) fn new(unit: U, weight: &[f32], bias: Vec<f32>) -> Self {
+    pub(crate) fn new(simd: S, weight: &[f32], bias: Vec<f32>) -> Self {
         let inputs = weight.len() / bias.len();
         let weight = Matrix::new(weight, inputs, bias.len());
         Self {
-            weight: Panels::pack(unit, weight, Threads::Caller),
+            weight: Panels::pack(simd, weight, Threads::Caller),
             bias,
             inputs,
         }
@@ -27,7 +27,7 @@ impl<U: Unit> Dense<U> {
 
     /// A layer of `weight` [out, in] and `bias` [out] on maps of `channels`, whose inputs are row, column, channel here, and channel, row,
     /// column in PyTorch's weight.
-    pub(crate) fn of_maps(unit: U, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
+    pub(crate) fn of_maps(simd: S, weight: &[f32], bias: Vec<f32>, channels: usize) -> Self {
         let inputs = weight.len() / bias.len();
         let locations = inputs / channels;
         let mut inputs_first = Vec::with_capacity(weight.len());
@@ -35,7 +35,7 @@ impl<U: Unit> Dense<U> {
             let column = input % channels * locations + input / channels;
             inputs_first.extend(weight[column..].iter().step_by(inputs));
         }
-        Self::new(unit, &inputs_first, bias)
+        Self::new(simd, &inputs_first, bias)
     }
 
     pub(crate) const fn inputs(&self) -> usize {
@@ -47,13 +47,13 @@ impl<U: Unit> Dense<U> {
     }
 
     /// [count, out] of `x` [count, in], whose rows begin at whole steps.
-    pub(crate) fn forward(&self, unit: U, x: &[U::Element], count: usize) -> Buffer<f32> {
+    pub(crate) fn forward(&self, simd: S, x: &[S::Element], count: usize) -> Buffer<f32> {
         let outputs = self.bias.len();
         let mut y = Buffer::new(count * outputs);
         for row in y.chunks_exact_mut(outputs) {
             row.copy_from_slice(&self.bias);
         }
-        let depth = U::Element::DEPTH;
+        let depth = S::Element::DEPTH;
         let row_stride = self.inputs.next_multiple_of(depth);
         let left = Left {
             values: x,
@@ -65,7 +65,7 @@ impl<U: Unit> Dense<U> {
             runs: 1,
         };
         self.weight
-            .multiply_rows(unit, count, left, Mode::Add, &mut y, outputs);
+            .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y
     }
 }
@@ -86,12 +86,12 @@ pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> 
 
 vectorized! {
     /// relu of `hidden` [rows, cols] as rows of whole steps.
-    pub(crate) fn activate<U>(unit, hidden: &'a [f32], cols: usize, active: &'a mut [U::Element]) {
-        let rows = active.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
+    pub(crate) fn activate<S>(simd, hidden: &'a [f32], cols: usize, active: &'a mut [S::Element]) {
+        let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
         for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
-            row.fill(U::Element::default());
+            row.fill(S::Element::default());
             for (value, &hidden) in row.iter_mut().zip(hidden) {
-                *value = U::Element::of(relu_of(hidden));
+                *value = S::Element::of(relu_of(hidden));
             }
         }
     }

@@ -7,11 +7,11 @@ use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::Mode;
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
 use crate::kernels::tensors::{floats, values_of};
-use crate::kernels::units::Mode;
 
 /// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.
 ///
@@ -19,8 +19,8 @@ use crate::kernels::units::Mode;
 /// the same bits whatever the number of threads.
 pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     let sizes = |vectors: &Tensor| match *vectors.dims() {
-        [rows, rkhs] => Some((rows, 1, rkhs)),
-        [rows, locations, rkhs] => Some((rows, locations, rkhs)),
+        [rows, embedding_dim] => Some((rows, 1, embedding_dim)),
+        [rows, locations, embedding_dim] => Some((rows, locations, embedding_dim)),
         _ => None,
     };
     let (Some(anchors), Some(candidates)) = (sizes(psi), sizes(phi)) else {
@@ -37,7 +37,7 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     }
     let op = Dots {
         rows: anchors.0,
-        rkhs: anchors.2,
+        embedding_dim: anchors.2,
         locations,
         psi_locations: anchors.1,
         phi_locations: candidates.1,
@@ -47,7 +47,7 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
 
 struct Dots {
     rows: usize,
-    rkhs: usize,
+    embedding_dim: usize,
     locations: usize,
     psi_locations: usize,
     phi_locations: usize,
@@ -65,10 +65,10 @@ impl Dots {
         if locations == 1 {
             return Located::InPlace(vectors);
         }
-        let mut copied = Buffer::new(self.rows * self.rkhs);
-        let rows = vectors.chunks_exact(locations * self.rkhs);
-        for (to, row) in copied.chunks_exact_mut(self.rkhs).zip(rows) {
-            to.copy_from_slice(&row[at * self.rkhs..][..self.rkhs]);
+        let mut copied = Buffer::new(self.rows * self.embedding_dim);
+        let rows = vectors.chunks_exact(locations * self.embedding_dim);
+        for (to, row) in copied.chunks_exact_mut(self.embedding_dim).zip(rows) {
+            to.copy_from_slice(&row[at * self.embedding_dim..][..self.embedding_dim]);
         }
         Located::Copied(copied)
     }
@@ -97,19 +97,20 @@ impl Dots {
                 let grad = Matrix::new(grad, self.rows, self.rows);
                 let grad = if transposed { grad.transposed() } else { grad };
                 let others = self.located(others, others_locations, at);
-                let others = Matrix::new(others.values(), self.rows, self.rkhs);
-                let mut part = Buffer::new(self.rows * self.rkhs);
+                let others = Matrix::new(others.values(), self.rows, self.embedding_dim);
+                let mut part = Buffer::new(self.rows * self.embedding_dim);
                 self.product(grad, others).write(&mut part, Mode::Replace);
                 part
             })
             .collect();
-        let mut sum = vec![0.0; self.rows * own_locations * self.rkhs];
-        sum.par_chunks_mut(own_locations * self.rkhs)
+        let mut sum = vec![0.0; self.rows * own_locations * self.embedding_dim];
+        sum.par_chunks_mut(own_locations * self.embedding_dim)
             .enumerate()
             .for_each(|(row, sum)| {
                 for (at, part) in parts.iter().enumerate() {
-                    let part = &part[row * self.rkhs..][..self.rkhs];
-                    let to = &mut sum[at % own_locations * self.rkhs..][..self.rkhs];
+                    let part = &part[row * self.embedding_dim..][..self.embedding_dim];
+                    let to =
+                        &mut sum[at % own_locations * self.embedding_dim..][..self.embedding_dim];
                     for (to, part) in to.iter_mut().zip(part) {
                         *to += part;
                     }
@@ -141,15 +142,15 @@ impl CustomOp2 for Dots {
         phi_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let (psi, phi) = (floats(psi, psi_layout)?, floats(phi, phi_layout)?);
-        let (rows, rkhs) = (self.rows, self.rkhs);
+        let (rows, embedding_dim) = (self.rows, self.embedding_dim);
         let mut dots = vec![0.0; self.locations * rows * rows];
         dots.par_chunks_exact_mut(rows * rows)
             .enumerate()
             .for_each(|(at, dots)| {
                 let psi = self.located(psi, self.psi_locations, at);
                 let phi = self.located(phi, self.phi_locations, at);
-                let psi = Matrix::new(psi.values(), rows, rkhs);
-                let phi = Matrix::new(phi.values(), rows, rkhs).transposed();
+                let psi = Matrix::new(psi.values(), rows, embedding_dim);
+                let phi = Matrix::new(phi.values(), rows, embedding_dim).transposed();
                 self.product(psi, phi).write(dots, Mode::Replace);
             });
         Ok((CpuStorage::F32(dots), (self.locations, rows, rows).into()))

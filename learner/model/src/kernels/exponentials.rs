@@ -1,8 +1,8 @@
 //! Exponentials of many numbers at once, in f64: the soft clip of scores with its slope, and the weights of a softmax.
 //! It sums nothing, so that what is summed has the same bits on every processor.
 
+use crate::kernels::isa::{AnySimd, vectorized, with_simd};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{AnyUnit, on_unit, vectorized};
 
 /// Scores `c tanh(x / c)` of x = `scale` * dot, and their slopes by the dot.
 ///
@@ -18,18 +18,18 @@ pub fn soft_clip(dots: &[f32], scale: f64, bound: f64, scores: &mut [f64], slope
         dots.len() == scores.len() && dots.len() == slopes.len(),
         "a score and a slope for each dot product"
     );
-    on_unit!(AnyUnit::of(Precision::F32), unit => clip(unit, dots, scale, bound, scores, slopes));
+    with_simd!(AnySimd::of(Precision::F32), simd => clip(simd, dots, scale, bound, scores, slopes));
 }
 
 /// Puts `exp(value - max)` in the place of each value, none of which is above `max`: right to a relative 1e-15 beside the rounding
 /// of the difference; 0 below 1e-307; NaN of a NaN.
 pub fn exp_below(values: &mut [f64], max: f64) {
-    on_unit!(AnyUnit::of(Precision::F32), unit => exp_of_differences(unit, values, max));
+    with_simd!(AnySimd::of(Precision::F32), simd => exp_of_differences(simd, values, max));
 }
 
 vectorized! {
-    fn clip<U>(
-        unit,
+    fn clip<S>(
+        simd,
         dots: &'a [f32],
         scale: f64,
         bound: f64,
@@ -47,7 +47,7 @@ vectorized! {
 }
 
 vectorized! {
-    fn exp_of_differences<U>(unit, values: &'a mut [f64], max: f64) {
+    fn exp_of_differences<S>(simd, values: &'a mut [f64], max: f64) {
         for value in values {
             *value = exp_pair(*value - max).0;
         }

@@ -11,11 +11,11 @@ use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::Mode;
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Biases, Product};
 use crate::kernels::tensors::{floats, values_of};
-use crate::kernels::units::Mode;
 
 /// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
 ///

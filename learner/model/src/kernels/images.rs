@@ -1,8 +1,8 @@
 //! Images and maps as convolutions take them: as they are stored, and one by one as operands of products.
 
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::{Element, Simd};
 use crate::kernels::rounding::{store, store_bytes, store_steps_of, store_steps_of_bytes};
-use crate::kernels::units::{Element, Unit};
 
 /// Images [n, height, width, channels_in], as they are stored.
 #[derive(Clone, Copy)]
@@ -48,9 +48,9 @@ impl<E: Element> Images<'_, E> {
     /// The image with this index as an operand, `len` scalars and `padding` zeros after them; `room` is for those that have to be made.
     ///
     /// What lies behind an image in memory is the next one, which is not padding: 0 times a NaN in it is NaN.
-    pub(crate) fn image<'r, U: Unit<Element = E>>(
+    pub(crate) fn image<'r, S: Simd<Element = E>>(
         &'r self,
-        unit: U,
+        simd: S,
         index: usize,
         (len, padding): (usize, usize),
         room: &'r mut Room<E>,
@@ -64,17 +64,17 @@ impl<E: Element> Images<'_, E> {
         let image = &mut operand[..len];
         match self {
             Self::Maps(maps) => image.copy_from_slice(&maps[range]),
-            Self::Pixels(Pixels::Bytes(bytes)) => store_bytes(unit, &bytes[range], image),
-            Self::Pixels(Pixels::Floats(floats)) => store(unit, &floats[range], image),
+            Self::Pixels(Pixels::Bytes(bytes)) => store_bytes(simd, &bytes[range], image),
+            Self::Pixels(Pixels::Floats(floats)) => store(simd, &floats[range], image),
         }
         operand
     }
 
     /// The image with this index as the operand of a sum over windows: each of its `len` scalars with the one `shift` further if
     /// steps are pairs, or with 0 where the image ends before.
-    pub(crate) fn steps<'r, U: Unit<Element = E>>(
+    pub(crate) fn steps<'r, S: Simd<Element = E>>(
         &'r self,
-        unit: U,
+        simd: S,
         index: usize,
         (len, shift): (usize, usize),
         [room, single]: &'r mut [Room<E>; 2],
@@ -82,15 +82,15 @@ impl<E: Element> Images<'_, E> {
         let range = index * len..(index + 1) * len;
         if let Self::Pixels(Pixels::Bytes(bytes)) = self {
             let steps = room.of(len * E::DEPTH);
-            store_steps_of_bytes(unit, &bytes[range], shift, steps);
+            store_steps_of_bytes(simd, &bytes[range], shift, steps);
             return steps;
         }
-        let image = self.image(unit, index, (len, 0), single);
+        let image = self.image(simd, index, (len, 0), single);
         if E::DEPTH == 1 {
             return image;
         }
         let steps = room.of(len * E::DEPTH);
-        store_steps_of(unit, image, shift, steps);
+        store_steps_of(simd, image, shift, steps);
         steps
     }
 }

@@ -10,12 +10,12 @@ use crate::geometry::{STAGE_CONVOLUTIONS, stages};
 use crate::kernels::candle::BorderedTensors;
 use crate::kernels::conv::pixels;
 use crate::kernels::images::Pixels;
+use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::linear::add_in_order;
 use crate::kernels::precision::Precision;
 use crate::kernels::stack::{parameters_len, unpacked};
 use crate::kernels::stages::{Saved, Stages};
 use crate::kernels::tensors::{cpu, floats, values_of};
-use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 8;
@@ -49,9 +49,9 @@ pub(crate) fn residual_stages(
     let parameters = layers.iter().flat_map(|&(weight, bias)| [weight, bias]);
     let parameters: Result<Vec<_>> = parameters.map(Tensor::flatten_all).collect();
     let (images, parameters) = (images.contiguous()?, Tensor::cat(&parameters?, 0)?);
-    on_unit!(AnyUnit::of(precision), unit => {
+    with_simd!(AnySimd::of(precision), simd => {
         let op = ResidualStages {
-            unit,
+            simd,
             input,
             widths,
             saved: OnceLock::new(),
@@ -60,17 +60,17 @@ pub(crate) fn residual_stages(
     })
 }
 
-struct ResidualStages<U: Unit> {
-    unit: U,
+struct ResidualStages<S: Simd> {
+    simd: S,
     input: (usize, usize, usize),
     widths: Vec<usize>,
     /// Of each task, what the forward pass leaves to the backward pass.
-    saved: OnceLock<Vec<Saved<U::Element>>>,
+    saved: OnceLock<Vec<Saved<S::Element>>>,
 }
 
-impl<U: Unit> ResidualStages<U> {
-    fn stages(&self, parameters: &[f32], backward: bool) -> Stages<U> {
-        Stages::new(self.unit, self.input, &self.widths, parameters, backward)
+impl<S: Simd> ResidualStages<S> {
+    fn stages(&self, parameters: &[f32], backward: bool) -> Stages<S> {
+        Stages::new(self.simd, self.input, &self.widths, parameters, backward)
     }
 }
 
@@ -81,7 +81,7 @@ fn bytes<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [u8]> {
     }
 }
 
-impl<U: Unit> CustomOp2 for ResidualStages<U> {
+impl<S: Simd> CustomOp2 for ResidualStages<S> {
     fn name(&self) -> &'static str {
         "residual-stages"
     }

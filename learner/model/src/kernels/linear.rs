@@ -12,12 +12,12 @@ use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::{AnySimd, Mode, with_simd};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Biases, Product};
 use crate::kernels::rounding::transpose;
 use crate::kernels::tensors::{floats, values_of};
-use crate::kernels::units::{AnyUnit, Mode, on_unit};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;
@@ -70,7 +70,7 @@ fn apply(
         w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
     let rows = x.elem_count() / inputs.max(1);
     let groups = b.elem_count() / outputs.max(1);
-    if !fits || groups == 0 || rows % groups != 0 {
+    if !fits || groups == 0 || !rows.is_multiple_of(groups) {
         bail!(
             "linear layer of x {:?} with weight {:?} and bias {:?}",
             x.shape(),
@@ -193,12 +193,12 @@ impl CustomOp3 for Linear {
 /// Transposes every image [rows, cols] of a batch.
 fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
     // Nothing is rounded.
-    on_unit!(AnyUnit::of(Precision::F32), unit => {
+    with_simd!(AnySimd::of(Precision::F32), simd => {
         result
             .par_chunks_mut(rows * cols)
             .zip(values.par_chunks(rows * cols))
             .with_min_len(16)
-            .for_each(|(result, values)| transpose(unit, values, rows, cols, result));
+            .for_each(|(result, values)| transpose(simd, values, rows, cols, result));
     });
 }
 

@@ -3,7 +3,7 @@
 //! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
 //! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does, with
 //! [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of [`panels`] and in
-//! tiles for a [`units`] unit, an instruction set with the type that it multiplies; all unsafe code of the crate is there.
+//! tiles for an instruction set of [`isa`] with the type that it multiplies; all unsafe code of the crate is there.
 //! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`tensors`] reads candle's, [`precision`] is the setting. [`candle`] needs none of them.
 
 pub(crate) mod bordered;
@@ -17,6 +17,7 @@ pub(crate) mod exponentials;
 pub(crate) mod grouped;
 pub(crate) mod images;
 pub(crate) mod impala;
+pub(crate) mod isa;
 pub(crate) mod linear;
 pub(crate) mod panels;
 pub(crate) mod pool;
@@ -29,4 +30,3 @@ pub(crate) mod stack;
 pub(crate) mod stages;
 pub(crate) mod tensors;
 pub(crate) mod torso;
-pub(crate) mod units;

@@ -4,10 +4,10 @@
 use rayon::prelude::*;
 
 use crate::kernels::buffer::Buffer;
-use crate::kernels::rounding::write_rows;
-use crate::kernels::units::{
-    Columns, Element, LANES, Left, Mode, Unit, multiply_tile, row_tiles, tile_vecs, vectorized,
+use crate::kernels::isa::{
+    Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
+use crate::kernels::rounding::write_rows;
 
 /// A matrix laid over a slice: its rows are runs of it, or its columns if it is transposed.
 #[derive(Clone, Copy)]
@@ -88,13 +88,13 @@ pub(crate) struct Panels<E: Element> {
 
 impl<E: Element> Panels<E> {
     /// The panels of `b` [k, n].
-    pub(crate) fn pack<U: Unit<Element = E>>(unit: U, b: Matrix<'_>, threads: Threads) -> Self {
-        let vecs = tile_vecs::<U>(b.cols);
+    pub(crate) fn pack<S: Simd<Element = E>>(simd: S, b: Matrix<'_>, threads: Threads) -> Self {
+        let vecs = tile_vecs::<S>(b.cols);
         let (steps, width) = (b.rows.div_ceil(E::DEPTH), vecs * LANES);
         let panel_len = steps * width * E::DEPTH;
         let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
         let pack = |panel: usize, values: &mut [E]| {
-            pack_panel(unit, b, panel * width, width, values);
+            pack_panel(simd, b, panel * width, width, values);
         };
         match threads {
             Threads::Caller => {
@@ -122,23 +122,23 @@ impl<E: Element> Panels<E> {
     }
 
     /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows are this operand's columns long.
-    pub(crate) fn multiply<U: Unit<Element = E>>(
+    pub(crate) fn multiply<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         rows: usize,
         left: Left<'_, E>,
         mode: Mode,
         out: &mut [f32],
     ) {
-        self.multiply_apart(unit, rows, left, mode, out, self.cols);
+        self.multiply_apart(simd, rows, left, mode, out, self.cols);
     }
 
     /// Multiplies any number of rows of one run into `out`, whose rows begin `stride` scalars apart.
     ///
     /// A block of a panel stays in the first cache while all rows pass it.
-    pub(crate) fn multiply_rows<U: Unit<Element = E>>(
+    pub(crate) fn multiply_rows<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         rows: usize,
         left: Left<'_, E>,
         mode: Mode,
@@ -154,7 +154,7 @@ impl<E: Element> Panels<E> {
                 let mode = if block == 0 { mode } else { Mode::Add };
                 let start = left.start + block * STEPS_IN_CACHE * left.step;
                 let steps = panel.len() / (width * E::DEPTH);
-                for (row, count) in row_tiles::<U>(rows, self.vecs) {
+                for (row, count) in row_tiles::<S>(rows, self.vecs) {
                     let left = Left {
                         start: start + row * left.row_stride,
                         steps,
@@ -167,16 +167,16 @@ impl<E: Element> Panels<E> {
                         vecs: self.vecs,
                         mode,
                     };
-                    multiply_tile(unit, count, left, panel, columns);
+                    multiply_tile(simd, count, left, panel, columns);
                 }
             }
         }
     }
 
     /// [`Panels::multiply`] into rows of `out` that begin `stride` scalars apart.
-    pub(crate) fn multiply_apart<U: Unit<Element = E>>(
+    pub(crate) fn multiply_apart<S: Simd<Element = E>>(
         &self,
-        unit: U,
+        simd: S,
         rows: usize,
         left: Left<'_, E>,
         mode: Mode,
@@ -188,7 +188,7 @@ impl<E: Element> Panels<E> {
         for (index, panel) in panels.enumerate() {
             let first = index * width;
             multiply_tile(
-                unit,
+                simd,
                 rows,
                 left,
                 panel,
@@ -206,38 +206,38 @@ impl<E: Element> Panels<E> {
 
 vectorized! {
     /// Packs columns `first..` of `b` as one panel of this width.
-    fn pack_panel<U>(
-        unit,
+    fn pack_panel<S>(
+        simd,
         b: Matrix<'a>,
         first: usize,
         width: usize,
-        panel: &'a mut [U::Element],
+        panel: &'a mut [S::Element],
     ) {
         if b.transposed {
-            return pack_transposed(unit, b, first, width, panel);
+            return pack_transposed(simd, b, first, width, panel);
         }
-        let (cols, depth) = (width.min(b.cols - first), U::Element::DEPTH);
+        let (cols, depth) = (width.min(b.cols - first), S::Element::DEPTH);
         let steps = panel.chunks_exact_mut(width * depth);
         for (step, rows) in steps.zip(b.data.chunks(b.stride * depth)) {
             let part = |row: usize| {
                 let row = rows.get(row * b.stride..).unwrap_or_default();
                 row.get(first..first + cols).unwrap_or_default()
             };
-            U::Element::join(unit, part(0), part(1), step);
+            S::Element::join(simd, part(0), part(1), step);
         }
     }
 }
 
 /// [`pack_panel`] of a matrix whose columns are its runs in memory: square blocks of steps are transposed in registers.
 #[inline(always)]
-fn pack_transposed<U: Unit>(
-    unit: U,
+fn pack_transposed<S: Simd>(
+    simd: S,
     b: Matrix<'_>,
     first: usize,
     width: usize,
-    panel: &mut [U::Element],
+    panel: &mut [S::Element],
 ) {
-    let (k, depth) = (b.rows, U::Element::DEPTH);
+    let (k, depth) = (b.rows, S::Element::DEPTH);
     let (steps, cols) = (k.div_ceil(depth), width.min(b.cols - first));
     let columns = b.data[first * b.stride..].chunks(b.stride).take(cols);
     for step in (0..steps).step_by(LANES) {
@@ -246,13 +246,13 @@ fn pack_transposed<U: Unit>(
             let mut block = [[0; LANES]; LANES];
             let block_columns = columns.clone().skip(col).take(LANES);
             for (block, column) in block.iter_mut().zip(block_columns) {
-                U::Element::steps(unit, &column[run.clone()], block);
+                S::Element::steps(simd, &column[run.clone()], block);
             }
-            unit.transpose(&mut block);
+            simd.transpose(&mut block);
             for (at, block) in block.iter().enumerate().take(steps - step) {
                 let to = &mut panel[((step + at) * width + col) * depth..][..LANES * depth];
                 for (to, &bits) in to.chunks_exact_mut(depth).zip(block) {
-                    U::Element::unpack(bits, to);
+                    S::Element::unpack(bits, to);
                 }
             }
         }
@@ -277,7 +277,7 @@ impl<'a, E: Element> Rows<'a, E> {
     ///
     /// # Panics
     /// If the runs of `a` do not follow each other.
-    pub(crate) fn pack<U: Unit<Element = E>>(unit: U, a: Matrix<'a>, threads: Threads) -> Self {
+    pub(crate) fn pack<S: Simd<Element = E>>(simd: S, a: Matrix<'a>, threads: Threads) -> Self {
         assert!(
             a.data.len() == a.rows * a.cols,
             "some columns of a matrix as a left operand"
@@ -293,9 +293,9 @@ impl<'a, E: Element> Rows<'a, E> {
         } else {
             let mut values = Buffer::new(m * steps * depth);
             if a.transposed {
-                pack_steps(unit, a.transposed(), &mut values, threads);
+                pack_steps(simd, a.transposed(), &mut values, threads);
             } else {
-                pack_rows(unit, a.data, k, row_stride, &mut values, threads);
+                pack_rows(simd, a.data, k, row_stride, &mut values, threads);
             }
             Operand::Packed(values)
         };
@@ -327,17 +327,17 @@ impl<'a, E: Element> Rows<'a, E> {
 const TASK_LEN: usize = 1 << 15;
 
 /// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
-fn pack_rows<U: Unit>(
-    unit: U,
+fn pack_rows<S: Simd>(
+    simd: S,
     data: &[f32],
     cols: usize,
     stride: usize,
-    values: &mut [U::Element],
+    values: &mut [S::Element],
     threads: Threads,
 ) {
     let rows = (TASK_LEN / stride).max(1);
-    let pack = |values: &mut [U::Element], data: &[f32]| {
-        write_rows(unit, data, cols, values);
+    let pack = |values: &mut [S::Element], data: &[f32]| {
+        write_rows(simd, data, cols, values);
     };
     match threads {
         Threads::Caller => pack(values, data),
@@ -349,12 +349,12 @@ fn pack_rows<U: Unit>(
 }
 
 /// Packs all columns of `b` as one panel, a share of the steps on each thread.
-fn pack_steps<U: Unit>(unit: U, b: Matrix<'_>, values: &mut [U::Element], threads: Threads) {
-    let (depth, cols) = (U::Element::DEPTH, b.cols);
+fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], threads: Threads) {
+    let (depth, cols) = (S::Element::DEPTH, b.cols);
     let steps = (TASK_LEN / (cols * depth)).max(1);
-    let pack = |values: &mut [U::Element], data: &[f32]| {
+    let pack = |values: &mut [S::Element], data: &[f32]| {
         let part = Matrix::new(data, data.len() / cols, cols);
-        pack_panel(unit, part, 0, cols, values);
+        pack_panel(simd, part, 0, cols, values);
     };
     match threads {
         Threads::Caller => pack(values, b.data),

@@ -4,7 +4,7 @@
 //! What lies beyond the maps is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
 
 use crate::geometry::pooled;
-use crate::kernels::units::vectorized;
+use crate::kernels::isa::vectorized;
 
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
@@ -44,8 +44,8 @@ const BLOCK: usize = 8;
 
 vectorized! {
     /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
-    pub(crate) fn pool<U>(
-        unit,
+    pub(crate) fn pool<S>(
+        simd,
         maps: &'a [f32],
         size: Size,
         largest: &'a mut [f32],
@@ -91,8 +91,8 @@ fn pool_block<const N: usize>(
 
 vectorized! {
     /// The inverse of [`pool`] for gradients: adds that of each window, of `grads`, to the pixel it was taken from, in `grad_maps`.
-    pub(crate) fn unpool<U>(
-        unit,
+    pub(crate) fn unpool<S>(
+        simd,
         grads: &'a [f32],
         size: Size,
         taken: &'a [u8],
@@ -137,24 +137,24 @@ fn unpool_block<const N: usize>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::isa::{AnySimd, with_simd};
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{AnyUnit, on_unit};
 
-    /// On every unit the largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
+    /// On every instruction set the largest, and the gradients of the maps where those of the windows are 1, 2, 3 and so on.
     fn pooled_and_back(maps: &[f32], size: Size) -> Vec<(Vec<f32>, Vec<f32>)> {
         let (rows, cols, channels) = pooled(size);
         let len = rows * cols * channels;
         let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
-        let of_unit = |unit| {
+        let of_unit = |simd| {
             let (mut largest, mut taken) = (vec![f32::NAN; len], vec![u8::MAX; len]);
             let mut grad_maps = vec![0.0; maps.len()];
-            on_unit!(unit, unit => {
-                pool(unit, maps, size, &mut largest, &mut taken);
-                unpool(unit, &grads, size, &taken, &mut grad_maps);
+            with_simd!(simd, simd => {
+                pool(simd, maps, size, &mut largest, &mut taken);
+                unpool(simd, &grads, size, &taken, &mut grad_maps);
             });
             (largest, grad_maps)
         };
-        AnyUnit::every(Precision::F32)
+        AnySimd::every(Precision::F32)
             .into_iter()
             .map(of_unit)
             .collect()

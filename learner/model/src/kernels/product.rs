@@ -3,9 +3,9 @@
 
 use rayon::prelude::*;
 
+use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
 use crate::kernels::panels::{Matrix, Panels, Rows, Threads};
 use crate::kernels::precision::Precision;
-use crate::kernels::units::{AnyUnit, Element, Mode, Unit, on_unit};
 
 /// Rows of the output that one task computes. Fixed, so that a product's bits do not depend on the number of threads.
 const TASK_ROWS: usize = 32;
@@ -127,10 +127,10 @@ impl<'a> Product<'a> {
 
     pub(crate) fn to_vec(self) -> Vec<f32> {
         let len = self.a.rows * self.b.cols;
-        on_unit!(AnyUnit::of(self.precision), unit => {
+        with_simd!(AnySimd::of(self.precision), simd => {
             // Clearing memory takes a core about as long as laying out the operands.
-            let (mut out, operands) = self.both(|| vec![0.0; len], || Operands::new(unit, self));
-            self.multiply(unit, operands, &mut out, self.b.cols, Mode::Replace);
+            let (mut out, operands) = self.both(|| vec![0.0; len], || Operands::new(simd, self));
+            self.multiply(simd, operands, &mut out, self.b.cols, Mode::Replace);
             out
         })
     }
@@ -147,8 +147,8 @@ impl<'a> Product<'a> {
     }
 
     fn run(self, out: &mut [f32], stride: usize, mode: Mode) {
-        on_unit!(AnyUnit::of(self.precision), unit => {
-            self.multiply(unit, Operands::new(unit, self), out, stride, mode);
+        with_simd!(AnySimd::of(self.precision), simd => {
+            self.multiply(simd, Operands::new(simd, self), out, stride, mode);
         });
     }
 
@@ -169,10 +169,10 @@ impl<'a> Product<'a> {
         }
     }
 
-    fn multiply<U: Unit>(
+    fn multiply<S: Simd>(
         self,
-        unit: U,
-        operands: Option<Operands<'a, U::Element>>,
+        simd: S,
+        operands: Option<Operands<'a, S::Element>>,
         out: &mut [f32],
         stride: usize,
         mode: Mode,
@@ -191,7 +191,7 @@ impl<'a> Product<'a> {
             match &operands {
                 Some(Operands { panels, rows }) => {
                     let count = out.len().div_ceil(stride);
-                    panels.multiply_rows(unit, count, rows.left(first), mode, out, stride);
+                    panels.multiply_rows(simd, count, rows.left(first), mode, out, stride);
                 }
                 None if mode == Mode::Replace => out.fill(0.0),
                 None => {}
@@ -211,7 +211,7 @@ impl<'a> Product<'a> {
     }
 }
 
-/// A product's operands as a unit reads them.
+/// A product's operands as an instruction set reads them.
 struct Operands<'a, E: Element> {
     panels: Panels<E>,
     rows: Rows<'a, E>,
@@ -219,7 +219,7 @@ struct Operands<'a, E: Element> {
 
 impl<'a, E: Element> Operands<'a, E> {
     /// Those of `product`, if there is anything to sum.
-    fn new<U: Unit<Element = E>>(unit: U, product: Product<'a>) -> Option<Self> {
+    fn new<S: Simd<Element = E>>(simd: S, product: Product<'a>) -> Option<Self> {
         let (a, b) = (product.a, product.b);
         if a.rows * a.cols * b.cols == 0 {
             return None;
@@ -229,8 +229,8 @@ impl<'a, E: Element> Operands<'a, E> {
             false => Threads::Caller,
         };
         let (panels, rows) = product.both(
-            || Panels::pack(unit, b, threads),
-            || Rows::pack(unit, a, threads),
+            || Panels::pack(simd, b, threads),
+            || Rows::pack(simd, a, threads),
         );
         Some(Self { panels, rows })
     }

@@ -10,12 +10,12 @@ use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 
 use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
+use crate::kernels::isa::Mode;
 use crate::kernels::linear::{add_to, group_sums, relu_gradient, relu_in_place};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Biases, Product};
 use crate::kernels::tensors::{floats, values_of};
-use crate::kernels::units::Mode;
 
 /// The parameters of a block on x, or on x with `joined` behind it.
 #[derive(Clone, Debug)]

@@ -1,61 +1,61 @@
 //! From f32 and bytes to the operands of products, element by element; images turned.
 
-use crate::kernels::units::{Element, LANES, vectorized};
+use crate::kernels::isa::{Element, LANES, vectorized};
 
 vectorized! {
     /// Stores pixels in the first of `values`.
-    pub(crate) fn store_bytes<U>(unit, bytes: &'a [u8], values: &'a mut [U::Element]) {
-        U::Element::store_bytes(unit, bytes, values);
+    pub(crate) fn store_bytes<S>(simd, bytes: &'a [u8], values: &'a mut [S::Element]) {
+        S::Element::store_bytes(simd, bytes, values);
     }
 }
 
 vectorized! {
     /// Stores pixels as operands of a sum over windows, as [`Element::steps_of_bytes`].
-    pub(crate) fn store_steps_of_bytes<U>(
-        unit,
+    pub(crate) fn store_steps_of_bytes<S>(
+        simd,
         bytes: &'a [u8],
         shift: usize,
-        steps: &'a mut [U::Element],
+        steps: &'a mut [S::Element],
     ) {
-        U::Element::steps_of_bytes(unit, bytes, shift, steps);
+        S::Element::steps_of_bytes(simd, bytes, shift, steps);
     }
 }
 
 vectorized! {
     /// Rounds `floats` into `values`, which is as long.
-    pub(crate) fn store<U>(unit, floats: &'a [f32], values: &'a mut [U::Element]) {
-        U::Element::store(unit, floats, values);
+    pub(crate) fn store<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
+        S::Element::store(simd, floats, values);
     }
 }
 
 vectorized! {
     /// Rounds rows of `cols` scalars into rows of whole steps, with zeros after them.
-    pub(crate) fn write_rows<U>(unit, values: &'a [f32], cols: usize, rows: &'a mut [U::Element]) {
-        let rows = rows.chunks_exact_mut(cols.next_multiple_of(U::Element::DEPTH));
+    pub(crate) fn write_rows<S>(simd, values: &'a [f32], cols: usize, rows: &'a mut [S::Element]) {
+        let rows = rows.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
         for (row, values) in rows.zip(values.chunks_exact(cols)) {
             let (begin, end) = row.split_at_mut(cols);
-            U::Element::store(unit, values, begin);
-            end.fill(U::Element::default());
+            S::Element::store(simd, values, begin);
+            end.fill(S::Element::default());
         }
     }
 }
 
 vectorized! {
     /// Elements as operands of a sum over windows, as [`Element::steps_of`].
-    pub(crate) fn store_steps_of<U>(
-        unit,
-        values: &'a [U::Element],
+    pub(crate) fn store_steps_of<S>(
+        simd,
+        values: &'a [S::Element],
         shift: usize,
-        steps: &'a mut [U::Element],
+        steps: &'a mut [S::Element],
     ) {
-        U::Element::steps_of(unit, values, shift, steps);
+        S::Element::steps_of(simd, values, shift, steps);
     }
 }
 
 vectorized! {
     /// Transposes an image [rows, cols], in square blocks that fit the registers.
-    pub(crate) fn transpose<U>(
-        unit,
+    pub(crate) fn transpose<S>(
+        simd,
         values: &'a [f32],
         rows: usize,
         cols: usize,
@@ -71,7 +71,7 @@ vectorized! {
                         *bits = value.to_bits();
                     }
                 }
-                unit.transpose(&mut block);
+                simd.transpose(&mut block);
                 for (line, block) in block.iter().enumerate().take(width) {
                     let turned = &mut turned[(col + line) * rows + row..][..height];
                     for (value, &bits) in turned.iter_mut().zip(block) {
@@ -86,16 +86,16 @@ vectorized! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::isa::{AnySimd, with_simd};
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{AnyUnit, on_unit};
 
     #[test]
-    fn every_unit_turns_images_of_any_size() {
+    fn every_instruction_set_turns_images_of_any_size() {
         for [rows, cols] in [[1, 1], [16, 64], [17, 15], [3, 70], [33, 32], [5, 0]] {
             let values: Vec<f32> = (0..rows * cols).map(|at| at as f32).collect();
-            for unit in Precision::ALL.into_iter().flat_map(AnyUnit::every) {
+            for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
                 let mut turned = vec![f32::NAN; values.len()];
-                on_unit!(unit, unit => transpose(unit, &values, rows, cols, &mut turned));
+                with_simd!(simd, simd => transpose(simd, &values, rows, cols, &mut turned));
                 for (at, &value) in turned.iter().enumerate() {
                     assert_eq!(value, values[at % rows * cols + at / rows]);
                 }

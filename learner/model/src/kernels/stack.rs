@@ -7,7 +7,7 @@ use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
 use crate::kernels::images::{Images, Pixels};
-use crate::kernels::units::Unit;
+use crate::kernels::isa::Simd;
 
 /// The maps of all layers but the last, one layer after the other: what forward leaves to backward.
 pub(crate) type SavedActivations<E> = Buffer<E>;
@@ -19,13 +19,13 @@ pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
 
 /// The layers of `parameters`: for each its weight [out, in, k, k], then its bias [out]. `images` says whether the images of the
 /// first will need a gradient; all other layers' do in a backward pass, for which `backward` stands.
-pub(crate) fn layers<U: Unit>(
-    unit: U,
+pub(crate) fn layers<S: Simd>(
+    simd: S,
     shapes: &[ConvShape],
     mut parameters: &[f32],
     backward: bool,
     images: bool,
-) -> Vec<Convolution<U::Element>> {
+) -> Vec<Convolution<S::Element>> {
     let mut of_layers = Vec::with_capacity(shapes.len());
     for shape in shapes {
         let (own, rest) = parameters.split_at(shape.parameters_len());
@@ -37,7 +37,7 @@ pub(crate) fn layers<U: Unit>(
     let layers = layers.map(|(index, (&shape, own))| {
         let (weight, bias) = own.split_at(shape.weight_len());
         let backward = backward && (index > 0 || images);
-        Convolution::new(unit, shape, weight, bias, backward)
+        Convolution::new(simd, shape, weight, bias, backward)
     });
     layers.with_max_len(1).collect()
 }
@@ -59,12 +59,12 @@ pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
 }
 
 /// Runs `images` through the layers into `maps`, the last layer's output.
-pub(crate) fn stack_forward<U: Unit>(
-    unit: U,
-    layers: &[Convolution<U::Element>],
+pub(crate) fn stack_forward<S: Simd>(
+    simd: S,
+    layers: &[Convolution<S::Element>],
     images: Pixels<'_>,
     maps: &mut [f32],
-) -> SavedActivations<U::Element> {
+) -> SavedActivations<S::Element> {
     let Some((last, inner)) = layers.split_last() else {
         unreachable!("a stack has at least one layer")
     };
@@ -76,10 +76,10 @@ pub(crate) fn stack_forward<U: Unit>(
     for layer in inner {
         let len = count * layer.shape.map_len();
         let (output, rest) = std::mem::take(&mut free).split_at_mut(len);
-        forward(unit, layer, input, output);
+        forward(simd, layer, input, output);
         (input, free) = (Images::Maps(output), rest);
     }
-    forward(unit, last, input, maps);
+    forward(simd, last, input, maps);
     saved
 }
 
@@ -87,11 +87,11 @@ pub(crate) fn stack_forward<U: Unit>(
 ///
 /// The result is the parameters' gradients, for each layer the weight's [k, k, in, out], then the bias's. The images' are
 /// added to `grad_images`, if it is there.
-pub(crate) fn stack_backward<U: Unit>(
-    unit: U,
-    layers: &[Convolution<U::Element>],
+pub(crate) fn stack_backward<S: Simd>(
+    simd: S,
+    layers: &[Convolution<S::Element>],
     images: Pixels<'_>,
-    saved: &SavedActivations<U::Element>,
+    saved: &SavedActivations<S::Element>,
     maps: &[f32],
     grad_maps: &[f32],
     mut grad_images: Option<&mut [f32]>,
@@ -104,7 +104,7 @@ pub(crate) fn stack_backward<U: Unit>(
     let count = grad_maps.len() / layers[layers.len() - 1].shape.map_len();
     let (mut sums_left, mut saved) = (&mut sums[..], &saved[..]);
     // The output of the layer at hand, and its gradient; the last layer's are f32 and not ours.
-    let mut output: Option<&[U::Element]> = None;
+    let mut output: Option<&[S::Element]> = None;
     let mut grad_output: Option<Buffer<f32>> = None;
     for layer in rest.iter().rev() {
         let shape = &layer.shape;
@@ -115,8 +115,8 @@ pub(crate) fn stack_backward<U: Unit>(
         let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
         let images = Images::Maps(input);
         match (output, &grad_output) {
-            (Some(output), Some(grad)) => backward(unit, layer, images, output, grad, grads),
-            _ => backward(unit, layer, images, maps, grad_maps, grads),
+            (Some(output), Some(grad)) => backward(simd, layer, images, output, grad, grads),
+            _ => backward(simd, layer, images, maps, grad_maps, grads),
         }
         output = Some(input);
         grad_output = Some(grad_input);
@@ -125,8 +125,8 @@ pub(crate) fn stack_backward<U: Unit>(
     let scale = images.scale();
     let grads = ConvGradients::cut(&mut sums_left, &first.shape, grad_images.take());
     match (output, &grad_output) {
-        (Some(output), Some(grad)) => backward(unit, first, images, output, grad, grads),
-        _ => backward(unit, first, images, maps, grad_maps, grads),
+        (Some(output), Some(grad)) => backward(simd, first, images, output, grad, grads),
+        _ => backward(simd, first, images, maps, grad_maps, grads),
     }
     // Products with bytes that are scaled after them.
     if scale != 1.0 {
@@ -141,8 +141,8 @@ pub(crate) fn stack_backward<U: Unit>(
 mod tests {
     use super::*;
     use crate::geometry::ConvLayer;
+    use crate::kernels::isa::{AnySimd, with_simd};
     use crate::kernels::precision::Precision;
-    use crate::kernels::units::{AnyUnit, on_unit};
 
     /// Sizes that fill no register: odd runs, odd numbers of windows, channels beyond a panel.
     fn shapes() -> Vec<ConvShape> {
@@ -168,24 +168,24 @@ mod tests {
     }
 
     /// Maps, gradients of parameters and of images.
-    fn passed<U: Unit>(
-        unit: U,
+    fn passed<S: Simd>(
+        simd: S,
         shapes: &[ConvShape],
         parameters: &[f32],
         images: Pixels<'_>,
         grad_maps: &[f32],
     ) -> [Vec<f32>; 3] {
-        let layers = layers(unit, shapes, parameters, true, true);
+        let layers = layers(simd, shapes, parameters, true, true);
         let mut maps = vec![0.0; grad_maps.len()];
-        let saved = stack_forward(unit, &layers, images, &mut maps);
+        let saved = stack_forward(simd, &layers, images, &mut maps);
         let mut grad_images = vec![0.0; images.len()];
         let to = Some(&mut grad_images[..]);
-        let grads = stack_backward(unit, &layers, images, &saved, &maps, grad_maps, to);
+        let grads = stack_backward(simd, &layers, images, &saved, &maps, grad_maps, to);
         [maps, grads.to_vec(), grad_images]
     }
 
     #[test]
-    fn every_unit_gives_the_same_up_to_the_order_of_sums() {
+    fn every_instruction_set_gives_the_same_up_to_the_order_of_sums() {
         let shapes = shapes();
         let (first, last) = (&shapes[0], &shapes[2]);
         let count = 3;
@@ -195,8 +195,8 @@ mod tests {
         let grad_maps = values(count * last.map_len(), 17, 1.0);
         for images in [Pixels::Floats(&floats), Pixels::Bytes(&bytes)] {
             for precision in Precision::ALL {
-                let of_unit = |unit| on_unit!(unit, unit => passed(unit, &shapes, &parameters, images, &grad_maps));
-                let results: Vec<_> = AnyUnit::every(precision).into_iter().map(of_unit).collect();
+                let of_unit = |simd| with_simd!(simd, simd => passed(simd, &shapes, &parameters, images, &grad_maps));
+                let results: Vec<_> = AnySimd::every(precision).into_iter().map(of_unit).collect();
                 let (wanted, others) = results.split_first().unwrap();
                 // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
                 let tolerance = match precision {

@@ -7,15 +7,15 @@ use crate::geometry::{STAGE_CONVOLUTIONS, pooled, stages};
 use crate::kernels::bordered::{BorderedConvolution, Inside};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{ConvGradients, finish_row};
+use crate::kernels::isa::{Element, Simd, vectorized};
 use crate::kernels::linear::{relu_gradient, relu_of};
 use crate::kernels::pool::{pool, unpool};
 use crate::kernels::stack::parameters_len;
-use crate::kernels::units::{Element, Unit, vectorized};
 
 /// Every stage with its parameters as the kernels want them.
-pub(crate) struct Stages<U: Unit> {
-    unit: U,
-    convolutions: Vec<BorderedConvolution<U::Element>>,
+pub(crate) struct Stages<S: Simd> {
+    simd: S,
+    convolutions: Vec<BorderedConvolution<S::Element>>,
     output: (usize, usize, usize),
 }
 
@@ -28,11 +28,11 @@ pub(crate) struct Saved<E: Element> {
     taken: Buffer<u8>,
 }
 
-impl<U: Unit> Stages<U> {
+impl<S: Simd> Stages<S> {
     /// Stages of these widths on images of (height, width, channels); `parameters` has for each convolution its weight [out, in, 3, 3],
     /// then its bias [out]. `backward` says whether there will be a backward pass.
     pub(crate) fn new(
-        unit: U,
+        simd: S,
         input: (usize, usize, usize),
         widths: &[usize],
         mut parameters: &[f32],
@@ -48,10 +48,10 @@ impl<U: Unit> Stages<U> {
         // On the pool, which all wait for.
         let each = each.into_par_iter().enumerate().with_max_len(1);
         let convolutions = each.map(|(index, (shape, (weight, bias)))| {
-            BorderedConvolution::new(unit, shape, weight, bias, backward && index > 0)
+            BorderedConvolution::new(simd, shape, weight, bias, backward && index > 0)
         });
         Self {
-            unit,
+            simd,
             convolutions: convolutions.collect(),
             output,
         }
@@ -72,7 +72,7 @@ impl<U: Unit> Stages<U> {
     }
 
     /// Memory for what the forward pass of so many images leaves.
-    pub(crate) fn saved(&self, images: usize) -> Saved<U::Element> {
+    pub(crate) fn saved(&self, images: usize) -> Saved<S::Element> {
         let (inputs, taken) = self.saved_lens();
         Saved {
             inputs: Buffer::new(images * inputs),
@@ -83,7 +83,7 @@ impl<U: Unit> Stages<U> {
     /// Scalars of an image in the two parts of [`Saved`].
     fn saved_lens(&self) -> (usize, usize) {
         let inputs = self.convolutions[1..].iter();
-        let inputs = inputs.map(|it| it.border().len::<U::Element>());
+        let inputs = inputs.map(|it| it.border().len::<S::Element>());
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         (
             inputs.sum(),
@@ -92,7 +92,7 @@ impl<U: Unit> Stages<U> {
     }
 
     /// f3 of some images, one after the other.
-    pub(crate) fn forward(&self, images: &[u8], saved: &mut Saved<U::Element>, f3: &mut [f32]) {
+    pub(crate) fn forward(&self, images: &[u8], saved: &mut Saved<S::Element>, f3: &mut [f32]) {
         let (inputs, taken) = self.saved_lens();
         images
             .chunks_exact(self.image_len())
@@ -105,47 +105,47 @@ impl<U: Unit> Stages<U> {
     fn forward_one(
         &self,
         image: &[u8],
-        mut inputs: &mut [U::Element],
+        mut inputs: &mut [S::Element],
         mut taken: &mut [u8],
         f3: &mut [f32],
     ) {
-        let unit = self.unit;
-        let mut first = Buffer::new(self.convolutions[0].border().len::<U::Element>());
+        let simd = self.simd;
+        let mut first = Buffer::new(self.convolutions[0].border().len::<S::Element>());
         let mut x = Buffer::new(0);
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate() {
             let (conv, blocks) = (&convolutions[0], convolutions[1..].chunks_exact(2));
             let (input, inside, scale) = if stage == 0 {
-                (&mut first[..], Inside::Bytes(image), U::Element::BYTE_SCALE)
+                (&mut first[..], Inside::Bytes(image), S::Element::BYTE_SCALE)
             } else {
                 (cut_input(conv, &mut inputs), Inside::Maps(&x), 1.0)
             };
-            conv.border().put(unit, inside, input);
+            conv.border().put(simd, inside, input);
             let mut maps = Buffer::new(conv.shape().map_len());
-            conv.forward(unit, input, |y, row| {
+            conv.forward(simd, input, |y, row| {
                 let to = &mut maps[y * row.len()..][..row.len()];
-                add_bias(unit, row, scale, conv.bias(), to);
+                add_bias(simd, row, scale, conv.bias(), to);
             });
             x = Buffer::new(pooled_len(conv));
             let (own, rest) = std::mem::take(&mut taken).split_at_mut(x.len());
             taken = rest;
-            pool(unit, &maps, conv.shape().output(), &mut x, own);
+            pool(simd, &maps, conv.shape().output(), &mut x, own);
             for block in blocks {
                 let (one, two) = (&block[0], &block[1]);
                 let outer = cut_input(one, &mut inputs);
-                one.border().put(unit, Inside::Active(&x), outer);
+                one.border().put(simd, Inside::Active(&x), outer);
                 let inner = cut_input(two, &mut inputs);
                 two.border().clear(inner);
-                one.forward(unit, outer, |y, row| {
-                    finish_row(unit, row, one.bias(), 1.0, &mut inner[two.border().line(y)]);
+                one.forward(simd, outer, |y, row| {
+                    finish_row(simd, row, one.bias(), 1.0, &mut inner[two.border().line(y)]);
                 });
-                two.forward(unit, inner, |y, row| {
+                two.forward(simd, inner, |y, row| {
                     let to = &mut x[y * row.len()..][..row.len()];
-                    add_residual(unit, row, two.bias(), to);
+                    add_residual(simd, row, two.bias(), to);
                 });
             }
         }
-        activate(unit, &x, f3);
+        activate(simd, &x, f3);
     }
 
     /// The gradients of all parameters for `grad_f3`, where `saved` and `f3` are from the forward pass of `images`: for each
@@ -153,7 +153,7 @@ impl<U: Unit> Stages<U> {
     pub(crate) fn backward(
         &self,
         images: &[u8],
-        saved: &Saved<U::Element>,
+        saved: &Saved<S::Element>,
         f3: &[f32],
         grad_f3: &[f32],
     ) -> Buffer<f32> {
@@ -167,12 +167,12 @@ impl<U: Unit> Stages<U> {
             .zip(f3.chunks_exact(len).zip(grad_f3.chunks_exact(len)))
             .for_each(|(((image, inputs), taken), (f3, grad_f3))| {
                 let mut grad = Buffer::new(len);
-                pass_active(self.unit, f3, grad_f3, &mut grad);
+                pass_active(self.simd, f3, grad_f3, &mut grad);
                 self.backward_one(image, inputs, taken, grad, &mut sums);
             });
         // Products with bytes that are scaled after them.
         for sum in &mut sums[..shapes[0].weight_len()] {
-            *sum *= U::Element::BYTE_SCALE;
+            *sum *= S::Element::BYTE_SCALE;
         }
         sums
     }
@@ -181,16 +181,16 @@ impl<U: Unit> Stages<U> {
     fn backward_one(
         &self,
         image: &[u8],
-        mut inputs: &[U::Element],
+        mut inputs: &[S::Element],
         mut taken: &[u8],
         mut grad: Buffer<f32>,
         mut sums: &mut [f32],
     ) {
-        let unit = self.unit;
+        let simd = self.simd;
         let mut own_sums =
-            |convolution: &BorderedConvolution<U::Element>, input: &[U::Element], grad: &[f32]| {
+            |convolution: &BorderedConvolution<S::Element>, input: &[S::Element], grad: &[f32]| {
                 let own = ConvGradients::cut(&mut sums, convolution.shape(), None);
-                convolution.parameter_gradients(unit, input, grad, own.packed, own.bias);
+                convolution.parameter_gradients(simd, input, grad, own.packed, own.bias);
             };
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate().rev() {
@@ -201,29 +201,29 @@ impl<U: Unit> Stages<U> {
                 let outer = last_input(one, &mut inputs);
                 own_sums(two, inner, &grad);
                 let mut between = Buffer::<f32>::new(one.shape().map_len());
-                two.image_gradient(unit, &grad, |y, row| {
+                two.image_gradient(simd, &grad, |y, row| {
                     let to = &mut between[y * row.len()..][..row.len()];
-                    pass_active(unit, &inner[two.border().line(y)], row, to);
+                    pass_active(simd, &inner[two.border().line(y)], row, to);
                 });
                 own_sums(one, outer, &between);
-                one.image_gradient(unit, &between, |y, row| {
+                one.image_gradient(simd, &between, |y, row| {
                     let to = &mut grad[y * row.len()..][..row.len()];
-                    add_active(unit, &outer[one.border().line(y)], row, to);
+                    add_active(simd, &outer[one.border().line(y)], row, to);
                 });
             }
             let before;
             (taken, before) = cut_last(taken, grad.len());
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
-            unpool(unit, &grad, conv.shape().output(), before, &mut grad_maps);
+            unpool(simd, &grad, conv.shape().output(), before, &mut grad_maps);
             if stage == 0 {
-                let mut room = Buffer::new(conv.border().len::<U::Element>());
-                conv.border().put(unit, Inside::Bytes(image), &mut room);
+                let mut room = Buffer::new(conv.border().len::<S::Element>());
+                conv.border().put(simd, Inside::Bytes(image), &mut room);
                 own_sums(conv, &room, &grad_maps);
                 return;
             }
             own_sums(conv, last_input(conv, &mut inputs), &grad_maps);
             grad = Buffer::new(conv.shape().locations() * conv.shape().channels_in);
-            conv.image_gradient(unit, &grad_maps, |y, row| {
+            conv.image_gradient(simd, &grad_maps, |y, row| {
                 grad[y * row.len()..][..row.len()].copy_from_slice(row);
             });
         }
@@ -257,7 +257,7 @@ fn cut_last<T>(values: &[T], len: usize) -> (&[T], &[T]) {
 
 vectorized! {
     /// scale * row + bias for each location of `row` [locations, out].
-    fn add_bias<U>(unit, row: &'a [f32], scale: f32, bias: &'a [f32], to: &'a mut [f32]) {
+    fn add_bias<S>(simd, row: &'a [f32], scale: f32, bias: &'a [f32], to: &'a mut [f32]) {
         let locations = row.chunks_exact(bias.len());
         for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
             for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
@@ -269,7 +269,7 @@ vectorized! {
 
 vectorized! {
     /// Adds row + bias for each location of `row` [locations, out].
-    fn add_residual<U>(unit, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
+    fn add_residual<S>(simd, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
         let locations = row.chunks_exact(bias.len());
         for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
             for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
@@ -280,7 +280,7 @@ vectorized! {
 }
 
 vectorized! {
-    fn activate<U>(unit, x: &'a [f32], to: &'a mut [f32]) {
+    fn activate<S>(simd, x: &'a [f32], to: &'a mut [f32]) {
         for (to, &x) in to.iter_mut().zip(x) {
             *to = relu_of(x);
         }
@@ -289,7 +289,7 @@ vectorized! {
 
 vectorized! {
     /// The gradients before a ReLU that gave `active`.
-    fn pass_active<U, M>(unit, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
+    fn pass_active<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to = relu_gradient(active.value(), grad);
         }
@@ -298,7 +298,7 @@ vectorized! {
 
 vectorized! {
     /// Adds the gradients before a ReLU that gave `active`.
-    fn add_active<U>(unit, active: &'a [U::Element], grads: &'a [f32], to: &'a mut [f32]) {
+    fn add_active<S>(simd, active: &'a [S::Element], grads: &'a [f32], to: &'a mut [f32]) {
         for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
             *to += relu_gradient(active.value(), grad);
         }
@@ -311,9 +311,9 @@ mod tests {
 
     use super::*;
     use crate::kernels::candle::residual_stages;
+    use crate::kernels::isa::{AnySimd, with_simd};
     use crate::kernels::precision::Precision;
     use crate::kernels::stack::unpacked;
-    use crate::kernels::units::{AnyUnit, on_unit};
 
     const INPUT: (usize, usize, usize) = (9, 14, 3);
     /// Odd runs, and channels beyond a register; maps of 5 x 7 and 3 x 4.
@@ -333,8 +333,8 @@ mod tests {
 
     impl Run<'_> {
         /// f3, and the gradients of parameters.
-        fn on<U: Unit>(self, unit: U) -> [Vec<f32>; 2] {
-            let stages = Stages::new(unit, INPUT, &WIDTHS, self.parameters, true);
+        fn on<S: Simd>(self, simd: S) -> [Vec<f32>; 2] {
+            let stages = Stages::new(simd, INPUT, &WIDTHS, self.parameters, true);
             let mut f3 = vec![f32::NAN; self.grad_f3.len()];
             let mut saved = stages.saved(self.images.len() / stages.image_len());
             stages.forward(self.images, &mut saved, &mut f3);
@@ -379,7 +379,7 @@ mod tests {
     }
 
     #[test]
-    fn every_unit_gives_what_candle_does_in_f64() -> Result<()> {
+    fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
         let count = 3;
         let (shapes, (height, width, channels)) = super::stages(INPUT, &WIDTHS);
         // The last image is flat: most windows of the pools have nine equal values.
@@ -400,8 +400,8 @@ mod tests {
                 // ReLUs and pools that choose otherwise, too.
                 Precision::Bf16 => 0.3,
             };
-            for unit in AnyUnit::every(precision) {
-                let found = on_unit!(unit, unit => run.on(unit));
+            for simd in AnySimd::every(precision) {
+                let found = with_simd!(simd, simd => run.on(simd));
                 for (found, wanted) in found.iter().zip(&wanted) {
                     let off = found.iter().zip(wanted).map(|(a, b)| f64::from(*a) - b);
                     let error = off.map(|it| it * it).sum::<f64>().sqrt();

@@ -12,12 +12,12 @@ use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
 use crate::kernels::conv::{ConvStack, GradLayout, pixels, stack_of};
+use crate::kernels::isa::{AnySimd, Mode, Simd, with_simd};
 use crate::kernels::linear::{add_to, group_sums};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::{Biases, Product};
 use crate::kernels::tensors::{cpu, floats, values_of};
-use crate::kernels::units::{AnyUnit, Mode, Unit, on_unit};
 
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack), to the last bit: [B, outputs] of
 /// `images` [B, H, W, C] u8.
@@ -39,8 +39,8 @@ pub(crate) fn torso(
     };
     let (shapes, parameters) = stack_of(images, layers)?;
     let images = images.contiguous()?;
-    on_unit!(AnyUnit::of(precision), unit => {
-        let stack = ConvStack::new(unit, shapes);
+    with_simd!(AnySimd::of(precision), simd => {
+        let stack = ConvStack::new(simd, shapes);
         let (inputs, outputs) = (stack.last().map_len(), fc.outputs);
         if fc.weight.dims() != [outputs, inputs] || fc.bias.dims() != [outputs] {
             bail!(
@@ -71,13 +71,13 @@ struct Kept {
     flat: Buffer<f32>,
 }
 
-struct Torso<U: Unit> {
-    stack: ConvStack<U>,
+struct Torso<S: Simd> {
+    stack: ConvStack<S>,
     fc: Fc,
     kept: OnceLock<Kept>,
 }
 
-impl<U: Unit> CustomOp2 for Torso<U> {
+impl<S: Simd> CustomOp2 for Torso<S> {
     fn name(&self) -> &'static str {
         "torso"
     }

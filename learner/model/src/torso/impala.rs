@@ -9,10 +9,10 @@ use crate::compute::Kernels;
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
+use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
-use crate::kernels::units::{AnyUnit, Element, Unit, on_unit};
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "conv",
@@ -96,12 +96,12 @@ impl Torso for Impala {
         let layers = convolutions.into_iter();
         let layers = layers.map(|it| [it.weight, it.bias].concat());
         let parameters = layers.collect::<Vec<_>>().concat();
-        on_unit!(AnyUnit::of(precision), unit => {
-            let stages = Stages::new(unit, self.input, &self.widths, &parameters, false);
+        with_simd!(AnySimd::of(precision), simd => {
+            let stages = Stages::new(simd, self.input, &self.widths, &parameters, false);
             let channels = stages.output().2;
             Box::new(ActingStages {
-                unit,
-                fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+                simd,
+                fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
                 stages,
                 takes_mean: self.takes_mean,
             })
@@ -109,30 +109,30 @@ impl Torso for Impala {
     }
 }
 
-struct ActingStages<U: Unit> {
-    unit: U,
-    stages: Stages<U>,
-    fc: Dense<U>,
+struct ActingStages<S: Simd> {
+    simd: S,
+    stages: Stages<S>,
+    fc: Dense<S>,
     takes_mean: bool,
 }
 
-impl<U: Unit> ActingTorso for ActingStages<U> {
+impl<S: Simd> ActingTorso for ActingStages<S> {
     fn f4(&self, frames: &[u8]) -> Buffer<f32> {
-        let (unit, stages, inputs) = (self.unit, &self.stages, self.fc.inputs());
+        let (simd, stages, inputs) = (self.simd, &self.stages, self.fc.inputs());
         let images = frames.chunks_exact(stages.image_len());
         let count = images.len();
-        let mut rows = Buffer::new(count * inputs.next_multiple_of(U::Element::DEPTH));
+        let mut rows = Buffer::new(count * inputs.next_multiple_of(S::Element::DEPTH));
         let (mut saved, mut f3) = (stages.saved(1), Buffer::new(stages.output_len()));
-        let each = rows.chunks_exact_mut(inputs.next_multiple_of(U::Element::DEPTH));
+        let each = rows.chunks_exact_mut(inputs.next_multiple_of(S::Element::DEPTH));
         for (image, row) in images.zip(each) {
             stages.forward(image, &mut saved, &mut f3);
             if self.takes_mean {
-                write_rows(unit, &mean_of_locations(&f3, inputs), inputs, row);
+                write_rows(simd, &mean_of_locations(&f3, inputs), inputs, row);
             } else {
-                write_rows(unit, &f3, inputs, row);
+                write_rows(simd, &f3, inputs, row);
             }
         }
-        self.fc.forward(unit, &rows, count)
+        self.fc.forward(simd, &rows, count)
     }
 }
 

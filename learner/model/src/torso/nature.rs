@@ -10,9 +10,9 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, forward};
 use crate::kernels::dense::{Dense, whole_steps};
 use crate::kernels::images::{Images, Pixels};
+use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::torso::torso;
-use crate::kernels::units::{AnyUnit, Unit, on_unit};
 
 #[derive(Debug)]
 pub(crate) struct Nature {
@@ -91,40 +91,40 @@ impl Torso for Nature {
     ) -> Box<dyn ActingTorso> {
         let TorsoParameters { convolutions, fc } = parameters;
         let channels = self.shapes.last().map_or(1, |last| last.channels_out);
-        on_unit!(AnyUnit::of(precision), unit => {
+        with_simd!(AnySimd::of(precision), simd => {
             let layers = self.shapes.iter().zip(&convolutions);
             let layers = layers
-                .map(|(&shape, it)| Convolution::new(unit, shape, &it.weight, &it.bias, false));
+                .map(|(&shape, it)| Convolution::new(simd, shape, &it.weight, &it.bias, false));
             Box::new(ActingNature {
-                unit,
+                simd,
                 convolutions: layers.collect(),
-                fc: Dense::of_maps(unit, &fc.weight, fc.bias, channels),
+                fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
             })
         })
     }
 }
 
-struct ActingNature<U: Unit> {
-    unit: U,
-    convolutions: Vec<Convolution<U::Element>>,
-    fc: Dense<U>,
+struct ActingNature<S: Simd> {
+    simd: S,
+    convolutions: Vec<Convolution<S::Element>>,
+    fc: Dense<S>,
 }
 
-impl<U: Unit> ActingTorso for ActingNature<U> {
+impl<S: Simd> ActingTorso for ActingNature<S> {
     fn f4(&self, frames: &[u8]) -> Buffer<f32> {
-        let unit = self.unit;
+        let simd = self.simd;
         let count = frames.len() / self.convolutions[0].shape.image_len();
-        let mut maps = Buffer::<U::Element>::new(0);
+        let mut maps = Buffer::<S::Element>::new(0);
         for (index, layer) in self.convolutions.iter().enumerate() {
-            let mut output = Buffer::<U::Element>::new(count * layer.shape.map_len());
+            let mut output = Buffer::<S::Element>::new(count * layer.shape.map_len());
             let images = match index {
                 0 => Images::Pixels(Pixels::Bytes(frames)),
                 _ => Images::Maps(&maps),
             };
-            forward(unit, layer, images, &mut output);
+            forward(simd, layer, images, &mut output);
             maps = output;
         }
         let rows = whole_steps(maps, self.fc.inputs());
-        self.fc.forward(unit, &rows, count)
+        self.fc.forward(simd, &rows, count)
     }
 }

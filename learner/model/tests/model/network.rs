@@ -123,7 +123,7 @@ fn the_dim_heads_follow_their_formula_with_gradients() -> Result<()> {
             local = Tensor::cat(&[&flat, &tiled], 1)?;
             global = Tensor::cat(&[&f4, &embedded], 1)?;
         }
-        let by_location = |x: Tensor| x.reshape((6, h * w, config.rkhs));
+        let by_location = |x: Tensor| x.reshape((6, h * w, config.embedding_dim));
         let pairs = [
             (
                 "psi3",
@@ -349,7 +349,7 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.conv[1].kernel = 9);
     fails(|config| config.conv[0].stride = 0);
     fails(|config| config.conv[2].out = 0);
-    fails(|config| (config.hidden, config.rkhs) = (65_536, 65_536));
+    fails(|config| (config.hidden, config.embedding_dim) = (65_536, 65_536));
 }
 
 #[test]

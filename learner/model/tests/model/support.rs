@@ -129,7 +129,7 @@ pub(crate) fn small() -> ModelConfig {
         channels: vec![],
         scale_blocks: false,
         hidden: 19,
-        rkhs: 13,
+        embedding_dim: 13,
         action_embed: 9,
         dim: DimHeads {
             psi3: true,

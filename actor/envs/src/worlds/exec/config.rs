@@ -41,7 +41,7 @@ impl ExecConfig {
 }
 
 /// What a process declares, in words.
-pub(super) fn in_words(shape: FrameShape, actions: &[String]) -> String {
+pub(super) fn describe(shape: FrameShape, actions: &[String]) -> String {
     format!(
         "frames of {} x {} x {} and the {} actions {}",
         shape.height,

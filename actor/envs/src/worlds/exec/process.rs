@@ -215,7 +215,7 @@ impl WorldProcess {
     fn ended(&mut self, doing: &'static str) -> ExecError {
         self.to = None;
         let how = match self.end_within(END_MAX) {
-            Some(status) => format!("ended {doing} ({})", in_words(status)),
+            Some(status) => format!("ended {doing} ({})", describe(status)),
             None => format!("closed its stdout {doing} without ending, and was killed"),
         };
         self.kill();
@@ -286,7 +286,7 @@ impl Drop for WorldProcess {
     }
 }
 
-fn in_words(status: ExitStatus) -> String {
+fn describe(status: ExitStatus) -> String {
     match status.code() {
         Some(127) => "exit status 127: the shell found no such command".into(),
         _ => status.to_string(),

@@ -296,7 +296,7 @@ impl SavedExec {
                 this.command, config.command
             )));
         }
-        saved::check_copies(this.copies, num_envs)?;
+        saved::check_env_count(this.copies, num_envs)?;
         let shape = [config.height, config.width, config.channels];
         saved::check(
             this.shape == shape && this.actions == config.actions,

@@ -97,7 +97,7 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
 }
 
 #[test]
-fn a_copy_s_seed_does_not_depend_on_how_many_copies_there_are() {
+fn an_environment_s_seed_does_not_depend_on_how_many_environments_there_are() {
     let many = seeds(7, 64);
     assert_eq!(seeds(7, 3), many[..3]);
     assert_ne!(seeds(8, 3), many[..3]);
@@ -353,7 +353,10 @@ fn a_state_of_another_world_is_refused_by_name() {
         "{text}"
     );
     let text = refused("saves", 3, &state);
-    assert!(text.contains("2 copies, and this world has 3"), "{text}");
+    assert!(
+        text.contains("2 environments, and this world has 3"),
+        "{text}"
+    );
     for wrong in [
         &state[..state.len() - 1],
         &[state.clone(), vec![0]].concat(),

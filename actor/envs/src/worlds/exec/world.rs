@@ -4,13 +4,13 @@
 use rand::Rng;
 use tracing::Level;
 
-use super::config::{ExecConfig, in_words, start_patience};
+use super::config::{ExecConfig, describe, start_patience};
 use super::process::{Patience, WorldProcess};
 use super::protocol::{
     Block, Declaration, Opening, Request, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
 };
-use crate::copies::{RngUse, check_frames, check_num_envs, check_step, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::{EnvError, ExecError, Fault};
 use crate::settings::{Variants, WorldSettings};
 
@@ -72,8 +72,8 @@ impl ExecWorld {
             channels: declared.channels,
         };
         if shape != config.frame_shape() || declared.actions != config.actions {
-            let found = in_words(shape, &declared.actions);
-            let promised = in_words(config.frame_shape(), &config.actions);
+            let found = describe(shape, &declared.actions);
+            let promised = describe(config.frame_shape(), &config.actions);
             let other = format!(
                 "declares {found}, but the run's settings say {promised}: start the run anew, or the command as it was"
             );
@@ -224,7 +224,7 @@ pub fn declaration(
 /// The seed of each copy, below 2^31 so that every language and engine has room for it.
 pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
     (0..copies)
-        .map(|copy| copy_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
+        .map(|copy| env_rng(seed, copy, RngUse::Game).random::<u32>() >> 1)
         .collect()
 }
 

@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
-use crate::copies::{Copies, RngUse, check_num_envs, copy_rng};
 use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved;
 use crate::settings::WorldSettings;
@@ -37,7 +37,7 @@ pub struct IsingConfig {
 /// Source: the paper's appendix on the Ising model, with the place held for an episode as its main text has it.
 pub struct IsingWorld {
     config: IsingConfig,
-    copies: Vec<Field>,
+    envs: Vec<Field>,
 }
 
 struct Field {
@@ -63,7 +63,7 @@ impl IsingWorld {
     /// The only action.
     pub const ACTION_NAMES: [&str; 1] = ["no-op"];
 
-    /// `num_envs` fields; copy i depends on (`seed`, i) only.
+    /// `num_envs` fields; environment i depends on (`seed`, i) only.
     ///
     /// # Errors
     /// Settings that cannot work.
@@ -71,7 +71,7 @@ impl IsingWorld {
         config.validate()?;
         check_num_envs(num_envs)?;
         let field = |env| {
-            let mut rng = copy_rng(seed, env, RngUse::Game);
+            let mut rng = env_rng(seed, env, RngUse::Game);
             let side = config.patch_size;
             let patch =
                 IsingLattice::random(side, side, config.temperature, config.boundary, &mut rng)?;
@@ -86,16 +86,16 @@ impl IsingWorld {
             field.reset(config);
             Ok(field)
         };
-        let copies = (0..num_envs).map(field).collect::<Result<_, EnvError>>()?;
+        let envs = (0..num_envs).map(field).collect::<Result<_, EnvError>>()?;
         Ok(Self {
             config: config.clone(),
-            copies,
+            envs,
         })
     }
 
-    /// Row and column of the first site of copy `env`'s patch in the current episode; `None` if there is no such copy.
+    /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if there is no such environment.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
-        self.copies.get(env).map(|field| field.origin)
+        self.envs.get(env).map(|field| field.origin)
     }
 }
 
@@ -144,7 +144,7 @@ impl WorldSettings for IsingConfig {
     }
 }
 
-impl Copies for IsingWorld {
+impl Envs for IsingWorld {
     type Saved = SavedField;
 
     fn shape(&self) -> FrameShape {
@@ -156,23 +156,23 @@ impl Copies for IsingWorld {
     }
 
     fn count(&self) -> usize {
-        self.copies.len()
+        self.envs.len()
     }
 
-    fn draw(&self, copy: usize, frame: &mut [u8]) {
-        frame.copy_from_slice(&self.copies[copy].frame);
+    fn draw(&self, env: usize, frame: &mut [u8]) {
+        frame.copy_from_slice(&self.envs[env].frame);
     }
 
-    fn act(&mut self, copy: usize, _: u8) -> (f32, StepEnd) {
-        (0.0, self.copies[copy].step(&self.config))
+    fn act(&mut self, env: usize, _: u8) -> (f32, StepEnd) {
+        (0.0, self.envs[env].step(&self.config))
     }
 
-    fn saved(&self, copy: usize) -> SavedField {
-        self.copies[copy].saved()
+    fn saved(&self, env: usize) -> SavedField {
+        self.envs[env].saved()
     }
 
-    fn restore(&mut self, copy: usize, saved: SavedField) -> Result<(), EnvError> {
-        self.copies[copy].load(saved, &self.config)
+    fn restore(&mut self, env: usize, saved: SavedField) -> Result<(), EnvError> {
+        self.envs[env].load(saved, &self.config)
     }
 }
 
@@ -327,7 +327,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_copy_depends_on_seed_and_index_only() {
+    fn an_environment_depends_on_seed_and_index_only() {
         let bytes = paper().frame_shape().bytes();
         let (one, _) = run(&mut IsingWorld::new(&paper(), 1, 9).unwrap(), 20);
         let (three, _) = run(&mut IsingWorld::new(&paper(), 3, 9).unwrap(), 20);

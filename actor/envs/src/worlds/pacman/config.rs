@@ -48,7 +48,7 @@ pub struct PacmanConfig {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LethalSchedule {
-    /// Episodes of one copy until the next ghost, at least 1. N copies pass N times as many episodes in a task: for the
+    /// Episodes of one environment until the next ghost, at least 1. N environments pass N times as many episodes in a task: for the
     /// paper's 5000 in all, set 5000 / N.
     pub episodes_per_task: u64,
     /// The lethal ghost (0 to 3) of each task; after the last the first again.
@@ -115,7 +115,7 @@ impl PacmanConfig {
         }
     }
 
-    /// Which ghosts are lethal in a copy's episode number `episode`, counted from 0.
+    /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0.
     pub fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
         match &self.lethal_schedule {
             None => self.lethal,
@@ -146,14 +146,14 @@ impl LethalSchedule {
         }
     }
 
-    /// The lethal ghost of a copy's episode number `episode`, counted from 0; the schedule must be a valid one.
+    /// The lethal ghost of an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
     pub fn ghost_in(&self, episode: u64) -> usize {
         self.order[(episode / self.episodes_per_task % self.order.len() as u64) as usize].into()
     }
 }
 
 impl IsingOverlay {
-    /// The lattice of one copy: a site in each wall, free boundary.
+    /// The lattice of one environment: a site in each wall, free boundary.
     pub(super) fn lattice(
         &self,
         walls: &[bool],

@@ -9,8 +9,8 @@ use super::{
     maze::{GHOSTS, Item, Maze, Place},
     render,
 };
-use crate::copies::{RngUse, copy_rng};
 use crate::environment::StepEnd;
+use crate::envs::{RngUse, env_rng};
 use crate::error::EnvError;
 use crate::worlds::ising::IsingLattice;
 
@@ -24,7 +24,7 @@ pub(super) struct Game {
     pub(super) items: Vec<Item>,
     pub(super) pellets_left: u32,
     pub(super) episode_step: u32,
-    /// Episodes that this copy has ended.
+    /// Episodes that this environment has ended.
     pub(super) episodes: u64,
     /// The frame without what moves.
     pub(super) background: Vec<u8>,
@@ -40,7 +40,7 @@ impl Game {
         env: usize,
         seed: u64,
     ) -> Result<Self, EnvError> {
-        let mut overlay_rng = copy_rng(seed, env, RngUse::Overlay);
+        let mut overlay_rng = env_rng(seed, env, RngUse::Overlay);
         let walls = match &config.ising {
             Some(overlay) => Some((
                 overlay.lattice(&maze.walls(), &mut overlay_rng)?,
@@ -49,7 +49,7 @@ impl Game {
             None => None,
         };
         let mut game = Self {
-            rng: copy_rng(seed, env, RngUse::Game),
+            rng: env_rng(seed, env, RngUse::Game),
             agent: maze.agent_start(),
             ghosts: maze.ghost_starts().map(Ghost::at),
             lethal: config.lethal_in(0),

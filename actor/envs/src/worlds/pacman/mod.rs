@@ -27,8 +27,8 @@ use ghost::Chance;
 use maze::{GHOSTS, Maze};
 use saved::SavedGame;
 
-use crate::copies::{Copies, check_num_envs};
 use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::{Envs, check_num_envs};
 use crate::error::EnvError;
 use crate::settings::WorldSettings;
 
@@ -41,14 +41,14 @@ pub struct PacmanWorld {
     maze: Maze,
     /// The frame at the start of an episode, without what moves.
     fresh: Vec<u8>,
-    copies: Vec<Game>,
+    envs: Vec<Game>,
 }
 
 impl PacmanWorld {
     /// The actions, in their order.
     pub const ACTION_NAMES: [&str; 5] = ["no-op", "up", "down", "left", "right"];
 
-    /// `num_envs` games; copy i depends on (`seed`, i) and its actions only.
+    /// `num_envs` games; environment i depends on (`seed`, i) and its actions only.
     ///
     /// # Errors
     /// Settings that cannot work.
@@ -58,7 +58,7 @@ impl PacmanWorld {
         let maze = Maze::new();
         let mut fresh = vec![0; render::FRAME_BYTES];
         render::background(&maze, &mut fresh);
-        let copies = (0..num_envs)
+        let envs = (0..num_envs)
             .map(|env| Game::new(config, &maze, &fresh, env, seed))
             .collect::<Result<Vec<_>, EnvError>>()?;
         let chance = Chance {
@@ -70,13 +70,13 @@ impl PacmanWorld {
             chance,
             maze,
             fresh,
-            copies,
+            envs,
         })
     }
 
-    /// Which ghosts are lethal in copy `env`'s current episode; `None` if there is no such copy.
+    /// Which ghosts are lethal in environment `env`'s current episode; `None` if there is no such environment.
     pub fn lethal(&self, env: usize) -> Option<[bool; GHOSTS]> {
-        self.copies.get(env).map(|game| game.lethal)
+        self.envs.get(env).map(|game| game.lethal)
     }
 }
 
@@ -108,7 +108,7 @@ impl WorldSettings for PacmanConfig {
     }
 }
 
-impl Copies for PacmanWorld {
+impl Envs for PacmanWorld {
     type Saved = SavedGame;
 
     fn shape(&self) -> FrameShape {
@@ -120,11 +120,11 @@ impl Copies for PacmanWorld {
     }
 
     fn count(&self) -> usize {
-        self.copies.len()
+        self.envs.len()
     }
 
-    fn draw(&self, copy: usize, frame: &mut [u8]) {
-        let game = &self.copies[copy];
+    fn draw(&self, env: usize, frame: &mut [u8]) {
+        let game = &self.envs[env];
         frame.copy_from_slice(&game.background);
         if let Some((lattice, _)) = &game.walls {
             render::overlay(lattice.spins(), frame);
@@ -133,8 +133,8 @@ impl Copies for PacmanWorld {
         render::actors(&self.maze, ghosts, game.agent, game.boost_left > 0, frame);
     }
 
-    fn act(&mut self, copy: usize, action: u8) -> (f32, StepEnd) {
-        let game = &mut self.copies[copy];
+    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd) {
+        let game = &mut self.envs[env];
         let (reward, end) = game.step(&self.config, &self.maze, self.chance, action);
         if end != StepEnd::Running {
             game.episodes += 1;
@@ -146,11 +146,11 @@ impl Copies for PacmanWorld {
         (reward, end)
     }
 
-    fn saved(&self, copy: usize) -> SavedGame {
-        self.copies[copy].saved()
+    fn saved(&self, env: usize) -> SavedGame {
+        self.envs[env].saved()
     }
 
-    fn restore(&mut self, copy: usize, saved: SavedGame) -> Result<(), EnvError> {
-        self.copies[copy].load(saved, &self.maze)
+    fn restore(&mut self, env: usize, saved: SavedGame) -> Result<(), EnvError> {
+        self.envs[env].load(saved, &self.maze)
     }
 }

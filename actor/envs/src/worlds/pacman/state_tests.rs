@@ -51,7 +51,7 @@ fn unusable_settings_and_actions_are_errors() {
         .unwrap_err();
     assert_eq!(
         error.to_string(),
-        "action 5 of copy 0 is out of range: this world has 5 actions"
+        "action 5 of environment 0 is out of range: this world has 5 actions"
     );
 }
 
@@ -77,11 +77,11 @@ fn a_game_continues_where_it_was_saved() {
 fn a_state_that_no_game_has_is_refused() {
     let mut world = PacmanWorld::new(&config(), 1, 5).unwrap();
     let maze = Maze::new();
-    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().copies.remove(0);
+    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
     let mut refuse = |what: &str, change: fn(&mut Game)| {
         let mut wrong = fine();
         change(&mut wrong);
-        let said = world.copies[0].load(wrong.saved(), &maze).unwrap_err();
+        let said = world.envs[0].load(wrong.saved(), &maze).unwrap_err();
         assert!(said.to_string().contains(what), "{said}");
     };
     refuse("the agent's place", |game| game.agent = 10_000);

@@ -67,7 +67,7 @@ fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
         at(&world, 19, 9 + apart),
         at(&world, 1, 1),
     );
-    let game = &mut world.copies[0];
+    let game = &mut world.envs[0];
     game.agent = agent;
     game.ghosts = [hunter, far, far, far].map(Ghost::at);
     game.ghosts[0].mode = Mode::Follow;
@@ -85,7 +85,7 @@ fn play(
     let (mut frames, mut all_rewards, mut all_ends) = (vec![], vec![], vec![]);
     for _ in 0..steps {
         frames.push(frame(world));
-        // The same action in every copy, so that a copy's play does not depend on how many there are.
+        // The same action in every environment, so that an environment's play does not depend on how many there are.
         let actions = vec![rng.random_range(0..5); n];
         let (mut rewards, mut ends) = (vec![0.0; n], vec![StepEnd::Running; n]);
         world.step(&actions, &mut rewards, &mut ends).unwrap();
@@ -96,7 +96,7 @@ fn play(
 }
 
 #[test]
-fn a_copy_depends_on_seed_and_index_only() {
+fn an_environment_depends_on_seed_and_index_only() {
     let (one, rewards, ends) = play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
     let (again, same_rewards, same_ends) =
         play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
@@ -107,7 +107,7 @@ fn a_copy_depends_on_seed_and_index_only() {
     assert!(one.iter().zip(&three).all(|(a, b)| a[..] == b[..bytes]));
     assert!(
         three.iter().any(|f| f[..bytes] != f[bytes..2 * bytes]),
-        "copies differ"
+        "environments differ"
     );
     assert_ne!(one, other, "seeds differ");
     assert!(ends.contains(&StepEnd::Terminal), "some episode ended");
@@ -133,20 +133,20 @@ fn the_first_frame_shows_everything() {
 #[test]
 fn a_wall_stops_the_agent_and_a_no_op_keeps_it() {
     let mut world = duel(&harmless(), 3);
-    let before = world.copies[0].agent;
+    let before = world.envs[0].agent;
     for action in [0, 2] {
         step(&mut world, action);
-        assert_eq!(world.copies[0].agent, before);
+        assert_eq!(world.envs[0].agent, before);
     }
     step(&mut world, 3);
-    assert_eq!(world.copies[0].agent, at(&world, 19, 8));
+    assert_eq!(world.envs[0].agent, at(&world, 19, 8));
 }
 
 #[test]
 fn food_is_eaten_once() {
     let mut world = duel(&harmless(), 3);
     assert_eq!(step(&mut world, 3).0, 1.0);
-    assert_eq!(world.copies[0].pellets_left, 186);
+    assert_eq!(world.envs[0].pellets_left, 186);
     assert_eq!(
         step(&mut world, 4).0,
         1.0,
@@ -154,7 +154,7 @@ fn food_is_eaten_once() {
     );
     assert_eq!(step(&mut world, 3).0, 0.0);
     let pixel = world.maze.pixel(at(&world, 19, 9));
-    assert_eq!(world.copies[0].background[pixel * 3..][..3], render::FLOOR);
+    assert_eq!(world.envs[0].background[pixel * 3..][..3], render::FLOOR);
 }
 
 #[test]
@@ -182,7 +182,7 @@ fn the_game_starts_again_after_an_end() {
     assert_eq!(step(&mut world, 0).1, StepEnd::Terminal);
     assert_eq!(frame(&mut world), start);
     assert_eq!(
-        (world.copies[0].pellets_left, world.copies[0].episode_step),
+        (world.envs[0].pellets_left, world.envs[0].episode_step),
         (187, 0)
     );
 }
@@ -197,7 +197,7 @@ fn contact_with_a_harmless_ghost_is_nothing() {
         1,
     );
     assert_eq!(step(&mut world, 0), (1.0, StepEnd::Running));
-    assert_eq!(world.copies[0].ghosts[0].place, world.copies[0].agent);
+    assert_eq!(world.envs[0].ghosts[0].place, world.envs[0].agent);
     assert_eq!(
         step(&mut world, 0),
         (0.0, StepEnd::Running),
@@ -209,11 +209,11 @@ fn contact_with_a_harmless_ghost_is_nothing() {
 fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
     for (lethal, reward) in [([true; 4], 1.0 + 20.0), ([false, true, true, true], 1.0)] {
         let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
-        world.copies[0].boost_left = 5;
+        world.envs[0].boost_left = 5;
         assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
         let home = Ghost::at(world.maze.ghost_starts()[0]);
         assert_eq!(
-            world.copies[0].ghosts[0], home,
+            world.envs[0].ghosts[0], home,
             "back at its start, wandering"
         );
     }
@@ -224,9 +224,9 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
     let mut world = duel(&config(), 1);
     let (boost, beside) = (at(&world, 1, 1), at(&world, 1, 2));
     let away = at(&world, 19, 9);
-    world.copies[0].agent = beside;
-    world.copies[0].ghosts = [boost, away, away, away].map(Ghost::at);
-    world.copies[0].ghosts[0].mode = Mode::Follow;
+    world.envs[0].agent = beside;
+    world.envs[0].ghosts = [boost, away, away, away].map(Ghost::at);
+    world.envs[0].ghosts[0].mode = Mode::Follow;
     assert_eq!(
         step(&mut world, 3),
         (5.0 + 20.0, StepEnd::Running),
@@ -240,7 +240,7 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
             render::AGENT
         };
         assert_eq!(frame(&mut world)[pixel..][..3], colour);
-        world.copies[0].ghosts[0] = Ghost {
+        world.envs[0].ghosts[0] = Ghost {
             mode: Mode::Follow,
             ..Ghost::at(beside)
         };
@@ -260,10 +260,10 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
 #[test]
 fn the_last_pellet_ends_the_episode_before_any_contact() {
     let mut world = duel(&config(), 1);
-    world.copies[0].items.fill(Item::Nothing);
+    world.envs[0].items.fill(Item::Nothing);
     let last = at(&world, 19, 10);
-    world.copies[0].items[usize::from(last)] = Item::Pellet;
-    world.copies[0].pellets_left = 1;
+    world.envs[0].items[usize::from(last)] = Item::Pellet;
+    world.envs[0].pellets_left = 1;
     assert_eq!(step(&mut world, 4), (1.0 + 1000.0, StepEnd::Terminal));
 }
 
@@ -276,7 +276,7 @@ fn a_whole_game_can_be_cleared() {
     let mut world = PacmanWorld::new(&config, 1, 5).unwrap();
     let mut total = 0.0;
     for steps in 1.. {
-        let game = &world.copies[0];
+        let game = &world.envs[0];
         let target = (0..game.items.len() as u16)
             .filter(|&p| game.items[usize::from(p)] != Item::Nothing)
             .min_by_key(|&p| world.maze.distance(game.agent, p))

@@ -82,7 +82,7 @@ fn the_same_level_is_followed_by_different_ones() {
     }
 }
 
-/// A redrawn copy equals a fresh one of that level, also in the steps that follow, in every game.
+/// A redrawn environment equals a fresh one of that level, also in the steps that follow, in every game.
 #[test]
 fn a_redrawn_level_is_the_level_itself() {
     let Some(engine) = engine() else { return };

@@ -20,10 +20,10 @@
 //! continuing. With 500 levels this leaves the training set at the first completed level, and the agent trains on ever
 //! new levels until it dies; only a lost or timed-out episode draws from the set again.
 //!
-//! Here a completed level is followed by one **of the set**: when the engine has left it, the copy's complete state is
-//! moved to a spare copy of the game, reset there, and moved back. The spare's reset draws the level with the copy's
+//! Here a completed level is followed by one **of the set**: when the engine has left it, the environment's complete state is
+//! moved to a spare environment, reset there, and moved back. The spare's reset draws the level with the environment's
 //! own generator, as every lost episode does, so the law of levels is uniform over the set, the result depends on the
-//! seed and the copy's own actions only, no other copy is stepped, and no transition is made up: the step that completed
+//! seed and the environment's own actions only, no other environment is stepped, and no transition is made up: the step that completed
 //! the level keeps its reward and is a `LevelChange`, and the next frame is the first of the drawn level. Where s + 997
 //! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
 
@@ -37,8 +37,8 @@ mod visible_actions;
 
 use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
-use crate::copies::{check_frames, check_step};
 use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::{check_frames, check_step};
 use crate::error::EnvError;
 use crate::saved;
 use crate::settings::{Levels, Variants, WorldSettings};
@@ -58,7 +58,7 @@ const SIDE_MIN: u32 = 8;
 /// no-op completes the drawn level in its first step.
 const REDRAWS_MAX: usize = 16;
 
-/// Copies of one of Procgen's games.
+/// Environments of one of Procgen's games.
 pub struct ProcgenWorld {
     game: VecGame,
     /// Steps taken in the current level or episode [N].
@@ -75,7 +75,7 @@ pub struct ProcgenWorld {
     shrink: Option<Shrink>,
 }
 
-/// The set of levels, and the spare copy of the game in which a copy that has left it is reset.
+/// The set of levels, and the spare environment in which an environment that has left it is reset.
 struct LevelSet {
     levels: std::ops::Range<i32>,
     spare: VecGame,
@@ -101,7 +101,7 @@ impl ProcgenWorld {
         "e",
     ];
 
-    /// Makes `num_envs` copies. Fetches the engine if it is not installed; see [`Engine::install`] for how to do that
+    /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`Engine::install`] for how to do that
     /// beforehand and watch it.
     ///
     /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
@@ -159,12 +159,12 @@ impl ProcgenWorld {
         })
     }
 
-    /// The level that each copy's current frame shows [N].
+    /// The level that each environment's current frame shows [N].
     pub fn levels(&self) -> &[i32] {
         self.game.level_seed()
     }
 
-    /// What the last step ended in copy `env`, whose steps were counted including it.
+    /// What the last step ended in environment `env`, whose steps were counted including it.
     fn end_of(&self, env: usize) -> StepEnd {
         let completed = self.game.prev_level_complete()[env] != 0;
         match (self.game.first()[env] != 0, completed) {
@@ -177,7 +177,7 @@ impl ProcgenWorld {
 }
 
 impl LevelSet {
-    /// Moves copy `env` of `game` to the first frame of a level of the set, drawn by the copy's own generator.
+    /// Moves environment `env` of `game` to the first frame of a level of the set, drawn by the environment's own generator.
     fn redraw(&mut self, game: &mut VecGame, env: usize) -> Result<(), ProcgenError> {
         self.spare.set_state(0, &game.state(env)?)?;
         for _ in 0..REDRAWS_MAX {
@@ -325,14 +325,14 @@ impl Environment for ProcgenWorld {
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
         let game = &mut self.game;
-        let copies = self.steps_taken.iter().enumerate();
-        let copies = copies.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
-        saved::encode(&copies.collect::<Result<Vec<_>, ProcgenError>>()?)
+        let envs = self.steps_taken.iter().enumerate();
+        let envs = envs.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
+        saved::encode(&envs.collect::<Result<Vec<_>, ProcgenError>>()?)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let copies: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
-        for (env, (steps, sealed)) in copies.into_iter().enumerate() {
+        let envs: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
+        for (env, (steps, sealed)) in envs.into_iter().enumerate() {
             self.game.set_state(env, &State::unsealed(&sealed)?)?;
             self.steps_taken[env] = steps;
         }

@@ -54,7 +54,7 @@ pub(super) fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f3
     (frames, rewards, ends)
 }
 
-/// One copy of the game at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
+/// One environment at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
 /// was taken before: the engine aims shots with it, and does not forget it when a level starts.
 pub(super) fn alone(engine: &Engine, config: &ProcgenConfig, level: i32, last_move: u8) -> VecGame {
     let options = config.options(1, 0, 0).unwrap();
@@ -167,7 +167,7 @@ fn wrong_settings_are_refused_without_an_engine() {
         let error = config.validate().unwrap_err().to_string();
         assert!(error.contains(text), "{error}");
     }
-    for (num_envs, threads, text) in [(0, 0, "0 copies"), (1, 1000, "1000 threads")] {
+    for (num_envs, threads, text) in [(0, 0, "0 environments"), (1, 1000, "1000 threads")] {
         let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
             .err()
             .unwrap()
@@ -211,7 +211,7 @@ fn seeds_are_mixed_and_not_negative() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_frames_and_copies_do_not_depend_on_their_number() {
+fn the_same_seed_gives_the_same_frames_and_environments_do_not_depend_on_their_number() {
     let Some(engine) = engine() else { return };
     // Maze is won by chance within a few steps, so this crosses redrawn levels too.
     let run = |num_envs: usize, seed: u64, threads: usize| {

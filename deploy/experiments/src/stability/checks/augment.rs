@@ -1,4 +1,4 @@
-//! States cropped and recoloured, as an auxiliary objective sees them, against bytes that are rounded once.
+//! States cropped and recoloured, as an auxiliary loss sees them, against bytes that are rounded once.
 
 use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR, View};
 use rand::Rng;

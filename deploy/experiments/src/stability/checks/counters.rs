@@ -2,7 +2,7 @@
 
 use driml_actor::{Incarnation, Schedule};
 use driml_learner::{AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings};
-use driml_protocol::{Chunk, End, InsertReply, LearnerJoin, RunSpec, Tally, TimeoutRule};
+use driml_protocol::{Chunk, End, InsertReply, LearnerJoin, RunSpec, ShardCounts, TimeoutRule};
 use driml_replay_server::{RateLimiter, Replay};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -125,11 +125,11 @@ fn limiter(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         true => rng.random_range(0..=count),
         false => 0,
     };
-    let others = Tally {
+    let others = ShardCounts {
         inserted: part(inserted),
         rows_sampled: part(rows_sampled),
     };
-    let own = Tally {
+    let own = ShardCounts {
         inserted: inserted - others.inserted,
         rows_sampled: rows_sampled - others.rows_sampled,
     };
@@ -153,11 +153,11 @@ fn resumed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         learner: 1,
         run: 1,
         updates,
-        tally: Tally {
+        counts: ShardCounts {
             inserted: before,
             rows_sampled: updates * 32,
         },
-        other_shards: Tally::default(),
+        other_shards: ShardCounts::default(),
         restart: false,
     };
     replay.join_learner(join).map_err(anyhow::Error::msg)?;

@@ -49,9 +49,9 @@ fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let bound: f64 = cases.of(&bounds, |rng| 10f64.powf(rng.random_range(-30.0..=30.0)));
     let dots = [0.0, 1e-45, 1e-20, 3.7, 400.0, 7e3, 1e10, 1e30, f32::MAX];
     let dot = cases.of(&dots, finite) * cases.of(&[1.0, -1.0], |_| 1.0);
-    let rkhs = cases.of(&[256usize], |rng| rng.random_range(1..4096));
-    let (score, slope) = Scores::new(rkhs, bound).clip(dot);
-    let x = f64::from(dot) / (rkhs as f64).sqrt();
+    let embedding_dim = cases.of(&[256usize], |rng| rng.random_range(1..4096));
+    let (score, slope) = Scores::new(embedding_dim, bound).clip(dot);
+    let x = f64::from(dot) / (embedding_dim as f64).sqrt();
     let ratio = x / bound;
     let expected = bound * ratio.tanh();
     let of_score = match expected {
@@ -59,10 +59,10 @@ fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         _ => (score - expected) / expected,
     };
     // Divided twice, as the square of the cosh may be too large for a float where the slope is not yet too small for one.
-    let expected = 1.0 / (rkhs as f64).sqrt() / ratio.cosh() / ratio.cosh();
+    let expected = 1.0 / (embedding_dim as f64).sqrt() / ratio.cosh() / ratio.cosh();
     let allowed = scores::slope_error(x, bound) * expected.max(scores::LEAST_SLOPE);
     let of_slope = (slope - expected).abs() / allowed;
-    let input = format_args!("dot {dot:e}, width {rkhs}, bound {bound:e}");
+    let input = format_args!("dot {dot:e}, width {embedding_dim}, bound {bound:e}");
     cases.see(input, [of_score, of_slope])
 }
 

@@ -53,7 +53,7 @@ chain actor.epsilon_start -0.1 1.1
 chain actor.epsilon_end -0.1 1.1
 chain replay.replay_ratio 0.0 inf
 chain learner.precision "f16"
-chain learner.publish_as "f8"
+chain learner.publish_dtype "f8"
 chain learner.batch_size 0 100000
 ising world.temperature 0.0 5.1 1e300
 "#;

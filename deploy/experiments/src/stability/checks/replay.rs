@@ -3,7 +3,7 @@
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, Unready, return_sum_error};
+use driml_replay_server::{Compression, Config, NotReady, RETURN_ERROR, Replay, return_sum_error};
 use rand::Rng;
 
 use crate::stability::{
@@ -233,7 +233,7 @@ impl Sizes {
             Ok(batch) => batch,
             Err(why) => {
                 let is_too_few = held < lost + u64::from(self.n_step) + 1;
-                return is_too_few && matches!(why, Unready::Wait(_));
+                return is_too_few && matches!(why, NotReady::Wait(_));
             }
         };
         let anchors = oldest + lost..inserted.saturating_sub(self.n_step.into());

@@ -17,13 +17,13 @@ const ALL: &str = "every number of the type, the middles between them and the fl
 pub(super) const PROPERTIES: &[Property] = &[
     Property {
         routine: "f32 weights",
-        range: "as published (learner.publish_as); finite",
+        range: "as published (learner.publish_dtype); finite",
         promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F32.error())],
         extremes: &[("drawn", Drawn(0.005), |cases| any(cases, StoredAs::F32))],
     },
     Property {
         routine: "f16 weights",
-        range: "as published (learner.publish_as); within 65,504",
+        range: "as published (learner.publish_dtype); within 65,504",
         promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F16.error())],
         extremes: &[
             (ALL, Listed, |cases| all(cases, StoredAs::F16)),
@@ -32,7 +32,7 @@ pub(super) const PROPERTIES: &[Property] = &[
     },
     Property {
         routine: "bf16 weights",
-        range: "as published (learner.publish_as); within 3.3895e38",
+        range: "as published (learner.publish_dtype); within 3.3895e38",
         promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::Bf16.error())],
         extremes: &[
             (ALL, Listed, |cases| all(cases, StoredAs::Bf16)),

@@ -2,7 +2,7 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Batch, Compute, EqualStates, Lambda, LearnerSettings,
+    Batch, Compute, Lambda, LearnerSettings,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
 use driml_model::{ConvLayer, ModelConfig, Parameters};
@@ -90,7 +90,7 @@ impl Setting {
             input_channels: 2,
             num_actions: ACTIONS,
             conv: vec![layer(4, 2), layer(3, 1)],
-            rkhs: 16,
+            embedding_dim: 16,
             action_embed: 4,
             dim: settings.dim_heads(ACTIONS),
             ..small::config(51, 32, self.support)
@@ -152,8 +152,8 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
         importance_weight: None,
     };
     let (mut losses, mut gradients) = (Vec::new(), Vec::new());
-    for equal_states in [EqualStates::Each, EqualStates::Once] {
-        agent = agent.with_equal_states(equal_states);
+    for deduplicate in [false, true] {
+        agent = agent.with_deduplication(deduplicate);
         let found = ErrorOfUpdate::of(&agent, &batch, &reference)?;
         let share = found.reference_loss.abs() / (1.0 + found.reference_loss.abs());
         losses.push(found.loss * share);

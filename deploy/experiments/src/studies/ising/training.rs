@@ -119,7 +119,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     })
 }
 
-/// Frames [T, N, H * W] of whole episodes of N copies, and the patches' first rows and columns.
+/// Frames [T, N, H * W] of whole episodes of N environments, and the patches' first rows and columns.
 #[derive(Default)]
 pub(super) struct Episodes {
     pub(super) frames: Vec<Vec<u8>>,
@@ -127,10 +127,10 @@ pub(super) struct Episodes {
 }
 
 impl Episodes {
-    /// `steps` + 1 frames of each of `copies` episodes.
+    /// `steps` + 1 frames of each of `envs` episodes.
     pub(super) fn play(
         config: &IsingConfig,
-        copies: usize,
+        envs: usize,
         steps: u32,
         seed: u64,
     ) -> anyhow::Result<Self> {
@@ -138,19 +138,19 @@ impl Episodes {
             episode_steps: steps + 1,
             ..config.clone()
         };
-        let mut world = IsingWorld::new(&config, copies, seed)?;
+        let mut world = IsingWorld::new(&config, envs, seed)?;
         let bytes = world.frame_shape().bytes();
-        let (mut rewards, mut ends) = (vec![0.0; copies], vec![StepEnd::Running; copies]);
+        let (mut rewards, mut ends) = (vec![0.0; envs], vec![StepEnd::Running; envs]);
         let mut frames = Vec::new();
         for step in 0..=steps {
-            let mut frame = vec![0; copies * bytes];
+            let mut frame = vec![0; envs * bytes];
             world.observe(&mut frame);
             frames.push(frame);
             if step < steps {
-                world.step(&vec![0; copies], &mut rewards, &mut ends)?;
+                world.step(&vec![0; envs], &mut rewards, &mut ends)?;
             }
         }
-        let origins = (0..copies).filter_map(|copy| world.patch_origin(copy));
+        let origins = (0..envs).filter_map(|env| world.patch_origin(env));
         Ok(Self {
             frames,
             origins: origins.collect(),

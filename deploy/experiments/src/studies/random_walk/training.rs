@@ -34,7 +34,7 @@ pub(super) struct Settings {
     /// Pairs in a batch, each with all others as negatives.
     pub(super) batch_size: usize,
     /// Width of the heads.
-    pub(super) rkhs: usize,
+    pub(super) embedding_dim: usize,
     /// Rows sampled per transition of a single walker.
     pub(super) replay_ratio: f64,
     /// Bound of the scores' soft clip.
@@ -185,7 +185,7 @@ impl Heads {
             channels: vec![],
             scale_blocks: false,
             hidden: states,
-            rkhs: settings.rkhs,
+            embedding_dim: settings.embedding_dim,
             action_embed: 1,
             dim: lambda.dim_heads(false),
             head: HeadConfig::PLAIN,

@@ -56,9 +56,9 @@ pub(super) struct Continual {
     pub(super) tasks: u64,
     /// The lethal ghost of each task; after the last the first again.
     pub(super) order: Vec<u8>,
-    /// Episodes of a task, of all copies together.
+    /// Episodes of a task, of all environments together.
     pub(super) episodes_per_task: u64,
-    /// Copies of the world, in one actor.
+    /// Environments, in one actor.
     pub(super) envs: u64,
     /// What differs from the other runs, in the form of `--set`.
     pub(super) sets: Vec<String>,
@@ -72,9 +72,9 @@ impl Continual {
 }
 
 /// (b) and (c).
-pub(super) const PARTS: usize = 2;
+pub(super) const PROCESSES: usize = 2;
 /// As files name them.
-pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
+pub(super) const PART_NAMES: [&str; PROCESSES] = ["ghosts", "noise"];
 
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,7 +105,7 @@ impl Settings {
             let plan = PlannedRun::new(name, call, *frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
-        for (part, part_name) in PART_NAMES.iter().enumerate() {
+        for (part, process_name) in PART_NAMES.iter().enumerate() {
             let continual = self.tasks(part);
             let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
             let schedule = format!(
@@ -121,7 +121,7 @@ impl Settings {
             let episodes = continual.episodes();
             let frames = episodes * EPISODE_FRAMES_MAX;
             for agent in &self.agents {
-                let name = format!("{part_name}-{agent}-seed{seed}");
+                let name = format!("{process_name}-{agent}-seed{seed}");
                 let call = self.call(agent, seed, frames, &sets.concat());
                 let plan = PlannedRun {
                     episodes: Some(episodes),
@@ -166,7 +166,7 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
             .unwrap_or(continual.episodes_per_task);
         if !episodes.is_multiple_of(continual.envs) {
             return Err(usage!(
-                "--episodes-per-task {episodes} is not a multiple of the {} copies of the world, each of which changes its ghost \
+                "--episodes-per-task {episodes} is not a multiple of the {} environments, each of which changes its ghost \
                  by itself",
                 continual.envs
             ));

@@ -12,7 +12,7 @@ use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-use super::held::HeldBatch;
+use super::fixed_batch::FixedBatch;
 
 /// Rows of the batch whose loss and gradient are compared, at most.
 const ROWS_MAX: usize = 64;
@@ -63,14 +63,14 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
         key: None,
     };
     let agent = Agent::from_parameters(model.clone(), update.clone(), &compute, parameters)?
-        .with_equal_states(config.learner.equal_states);
+        .with_deduplication(config.learner.deduplicate_states);
     let weights = agent.weights()?;
     let (rows, states) = sizes(config);
-    let held = HeldBatch::play(config, Some(&weights), rows)?;
+    let held = FixedBatch::play(config, Some(&weights), rows)?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
-    let published = agent.weights_as(config.learner.publish_as)?;
+    let published = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let held = HeldBatch::play(config, Some(&weights), states)?;
+    let held = FixedBatch::play(config, Some(&weights), states)?;
     let mut acted = vec![0.0; held.rows() * model.num_actions];
     policy.q_values(&held.states_t, &mut acted)?;
     let expected = reference.q_values_t(&held.batch())?;

@@ -64,7 +64,7 @@ mod tests {
             level(("c51", 100.0), ("bf16", 60.0)),
             level(("c51", 100.0), ("driml-fix", 200.0)),
             level(("c51", 100.0), ("f16", 100.0)),
-            level(("driml-fix", 200.0), ("rkhs", 40.0)),
+            level(("driml-fix", 200.0), ("embedding_dim", 40.0)),
         ];
         // What is finished costs nothing and is always there; what is not asked for never is.
         let finished = [

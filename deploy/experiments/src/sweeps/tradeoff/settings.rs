@@ -148,7 +148,7 @@ mod tests {
     const BASES: &str = "\
 mspacman coinrun chain|learner.precision|learner.precision=f32
 mspacman coinrun chain|actor.precision|actor.precision=f32
-mspacman coinrun chain|learner.publish_as|learner.publish_as=f32
+mspacman coinrun chain|learner.publish_dtype|learner.publish_dtype=f32
 mspacman coinrun chain|learner.batch_size|learner.batch_size=64
 mspacman coinrun chain|replay.replay_ratio|replay.replay_ratio=8
 mspacman coinrun chain|model.atoms|model.atoms=51
@@ -158,7 +158,7 @@ mspacman coinrun chain|replay.shards|replay.shards=1
 mspacman coinrun chain|transport.shared_memory|transport.shared_memory=true
 mspacman coinrun|learner.publish_period_updates|learner.publish_period_updates=8
 mspacman coinrun|model.hidden|model.hidden=512
-mspacman coinrun|model.rkhs|model.rkhs=512
+mspacman coinrun|model.embedding_dim|model.embedding_dim=512
 mspacman coinrun|pairs NtM|learner.update.lambda.3t3=0 learner.update.lambda.3t4=0 learner.update.lambda.4t3=0
 mspacman|observation|input.height=42 input.width=38
 coinrun|observation|input.height=64 input.width=64";

@@ -10,7 +10,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::held::HeldBatch;
+use super::fixed_batch::FixedBatch;
 
 /// Times of one update and one action, of a level and of its base in turns with it. Medians over the turns.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -19,7 +19,7 @@ pub(super) struct Speed {
     pub(super) update_seconds: f64,
     /// How many times as many rows a second are learned from as at the base.
     rows_gain: f64,
-    /// Seconds of choosing an action for one frame, among as many as an actor has copies.
+    /// Seconds of choosing an action for one frame, among as many as an actor has environments.
     pub(super) act_seconds: f64,
     /// How many times as many frames a second are acted on as at the base.
     act_gain: f64,
@@ -32,30 +32,30 @@ pub(super) struct Speed {
 /// What is timed.
 struct Side {
     agent: Agent,
-    held: HeldBatch,
+    held: FixedBatch,
     policy: PolicyNetwork,
-    /// Frames of a round of all copies of an actor.
+    /// Frames of a round of all environments of an actor.
     frames: Vec<u8>,
     actions: Vec<u8>,
 }
 
 impl Side {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
-        let held = HeldBatch::play(config, None, config.learner.batch_size as usize)?;
+        let held = FixedBatch::play(config, None, config.learner.batch_size as usize)?;
         let agent = Agent::new(
             config.model.clone(),
             config.learner.update.clone(),
             &Compute::cpu(config.learner.precision),
             &mut ChaCha8Rng::seed_from_u64(1),
         )?
-        .with_equal_states(config.learner.equal_states);
-        let weights = agent.weights_as(config.learner.publish_as)?;
+        .with_deduplication(config.learner.deduplicate_states);
+        let weights = agent.weights_as(config.learner.publish_dtype)?;
         let policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
-        let copies = config.actor.envs as usize;
-        let bytes = copies * config.model.frame_len();
+        let envs = config.actor.envs as usize;
+        let bytes = envs * config.model.frame_len();
         Ok(Self {
             frames: held.states_t.iter().copied().cycle().take(bytes).collect(),
-            actions: vec![0; copies],
+            actions: vec![0; envs],
             agent,
             held,
             policy,
@@ -112,7 +112,7 @@ pub(super) fn measure(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyho
         rows_gain: rows * median(&mut update_gains),
         act_seconds: median(&mut acts),
         act_gain: median(&mut act_gains),
-        weights_bytes: to.agent.weights_as(level.learner.publish_as)?.len() as u64,
+        weights_bytes: to.agent.weights_as(level.learner.publish_dtype)?.len() as u64,
         frame_bytes: u64::from(run.frame_height * run.frame_width * run.frame_channels),
     })
 }

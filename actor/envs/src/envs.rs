@@ -1,0 +1,147 @@
+//! What every world of many environments shares: a generator for each environment, the check of a caller's step buffers, and how environments that are
+//! stepped one by one are a world.
+//! It holds no game rules and no state.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Serialize, de::DeserializeOwned};
+
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::error::EnvError;
+use crate::saved;
+
+/// A world whose environments are stepped one by one, each by itself.
+pub(crate) trait Envs: Send {
+    /// All of an environment that does not follow from the settings.
+    type Saved: Serialize + DeserializeOwned;
+
+    fn shape(&self) -> FrameShape;
+
+    fn actions(&self) -> usize;
+
+    fn count(&self) -> usize;
+
+    /// Writes the current frame [H, W, C] of an environment.
+    fn draw(&self, env: usize, frame: &mut [u8]);
+
+    /// Takes an action, which the world has, and starts anew what it ended.
+    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd);
+
+    fn saved(&self, env: usize) -> Self::Saved;
+
+    fn restore(&mut self, env: usize, saved: Self::Saved) -> Result<(), EnvError>;
+}
+
+impl<W: Envs> Environment for W {
+    fn frame_shape(&self) -> FrameShape {
+        self.shape()
+    }
+
+    fn num_actions(&self) -> usize {
+        self.actions()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.count()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        check_frames(frames, self.count(), self.shape());
+        let bytes = self.shape().bytes();
+        for (env, frame) in frames.chunks_exact_mut(bytes).enumerate() {
+            self.draw(env, frame);
+        }
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        check_step(self.count(), self.actions(), actions, rewards, ends)?;
+        for (env, &action) in actions.iter().enumerate() {
+            (rewards[env], ends[env]) = self.act(env, action);
+        }
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        let envs: Vec<_> = (0..self.count()).map(|env| self.saved(env)).collect();
+        saved::encode(&envs)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let envs = saved::decode(state, self.count())?;
+        let mut envs = envs.into_iter().enumerate();
+        envs.try_for_each(|(env, saved)| self.restore(env, saved))
+    }
+}
+
+/// The argument of `Environment::observe` is as long as the frames of all environments.
+pub(crate) fn check_frames(frames: &[u8], num_envs: usize, shape: FrameShape) {
+    assert_eq!(
+        frames.len(),
+        num_envs * shape.bytes(),
+        "observe needs room for every environment's frame"
+    );
+}
+
+/// What an environment's generator is used for; each use has its own stream, so adding one leaves the others as they were.
+#[derive(Clone, Copy)]
+pub(crate) enum RngUse {
+    /// The game's own chance moves.
+    Game,
+    /// The Ising model in Ms. PacMan's walls.
+    Overlay,
+}
+
+/// The generator of environment `env` in a world seeded with `seed`: ChaCha8 keyed by the seed, one stream an environment and use.
+pub(crate) fn env_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(2 * env as u64 + used_for as u64);
+    rng
+}
+
+pub(crate) fn check_num_envs(num_envs: usize) -> Result<(), EnvError> {
+    if num_envs == 0 {
+        return Err(EnvError::Config(
+            "a world needs at least one environment, got num_envs = 0".into(),
+        ));
+    }
+    Ok(())
+}
+
+/// Checks the arguments of `Environment::step`: `actions`, `rewards` and `ends` are [N], each action < `num_actions`.
+pub(crate) fn check_step(
+    num_envs: usize,
+    num_actions: usize,
+    actions: &[u8],
+    rewards: &[f32],
+    ends: &[StepEnd],
+) -> Result<(), EnvError> {
+    for (name, got) in [
+        ("actions", actions.len()),
+        ("rewards", rewards.len()),
+        ("ends", ends.len()),
+    ] {
+        if got != num_envs {
+            return Err(EnvError::BufferLength {
+                name,
+                got,
+                num_envs,
+            });
+        }
+    }
+    match actions
+        .iter()
+        .position(|&action| usize::from(action) >= num_actions)
+    {
+        Some(env) => Err(EnvError::ActionOutOfRange {
+            env,
+            action: actions[env],
+            num_actions,
+        }),
+        None => Ok(()),
+    }
+}

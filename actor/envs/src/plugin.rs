@@ -1,0 +1,117 @@
+//! Worlds that a program adds to those of this crate, before anything else is done; they are known by name from then on.
+//! They come from the same program that starts every process, so that all processes know them.
+
+use std::fmt;
+use std::sync::{Arc, OnceLock};
+
+use serde::de::DeserializeOwned;
+use serde::{Serialize, Serializer};
+use toml::{Table, Value};
+
+use crate::settings::WorldSettings;
+
+/// Settings of any world, shared by those who read them.
+type Settings = Arc<dyn WorldSettings + Send + Sync>;
+
+/// A kind of world that a program adds.
+#[derive(Debug)]
+pub struct CustomKind {
+    name: &'static str,
+    preset: &'static str,
+    read: fn(Table) -> Result<Settings, toml::de::Error>,
+}
+
+static CUSTOM: OnceLock<Vec<CustomKind>> = OnceLock::new();
+
+impl CustomKind {
+    /// The world of this name: `--env NAME` trains in it, and `kind = "NAME"` in settings is read as an `S`.
+    ///
+    /// `preset` is the world's layer of settings, TOML as in `deploy/settings/presets/world/`: at least `run.frame_stack`,
+    /// `input.height`, `input.width` and the table `[world]` with the fields of `S`. A name that this crate's worlds have stays
+    /// theirs, and of two of one name the first one counts.
+    pub fn of<S>(name: &'static str, preset: &'static str) -> Self
+    where
+        S: WorldSettings + DeserializeOwned + Send + Sync + 'static,
+    {
+        Self {
+            name,
+            preset,
+            read: |table| Ok(Arc::new(table.try_into::<S>()?)),
+        }
+    }
+}
+
+/// Makes these worlds known.
+///
+/// # Panics
+/// If it was called before.
+pub fn register(kinds: Vec<CustomKind>) {
+    let first = CUSTOM.set(kinds);
+    first.expect("a program registers its worlds once");
+}
+
+fn custom() -> &'static [CustomKind] {
+    CUSTOM.get().map_or(&[], Vec::as_slice)
+}
+
+/// The names of all worlds that were registered.
+pub(crate) fn kinds() -> impl Iterator<Item = &'static str> {
+    custom().iter().map(|kind| kind.name)
+}
+
+/// The layer of settings of a registered world.
+pub fn preset(name: &str) -> Option<&'static str> {
+    let kind = custom().iter().find(|kind| kind.name == name);
+    kind.map(|kind| kind.preset)
+}
+
+/// The settings of a world that a program added: as they were read, and what its code made of them.
+#[derive(Clone)]
+pub struct CustomWorld {
+    kind: &'static str,
+    /// With `kind`, so that they are written as they were read.
+    table: Table,
+    settings: Settings,
+}
+
+impl CustomWorld {
+    /// Reads the settings of a registered world; `None` if its `kind` is not registered.
+    pub(crate) fn read(table: &Table) -> Option<Result<Self, toml::de::Error>> {
+        let name = table.get("kind").and_then(Value::as_str)?;
+        let kind = custom().iter().find(|kind| kind.name == name)?;
+        let mut fields = table.clone();
+        fields.remove("kind");
+        let settings = (kind.read)(fields);
+        Some(settings.map(|settings| Self {
+            kind: kind.name,
+            table: table.clone(),
+            settings,
+        }))
+    }
+
+    pub(crate) const fn kind(&self) -> &'static str {
+        self.kind
+    }
+
+    pub(crate) fn settings(&self) -> &(dyn WorldSettings + 'static) {
+        self.settings.as_ref()
+    }
+}
+
+impl fmt::Debug for CustomWorld {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.table.fmt(f)
+    }
+}
+
+impl PartialEq for CustomWorld {
+    fn eq(&self, other: &Self) -> bool {
+        self.table == other.table
+    }
+}
+
+impl Serialize for CustomWorld {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.table.serialize(serializer)
+    }
+}

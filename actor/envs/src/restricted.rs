@@ -1,0 +1,182 @@
+//! A part of a world: some of its actions, and frames that are cut at the right and at the bottom: where nothing reads those borders,
+//! nothing keeps or sends them.
+//! Which actions do the same is for each world to say, and who reads what of a frame for the caller.
+
+use serde::{Deserialize, Serialize};
+
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::check_frames;
+use crate::error::EnvError;
+
+/// Which of a world's actions an agent chooses among.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ActionSet {
+    /// All that the world takes.
+    #[default]
+    All,
+    /// One of those that do the same in this world. Chance and the network choose among fewer then, so neither what is explored nor
+    /// what is learned is the same.
+    Visible,
+}
+
+/// Another world, with some of its actions, numbered without gaps, and the upper left part of its frames.
+pub struct RestrictedWorld {
+    world: Box<dyn Environment>,
+    actions: Vec<u8>,
+    /// The world's actions of the step in progress [N].
+    step: Vec<u8>,
+    whole: FrameShape,
+    shape: FrameShape,
+    /// Whole frames of all environments: memory to use again.
+    frames: Vec<u8>,
+}
+
+impl RestrictedWorld {
+    /// `world` with a subset `actions` of its actions and frames of (height, width); unchanged where these are all that it has.
+    ///
+    /// # Errors
+    /// No action, or one that the world does not have; frames larger than the world's, or without a pixel.
+    pub fn of(
+        world: Box<dyn Environment>,
+        actions: Vec<u8>,
+        (height, width): (usize, usize),
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        let (whole, count) = (world.frame_shape(), world.num_actions());
+        let shape = FrameShape {
+            height,
+            width,
+            channels: whole.channels,
+        };
+        let has_all = actions.iter().map(|&it| usize::from(it)).eq(0..count);
+        if shape == whole && has_all {
+            return Ok(world);
+        }
+        if actions.is_empty() || actions.iter().any(|&it| usize::from(it) >= count) {
+            return Err(EnvError::Config(format!(
+                "{actions:?} are not actions of a world that has {count}"
+            )));
+        }
+        if height.min(width) == 0 || height > whole.height || width > whole.width {
+            return Err(EnvError::Config(format!(
+                "frames of {height} x {width} cannot be cut from frames of {} x {}",
+                whole.height, whole.width
+            )));
+        }
+        let envs = world.num_envs();
+        Ok(Box::new(Self {
+            world,
+            actions,
+            step: Vec::with_capacity(envs),
+            whole,
+            shape,
+            frames: vec![0; envs * whole.bytes()],
+        }))
+    }
+}
+
+impl Environment for RestrictedWorld {
+    fn frame_shape(&self) -> FrameShape {
+        self.shape
+    }
+
+    fn num_actions(&self) -> usize {
+        self.actions.len()
+    }
+
+    fn num_envs(&self) -> usize {
+        self.world.num_envs()
+    }
+
+    fn observe(&mut self, frames: &mut [u8]) {
+        check_frames(frames, self.num_envs(), self.shape);
+        self.world.observe(&mut self.frames);
+        let [whole_row, row] = [self.whole, self.shape].map(|shape| shape.width * shape.channels);
+        let whole = self.frames.chunks_exact(self.whole.bytes());
+        for (part, whole) in frames.chunks_exact_mut(self.shape.bytes()).zip(whole) {
+            let rows = whole.chunks_exact(whole_row);
+            for (part, whole) in part.chunks_exact_mut(row).zip(rows) {
+                part.copy_from_slice(&whole[..row]);
+            }
+        }
+    }
+
+    fn step(
+        &mut self,
+        actions: &[u8],
+        rewards: &mut [f32],
+        ends: &mut [StepEnd],
+    ) -> Result<(), EnvError> {
+        self.step.clear();
+        for &action in actions {
+            let Some(&own) = self.actions.get(usize::from(action)) else {
+                let count = self.actions.len();
+                return Err(EnvError::Config(format!("action {action} of {count}")));
+            };
+            self.step.push(own);
+        }
+        self.world.step(&self.step, rewards, ends)
+    }
+
+    fn save(&mut self) -> Result<Vec<u8>, EnvError> {
+        self.world.save()
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        self.world.load(state)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::settings::WorldSettings;
+    use crate::worlds::chain::{ChainConfig, tests::config};
+
+    /// Two corridors with frames of 4 x 6.
+    fn part(actions: &[u8], size: (usize, usize)) -> Result<Box<dyn Environment>, EnvError> {
+        let config = ChainConfig {
+            cells: 3,
+            height: 4,
+            width: 6,
+            reward_left: -1.0,
+            ..config()
+        };
+        RestrictedWorld::of(config.build(2, 1, 0)?, actions.to_vec(), size)
+    }
+
+    #[test]
+    fn actions_and_frames_are_the_world_s_own() {
+        let mut world = part(&[2, 1], (2, 3)).unwrap();
+        assert_eq!((world.num_envs(), world.num_actions()), (2, 2));
+        assert_eq!(world.frame_shape().bytes(), 6);
+        let mut frames = [7; 12];
+        // The agent's cell is the middle one: columns 2 and 3.
+        world.observe(&mut frames);
+        assert_eq!(frames, [0, 0, 255].repeat(4)[..]);
+        let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
+        // Right is 2 in the corridor, left 1.
+        world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
+        assert_eq!((rewards, ends), ([1.0, -1.0], [StepEnd::Terminal; 2]));
+        assert!(world.step(&[0, 2], &mut rewards, &mut ends).is_err());
+        // No-op is 0, and left is not among these.
+        let mut world = part(&[0, 2], (2, 3)).unwrap();
+        world.step(&[1, 0], &mut rewards, &mut ends).unwrap();
+        assert_eq!(
+            (rewards, ends),
+            ([1.0, 0.0], [StepEnd::Terminal, StepEnd::Running])
+        );
+    }
+
+    #[test]
+    fn the_whole_is_the_world_as_it_is_and_what_it_has_not_is_refused() {
+        let all = part(&[0, 1, 2], (4, 6)).unwrap();
+        assert_eq!((all.num_actions(), all.frame_shape().bytes()), (3, 24));
+        for wrong in [&[][..], &[3], &[0, 1, 2, 3]] {
+            assert!(part(wrong, (4, 6)).is_err(), "{wrong:?}");
+        }
+        for size in [(5, 6), (4, 7), (0, 6), (4, 0)] {
+            assert!(part(&[0, 1, 2], size).is_err(), "{size:?}");
+        }
+    }
+}

@@ -1,0 +1,305 @@
+//! A corridor with a small reward near and a large one far, whose best return is known: a learner must pass by the near.
+//! It has no chance in it and no environments that differ; it exists for fast learning tests.
+
+use serde::{Deserialize, Serialize};
+
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::envs::{Envs, check_num_envs};
+use crate::error::EnvError;
+use crate::saved;
+use crate::settings::WorldSettings;
+
+/// The cell in which every episode starts: beside the near end.
+const START_CELL: usize = 1;
+
+/// The settings of the corridor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChainConfig {
+    /// Cells, both ends included; at least 3. More make the far end harder to find: a uniform random walk gets there
+    /// before the near end with probability 1 / (`cells` - 1).
+    pub cells: usize,
+    /// Rows of a frame, in pixels, at least 1.
+    pub height: usize,
+    /// Columns of a frame, in pixels, at least `cells`.
+    pub width: usize,
+    /// Env steps after which an episode is cut off, at least 1.
+    pub step_limit: u32,
+    /// Reward of reaching the left end (cell 0), which ends the episode; the distractor.
+    pub reward_left: f32,
+    /// Reward of reaching the right end (the last cell), which ends the episode.
+    pub reward_right: f32,
+}
+
+/// The best undiscounted return of one episode: `optimal_discounted_return` with gamma = 1.
+pub fn optimal_return(config: &ChainConfig) -> f64 {
+    optimal_discounted_return(config, 1.0)
+}
+
+/// The best return from the start with discount `gamma` in 0..=1: max(0, r_left, gamma^(cells - 3) r_right).
+///
+/// The right end is `cells` - 2 steps away, so its reward is the (`cells` - 2)-th, and it counts only if the step limit
+/// allows it; 0 is what waiting for the limit earns.
+pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
+    let steps_right = (config.cells - 1 - START_CELL) as u32;
+    let left = f64::from(config.reward_left);
+    let right = gamma.powi(steps_right as i32 - 1) * f64::from(config.reward_right);
+    let reachable = steps_right <= config.step_limit;
+    if reachable {
+        left.max(right).max(0.0)
+    } else {
+        left.max(0.0)
+    }
+}
+
+/// N corridors. A frame is black but for the band of columns that belongs to the agent's cell, which is white.
+///
+/// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows.
+pub struct ChainWorld {
+    config: ChainConfig,
+    cells: Vec<usize>,
+    episode_steps: Vec<u32>,
+}
+
+impl ChainWorld {
+    /// The actions, in their order.
+    pub const ACTION_NAMES: [&str; 3] = ["no-op", "left", "right"];
+
+    /// `num_envs` corridors. No seed: nothing in them is left to chance.
+    ///
+    /// # Errors
+    /// Settings that cannot work.
+    pub fn new(config: &ChainConfig, num_envs: usize) -> Result<Self, EnvError> {
+        config.validate()?;
+        check_num_envs(num_envs)?;
+        Ok(Self {
+            config: config.clone(),
+            cells: vec![START_CELL; num_envs],
+            episode_steps: vec![0; num_envs],
+        })
+    }
+}
+
+impl WorldSettings for ChainConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        if self.cells < 3
+            || self.width < self.cells
+            || self.height == 0
+            || self.width.max(self.height) > 1024
+        {
+            return Err(EnvError::Config(format!(
+                "the chain needs cells >= 3, cells <= width <= 1024 and 1 <= height <= 1024, got cells = {}, width = {}, height = {}",
+                self.cells, self.width, self.height
+            )));
+        }
+        if self.step_limit == 0 {
+            return Err(EnvError::Config(
+                "the chain's step_limit must be at least 1, got 0".into(),
+            ));
+        }
+        if !self.reward_left.is_finite() || !self.reward_right.is_finite() {
+            return Err(EnvError::Config(format!(
+                "the chain's rewards must be finite, got reward_left = {} and reward_right = {}",
+                self.reward_left, self.reward_right
+            )));
+        }
+        Ok(())
+    }
+
+    /// `height` x `width` x 1.
+    fn frame_shape(&self) -> FrameShape {
+        FrameShape {
+            height: self.height,
+            width: self.width,
+            channels: 1,
+        }
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        ChainWorld::ACTION_NAMES.to_vec()
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        _seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(ChainWorld::new(self, num_envs)?))
+    }
+}
+
+impl Envs for ChainWorld {
+    /// Cell, and steps of the episode.
+    type Saved = (usize, u32);
+
+    fn shape(&self) -> FrameShape {
+        self.config.frame_shape()
+    }
+
+    fn actions(&self) -> usize {
+        Self::ACTION_NAMES.len()
+    }
+
+    fn count(&self) -> usize {
+        self.cells.len()
+    }
+
+    fn draw(&self, env: usize, frame: &mut [u8]) {
+        let (cell, cells, width) = (self.cells[env], self.config.cells, self.config.width);
+        frame.fill(0);
+        for row in frame.chunks_exact_mut(width) {
+            row[cell * width / cells..(cell + 1) * width / cells].fill(255);
+        }
+    }
+
+    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd) {
+        let (cell, steps) = (&mut self.cells[env], &mut self.episode_steps[env]);
+        match action {
+            1 => *cell -= 1,
+            2 => *cell += 1,
+            _ => {}
+        }
+        *steps += 1;
+        let (reward, end) = match *cell {
+            0 => (self.config.reward_left, StepEnd::Terminal),
+            it if it == self.config.cells - 1 => (self.config.reward_right, StepEnd::Terminal),
+            _ if *steps >= self.config.step_limit => (0.0, StepEnd::TimedOut),
+            _ => (0.0, StepEnd::Running),
+        };
+        if end != StepEnd::Running {
+            (*cell, *steps) = (START_CELL, 0);
+        }
+        (reward, end)
+    }
+
+    fn saved(&self, env: usize) -> Self::Saved {
+        (self.cells[env], self.episode_steps[env])
+    }
+
+    fn restore(&mut self, env: usize, saved: Self::Saved) -> Result<(), EnvError> {
+        let inner = 1..self.config.cells - 1;
+        saved::check(inner.contains(&saved.0), "a cell")?;
+        (self.cells[env], self.episode_steps[env]) = saved;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A corridor in which 0.1 is near and 1 is far.
+    pub(crate) fn config() -> ChainConfig {
+        ChainConfig {
+            cells: 8,
+            height: 12,
+            width: 12,
+            step_limit: 30,
+            reward_left: 0.1,
+            reward_right: 1.0,
+        }
+    }
+
+    /// Return and end of the first episode under a fixed action, with discount `gamma`.
+    fn play(config: &ChainConfig, action: u8, gamma: f64) -> (f64, StepEnd) {
+        let mut world = ChainWorld::new(config, 1).unwrap();
+        let (mut total, mut discount) = (0.0, 1.0);
+        loop {
+            let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
+            world.step(&[action], &mut reward, &mut end).unwrap();
+            total += discount * f64::from(reward[0]);
+            discount *= gamma;
+            if end[0] != StepEnd::Running {
+                return (total, end[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn the_best_policy_attains_the_optimum() {
+        let base = config();
+        assert_eq!(optimal_return(&base), 1.0);
+        for (cells, step_limit, reward_left) in [
+            (8, 30, 0.1),
+            (8, 6, 0.1),
+            (8, 5, 0.1),
+            (3, 1, 2.0),
+            (5, 9, -1.0),
+        ] {
+            let config = ChainConfig {
+                cells,
+                step_limit,
+                reward_left,
+                ..base.clone()
+            };
+            for gamma in [1.0, 0.9, 0.1] {
+                let best = (0..3)
+                    .map(|a| play(&config, a, gamma).0)
+                    .fold(f64::MIN, f64::max);
+                let optimum = optimal_discounted_return(&config, gamma);
+                assert!(
+                    (best - optimum).abs() < 1e-9,
+                    "{config:?}, gamma {gamma}: {best} against {optimum}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn ends_are_terminal_at_the_ends_and_timed_out_between() {
+        assert_eq!(play(&config(), 0, 1.0), (0.0, StepEnd::TimedOut));
+        let near = f64::from(0.1f32);
+        assert_eq!(play(&config(), 1, 1.0), (near, StepEnd::Terminal));
+        assert_eq!(play(&config(), 2, 1.0), (1.0, StepEnd::Terminal));
+        for (step_limit, end) in [(6, StepEnd::Terminal), (5, StepEnd::TimedOut)] {
+            let config = ChainConfig {
+                step_limit,
+                ..config()
+            };
+            assert_eq!(play(&config, 2, 1.0).1, end);
+        }
+    }
+
+    #[test]
+    fn each_cell_has_its_own_frame() {
+        let mut world = ChainWorld::new(&config(), 2).unwrap();
+        let mut seen = std::collections::BTreeSet::new();
+        let mut frames = vec![0; 2 * 144];
+        for _ in 1..7 {
+            world.observe(&mut frames);
+            assert!(seen.insert(frames[144..].to_vec()));
+            world
+                .step(&[0, 2], &mut [0.0; 2], &mut [StepEnd::Running; 2])
+                .unwrap();
+        }
+        world.observe(&mut frames);
+        assert_eq!(
+            frames[..144],
+            frames[144..],
+            "the second environment started again, the first never moved"
+        );
+        assert_eq!(seen.len(), 6);
+    }
+
+    #[test]
+    fn bad_actions_and_settings_are_errors() {
+        let mut world = ChainWorld::new(&config(), 1).unwrap();
+        for wrong in [&[3][..], &[0, 0]] {
+            let step = world.step(wrong, &mut [0.0], &mut [StepEnd::Running]);
+            assert!(step.is_err(), "{wrong:?}");
+        }
+        let changes: [fn(&mut ChainConfig); 5] = [
+            |it| it.cells = 2,
+            |it| it.width = 7,
+            |it| it.height = 0,
+            |it| it.step_limit = 0,
+            |it| it.reward_right = f32::NAN,
+        ];
+        for change in changes {
+            let mut bad = config();
+            change(&mut bad);
+            assert!(ChainWorld::new(&bad, 1).is_err(), "{bad:?}");
+        }
+    }
+}

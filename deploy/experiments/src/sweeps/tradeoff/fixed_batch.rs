@@ -1,0 +1,167 @@
+//! Fixed batches: rows of a world that no replay serves, on which the speed and the error of updates are measured.
+//! They are spread over 512 steps of 16 environments, so over whole episodes. Frames, stacks and enlargement are the run's own; k is 1, and
+//! nothing is augmented.
+
+use anyhow::Context;
+use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
+use driml_envs::{RestrictedWorld, StepEnd};
+use driml_learner::Batch;
+use driml_protocol::NO_ACTION;
+use driml_settings::config::RunConfig;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+/// Environments that are played.
+const ENVS: usize = 16;
+/// Steps over which the rows of an environment are spread evenly.
+const SPAN: usize = 512;
+/// Share of random actions where a network chooses the others.
+const EPSILON: f64 = 0.1;
+/// Seed of the world and the actions: the same rows for every level of a dial that leaves the world alone.
+const SEED: u64 = 1_000_003;
+
+/// Rows as an update reads them.
+#[derive(Default)]
+pub(super) struct FixedBatch {
+    pub(super) states_t: Vec<u8>,
+    states_k: Vec<u8>,
+    states_n: Vec<u8>,
+    action: Vec<u8>,
+    next_action: Vec<u8>,
+    n_step_return: Vec<f32>,
+    bootstrap_discount: Vec<f32>,
+    positive_valid: Vec<u8>,
+    positives: usize,
+}
+
+/// What all environments saw and did at one step.
+struct Moment {
+    /// [N, H, W, C] at the network's size; empty where no row has them.
+    states: Vec<u8>,
+    actions: Vec<u8>,
+    rewards: Vec<f32>,
+    ends: Vec<StepEnd>,
+}
+
+impl FixedBatch {
+    /// Plays the world of `config` for `rows` rows, greedily with `weights` but for one action in ten, else at random.
+    pub(super) fn play(
+        config: &RunConfig,
+        weights: Option<&[u8]>,
+        rows: usize,
+    ) -> anyhow::Result<Self> {
+        let (n, k) = (config.run.n_step as usize, 1);
+        let of_env = rows.div_ceil(ENVS);
+        let apart = SPAN.div_ceil(of_env);
+        let steps = of_env * apart + n.max(k);
+        let wanted_at = |step: usize| {
+            let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % apart == 0);
+            [0, k, n].into_iter().any(of_row)
+        };
+        let history = history(config, weights, steps + 1, wanted_at)?;
+        let len = config.model.frame_len();
+        let mut batch = Self {
+            positives: config.run.horizon.positives().min(1),
+            ..Self::default()
+        };
+        for row in 0..rows {
+            let (env, t) = (row % ENVS, row / ENVS * apart);
+            let state = |t: usize| &history[t].states[env * len..][..len];
+            let mut n_step_return = 0.0;
+            let mut discount = 1.0;
+            for moment in &history[t..t + n] {
+                n_step_return += discount * f64::from(moment.rewards[env]);
+                discount *= config.run.gamma;
+                if ends(moment.ends[env]) {
+                    discount = 0.0;
+                    break;
+                }
+            }
+            batch.states_t.extend_from_slice(state(t));
+            batch.states_n.extend_from_slice(state(t + n));
+            batch.action.push(history[t].actions[env]);
+            batch.next_action.push(match ends(history[t].ends[env]) {
+                true => NO_ACTION,
+                false => history[t + 1].actions[env],
+            });
+            batch.n_step_return.push(n_step_return as f32);
+            batch.bootstrap_discount.push(discount as f32);
+            if batch.positives > 0 {
+                batch.states_k.extend_from_slice(state(t + k));
+                let is_running = history[t].ends[env] == StepEnd::Running;
+                batch.positive_valid.push(u8::from(is_running));
+            }
+        }
+        Ok(batch)
+    }
+
+    pub(super) fn batch(&self) -> Batch<'_> {
+        Batch {
+            rows: self.action.len(),
+            states_t: &self.states_t,
+            anchors: None,
+            positives: self.positives,
+            states_k: &self.states_k,
+            states_n: &self.states_n,
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+            importance_weight: None,
+        }
+    }
+
+    pub(super) fn rows(&self) -> usize {
+        self.action.len()
+    }
+}
+
+/// Whether the return ends there.
+fn ends(end: StepEnd) -> bool {
+    matches!(end, StepEnd::TimedOut | StepEnd::Terminal)
+}
+
+/// `steps` steps of all environments, with the states of those that are `wanted_at`.
+fn history(
+    config: &RunConfig,
+    weights: Option<&[u8]>,
+    steps: usize,
+    wanted_at: impl Fn(usize) -> bool,
+) -> anyhow::Result<Vec<Moment>> {
+    let (run, model) = (&config.run, &config.model);
+    let sent = (run.frame_height as usize, run.frame_width as usize);
+    let world = config.world.build(ENVS, SEED, 0);
+    let world = world.context("building the world")?;
+    let actions = config.world.actions(config.actor.actions);
+    let world = RestrictedWorld::of(world, actions, sent)?;
+    let rng = ChaCha8Rng::seed_from_u64(SEED);
+    let mut acting = Acting::new(world, run.frame_stack as usize, rng)?;
+    let enlarge = || config.input.enlarge(sent, model);
+    let enlarged = enlarge()?;
+    let precision = config.actor.precision;
+    let mut policy: Box<dyn Policy> = match weights {
+        Some(weights) => Box::new(NetworkPolicy::new(model, enlarge()?, weights, precision)?),
+        None => Box::new(RandomPolicy::new(u8::try_from(model.num_actions)?)),
+    };
+    let mut history = Vec::new();
+    for step in 0..steps {
+        let seen = acting.step(&mut *policy, EPSILON)?;
+        let mut states = Vec::new();
+        match &enlarged {
+            _ if !wanted_at(step) => {}
+            None => states.extend_from_slice(seen.states),
+            Some(enlarge) => {
+                states.resize(model.frame_len() * ENVS, 0);
+                enlarge.apply(seen.states, &mut states);
+            }
+        }
+        history.push(Moment {
+            states,
+            actions: seen.actions.to_vec(),
+            rewards: seen.rewards.to_vec(),
+            ends: seen.ends.to_vec(),
+        });
+    }
+    Ok(history)
+}

@@ -1,0 +1,147 @@
+//! The launcher's processes: the words that start each, and those that are started again when they have died.
+//! When the first are started, and how all end, is in `mod`.
+
+use anyhow::bail;
+use driml_protocol::session;
+
+use super::{Launch, Outside};
+use crate::{
+    managed_process::{ManagedProcess, Surroundings},
+    processes::Revived,
+};
+
+/// How often replay servers that keep their replay on disk are started again in a run, all together.
+const RESTARTS_MAX: u32 = 8;
+/// How often actors that have died are started again in one run, all together; one more is an error.
+const ACTOR_RESTARTS_MAX: u32 = 16;
+/// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
+const PROCESS_THREADS: u32 = 1;
+
+/// A command of this program and flags with their values.
+fn call<'a>(command: &str, flags: impl IntoIterator<Item = (&'a str, &'a str)>) -> Vec<String> {
+    let flags = flags.into_iter().flat_map(|(flag, value)| [flag, value]);
+    let words = command.split(' ').chain(flags);
+    words.map(str::to_owned).collect()
+}
+
+impl Outside {
+    /// Flags of the first replay server, beside where the processes meet.
+    fn flags(&self) -> Vec<String> {
+        let mut flags = Vec::new();
+        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
+            let folder = folder.display().to_string();
+            flags = ["--listen", listen, "--tls-dir", &folder]
+                .map(str::to_owned)
+                .to_vec();
+        }
+        if self.allow_insecure {
+            flags.push("--allow-insecure".into());
+        }
+        flags
+    }
+}
+
+impl Launch<'_> {
+    fn start(&self, name: &str, args: &[String], threads: u32) -> anyhow::Result<ManagedProcess> {
+        let surroundings = Surroundings {
+            logs: &self.run_dir.logs(),
+            screen: &self.screen,
+            rendezvous: Some(&self.rendezvous),
+        };
+        ManagedProcess::start(name, args, threads, surroundings)
+    }
+
+    pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
+        let folder = self.run_dir.display().to_string();
+        let device = self.config.local.learner_device.to_string();
+        let connect = self.endpoints.iter().map(|it| ("--connect", it.as_str()));
+        let flags = [("--run-dir", folder.as_str()), ("--device", &device)];
+        let args = call("learner --keep-alive", flags.into_iter().chain(connect));
+        self.start("learner", &args, self.config.local.learner_threads)
+    }
+
+    pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
+        let number = id.to_string();
+        let endpoint = &self.endpoints[id as usize % self.endpoints.len()];
+        let mut flags = vec![("--connect", endpoint.as_str()), ("--id", &number)];
+        if self.config.world.name().foreign_code().is_some() {
+            flags.push(("--env", &self.config.run.world));
+        }
+        let args = call("actor", flags);
+        self.start(&format!("actor-{id}"), &args, PROCESS_THREADS)
+    }
+
+    pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
+        let config = self.run_dir.config().display().to_string();
+        let number = shard.to_string();
+        let folder = self.run_dir.replay().display().to_string();
+        let mut flags = vec![
+            ("--listen", self.endpoints[shard].as_str()),
+            ("--shard", &number),
+            ("--config", &config),
+        ];
+        if self.config.transport.shared_memory && !self.shared_memory {
+            flags.push(("--set", "transport.shared_memory=false"));
+        }
+        if self.config.local.durable {
+            flags.push(("--replay-dir", &folder));
+        }
+        let mut args = call("replay-server --keep-alive", flags);
+        if shard == 0 {
+            args.extend(self.outside.flags());
+        }
+        self.start(&self.servers[shard], &args, PROCESS_THREADS)
+    }
+
+    pub(super) fn revived(&self) -> Revived {
+        Revived {
+            servers: self.config.local.durable && self.server_restarts < RESTARTS_MAX,
+            actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
+        }
+    }
+
+    /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. What an actor had not delivered is
+    /// lost; the run continues.
+    pub(super) fn revive(&mut self) -> anyhow::Result<()> {
+        for shard in 0..self.processes.replay_servers.len() {
+            let server = &mut self.processes.replay_servers[shard];
+            if server.end().is_none() || !self.revived().servers {
+                continue;
+            }
+            let report = self.processes.replay_servers[shard].exit_report();
+            self.server_restarts += 1;
+            let how = format!(
+                "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                self.servers[shard], self.server_restarts
+            );
+            self.note_restart(&report, &how);
+            self.processes.replay_servers[shard] = self.start_server(shard)?;
+        }
+        for id in 0..self.processes.actors.len() {
+            let actor = &mut self.processes.actors[id];
+            if !actor.may_be_started_again() || !self.revived().actors {
+                continue;
+            }
+            let report = self.processes.actors[id].exit_report();
+            if !self.config.world.is_resumable() {
+                bail!(
+                    "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
+                     count these from 0"
+                );
+            }
+            self.actor_restarts += 1;
+            let how = format!(
+                "actor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
+                self.actor_restarts
+            );
+            self.note_restart(&report, &how);
+            self.processes.actors[id] = self.start_actor(id as u32)?;
+        }
+        Ok(())
+    }
+
+    fn note_restart(&self, report: &str, how: &str) {
+        self.screen.line(&format!("{report}\n{how}"));
+        session::sweep_shared_memory();
+    }
+}

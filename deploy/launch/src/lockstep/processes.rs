@@ -1,0 +1,333 @@
+//! Actors, replay and learner stepped in a fixed order.
+//! A checkpoint holds the learner, and beside it the state of the others but for the replay's transitions, which lie in the run folder.
+//! When to save and what to show is for `mod`.
+
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
+use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
+use driml_machine::error::usage;
+use driml_protocol::{
+    ActorJoin, Batch, BufferPool, InsertReply, LearnerStatus, Leave, Weights, WeightsHeader, codec,
+};
+use driml_replay_server::{Mark, NotReady, PersistArgs, Replay};
+use driml_settings::config::RunConfig;
+use serde::{Deserialize, Serialize};
+
+use crate::{console, run_folder::RunFolder};
+
+/// Every actor's incarnation: an actor of this mode has one life, and its number influences nothing.
+const INCARNATION: u64 = 1;
+/// The learner's number, which influences nothing either.
+const LEARNER: u64 = 1;
+
+/// How it is written; another way is rejected.
+const FORMAT: u32 = 4;
+
+/// The state of a run in lockstep, without the learner.
+#[derive(Serialize, Deserialize)]
+struct SavedParts {
+    actors: Vec<CollectorState>,
+    replay: Mark,
+    turn: Turn,
+}
+
+/// Which actor is next, and with which weights.
+#[derive(Clone, Serialize, Deserialize)]
+pub(super) struct Turn {
+    next_actor: usize,
+    /// Transitions of each actor that came after the run's last.
+    unwanted: Vec<u64>,
+    pub(super) status: LearnerStatus,
+    /// The weights with which the actors act, a safetensors file, and the updates after which they were published.
+    acting: (WeightsHeader, Vec<u8>),
+    published: u64,
+}
+
+impl SavedParts {
+    fn to_bytes(&self) -> anyhow::Result<Vec<u8>> {
+        let mut bytes = FORMAT.to_le_bytes().to_vec();
+        bytes.extend(codec::encode_value(self).context("writing actors and replay")?);
+        Ok(bytes)
+    }
+
+    /// What the newest checkpoint in a run's folder holds.
+    fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let all = checkpoint::list(&run_dir.checkpoints())?;
+        let (_, path) = all.last().context("there is no checkpoint")?;
+        let bytes = checkpoint::companion(path)?
+            .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
+        let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
+            let path = path.display();
+            usage!("{path} is a lockstep checkpoint of another version of driml: resume with that version")
+        })?;
+        codec::decode_value(content)
+            .with_context(|| format!("reading actors and replay in {}", path.display()))
+    }
+}
+
+/// The replay of a run, kept in its folder; with a mark, as it was there.
+fn open(config: &RunConfig, run_dir: &RunFolder, mark: Option<Mark>) -> anyhow::Result<Replay> {
+    let args = PersistArgs {
+        dir: run_dir.replay(),
+        shard: 0,
+        segment_bytes: None,
+        mark,
+    };
+    let batch_size = config.learner.batch_size;
+    let (replay, recovery) = Replay::open(&args, &config.run, &config.replay, batch_size)?;
+    // A server could continue with a part of it, but a lockstep run must be the same.
+    match recovery.warnings.first() {
+        Some(why) if mark.is_some() => Err(usage!(
+            "the run cannot resume to the same weights: {why}. Start it again, in another folder"
+        )
+        .into()),
+        _ => Ok(replay),
+    }
+}
+
+/// The components of a run, which take turns.
+pub(super) struct Lockstep {
+    actors: Vec<Collector>,
+    pub(super) replay: Replay,
+    pub(super) learner: Learner,
+    batch_size: u32,
+    steps_per_chunk: u32,
+    pub(super) turn: Turn,
+}
+
+impl Lockstep {
+    /// The components of a run that begins; its replay is kept in the run's folder if its checkpoints can be resumed.
+    pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let mut this = Self::in_memory(config)?;
+        if let Err(e) = this.actor_states() {
+            return match e {
+                ActError::World(e) if e.is_not_saved() => {
+                    console::line(&format!("{e}: the run cannot be resumed, only repeated"));
+                    Ok(this)
+                }
+                e => Err(e.into()),
+            };
+        }
+        this.replay = open(config, run_dir, None)?;
+        this.join_actors()?;
+        Ok(this)
+    }
+
+    /// The components of the run in `run_dir`, as they were at its newest checkpoint.
+    pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
+        let saved = SavedParts::read(run_dir)?;
+        let mut this = Self::in_memory(config)?;
+        let compute = config.local.learner_device.open(config.learner.precision)?;
+        let settings = LearnerConfig::from_toml(&config.to_toml())?;
+        this.learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
+        this.replay = open(config, run_dir, Some(saved.replay))?;
+        this.take(saved)
+            .context("resuming the actors from the checkpoint")?;
+        Ok(this)
+    }
+
+    /// The components of a run that begins and is not kept.
+    pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
+        let text = config.to_toml();
+        let settings = ActorSettings::from_toml(&text)?;
+        let learner_config = LearnerConfig::from_toml(&text)?;
+        let batch_size = learner_config.learner.batch_size;
+        let replay = Replay::new(&config.run, &config.replay, batch_size)?;
+        let device = config.local.learner_device;
+        let compute = device.open(learner_config.learner.precision)?;
+        let mut learner = Learner::new(learner_config, &compute)?;
+        let Weights {
+            header,
+            safetensors,
+        } = learner.next_weights()?;
+        let status = LearnerStatus {
+            weights_version: header.version,
+            weights_sha256: header.sha256_hex(),
+            ..LearnerStatus::default()
+        };
+        let actor = |actor| {
+            let life = Incarnation {
+                actor,
+                id: INCARNATION,
+                after_updates: 0,
+                earlier_incarnations: 0,
+            };
+            let (settings, pool) = (settings.clone(), BufferPool::new(1));
+            Collector::new(settings, pool, life, header.version, &safetensors)
+        };
+        let actors = (0..config.local.actors)
+            .map(actor)
+            .collect::<Result<Vec<_>, _>>()?;
+        let mut this = Self {
+            turn: Turn {
+                next_actor: 0,
+                unwanted: vec![0; actors.len()],
+                status,
+                acting: (header, safetensors),
+                published: 0,
+            },
+            actors,
+            replay,
+            learner,
+            batch_size,
+            steps_per_chunk: settings.actor.steps_per_chunk,
+        };
+        this.join_actors()?;
+        Ok(this)
+    }
+
+    fn join_actors(&mut self) -> anyhow::Result<()> {
+        for actor in 0..self.actors.len() as u32 {
+            let join = ActorJoin {
+                actor,
+                incarnation: INCARNATION,
+            };
+            self.replay.join_actor(join).map_err(anyhow::Error::msg)?;
+        }
+        Ok(())
+    }
+
+    fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
+        self.actors.iter_mut().map(Collector::state).collect()
+    }
+
+    fn take(&mut self, SavedParts { actors, turn, .. }: SavedParts) -> anyhow::Result<()> {
+        let (found, count) = (actors.len(), self.actors.len());
+        if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
+            bail!("it holds {found} actors, and this run has {count}");
+        }
+        let (header, safetensors) = &turn.acting;
+        for (actor, state) in self.actors.iter_mut().zip(actors) {
+            actor.set_weights(header.version, safetensors)?;
+            actor.go_on_from(state)?;
+        }
+        self.turn = turn;
+        Ok(())
+    }
+
+    /// Writes a checkpoint into `folder`, from which the run continues exactly as now.
+    pub(super) fn save(&mut self, folder: &Path) -> anyhow::Result<()> {
+        let inserted = self.replay.counts().inserted;
+        self.learner.progress_mut().note_inserted(0, inserted);
+        let Some(mark) = self.replay.mark()? else {
+            return Ok(self.learner.save(folder)?);
+        };
+        let saved = self.save_at(mark, folder);
+        if saved.is_err() {
+            self.replay.give_up_mark(mark);
+        }
+        saved
+    }
+
+    /// [`Lockstep::save`] of a run whose replay is marked in its log.
+    fn save_at(&mut self, mark: Mark, folder: &Path) -> anyhow::Result<()> {
+        let actors = self.actor_states();
+        let saved = SavedParts {
+            actors: actors.context(
+                "saving the worlds for a checkpoint; at the run's start it could be done",
+            )?,
+            replay: mark,
+            turn: self.turn.clone(),
+        };
+        Ok(self.learner.save_with(folder, Some(&saved.to_bytes()?))?)
+    }
+
+    /// One chunk of the next actor, then every update that it allows; `false` once all updates are done.
+    pub(super) fn round(&mut self) -> anyhow::Result<bool> {
+        let id = self.turn.next_actor;
+        self.turn.next_actor = (id + 1) % self.actors.len();
+        let chunk = self.actors[id].collect(self.replay.inserted_total(), self.steps_per_chunk)?;
+        loop {
+            match self.replay.insert(&chunk) {
+                InsertReply::Stored { .. } => break,
+                InsertReply::Wait { .. } => match self.replay.sample(self.batch_size) {
+                    Ok(batch) => self.learn(&batch)?,
+                    Err(_) if self.replay.is_refused_by_disk() => {
+                        bail!(
+                            "the run folder cannot be written (the log has the reason): make room, then use --resume"
+                        )
+                    }
+                    Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
+                },
+                InsertReply::Finished { .. } => {
+                    self.turn.unwanted[id] += chunk.header.transitions() as u64;
+                    break;
+                }
+                InsertReply::OutOfOrder { expected } => {
+                    bail!(
+                        "actor {id} is at chunk {}, not {expected}",
+                        chunk.header.sequence
+                    )
+                }
+                InsertReply::Refused { why } => bail!("the replay rejected a chunk: {why}"),
+            }
+        }
+        loop {
+            match self.replay.sample(self.batch_size) {
+                Ok(batch) => self.learn(&batch)?,
+                Err(NotReady::Wait(_)) => return Ok(true),
+                Err(NotReady::Finished) => return Ok(false),
+                Err(NotReady::Refused { why }) => bail!("the replay cannot sample: {why}"),
+            }
+        }
+    }
+
+    fn learn(&mut self, batch: &Batch) -> anyhow::Result<()> {
+        let report = self.learner.update(batch)?;
+        self.learner.progress_mut().note(&[ServedPart {
+            shard: 0,
+            rows: batch.header.rows,
+            inserted: batch.header.counts.inserted,
+        }]);
+        let number = self.learner.updates();
+        if let Some(priorities) = batch.priority_update(LEARNER, number, &report.row_kls) {
+            let set = self.replay.set_priorities(&priorities);
+            set.map_err(anyhow::Error::msg)
+                .context("the replay rejected priorities")?;
+        }
+        self.learner.note(&report, &mut self.turn.status);
+        if let Some(affinity) = self.learner.affinity_update(LEARNER) {
+            let set = self.replay.set_affinity(&affinity);
+            set.map_err(anyhow::Error::msg)?;
+        }
+        if self.learner.publication_is_due() {
+            self.publish()?;
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self) -> anyhow::Result<()> {
+        let Weights {
+            header,
+            safetensors,
+        } = self.learner.next_weights()?;
+        for actor in &mut self.actors {
+            actor.set_weights(header.version, &safetensors)?;
+        }
+        let turn = &mut self.turn;
+        turn.published = self.learner.updates();
+        turn.status.weights_version = header.version;
+        turn.status.weights_sha256 = header.sha256_hex();
+        turn.acting = (header, safetensors);
+        Ok(())
+    }
+
+    /// Publishes the last weights; the actors leave.
+    pub(super) fn end(&mut self) -> anyhow::Result<()> {
+        if self.turn.published != self.learner.updates() {
+            self.publish()?;
+        }
+        for (id, (actor, unwanted)) in self.actors.iter().zip(&self.turn.unwanted).enumerate() {
+            let produced = actor.produced() - unwanted;
+            self.replay.leave(&Leave {
+                actor: id as u32,
+                incarnation: INCARNATION,
+                produced,
+            });
+        }
+        self.turn.status.finished = true;
+        Ok(())
+    }
+}

@@ -1,0 +1,207 @@
+//! AVX2: 8 f32 products an instruction, on f32 operands or on bf16 ones that are widened first.
+#![allow(unsafe_code, reason = "instructions of one kind of processor")]
+#![cfg(target_arch = "x86_64")]
+
+use std::arch::x86_64::{
+    __m256, __m256i, _mm256_add_ps, _mm256_and_si256, _mm256_castsi256_ps, _mm256_fmadd_ps,
+    _mm256_loadu_ps, _mm256_loadu_si256, _mm256_set1_epi32, _mm256_set1_ps, _mm256_setzero_ps,
+    _mm256_slli_epi32, _mm256_storeu_ps,
+};
+
+use half::bf16;
+
+use super::{
+    element::Rounding,
+    simd::{LANES, Loop, RawTile, Simd},
+    vector::{Vector, compute_sizes},
+};
+
+#[derive(Clone, Copy)]
+pub(crate) struct F32(());
+
+/// bf16 operands in pairs, multiplied as f32.
+#[derive(Clone, Copy)]
+pub(crate) struct Bf16(());
+
+macro_rules! simd {
+    ($simd:ident, $element:ty) => {
+        impl $simd {
+            /// It, if this processor and the operating system have AVX2 and fused multiplication and addition.
+            pub(super) fn new() -> Option<Self> {
+                let there = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+                there.then_some(Self(()))
+            }
+
+            #[target_feature(enable = "avx2,fma")]
+            unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4 5 6;);
+            }
+        }
+
+        impl Rounding for $simd {}
+
+        impl Simd for $simd {
+            type Element = $element;
+            const VECS_MAX: usize = 1;
+
+            fn rows_max(_: usize) -> usize {
+                6
+            }
+
+            unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                // SAFETY: `new` found the instructions; the rest is the caller's.
+                unsafe { Self::compute_sized(tile, rows, vecs) }
+            }
+
+            #[inline(always)]
+            fn vectorize<W: Loop>(self, work: W) {
+                // SAFETY: `new` found the instructions.
+                unsafe { vectorized(work) }
+            }
+        }
+    };
+}
+
+simd!(F32, f32);
+simd!(Bf16, bf16);
+
+#[target_feature(enable = "avx2,fma")]
+unsafe fn vectorized<W: Loop>(work: W) {
+    work.run();
+}
+
+/// Sums of 16 columns.
+type Sums = [__m256; 2];
+
+/// Writes the first `count` of 16 sums.
+#[inline(always)]
+unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
+    // SAFETY: whole registers where the caller vouches for 16 scalars; else only the first `count` are touched.
+    unsafe {
+        if count == LANES {
+            for (half, sums) in sums.into_iter().enumerate() {
+                let at = at.add(half * 8);
+                let old = if add {
+                    _mm256_loadu_ps(at)
+                } else {
+                    _mm256_setzero_ps()
+                };
+                _mm256_storeu_ps(at, if add { _mm256_add_ps(old, sums) } else { sums });
+            }
+            return;
+        }
+        let mut values = [0f32; LANES];
+        _mm256_storeu_ps(values.as_mut_ptr(), sums[0]);
+        _mm256_storeu_ps(values.as_mut_ptr().add(8), sums[1]);
+        for (index, value) in values.into_iter().take(count).enumerate() {
+            let at = at.add(index);
+            *at = if add { *at + value } else { value };
+        }
+    }
+}
+
+// SAFETY of both: loads and stores are of the addresses that the caller vouches for; none of them asks for alignment.
+
+impl Vector for F32 {
+    type Element = f32;
+    type Sums = Sums;
+    type Operand = Sums;
+
+    #[inline(always)]
+    unsafe fn zero() -> Sums {
+        unsafe { [_mm256_setzero_ps(); 2] }
+    }
+
+    #[inline(always)]
+    unsafe fn row(at: *const f32) -> Sums {
+        unsafe { [_mm256_set1_ps(*at); 2] }
+    }
+
+    #[inline(always)]
+    unsafe fn columns(at: *const f32) -> Sums {
+        unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))] }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sums: Sums, row: Sums, columns: Sums) -> Sums {
+        unsafe {
+            [
+                _mm256_fmadd_ps(row[0], columns[0], sums[0]),
+                _mm256_fmadd_ps(row[1], columns[1], sums[1]),
+            ]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
+        unsafe { write(sums, at, count, add) }
+    }
+}
+
+/// The lower of each pair of bf16, as f32.
+#[inline(always)]
+unsafe fn lower(pairs: __m256i) -> __m256 {
+    unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<16>(pairs)) }
+}
+
+/// The upper of each pair of bf16, as f32.
+#[inline(always)]
+unsafe fn upper(pairs: __m256i) -> __m256 {
+    unsafe {
+        _mm256_castsi256_ps(_mm256_and_si256(
+            pairs,
+            _mm256_set1_epi32(0xffff_0000_u32 as i32),
+        ))
+    }
+}
+
+/// `sums` plus the products of both bf16 of each pair.
+#[inline(always)]
+unsafe fn mul_add_pairs(sums: __m256, row: __m256i, columns: __m256i) -> __m256 {
+    unsafe {
+        let first = _mm256_fmadd_ps(lower(row), lower(columns), sums);
+        _mm256_fmadd_ps(upper(row), upper(columns), first)
+    }
+}
+
+impl Vector for Bf16 {
+    type Element = bf16;
+    type Sums = Sums;
+    type Operand = [__m256i; 2];
+
+    #[inline(always)]
+    unsafe fn zero() -> Sums {
+        unsafe { [_mm256_setzero_ps(); 2] }
+    }
+
+    #[inline(always)]
+    unsafe fn row(at: *const bf16) -> [__m256i; 2] {
+        unsafe { [_mm256_set1_epi32(at.cast::<i32>().read_unaligned()); 2] }
+    }
+
+    #[inline(always)]
+    unsafe fn columns(at: *const bf16) -> [__m256i; 2] {
+        unsafe {
+            [
+                _mm256_loadu_si256(at.cast()),
+                _mm256_loadu_si256(at.add(LANES).cast()),
+            ]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn mul_add(sums: Sums, row: [__m256i; 2], columns: [__m256i; 2]) -> Sums {
+        // No closure: it may be compiled without AVX2, and each instruction is then a call.
+        unsafe {
+            [
+                mul_add_pairs(sums[0], row[0], columns[0]),
+                mul_add_pairs(sums[1], row[1], columns[1]),
+            ]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
+        unsafe { write(sums, at, count, add) }
+    }
+}

@@ -1,0 +1,344 @@
+//! The choice among instruction sets at run time, by what the processor offers.
+
+use super::portable;
+#[cfg(target_arch = "x86_64")]
+use super::{amx, avx2, avx512};
+use crate::kernels::precision::Precision;
+
+/// An instruction set of this processor, to be used through [`with_simd`].
+#[derive(Clone, Copy)]
+pub(crate) enum AnySimd {
+    PortableF32(portable::F32),
+    PortableBf16(portable::Bf16),
+    #[cfg(target_arch = "x86_64")]
+    Avx2F32(avx2::F32),
+    #[cfg(target_arch = "x86_64")]
+    Avx2Bf16(avx2::Bf16),
+    #[cfg(target_arch = "x86_64")]
+    Avx512F32(avx512::F32),
+    #[cfg(target_arch = "x86_64")]
+    Avx512Bf16(avx512::Bf16),
+    #[cfg(target_arch = "x86_64")]
+    Amx(amx::Amx),
+    #[cfg(all(test, target_arch = "x86_64"))]
+    EmulatedAmx(super::emulated::EmulatedAmx),
+}
+
+/// `with_simd!(simd, s => expression)`: the expression with `s` as the instruction set of its own type.
+macro_rules! with_simd {
+    ($simd:expr, $typed:ident => $body:expr) => {
+        match $simd {
+            $crate::kernels::isa::dispatch::AnySimd::PortableF32($typed) => $body,
+            $crate::kernels::isa::dispatch::AnySimd::PortableBf16($typed) => $body,
+            #[cfg(target_arch = "x86_64")]
+            $crate::kernels::isa::dispatch::AnySimd::Avx2F32($typed) => $body,
+            #[cfg(target_arch = "x86_64")]
+            $crate::kernels::isa::dispatch::AnySimd::Avx2Bf16($typed) => $body,
+            #[cfg(target_arch = "x86_64")]
+            $crate::kernels::isa::dispatch::AnySimd::Avx512F32($typed) => $body,
+            #[cfg(target_arch = "x86_64")]
+            $crate::kernels::isa::dispatch::AnySimd::Avx512Bf16($typed) => $body,
+            #[cfg(target_arch = "x86_64")]
+            $crate::kernels::isa::dispatch::AnySimd::Amx($typed) => $body,
+            #[cfg(all(test, target_arch = "x86_64"))]
+            $crate::kernels::isa::dispatch::AnySimd::EmulatedAmx($typed) => $body,
+        }
+    };
+}
+pub(crate) use with_simd;
+
+/// Makes one where the processor has its instructions.
+type Candidate = fn() -> Option<AnySimd>;
+
+/// The instruction sets of a precision, the fastest first; the last one runs anywhere.
+const F32: &[Candidate] = &[
+    #[cfg(target_arch = "x86_64")]
+    || avx512::F32::new().map(AnySimd::Avx512F32),
+    #[cfg(target_arch = "x86_64")]
+    || avx2::F32::new().map(AnySimd::Avx2F32),
+    || Some(AnySimd::PortableF32(portable::F32)),
+];
+const BF16: &[Candidate] = &[
+    #[cfg(target_arch = "x86_64")]
+    || amx::Amx::new().map(AnySimd::Amx),
+    #[cfg(target_arch = "x86_64")]
+    || avx512::Bf16::new().map(AnySimd::Avx512Bf16),
+    #[cfg(target_arch = "x86_64")]
+    || avx2::Bf16::new().map(AnySimd::Avx2Bf16),
+    || Some(AnySimd::PortableBf16(portable::Bf16)),
+];
+
+impl AnySimd {
+    /// The fastest one that this processor has for `precision`.
+    pub(crate) fn of(precision: Precision) -> Self {
+        let mut all = Self::there(precision);
+        all.next().expect("portable code runs anywhere")
+    }
+
+    fn there(precision: Precision) -> impl Iterator<Item = Self> {
+        let candidates = match precision {
+            Precision::F32 => F32,
+            Precision::Bf16 => BF16,
+        };
+        candidates.iter().filter_map(|candidate| candidate())
+    }
+
+    /// Every one that can be had here, the emulated one included.
+    #[cfg(test)]
+    pub(crate) fn every(precision: Precision) -> Vec<Self> {
+        #[allow(unused_mut, reason = "there is no emulated simd elsewhere")]
+        let mut all: Vec<_> = Self::there(precision).collect();
+        #[cfg(target_arch = "x86_64")]
+        if precision == Precision::Bf16 {
+            all.push(Self::EmulatedAmx(super::emulated::EmulatedAmx));
+        }
+        all
+    }
+
+    const fn describe(self) -> &'static str {
+        match self {
+            Self::PortableF32(_) => "portable code, f32",
+            Self::PortableBf16(_) => {
+                "portable code on operands rounded to bf16: no faster than f32"
+            }
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2F32(_) => "AVX2, f32",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bf16(_) => "AVX2 on operands rounded to bf16: no faster than f32",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512F32(_) => "AVX-512, f32",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16(_) => "AVX512_BF16: bf16 products, f32 sums",
+            #[cfg(target_arch = "x86_64")]
+            Self::Amx(_) => "AMX: bf16 products, f32 sums",
+            #[cfg(all(test, target_arch = "x86_64"))]
+            Self::EmulatedAmx(_) => "AMX, emulated",
+        }
+    }
+}
+
+/// Whether this processor multiplies faster in bf16 than in f32: it has AVX512_BF16 or AMX.
+pub fn is_bf16_fast() -> bool {
+    match AnySimd::of(Precision::Bf16) {
+        #[cfg(target_arch = "x86_64")]
+        AnySimd::Avx512Bf16(_) | AnySimd::Amx(_) => true,
+        _ => false,
+    }
+}
+
+/// What products of this precision run on here, in words: for `driml doctor` and the head of a table of figures.
+pub fn describe_kernels(precision: Precision) -> &'static str {
+    AnySimd::of(precision).describe()
+}
+
+#[cfg(test)]
+mod tests {
+    use half::bf16;
+
+    use super::*;
+    use crate::kernels::isa::element::Rounding;
+    use crate::kernels::isa::{Columns, Element, LANES, Left, Mode, Simd, multiply_tile};
+
+    /// One tile of ones plus, or else, a product.
+    #[derive(Clone, Copy)]
+    struct Tile {
+        rows: usize,
+        vecs: usize,
+        cols: usize,
+        mode: Mode,
+        steps: usize,
+        /// Whether a row's steps lie apart, and the rows side by side.
+        rows_inside: bool,
+    }
+
+    /// Compares the tile with a plain sum; whether the instruction set has such a tile.
+    fn check_tile<S: Simd>(simd: S, tile: Tile) -> bool {
+        let Tile {
+            rows,
+            vecs,
+            cols,
+            mode,
+            steps,
+            rows_inside,
+        } = tile;
+        if vecs > S::VECS_MAX || rows > S::rows_max(vecs) {
+            return false;
+        }
+        let depth = S::Element::DEPTH;
+        let (k, width) = (steps * depth, vecs * LANES);
+        // Two runs of `k` terms a row, all in one piece.
+        let (row_stride, step, run_stride) = if rows_inside {
+            (depth, depth * rows, rows * k)
+        } else {
+            (2 * k, depth, k)
+        };
+        let left: Vec<_> = (0..rows * 2 * k)
+            .map(|at| S::Element::of((at % 97 * 37 % 41) as f32 / 8.0 - 2.5))
+            .collect();
+        let panel: Vec<_> = (0..2 * k * width)
+            .map(|at| S::Element::of((at % 89 * 29 % 31) as f32 / 8.0 - 1.9))
+            .collect();
+        let stride = cols + 3;
+        let mut out = vec![1.0; rows * stride];
+        let operand = Left {
+            values: &left,
+            start: 0,
+            row_stride,
+            step,
+            steps,
+            run_stride,
+            runs: 2,
+        };
+        let columns = Columns {
+            out: &mut out,
+            stride,
+            cols,
+            vecs,
+            mode,
+        };
+        multiply_tile(simd, rows, operand, &panel, columns);
+        for (at, &got) in out.iter().enumerate() {
+            let (row, col) = (at / stride, at % stride);
+            let start = if col < cols && mode == Mode::Replace {
+                0.0
+            } else {
+                1.0
+            };
+            let terms = (0..2 * k).filter(|_| col < cols).map(|term| {
+                let (at_step, part) = (term / depth, term % depth);
+                let right = panel[(at_step * width + col) * depth + part];
+                let run = at_step / steps * run_stride + at_step % steps * step;
+                let left = left[row * row_stride + run + part];
+                f64::from(left.value()) * f64::from(right.value())
+            });
+            let wanted = start + terms.sum::<f64>();
+            assert!(
+                (f64::from(got) - wanted).abs() <= 1e-5 * (1.0 + wanted.abs()),
+                "row {row}, column {col}: {got}, wanted {wanted}"
+            );
+        }
+        true
+    }
+
+    #[test]
+    fn every_instruction_set_computes_every_size_of_tile() {
+        let mut tried = 0;
+        let sizes = [1, 2, 4].into_iter().flat_map(|vecs| {
+            (1..=8)
+                .chain([16, 17, 40, 64])
+                .map(move |rows| (vecs, rows))
+        });
+        for ((vecs, rows), rows_inside) in sizes.flat_map(|size| [(size, false), (size, true)]) {
+            for (cols, mode, steps) in [
+                (vecs * LANES, Mode::Replace, 5),
+                (vecs * LANES - 5, Mode::Add, 1),
+                ((vecs - 1) * LANES + 1, Mode::Add, 16),
+                (vecs * LANES, Mode::Replace, 35),
+            ] {
+                let tile = Tile {
+                    rows,
+                    vecs,
+                    cols,
+                    mode,
+                    steps,
+                    rows_inside,
+                };
+                for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
+                    tried += usize::from(with_simd!(simd, simd => check_tile(simd, tile)));
+                }
+            }
+        }
+        assert!(tried >= 2 * 3 * 4, "{tried} tiles");
+    }
+
+    #[test]
+    fn every_instruction_set_transposes_a_block() {
+        let number = |row: usize, col: usize| (row * 100 + col) as u32;
+        for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
+            let mut block: [[u32; LANES]; LANES] =
+                std::array::from_fn(|row| std::array::from_fn(|col| number(row, col)));
+            with_simd!(simd, simd => simd.transpose(&mut block));
+            for (row, block) in block.iter().enumerate() {
+                for (col, &got) in block.iter().enumerate() {
+                    assert_eq!(got, number(col, row));
+                }
+            }
+        }
+    }
+
+    /// Lengths that fill no register; values over the whole of the float space, subnormals and what is not finite included.
+    #[test]
+    fn every_instruction_set_rounds_to_the_nearest() {
+        let mut bits = 1u32;
+        let mut draw = |_| {
+            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f32::from_bits(bits)
+        };
+        let check = |got: bf16, value: f32| {
+            let (got, wanted) = (got.to_f32(), bf16::from_f32(value).to_f32());
+            let subnormal = value.abs() < f32::MIN_POSITIVE && got == 0.0;
+            assert!(
+                got.to_bits() == wanted.to_bits()
+                    || value.is_nan() && got.is_nan()
+                    || subnormal && got.is_sign_negative() == value.is_sign_negative(),
+                "{value:e}: {got:e}, wanted {wanted:e}"
+            );
+        };
+        for len in (0..70).chain([100_000]) {
+            let first: Vec<f32> = (0..len).map(&mut draw).collect();
+            let second: Vec<f32> = (0..len).map(&mut draw).collect();
+            for simd in AnySimd::every(Precision::Bf16) {
+                // What lies beyond is left alone.
+                let mut rounded = vec![bf16::ONE; len + 3];
+                let mut pairs = vec![bf16::ONE; 2 * len + 3];
+                with_simd!(simd, simd => {
+                    simd.round(&first, &mut rounded);
+                    simd.round_pairs(&first, &second, &mut pairs);
+                });
+                for (at, (&first, &second)) in first.iter().zip(&second).enumerate() {
+                    check(rounded[at], first);
+                    check(pairs[2 * at], first);
+                    check(pairs[2 * at + 1], second);
+                }
+                assert_eq!(rounded[len..], [bf16::ONE; 3]);
+                assert_eq!(pairs[2 * len..], [bf16::ONE; 3]);
+            }
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_puts_scalars_in_pairs() {
+        for len in (0..140).chain([10_000]) {
+            let first: Vec<u8> = (0..len).map(|at| (at * 31 % 256) as u8).collect();
+            let second: Vec<u8> = (0..len).map(|at| (at * 7 % 255 + 1) as u8).collect();
+            for simd in AnySimd::every(Precision::Bf16) {
+                // What lies beyond is left alone.
+                let room = |len: usize| vec![bf16::NEG_ONE; len + 3];
+                let [mut bytes, mut others] = [room(len), room(len)];
+                let [mut pairs, mut of_bytes] = [room(2 * len), room(2 * len)];
+                with_simd!(simd, simd => {
+                    simd.of_bytes(&first, &mut bytes);
+                    simd.of_bytes(&second, &mut others);
+                    simd.pair(&bytes[..len], &others[..len], &mut pairs);
+                    simd.pair_bytes(&first, &second, &mut of_bytes);
+                });
+                for (at, both) in first.iter().zip(&second).enumerate() {
+                    let wanted = [*both.0, *both.1].map(|byte| bf16::from_f32(byte.into()));
+                    assert_eq!(bytes[at], wanted[0]);
+                    assert_eq!(pairs[2 * at..][..2], wanted);
+                    assert_eq!(of_bytes[2 * at..][..2], wanted);
+                }
+                assert_eq!(bytes[len..], [bf16::NEG_ONE; 3]);
+                assert_eq!(pairs[2 * len..], [bf16::NEG_ONE; 3]);
+                assert_eq!(of_bytes[2 * len..], [bf16::NEG_ONE; 3]);
+            }
+        }
+    }
+
+    #[test]
+    fn the_kernels_of_this_processor_have_names() {
+        for precision in Precision::ALL {
+            assert!(!describe_kernels(precision).is_empty());
+        }
+    }
+}

@@ -1,0 +1,287 @@
+//! What operands of products are stored as: f32, or bf16 in pairs along the sum.
+//! It multiplies nothing.
+
+use half::bf16;
+
+use crate::kernels::buffer::Pooled;
+
+/// Columns of one register, on every instruction set.
+pub(crate) const LANES: usize = 16;
+
+/// Instructions that round, and that put scalars in pairs.
+pub(crate) trait Rounding: Copy {
+    /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
+    /// what such an instruction set's products take it for.
+    #[inline(always)]
+    fn round(self, values: &[f32], to: &mut [bf16]) {
+        for (to, &value) in to.iter_mut().zip(values) {
+            *to = bf16::of(value);
+        }
+    }
+
+    /// As [`Rounding::round`], of two rows as pairs: `pairs` [columns, 2].
+    #[inline(always)]
+    fn round_pairs(self, first: &[f32], second: &[f32], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (bf16::of(first), bf16::of(second));
+        }
+    }
+
+    /// Two rows that are rounded already, as long as each other, as pairs: `pairs` [columns, 2].
+    #[inline(always)]
+    fn pair(self, first: &[bf16], second: &[bf16], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (first, second);
+        }
+    }
+
+    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    #[inline(always)]
+    fn of_bytes(self, bytes: &[u8], to: &mut [bf16]) {
+        for (to, &byte) in to.iter_mut().zip(bytes) {
+            *to = bf16::of_byte(byte);
+        }
+    }
+
+    /// As [`Rounding::pair`], of pixels.
+    #[inline(always)]
+    fn pair_bytes(self, first: &[u8], second: &[u8], pairs: &mut [bf16]) {
+        for ((pair, &first), &second) in pairs.chunks_exact_mut(2).zip(first).zip(second) {
+            (pair[0], pair[1]) = (bf16::of_byte(first), bf16::of_byte(second));
+        }
+    }
+}
+
+pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
+    /// Neighbours along the sum that are stored together, and multiplied in one step.
+    const DEPTH: usize;
+
+    /// What products of bytes stored by [`Element::of_byte`] are multiplied by, to be products of bytes / 255.
+    const BYTE_SCALE: f32;
+
+    /// The nearest element, ties to even.
+    fn of(value: f32) -> Self;
+
+    /// Stores `values` as [`Element::of`] in `to`, which is as long, with its own instructions.
+    fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]);
+
+    /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.
+    fn of_byte(byte: u8) -> Self;
+
+    fn value(self) -> f32;
+
+    /// Stores `DEPTH` rows that follow each other along the sum: `step` [columns, DEPTH], with 0 for what the rows do not have.
+    /// `second` is for a depth of 2.
+    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]);
+
+    /// `LANES` steps of `values`, [`LANES`, DEPTH], each as 32 bits.
+    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]);
+
+    /// Pixels as [`Element::of_byte`], into the first of `to`.
+    fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]);
+
+    /// Pixels as [`Element::of_byte`], each with the one `shift` further if `DEPTH` is 2, or with 0 where they end before:
+    /// `steps` [pixels, DEPTH].
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]);
+
+    /// The same of elements.
+    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
+
+    /// The scalars of a step, into `step` [DEPTH].
+    fn unpack(bits: u32, step: &mut [Self]);
+
+    /// Scalars that need no rounding, as they are.
+    fn in_place(values: &[f32]) -> Option<&[Self]>;
+}
+
+impl Element for f32 {
+    const DEPTH: usize = 1;
+    const BYTE_SCALE: f32 = 1.0;
+
+    #[inline(always)]
+    fn of(value: f32) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn of_byte(byte: u8) -> Self {
+        Self::from(byte) * (1.0 / 255.0)
+    }
+
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self
+    }
+
+    #[inline(always)]
+    fn store<R: Rounding>(_: R, values: &[f32], to: &mut [Self]) {
+        to.copy_from_slice(values);
+    }
+
+    #[inline(always)]
+    fn join<R: Rounding>(_: R, first: &[f32], _: &[f32], step: &mut [Self]) {
+        let (begin, end) = step.split_at_mut(first.len());
+        begin.copy_from_slice(first);
+        end.fill(0.0);
+    }
+
+    #[inline(always)]
+    fn steps<R: Rounding>(_: R, values: &[f32], steps: &mut [u32; LANES]) {
+        for (step, value) in steps.iter_mut().zip(values) {
+            *step = value.to_bits();
+        }
+    }
+
+    #[inline(always)]
+    fn store_bytes<R: Rounding>(_: R, bytes: &[u8], to: &mut [Self]) {
+        for (to, &byte) in to.iter_mut().zip(bytes) {
+            *to = Self::of_byte(byte);
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], _: usize, steps: &mut [Self]) {
+        Self::store_bytes(rounding, bytes, steps);
+    }
+
+    #[inline(always)]
+    fn steps_of<R: Rounding>(_: R, values: &[Self], _: usize, steps: &mut [Self]) {
+        steps.copy_from_slice(values);
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits);
+    }
+
+    fn in_place(values: &[f32]) -> Option<&[Self]> {
+        Some(values)
+    }
+}
+
+impl Element for bf16 {
+    const DEPTH: usize = 2;
+    /// Every byte is a bf16, so that pixels lose nothing if they are scaled after the product.
+    const BYTE_SCALE: f32 = 1.0 / 255.0;
+
+    /// As `bf16::from_f32`, without its branch, so that loops over it use the instruction set's registers.
+    #[inline(always)]
+    fn of(value: f32) -> Self {
+        let bits = value.to_bits();
+        let nearest = (bits.wrapping_add(0x7fff + ((bits >> 16) & 1)) >> 16) as u16;
+        // A NaN's lower bits could carry into its sign, or be all that tells it from an infinity.
+        let nan = (bits >> 16) as u16 | 0x40;
+        Self::from_bits(if value.is_nan() { nan } else { nearest })
+    }
+
+    #[inline(always)]
+    fn of_byte(byte: u8) -> Self {
+        Self::from_bits((f32::from(byte).to_bits() >> 16) as u16)
+    }
+
+    #[inline(always)]
+    fn value(self) -> f32 {
+        f32::from_bits(u32::from(self.to_bits()) << 16)
+    }
+
+    #[inline(always)]
+    fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]) {
+        rounding.round(values, to);
+    }
+
+    #[inline(always)]
+    fn join<R: Rounding>(rounding: R, first: &[f32], second: &[f32], step: &mut [Self]) {
+        let (begin, end) = step.split_at_mut(first.len() * 2);
+        if second.is_empty() {
+            for (pair, &first) in begin.chunks_exact_mut(2).zip(first) {
+                (pair[0], pair[1]) = (Self::of(first), Self::default());
+            }
+        } else {
+            rounding.round_pairs(first, second, begin);
+        }
+        end.fill(Self::default());
+    }
+
+    #[inline(always)]
+    fn steps<R: Rounding>(rounding: R, values: &[f32], steps: &mut [u32; LANES]) {
+        let mut rounded = [Self::default(); 2 * LANES];
+        rounding.round(values, &mut rounded);
+        for (step, pair) in steps.iter_mut().zip(rounded.chunks_exact(2)) {
+            *step = u32::from(pair[0].to_bits()) | u32::from(pair[1].to_bits()) << 16;
+        }
+    }
+
+    #[inline(always)]
+    fn store_bytes<R: Rounding>(rounding: R, bytes: &[u8], to: &mut [Self]) {
+        rounding.of_bytes(bytes, to);
+    }
+
+    #[inline(always)]
+    fn steps_of_bytes<R: Rounding>(rounding: R, bytes: &[u8], shift: usize, steps: &mut [Self]) {
+        let later = bytes.get(shift..).unwrap_or_default();
+        let (begin, end) = bytes.split_at(later.len());
+        let (both, one) = steps.split_at_mut(later.len() * 2);
+        rounding.pair_bytes(begin, later, both);
+        for (pair, &byte) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (Self::of_byte(byte), Self::default());
+        }
+    }
+
+    #[inline(always)]
+    fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]) {
+        let later = values.get(shift..).unwrap_or_default();
+        let (begin, end) = values.split_at(later.len());
+        let (both, one) = steps.split_at_mut(later.len() * 2);
+        rounding.pair(begin, later, both);
+        for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
+            (pair[0], pair[1]) = (value, Self::default());
+        }
+    }
+
+    #[inline(always)]
+    fn unpack(bits: u32, step: &mut [Self]) {
+        step[0] = Self::from_bits(bits as u16);
+        step[1] = Self::from_bits((bits >> 16) as u16);
+    }
+
+    fn in_place(_: &[f32]) -> Option<&[Self]> {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounding_is_to_the_nearest_and_keeps_what_is_not_finite() {
+        let mut bits = 1u32;
+        for _ in 0..1_000_000 {
+            // A full-period walk over the float space.
+            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let value = f32::from_bits(bits);
+            let (got, wanted) = (<bf16 as Element>::of(value), bf16::from_f32(value));
+            assert_eq!(got.is_nan(), wanted.is_nan(), "{bits:#x}");
+            assert!(
+                value.is_nan() || got == wanted,
+                "{value:e}: {got}, {wanted}"
+            );
+        }
+        for value in [0.0, -0.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY, 1e-45] {
+            assert_eq!(<bf16 as Element>::of(value), bf16::from_f32(value));
+        }
+        assert!(<bf16 as Element>::of(f32::from_bits(0x7f80_0001)).is_nan());
+        assert!(<bf16 as Element>::of(f32::from_bits(0xffff_ffff)).is_nan());
+    }
+
+    #[test]
+    fn bytes_are_exact() {
+        for byte in 0..=255 {
+            assert_eq!(<bf16 as Element>::of_byte(byte).value(), f32::from(byte));
+            assert_eq!(
+                <f32 as Element>::of_byte(byte),
+                f32::from(byte) * (1.0 / 255.0)
+            );
+        }
+    }
+}

@@ -1,0 +1,21 @@
+//! What a processor multiplies with: the instruction sets that products can run on, and the choice among them at run time.
+//! It knows neither matrices nor layers: an instruction set computes one tile, a few rows by a few columns, in registers.
+
+mod amx;
+mod amx_permission;
+mod avx2;
+mod avx512;
+mod avx512_rounding;
+pub(crate) mod dispatch;
+pub(crate) mod element;
+mod emulated;
+mod portable;
+pub(crate) mod simd;
+mod tile;
+mod vector;
+
+pub(crate) use dispatch::{AnySimd, with_simd};
+pub use dispatch::{describe_kernels, is_bf16_fast};
+pub(crate) use element::Element;
+pub(crate) use simd::{LANES, Mode, Simd, vectorized};
+pub(crate) use tile::{Columns, Left, multiply_tile, row_tiles, tile_vecs};

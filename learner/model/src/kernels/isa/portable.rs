@@ -1,0 +1,92 @@
+//! Portable code for processors without an instruction set of their own, which the compiler vectorises as far as it can.
+
+use half::bf16;
+
+use super::{
+    element::{Element, Rounding},
+    simd::{LANES, Loop, RawTile, Simd},
+    vector::{Vector, compute_sizes},
+};
+
+#[derive(Clone, Copy)]
+pub(crate) struct F32;
+
+/// bf16 operands in pairs, multiplied as f32.
+#[derive(Clone, Copy)]
+pub(crate) struct Bf16;
+
+macro_rules! simd {
+    ($simd:ident, $element:ty) => {
+        impl Rounding for $simd {}
+
+        #[allow(unsafe_code, reason = "tiles are pointers")]
+        impl Simd for $simd {
+            type Element = $element;
+            const VECS_MAX: usize = 1;
+
+            fn rows_max(_: usize) -> usize {
+                4
+            }
+
+            unsafe fn compute(self, tile: &RawTile<$element>, rows: usize, vecs: usize) {
+                // SAFETY: it takes no special instruction; the rest is the caller's.
+                compute_sizes!(Self, tile, rows, vecs; 1: 1 2 3 4;);
+            }
+
+            #[inline(always)]
+            fn vectorize<W: Loop>(self, work: W) {
+                work.run()
+            }
+        }
+
+        // SAFETY: reads and writes are of the addresses that the caller vouches for.
+        #[allow(unsafe_code, reason = "tiles are pointers")]
+        impl Vector for $simd {
+            type Element = $element;
+            type Sums = [f32; LANES];
+            type Operand = [[$element; <$element>::DEPTH]; LANES];
+
+            #[inline(always)]
+            unsafe fn zero() -> Self::Sums {
+                [0.0; LANES]
+            }
+
+            #[inline(always)]
+            unsafe fn row(at: *const $element) -> Self::Operand {
+                unsafe { [at.cast::<[$element; <$element>::DEPTH]>().read_unaligned(); LANES] }
+            }
+
+            #[inline(always)]
+            unsafe fn columns(at: *const $element) -> Self::Operand {
+                unsafe { at.cast::<Self::Operand>().read_unaligned() }
+            }
+
+            #[inline(always)]
+            unsafe fn mul_add(
+                mut sums: Self::Sums,
+                row: Self::Operand,
+                columns: Self::Operand,
+            ) -> Self::Sums {
+                for ((sum, row), columns) in sums.iter_mut().zip(row).zip(columns) {
+                    for (row, column) in row.into_iter().zip(columns) {
+                        *sum += row.value() * column.value();
+                    }
+                }
+                sums
+            }
+
+            #[inline(always)]
+            unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool) {
+                for (index, sum) in sums.into_iter().take(count).enumerate() {
+                    unsafe {
+                        let at = at.add(index);
+                        *at = if add { *at + sum } else { sum };
+                    }
+                }
+            }
+        }
+    };
+}
+
+simd!(F32, f32);
+simd!(Bf16, bf16);

@@ -1,0 +1,104 @@
+//! What an instruction set has to offer: it computes one tile of a product in registers.
+//! It names none; the choice is in `dispatch`.
+
+pub(crate) use super::element::LANES;
+use super::element::{Element, Rounding};
+
+/// What a product does to the output's old content.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mode {
+    /// out = a b
+    Replace,
+    /// out = out + a b, row after row, so that rows of the output may overlap.
+    Add,
+}
+
+/// A tile as the instruction sets take it.
+///
+/// `left` may be read at row * row_stride + run * run_stride + step * step_len for every row, run and step, `DEPTH` scalars each;
+/// `panel` holds runs * steps * vecs * LANES * DEPTH scalars; `out` may be read and written at row * out_stride, `cols` scalars each.
+pub(crate) struct RawTile<E> {
+    pub(super) left: *const E,
+    pub(super) row_stride: usize,
+    pub(super) step: usize,
+    pub(super) steps: usize,
+    pub(super) run_stride: usize,
+    pub(super) runs: usize,
+    pub(super) panel: *const E,
+    pub(super) out: *mut f32,
+    pub(super) out_stride: usize,
+    pub(super) cols: usize,
+    pub(super) mode: Mode,
+}
+
+/// An instruction set, with the type that its operands are stored as. Sums are f32.
+///
+/// A value exists only where the processor has its instructions: `new` looks before it makes one.
+pub(crate) trait Simd: Rounding + Send + Sync + 'static {
+    type Element: Element;
+
+    /// Most registers of columns in a tile.
+    const VECS_MAX: usize;
+
+    /// Most rows of a tile that is `vecs` registers wide.
+    fn rows_max(vecs: usize) -> usize;
+
+    /// Computes a tile of `rows` by `vecs` registers.
+    ///
+    /// # Safety
+    /// All that `tile` points to is as [`RawTile`] says; `rows` and `vecs` are within the limits above.
+    #[allow(unsafe_code, reason = "implemented with the simd's instructions")]
+    unsafe fn compute(self, tile: &RawTile<Self::Element>, rows: usize, vecs: usize);
+
+    /// Transposes a block of steps, [column, step] to [step, column].
+    #[inline(always)]
+    fn transpose(self, block: &mut [[u32; LANES]; LANES]) {
+        let turned: [[u32; LANES]; LANES] =
+            std::array::from_fn(|step| std::array::from_fn(|column| block[column][step]));
+        *block = turned;
+    }
+
+    /// Runs `work` compiled for these instructions, so that its loops use its registers.
+    fn vectorize<W: Loop>(self, work: W);
+}
+
+/// Loops over slices, made by `vectorized!`.
+pub(crate) trait Loop {
+    /// Runs them. To be `#[inline(always)]`: a separate function, or a closure, would be compiled for the least that any
+    /// processor has.
+    fn run(self);
+}
+
+/// Defines a function whose body is compiled for the instruction set that is its first argument.
+///
+/// `fn name<S>(simd, argument: &'a [S::Element], ..) { .. }`; further type parameters are elements, and references live for `'a`.
+macro_rules! vectorized {
+    (
+        $(#[$meta:meta])*
+        $vis:vis fn $name:ident<$S:ident $(, $E:ident)*>($simd:ident $(, $arg:ident: $ty:ty)* $(,)?) $body:block
+    ) => {
+        $(#[$meta])*
+        $vis fn $name<'a, $S: $crate::kernels::isa::simd::Simd $(, $E: $crate::kernels::isa::element::Element)*>(
+            $simd: $S
+            $(, $arg: $ty)*
+        ) {
+            struct Work<'a, $S: $crate::kernels::isa::simd::Simd $(, $E: $crate::kernels::isa::element::Element)*>(
+                $S,
+                $($ty,)*
+                std::marker::PhantomData<(&'a (), $($E,)*)>,
+            );
+            impl<'a, $S: $crate::kernels::isa::simd::Simd $(, $E: $crate::kernels::isa::element::Element)*>
+                $crate::kernels::isa::simd::Loop for Work<'a, $S $(, $E)*>
+            {
+                #[inline(always)]
+                #[allow(unused_variables, reason = "few loops need the simd itself")]
+                fn run(self) {
+                    let Self($simd, $($arg,)* _) = self;
+                    $body
+                }
+            }
+            $simd.vectorize(Work::<$S $(, $E)*>($simd, $($arg,)* std::marker::PhantomData));
+        }
+    };
+}
+pub(crate) use vectorized;

@@ -1,0 +1,126 @@
+//! One tile of a matrix product: what it reads and writes, checked before an instruction set computes it.
+//! It does not cut matrices into tiles.
+
+use super::{
+    element::Element,
+    simd::{LANES, Mode, RawTile, Simd},
+};
+
+/// The left operand of a tile: rows at a fixed distance, whose scalars along the sum lie in runs of steps.
+///
+/// A step is [`Element::DEPTH`] neighbours. The rows of a matrix are one run each; the windows of an image are a run for each
+/// row of the kernel, so that they need not be copied out.
+#[derive(Clone, Copy)]
+pub(crate) struct Left<'a, E> {
+    pub(crate) values: &'a [E],
+    /// Index of the first row's first scalar.
+    pub(crate) start: usize,
+    /// Scalars from one row to the next.
+    pub(crate) row_stride: usize,
+    /// Scalars from one step to the next.
+    pub(crate) step: usize,
+    pub(crate) steps: usize,
+    /// Scalars from one run to the next.
+    pub(crate) run_stride: usize,
+    pub(crate) runs: usize,
+}
+
+impl<E: Element> Left<'_, E> {
+    /// Whether so many rows lie inside the values.
+    fn holds(&self, rows: usize) -> bool {
+        let last = self.start
+            + (rows - 1) * self.row_stride
+            + (self.runs - 1) * self.run_stride
+            + (self.steps - 1) * self.step;
+        last + E::DEPTH <= self.values.len()
+    }
+}
+
+pub(crate) struct Columns<'a> {
+    /// From the first row's first column on.
+    pub(crate) out: &'a mut [f32],
+    /// Scalars from one row to the next.
+    pub(crate) stride: usize,
+    /// Columns that are written; at most `vecs` registers of them.
+    pub(crate) cols: usize,
+    /// Registers of columns that are computed.
+    pub(crate) vecs: usize,
+    pub(crate) mode: Mode,
+}
+
+/// Multiplies `rows` rows of `left` by `panel` [runs * steps, vecs * LANES, DEPTH].
+///
+/// Each sum is taken in the order of the runs and steps, on every instruction set.
+///
+/// # Panics
+/// If a size is 0 or beyond the instruction set's, or an operand or the output is too short.
+pub(crate) fn multiply_tile<S: Simd>(
+    simd: S,
+    rows: usize,
+    left: Left<'_, S::Element>,
+    panel: &[S::Element],
+    columns: Columns<'_>,
+) {
+    let Columns {
+        out,
+        stride,
+        cols,
+        vecs,
+        mode,
+    } = columns;
+    assert!(
+        (1..=S::VECS_MAX).contains(&vecs) && (1..=S::rows_max(vecs)).contains(&rows),
+        "a tile of {rows} rows by {vecs} registers"
+    );
+    assert!(
+        (1..=vecs * LANES).contains(&cols) && left.steps > 0 && left.runs > 0,
+        "{cols} columns, {} steps, {} runs",
+        left.steps,
+        left.runs
+    );
+    let panel_len = left.runs * left.steps * vecs * LANES * S::Element::DEPTH;
+    assert!(
+        left.holds(rows) && panel.len() >= panel_len && (rows - 1) * stride + cols <= out.len(),
+        "a tile beyond its operands"
+    );
+    let tile = RawTile {
+        left: left.values[left.start..].as_ptr(),
+        row_stride: left.row_stride,
+        step: left.step,
+        steps: left.steps,
+        run_stride: left.run_stride,
+        runs: left.runs,
+        panel: panel.as_ptr(),
+        out: out.as_mut_ptr(),
+        out_stride: stride,
+        cols,
+        mode,
+    };
+    // SAFETY: the sizes are the instruction set's, and the asserts above are what `RawTile` asks for: the largest index of each operand
+    // is inside its slice, and all others are smaller, as strides are not negative. `out` is exclusively borrowed.
+    #[allow(unsafe_code, reason = "tiles are pointers")]
+    unsafe {
+        simd.compute(&tile, rows, vecs);
+    }
+}
+
+/// Registers of columns in each panel of a right operand with this many columns.
+pub(crate) fn tile_vecs<S: Simd>(cols: usize) -> usize {
+    match cols.div_ceil(LANES) {
+        0 | 1 => 1,
+        2 => 2.min(S::VECS_MAX),
+        _ => S::VECS_MAX,
+    }
+}
+
+/// Cuts `rows` into as few tiles as go, of about equal size: (first, rows) of each.
+pub(crate) fn row_tiles<S: Simd>(
+    rows: usize,
+    vecs: usize,
+) -> impl Iterator<Item = (usize, usize)> + Clone {
+    let tiles = rows.div_ceil(S::rows_max(vecs)).max(1);
+    (0..tiles).filter_map(move |tile| {
+        let (first, end) = (rows * tile / tiles, rows * (tile + 1) / tiles);
+        (end > first).then(|| (first, end - first))
+    })
+}

@@ -1,0 +1,223 @@
+//! Small networks, settings and batches for these tests.
+//! Nothing here is measured or asserted.
+
+use std::collections::HashMap;
+
+use candle_core::{Device, Tensor};
+use driml_learner::{
+    AdamSettings, Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, NetworkParameters,
+    auxiliary::{cpc, curl, dim},
+};
+use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters, TorsoName};
+use driml_protocol::NO_ACTION;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+pub(crate) const ACTIONS: usize = 4;
+pub(crate) const DIM: AuxiliaryKind = AuxiliaryKind::of(&dim::DIM);
+pub(crate) const CPC: AuxiliaryKind = AuxiliaryKind::of(&cpc::CPC);
+pub(crate) const CURL: AuxiliaryKind = AuxiliaryKind::of(&curl::CURL);
+pub(crate) const NO_DIM: Lambda = Lambda::NONE;
+pub(crate) const ALL_DIM: Lambda = Lambda {
+    l3t3: 1.0,
+    l3t4: 0.5,
+    l4t3: 0.25,
+    l4t4: 2.0,
+};
+
+pub(crate) fn model(lambda: Lambda) -> ModelConfig {
+    ModelConfig {
+        height: 20,
+        width: 24,
+        input_channels: 2,
+        num_actions: ACTIONS,
+        atoms: 21,
+        v_min: -5.0,
+        v_max: 5.0,
+        torso: TorsoName::Nature,
+        conv: vec![
+            ConvLayer {
+                out: 5,
+                kernel: 8,
+                stride: 4,
+            },
+            ConvLayer {
+                out: 6,
+                kernel: 3,
+                stride: 1,
+            },
+        ],
+        channels: vec![],
+        scale_blocks: false,
+        hidden: 16,
+        embedding_dim: 12,
+        action_embed: 7,
+        dim: lambda.dim_heads(true),
+        head: HeadConfig::PLAIN,
+    }
+}
+
+pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
+    LearnerSettings {
+        double_dqn: false,
+        auxiliary_loss: if lambda == NO_DIM {
+            AuxiliaryKind::NONE
+        } else {
+            DIM
+        },
+        condition_on_action: true,
+        lambda,
+        tanh_clip: 20.0,
+        max_grad_norm: 10.0,
+        adam: AdamSettings {
+            lr: 1e-3,
+            beta1: 0.9,
+            beta2: 0.999,
+            eps: 1e-5,
+        },
+        target_period_updates: 3,
+        target_tau: 0.95,
+        average_tau: None,
+        own: toml::Table::new(),
+    }
+}
+
+pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
+    agent_on(&Compute::CPU, lambda, seed)
+}
+
+pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    Agent::new(model(lambda), settings(lambda), compute, rng).unwrap()
+}
+
+/// A learner whose head is made so.
+pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64) -> Agent {
+    let model = ModelConfig {
+        head,
+        ..model(settings.lambda)
+    };
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    Agent::new(model, settings, &Compute::CPU, rng).unwrap()
+}
+
+pub(crate) const DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: None,
+};
+pub(crate) const NOISY: HeadConfig = HeadConfig {
+    dueling: false,
+    noisy_sigma: Some(0.5),
+};
+
+pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
+    dueling: true,
+    noisy_sigma: Some(0.5),
+};
+
+/// The operations of a GPU, on the CPU.
+pub(crate) const CANDLE: Compute = Compute {
+    kernels: Kernels::Candle,
+    ..Compute::CPU
+};
+
+#[derive(Clone)]
+pub(crate) struct Rows {
+    pub(crate) frames: [Vec<u8>; 3],
+    pub(crate) action: Vec<u8>,
+    pub(crate) next_action: Vec<u8>,
+    pub(crate) n_step_return: Vec<f32>,
+    pub(crate) bootstrap_discount: Vec<f32>,
+    pub(crate) positive_valid: Vec<u8>,
+}
+
+impl Rows {
+    pub(crate) fn random(rows: usize, seed: u64) -> Self {
+        Self::of_frames(rows, 20 * 24 * 2, seed)
+    }
+
+    /// With states of `frame_len` bytes.
+    pub(crate) fn of_frames(rows: usize, frame_len: usize, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut frames = || {
+            (0..rows * frame_len)
+                .map(|_| rng.random())
+                .collect::<Vec<u8>>()
+        };
+        let frames = [frames(), frames(), frames()];
+        let mut draw = |below: u8| {
+            (0..rows)
+                .map(|_| rng.random_range(0..below))
+                .collect::<Vec<u8>>()
+        };
+        let action = draw(ACTIONS as u8);
+        let mut next_action = draw(ACTIONS as u8);
+        next_action[0] = NO_ACTION;
+        Self {
+            frames,
+            action,
+            next_action,
+            n_step_return: (0..rows).map(|_| rng.random_range(-3.0..3.0)).collect(),
+            bootstrap_discount: (0..rows)
+                .map(|row| if row == 0 { 0.0 } else { 0.93 })
+                .collect(),
+            positive_valid: (0..rows).map(|row| u8::from(row != 0)).collect(),
+        }
+    }
+
+    pub(crate) fn batch(&self) -> Batch<'_> {
+        Batch {
+            rows: self.action.len(),
+            states_t: &self.frames[0],
+            anchors: None,
+            positives: 1,
+            states_k: &self.frames[1],
+            states_n: &self.frames[2],
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+            importance_weight: None,
+        }
+    }
+}
+
+pub(crate) type Values = HashMap<String, Vec<f32>>;
+
+pub(crate) fn values(parameters: &Parameters) -> Values {
+    let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    parameters
+        .iter()
+        .map(|(name, var)| (name.to_owned(), flat(var)))
+        .collect()
+}
+
+pub(crate) fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
+    let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
+        let mut tensors = HashMap::new();
+        for (name, var) in parameters.iter() {
+            let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
+            change(name, &mut values);
+            tensors.insert(
+                name.to_owned(),
+                Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap(),
+            );
+        }
+        tensors
+    };
+    let device = Device::Cpu;
+    let model = agent.model();
+    let online =
+        Parameters::from_tensors(model, tensors(agent.online(), &change), &device).unwrap();
+    let acting = model.without_dim();
+    let target =
+        Parameters::from_tensors(&acting, tensors(agent.target(), &|_, _| ()), &device).unwrap();
+    let parameters = NetworkParameters {
+        online,
+        target,
+        key: None,
+    };
+    let settings = agent.settings().clone();
+    Agent::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
+}

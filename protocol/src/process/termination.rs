@@ -1,0 +1,150 @@
+//! Reasons for a process to exit: a signal, a closed terminal or stderr, a dead parent. It listens for the process's whole life.
+//! What a sign means, a wish to drain or to end at once, is for the caller.
+
+use std::{
+    fs,
+    ops::ControlFlow,
+    os::{fd::AsFd, unix::process::parent_id},
+    time::Duration,
+};
+
+use nix::{
+    poll::{PollFd, PollFlags, PollTimeout, poll},
+    sys::signal::Signal as Number,
+};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use super::fail_point;
+
+/// How often it is looked whether parent and stderr are still there.
+const LOOK: Duration = Duration::from_millis(500);
+
+/// Why a process should end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EndSign {
+    /// It was requested: SIGINT (Ctrl-C) or SIGTERM.
+    Asked,
+    /// The terminal was closed (SIGHUP), the reader of stderr exited, or the parent died.
+    Abandoned,
+}
+
+/// Calls `on_sign` at each sign, on a thread of this `name`, until it breaks or the process ends. `parent` is the process whose
+/// death is a sign, given by its number: if it died before this process looked, that is seen too.
+///
+/// SIGHUP is left ignored where it is ignored at the start, as `nohup` does it.
+///
+/// # Errors
+/// The operating system gave no thread, runtime or signal handler.
+pub fn listen(
+    name: &'static str,
+    parent: Option<u32>,
+    mut on_sign: impl FnMut(EndSign) -> ControlFlow<()> + Send + 'static,
+) -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let (mut interrupt, mut terminate, mut hangup) = {
+        let _inside = runtime.enter();
+        // A file at its size limit (`ulimit -f`) becomes a write error, like a full disk; without a handler this signal would kill
+        // the process. The handler stays.
+        drop(signal(SignalKind::from_raw(Number::SIGXFSZ as i32))?);
+        (
+            signal(SignalKind::interrupt())?,
+            signal(SignalKind::terminate())?,
+            if hangup_is_ignored() {
+                None
+            } else {
+                Some(signal(SignalKind::hangup())?)
+            },
+        )
+    };
+    let listening = async move {
+        let mut look = tokio::time::interval(LOOK);
+        let mut abandoned = false;
+        loop {
+            fail_point::reach(name);
+            let sign = tokio::select! {
+                _ = interrupt.recv() => EndSign::Asked,
+                _ = terminate.recv() => EndSign::Asked,
+                () = received(&mut hangup) => EndSign::Abandoned,
+                // Said once: it stays so.
+                _ = look.tick(), if !abandoned => {
+                    abandoned = stderr_is_gone() || parent.is_some_and(|pid| parent_id() != pid);
+                    if !abandoned {
+                        continue;
+                    }
+                    EndSign::Abandoned
+                }
+            };
+            if on_sign(sign).is_break() {
+                return;
+            }
+        }
+    };
+    std::thread::Builder::new()
+        .name(name.into())
+        .spawn(move || runtime.block_on(listening))?;
+    Ok(())
+}
+
+/// Waits for the signal; without one it never returns.
+async fn received(signal: &mut Option<Signal>) {
+    match signal {
+        Some(signal) => {
+            signal.recv().await;
+        }
+        None => std::future::pending().await,
+    }
+}
+
+/// Whether SIGHUP was set to be ignored before this process started, by the kernel's own table.
+fn hangup_is_ignored() -> bool {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    ignored_signals(&status) & (1 << (Number::SIGHUP as u32 - 1)) != 0
+}
+
+/// The mask of ignored signals in `/proc/PID/status`.
+fn ignored_signals(status: &str) -> u64 {
+    let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .unwrap_or_default()
+}
+
+/// Whether stderr has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
+/// count.
+fn stderr_is_gone() -> bool {
+    is_gone(std::io::stderr())
+}
+
+fn is_gone(output: impl AsFd) -> bool {
+    let mut output = [PollFd::new(output.as_fd(), PollFlags::empty())];
+    let found = poll(&mut output, PollTimeout::ZERO);
+    let events = output[0].revents().unwrap_or(PollFlags::empty());
+    // These two are always looked for.
+    found.is_ok() && events.intersects(PollFlags::POLLERR | PollFlags::POLLHUP)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pipe_is_gone_with_its_reader() {
+        let (reader, writer) = std::io::pipe().unwrap();
+        assert!(!is_gone(&writer));
+        drop(reader);
+        assert!(is_gone(&writer));
+        assert!(!is_gone(tempfile::tempfile().unwrap()));
+        assert!(!is_gone(fs::File::open("/dev/null").unwrap()));
+    }
+
+    #[test]
+    fn the_kernels_table_says_what_is_ignored() {
+        assert_eq!(
+            ignored_signals("Name:\tx\nSigIgn:\t0000000000001001\n"),
+            0x1001
+        );
+        assert_eq!(ignored_signals("Name:\tx\n"), 0);
+        assert!(!hangup_is_ignored());
+    }
+}

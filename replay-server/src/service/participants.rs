@@ -1,0 +1,337 @@
+//! The state of each process beyond its counts: whether it is connected, since when, when it was last seen, what it reports.
+//! It decides nothing. The replay knows which processes have joined, and all counts.
+
+use std::{
+    collections::{BTreeMap, HashSet},
+    mem::discriminant,
+    time::Instant,
+};
+
+use driml_protocol::{Alive, ProcessName, ProcessStatus, Report, WARNINGS_MAX, Waiting, Warning};
+
+use crate::ledger::actors::ACTORS_MAX;
+
+/// Most processes that count as connected at a time, far more than a run has; further ones count as absent.
+const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
+
+/// All processes that have joined, and the connections.
+pub(super) struct Participants {
+    started: Instant,
+    waiting: (Waiting, Instant),
+    weights_at: Option<Instant>,
+    /// Those that have not joined too.
+    connected: HashSet<Alive>,
+    processes: BTreeMap<ProcessName, Account>,
+}
+
+/// Of one process, over all its lives.
+struct Account {
+    /// Its newest life.
+    alive: Alive,
+    lives: u32,
+    /// When it was connected, or went.
+    changed: Instant,
+    last_seen: Option<Instant>,
+    weights_version: Option<u64>,
+    report: Option<(Report, Instant)>,
+}
+
+/// Which process it is, whatever its life.
+const fn name(who: Alive) -> ProcessName {
+    match who {
+        Alive::Actor { actor, .. } => ProcessName::Actor(actor),
+        Alive::Learner { .. } => ProcessName::Learner,
+    }
+}
+
+impl Participants {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            started: now,
+            waiting: (Waiting::Neither, now),
+            weights_at: None,
+            connected: HashSet::new(),
+            processes: BTreeMap::new(),
+        }
+    }
+
+    /// A process has joined. One that asks again has joined once.
+    pub(super) fn joined(&mut self, who: Alive, now: Instant) {
+        let earlier = self.processes.get(&name(who));
+        if earlier.is_some_and(|account| account.alive == who) {
+            return;
+        }
+        let account = Account {
+            alive: who,
+            lives: earlier.map_or(0, |account| account.lives) + 1,
+            changed: now,
+            last_seen: None,
+            weights_version: None,
+            report: None,
+        };
+        self.processes.insert(name(who), account);
+    }
+
+    /// The account of this life, if it takes part.
+    fn of(&mut self, who: Alive) -> Option<&mut Account> {
+        let account = self.processes.get_mut(&name(who))?;
+        (account.alive == who).then_some(account)
+    }
+
+    /// Those of all actors, or the learner's.
+    fn all(&self, learner: bool) -> impl Iterator<Item = &Account> {
+        let processes = self.processes.iter();
+        let processes =
+            processes.filter(move |(who, _)| (**who == ProcessName::Learner) == learner);
+        processes.map(|(_, account)| account)
+    }
+
+    pub(super) fn actor_lives(&self) -> u32 {
+        self.all(false).map(|account| account.lives).sum()
+    }
+
+    /// Whether this incarnation of a process is connected, also if it has not joined.
+    pub(super) fn is_connected(&self, who: Alive) -> bool {
+        self.connected.contains(&who)
+    }
+
+    pub(super) fn note_connected(&mut self, who: Alive, is_connected: bool, now: Instant) {
+        let has_changed = match is_connected {
+            true => self.connected.len() < CONNECTED_MAX && self.connected.insert(who),
+            false => self.connected.remove(&who),
+        };
+        if let Some(account) = self.of(who).filter(|_| has_changed) {
+            account.changed = now;
+        }
+    }
+
+    pub(super) fn actors_connected(&self) -> u32 {
+        let connected = self.all(false).filter(|it| self.is_connected(it.alive));
+        connected.count() as u32
+    }
+
+    pub(super) fn connected(&self) -> usize {
+        let processes = self.processes.values();
+        processes.filter(|it| self.is_connected(it.alive)).count()
+    }
+
+    /// A chunk came from an actor, in which weights of this version acted; or a request from the learner.
+    pub(super) fn seen(&mut self, who: Alive, weights_version: Option<u64>, now: Instant) {
+        if let Some(account) = self.of(who) {
+            account.last_seen = Some(now);
+            account.weights_version = weights_version.or(account.weights_version);
+        }
+    }
+
+    /// A process reports what it does; `false` if it has not joined.
+    pub(super) fn reported(&mut self, mut report: Report, now: Instant) -> bool {
+        let Some(account) = self.of(report.who.alive()) else {
+            return false;
+        };
+        // One that was under way meanwhile does not undo it.
+        let said = account.report.as_ref().and_then(|(it, _)| it.finished);
+        report.finished = report.finished.or(said);
+        account.report = Some((report, now));
+        true
+    }
+
+    pub(super) fn note_waiting(&mut self, waiting: Waiting, now: Instant) {
+        if discriminant(&self.waiting.0) != discriminant(&waiting) {
+            self.waiting.1 = now;
+        }
+        self.waiting.0 = waiting;
+    }
+
+    pub(super) fn weights_came(&mut self, now: Instant) {
+        self.weights_at = Some(now);
+    }
+
+    /// Who waits at the limiter, and for how many seconds.
+    pub(super) fn waiting(&self, now: Instant) -> (Waiting, f64) {
+        (self.waiting.0, seconds(now, self.waiting.1))
+    }
+
+    /// Seconds since the server started, and since the newest weights came.
+    pub(super) fn ages(&self, now: Instant) -> (f64, Option<f64>) {
+        let weights = self.weights_at.map(|at| seconds(now, at));
+        (seconds(now, self.started), weights)
+    }
+
+    /// Whether the learner said that it has learned from every batch, and has saved.
+    pub(super) fn is_over(&self) -> bool {
+        let mut reports = self.all(true).filter_map(|it| it.report.as_ref());
+        reports.any(|(report, _)| report.finished.is_some())
+    }
+
+    /// Which process the run cannot continue without and does not have, for a person; `finished` says whether all transitions are in.
+    pub(super) fn missing(&self, finished: bool) -> Option<&'static str> {
+        let lacks = |learner, gone, not_yet| {
+            let mut processes = self.all(learner).peekable();
+            let missing = processes.peek().map_or(not_yet, |_| gone);
+            let is_there = processes.any(|it| self.is_connected(it.alive));
+            (!is_there).then_some(missing)
+        };
+        let learner = lacks(true, "the learner is gone", "no learner has joined yet");
+        let actors = lacks(false, "all actors are gone", "no actor has joined yet");
+        learner.or(actors.filter(|_| !finished))
+    }
+
+    /// All processes; `held_since` says since when a process's chunk or request has been waiting. Of many processes only the newest
+    /// warnings are passed on.
+    pub(super) fn processes(
+        &self,
+        now: Instant,
+        held_since: impl Fn(ProcessName) -> Option<Instant>,
+    ) -> Vec<ProcessStatus> {
+        let process = |(&who, account): (&ProcessName, &Account)| {
+            let report = account.report.as_ref();
+            let report = report.map(|(report, at)| (report, seconds(now, *at)));
+            ProcessStatus {
+                who,
+                connected: self.is_connected(account.alive),
+                since_s: seconds(now, account.changed),
+                lives: account.lives,
+                last_seen_s: account.last_seen.map(|at| seconds(now, at)),
+                held_s: held_since(who).map(|at| seconds(now, at)),
+                weights_version: account.weights_version,
+                doing: report.map(|(it, said)| (it.doing.clone(), it.since_s + said, said)),
+                last_warning: report.and_then(|(report, said)| {
+                    let warning = report.last_warning.as_ref()?;
+                    Some(Warning::new(&warning.text, warning.age_s + said))
+                }),
+            }
+        };
+        let mut processes: Vec<_> = self.processes.iter().map(process).collect();
+        let age = |process: &ProcessStatus| {
+            let warning = process.last_warning.as_ref();
+            warning.map_or(f64::INFINITY, |warning| warning.age_s)
+        };
+        let mut by_age: Vec<_> = processes.iter_mut().collect();
+        by_age.sort_by(|one, other| age(one).total_cmp(&age(other)));
+        let older = by_age.into_iter().skip(WARNINGS_MAX);
+        older.for_each(|process| process.last_warning = None);
+        processes
+    }
+}
+
+fn seconds(now: Instant, since: Instant) -> f64 {
+    now.saturating_duration_since(since).as_secs_f64()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use driml_protocol::Participant;
+
+    use super::*;
+
+    fn actor(incarnation: u64) -> Alive {
+        Alive::actor(3, incarnation)
+    }
+
+    #[test]
+    fn an_account_is_of_the_newest_life() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let mut participants = Participants::new(start);
+        participants.note_connected(actor(1), true, at(1));
+        let processes = participants.processes(at(1), |_| None);
+        assert_eq!(processes, [], "who has not joined has no account");
+        participants.joined(actor(1), at(2));
+        participants.joined(actor(1), at(5));
+        participants.seen(actor(1), Some(7), at(6));
+        participants.seen(actor(9), Some(8), at(7));
+        let report = |incarnation| {
+            let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
+            Report::new(
+                Participant::Actor { actor, incarnation },
+                "plays",
+                2.0,
+                warning,
+            )
+        };
+        assert!(participants.reported(report(1), at(8)));
+        assert!(!participants.reported(report(9), at(8)));
+        participants.note_connected(actor(1), false, at(10));
+        participants.note_connected(actor(1), false, at(11));
+        let expected = ProcessStatus {
+            who: ProcessName::Actor(3),
+            connected: false,
+            since_s: 2.0,
+            lives: 1,
+            last_seen_s: Some(6.0),
+            held_s: Some(1.0),
+            weights_version: Some(7),
+            doing: Some(("plays".into(), 6.0, 4.0)),
+            last_warning: Some(Warning::new("late", 5.0)),
+        };
+        assert_eq!(participants.processes(at(12), |_| Some(at(11))), [expected]);
+
+        assert_eq!(participants.actors_connected(), 0);
+        participants.note_connected(actor(2), true, at(20));
+        participants.joined(actor(2), at(20));
+        participants.joined(Alive::learner(1), at(20));
+        assert_eq!(participants.actors_connected(), 1);
+        assert_eq!(participants.actor_lives(), 2);
+        let again = &participants.processes(at(21), |_| None)[1];
+        assert!(again.lives == 2 && again.connected && again.last_seen_s.is_none());
+    }
+
+    #[test]
+    fn what_is_missing_is_named() {
+        let now = Instant::now();
+        let mut participants = Participants::new(now);
+        let mut check = |who, joins, connected, all_in, missing| {
+            participants.note_connected(who, connected, now);
+            if joins {
+                participants.joined(who, now);
+            }
+            assert_eq!(participants.missing(all_in), missing);
+        };
+        let (learner, actor) = (Alive::learner(5), actor(1));
+        let no_learner = Some("no learner has joined yet");
+        check(learner, false, true, false, no_learner);
+        check(actor, false, true, false, no_learner);
+        check(learner, true, true, false, Some("no actor has joined yet"));
+        check(learner, true, true, true, None);
+        check(actor, true, true, false, None);
+        check(actor, true, false, false, Some("all actors are gone"));
+        check(learner, true, false, true, Some("the learner is gone"));
+    }
+
+    #[test]
+    fn waiting_has_a_beginning() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let warm_up = |have| Waiting::WarmUp { have, need: 100 };
+        let mut participants = Participants::new(start);
+        let actors = Waiting::ActorsWaitForLearner;
+        for (now, waiting, since) in [(1, warm_up(1), 1), (4, warm_up(50), 1), (6, actors, 6)] {
+            participants.note_waiting(waiting, at(now));
+            let seconds = (8 - since) as f64;
+            assert_eq!(participants.waiting(at(8)), (waiting, seconds));
+        }
+    }
+
+    #[test]
+    fn of_very_many_parts_only_the_newest_warnings_are_passed_on() {
+        let now = Instant::now();
+        let mut participants = Participants::new(now);
+        for actor in 0..200 {
+            let incarnation = 1;
+            let who = Participant::Actor { actor, incarnation };
+            participants.joined(who.alive(), now);
+            // The higher the number the newer, and many of one age.
+            let age = f64::from((200 - actor) / 50);
+            let report = Report::new(who, "plays", 0.0, Some(Warning::new("w", age)));
+            assert!(participants.reported(report, now));
+        }
+        let processes = participants.processes(now, |_| None);
+        let passed = processes
+            .iter()
+            .filter(|process| process.last_warning.is_some());
+        assert_eq!(passed.count(), WARNINGS_MAX);
+        assert!(processes[199].last_warning.is_some() && processes[0].last_warning.is_none());
+    }
+}
