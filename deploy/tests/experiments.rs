@@ -62,17 +62,17 @@ fn rows(files: &BTreeMap<String, Vec<u8>>, name: &str) -> usize {
 }
 
 /// The parts of a page, and the files beside it.
-fn check_page(folder: &Path, processes: &[&str], files: &str) -> String {
+fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let of_all = [
         "smoke length",
-        "**ChunkPoll.**",
+        "**Claim.**",
         "**Command.** `driml experiment",
         "**Got.**",
         "**Differences from the paper.**",
     ];
-    for role in of_all.iter().chain(processes) {
-        assert!(page.contains(role), "{role}\n{page}");
+    for part in of_all.iter().chain(sections) {
+        assert!(page.contains(part), "{part}\n{page}");
     }
     let found = data(folder);
     assert_eq!(names(&found), files);
@@ -286,7 +286,7 @@ fn tradeoff() {
         "over 1 seed of a level and 2 of a base",
         "--dials learner.precision`, then `driml tradeoff --env chain",
     ] {
-        assert!(page.contains(role), "{role}\n{page}");
+        assert!(page.contains(part), "{part}\n{page}");
     }
     let again = call("--report");
     assert!(

@@ -1,4 +1,4 @@
-//! What every part of one run must agree on, and its hash, which is in every message.
+//! What every process of one run must agree on, and its hash, which is in every message.
 //! It holds no setting that only one part uses.
 
 use serde::{Deserialize, Serialize};
@@ -76,7 +76,7 @@ pub enum TimeoutRule {
     Bootstrap,
 }
 
-/// What every part of one run must agree on.
+/// What every process of one run must agree on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunSpec {
@@ -84,7 +84,7 @@ pub struct RunSpec {
     pub world: String,
     /// The agent, as `--agent` takes it.
     pub agent: String,
-    /// The run's seed; every generator of every part is derived from it.
+    /// The run's seed; every generator of every process is derived from it.
     pub seed: u64,
     /// Rows of a frame as it travels: those of the world's that the network reads, from the top.
     pub frame_height: u32,
@@ -125,7 +125,7 @@ impl RunSpec {
         u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))
     }
 
-    /// The seed of one generator of one process: SHA-256 of the run's seed, the part's name and `index`.
+    /// The seed of one generator of one process: SHA-256 of the run's seed, the process's name and `index`.
     pub fn seed_for(&self, part: &str, index: u64) -> [u8; 32] {
         let mut hasher = Sha256::new();
         hasher.update(self.seed.to_le_bytes());

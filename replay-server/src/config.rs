@@ -1,5 +1,5 @@
 //! What can be set about the replay server, and the checks that keep a run from stalling.
-//! It does not hold the rules of the return or of k: those are the run spec's, shared by every part.
+//! It does not hold the rules of the return or of k: those are the run spec's, shared by every process.
 
 use driml_protocol::{
     BatchHeader, RunSpec, Sampling, TRANSITION_BYTES,

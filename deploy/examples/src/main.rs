@@ -1,6 +1,6 @@
 //! `driml` with a custom world and a custom auxiliary loss: `cargo run --release -p driml-examples -- local --env island --agent slow`.
 //! What it adds stands in two files beside this one; nothing of the project is changed. A package of yours looks the same, with
-//! dependencies on the crates by their git address. The launcher starts every part from this same program, so all know of both.
+//! dependencies on the crates by their git address. The launcher starts every process from this same program, so all know of both.
 
 mod island;
 mod slowness;

@@ -39,7 +39,7 @@ pub struct EndedEpisode {
     pub frames: u64,
     /// The actor that played it.
     pub actor: u32,
-    /// The environment of the actor's world in which it was played, from 0.
+    /// The actor's environment in which it was played, from 0.
     pub env: u32,
     /// What all of it earned; none if a part of it was lost.
     pub played: Option<Played>,

@@ -1,5 +1,5 @@
 //! The flag by which the threads of a process learn that it should stop.
-//! Draining and saving are each part's own; what raises the flag from outside is in `termination`.
+//! Draining and saving are each process's own; what raises the flag from outside is in `termination`.
 
 use std::{
     ops::ControlFlow,

@@ -92,7 +92,7 @@ impl Credentials {
             .collect();
         if names != [role.to_string()] {
             return Err(TlsError(format!(
-                "{} is the certificate of {:?}, not of {:?}: each part has its own; `deploy/certs.sh {}` makes it",
+                "{} is the certificate of {:?}, not of {:?}: each process has its own; `deploy/certs.sh {}` makes it",
                 certificate.display(),
                 names.join(", "),
                 role.to_string(),
@@ -136,7 +136,7 @@ impl Credentials {
         })
     }
 
-    /// What this part is.
+    /// What this process is.
     pub const fn role(&self) -> Role {
         self.role
     }
@@ -173,8 +173,8 @@ impl Credentials {
         let left = self.expires_in();
         if left < EXPIRES_SOON {
             tracing::warn!(
-                "{} expires in {} hours, and this part is cut off then: remove it and its key, let deploy/certs.sh make new ones, and \
-                 start this part again",
+                "{} expires in {} hours, and this process is cut off then: remove it and its key, let deploy/certs.sh make new ones, and \
+                 start this process again",
                 self.certificate.display(),
                 left.as_secs() / 3600
             );
@@ -217,7 +217,7 @@ fn read(path: &Path, role: Role) -> Result<Vec<u8>, TlsError> {
                 how_to_make(path, role)
             ),
             _ => format!(
-                "{} cannot be read: {why}; it belongs to the user who starts this part",
+                "{} cannot be read: {why}; it belongs to the user who starts this process",
                 path.display()
             ),
         })

@@ -21,12 +21,12 @@ pub enum CodecError {
     Magic,
     /// Another protocol version.
     #[error(
-        "the sender speaks protocol version {theirs}, this part version {ours}: run the same build of driml everywhere"
+        "the sender speaks protocol version {theirs}, this process version {ours}: run the same build of driml everywhere"
     )]
     Version {
         /// What the message says.
         theirs: u16,
-        /// What this part has, or expects here.
+        /// What this process has, or expects here.
         ours: u16,
     },
     /// Another kind than this place takes.
@@ -34,22 +34,22 @@ pub enum CodecError {
     Kind {
         /// What the message says.
         theirs: u16,
-        /// What this part has, or expects here.
+        /// What this process has, or expects here.
         ours: u16,
     },
     /// A message of a run with other settings.
     #[error(
-        "the message belongs to run spec {theirs:016x}, this part runs {ours:016x}: start every part with the same settings, or let actors and learner fetch them with --connect"
+        "the message belongs to run spec {theirs:016x}, this process runs {ours:016x}: start every process with the same settings, or let actors and learner fetch them with --connect"
     )]
     RunSpec {
         /// The hash in the message.
         theirs: u64,
-        /// What this part has, or expects here.
+        /// What this process has, or expects here.
         ours: u64,
     },
     /// A message of one actor at the key of another.
     #[error(
-        "the message speaks for {} at the key {key:?}: each part speaks for itself alone",
+        "the message speaks for {} at the key {key:?}: each process speaks for itself alone",
         .actor.map_or("the learner".into(), |actor| format!("actor {actor}"))
     )]
     Actor {

@@ -1,4 +1,4 @@
-//! Where each message travels: its own key under the run's namespace, and one for each part that is connected.
+//! Where each message travels: its own key under the run's namespace, and one for each process that is connected.
 //! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
 
 use sha2::{Digest, Sha256};

@@ -25,7 +25,7 @@ const SEGMENT_BYTES_MAX: u64 = 1 << 26;
 /// Segments that the ring, or the disk budget, is to span at least.
 const SEGMENTS: u64 = 16;
 
-/// Where a replay is kept, and which part of the run it is.
+/// Where a replay is kept, and which process of the run it is.
 #[derive(Clone, Debug)]
 pub struct PersistArgs {
     /// The folder, for this replay alone.

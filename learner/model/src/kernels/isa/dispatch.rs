@@ -86,7 +86,7 @@ impl AnySimd {
     /// Every one that can be had here, the emulated one included.
     #[cfg(test)]
     pub(crate) fn every(precision: Precision) -> Vec<Self> {
-        #[allow(unused_mut, reason = "there is no emulated simd elsewhere")]
+        #[allow(unused_mut, reason = "there is no emulated one elsewhere")]
         let mut all: Vec<_> = Self::there(precision).collect();
         #[cfg(target_arch = "x86_64")]
         if precision == Precision::Bf16 {
