@@ -49,7 +49,7 @@ FORMATS = {"contiguous": torch.contiguous_format, "channels-last": torch.channel
 def of(config, pairs=frozenset()):
     """The network of a parity case's configuration, with the heads of these DIM pairs, such as {"4t4"}."""
     obs, model = config["obs"], config["model"]
-    table = dict(model, num_actions=config["actions"], height=obs["height"], width=obs["width"], input_channels=obs["channels"])
+    table = dict(model, embedding_dim=model["rkhs"], num_actions=config["actions"], height=obs["height"], width=obs["width"], input_channels=obs["channels"])
     table |= {name: config[name] for name in ("atoms", "v_min", "v_max")}
     table["conv"] = [dict(zip(("out", "kernel", "stride"), layer)) for layer in model.get("conv", [])]
     table["head"] = config.get("head", {})
