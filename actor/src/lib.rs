@@ -10,7 +10,7 @@
 //! use driml_protocol::BufferPool;
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
-//! /// Two environments that shows how often it was stepped.
+//! /// Two environments that show how often they were stepped.
 //! struct Counter(u8);
 //!
 //! impl Environment for Counter {

@@ -125,7 +125,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
 
 #[test]
 fn completions_and_pages() {
-    for (shell, role) in [
+    for (shell, text) in [
         ("bash", "complete -F"),
         ("zsh", "#compdef driml"),
         ("fish", "complete -c driml"),
@@ -133,8 +133,8 @@ fn completions_and_pages() {
         let output = driml(&format!("completions {shell}"));
         assert!(output.status.success());
         let script = String::from_utf8(output.stdout).unwrap();
-        let has = |role| script.contains(role);
-        assert!(has(role) && has("eval-interval"), "{script}");
+        let has = |text| script.contains(text);
+        assert!(has(text) && has("eval-interval"), "{script}");
     }
     let root = tempfile::tempdir().unwrap();
     assert!(driml_in(root.path(), "man man1").status.success());

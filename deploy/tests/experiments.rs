@@ -360,9 +360,9 @@ fn a_grid_makes_every_combination_once() {
     let root = tempfile::tempdir().unwrap();
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
-    let refused = |call: &str, processes: &[&str]| {
+    let refused = |call: &str, words: &[&str]| {
         let text = said(root.path(), call, 64);
-        assert!(processes.iter().all(|it| text.contains(it)), "{text}");
+        assert!(words.iter().all(|it| text.contains(it)), "{text}");
     };
     // What cannot work is rejected before anything starts.
     let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");

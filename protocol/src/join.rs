@@ -22,7 +22,7 @@ use crate::{
     },
 };
 
-/// How long a joining part waits for a replay server.
+/// How long a joining process waits for a replay server.
 const SERVER_MAX: Duration = Duration::from_secs(60);
 /// How long it waits for its predecessor to be gone: a session that was cut off counts as connected for its lease of 30 s.
 const TAKEN_MAX: Duration = Duration::from_secs(45);
@@ -42,7 +42,7 @@ pub enum JoinError {
         last: SessionError,
     },
     /// An answer that cannot be read.
-    #[error("the replay server's greeting: {0}")]
+    #[error("the replay server's run info: {0}")]
     Codec(#[from] CodecError),
     /// Another process has the same role and does not end, or the replay server refuses.
     #[error("{0}")]

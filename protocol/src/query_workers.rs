@@ -209,7 +209,7 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
         })
     }
 
-    /// Takes the queries at the key of `M` in the client's run, until the result is dropped. No other part need be asked: the
+    /// Takes the queries at the key of `M` in the client's run, until the result is dropped. No other process need be asked: the
     /// reply is complete.
     ///
     /// # Errors

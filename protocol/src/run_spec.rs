@@ -1,5 +1,5 @@
 //! What every process of one run must agree on, and its hash, which is in every message.
-//! It holds no setting that only one part uses.
+//! It holds no setting that only one process uses.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -126,11 +126,11 @@ impl RunSpec {
     }
 
     /// The seed of one generator of one process: SHA-256 of the run's seed, the process's name and `index`.
-    pub fn seed_for(&self, part: &str, index: u64) -> [u8; 32] {
+    pub fn seed_for(&self, process: &str, index: u64) -> [u8; 32] {
         let mut hasher = Sha256::new();
         hasher.update(self.seed.to_le_bytes());
         hasher.update(index.to_le_bytes());
-        hasher.update(part.as_bytes());
+        hasher.update(process.as_bytes());
         hasher.finalize().into()
     }
 

@@ -221,16 +221,14 @@ impl TestSystem {
         processes.filter_map(survivor).collect()
     }
 
-    /// The process that runs `process` (`learner`, `actor`, `replay-server`), once it is there.
-    pub fn find_process(&self, process: &str) -> Survivor {
-        wait_for(&format!("a process {process}"), || {
-            self.find_process_now(process)
-        })
+    /// The process with this `role` (`learner`, `actor`, `replay-server`), once it is there.
+    pub fn find_process(&self, role: &str) -> Survivor {
+        wait_for(&format!("a process {role}"), || self.find_process_now(role))
     }
 
-    /// The first process that plays `process`, if there is one now.
-    pub fn find_process_now(&self, process: &str) -> Option<Survivor> {
-        let is_process = |it: &Survivor| it.args.first().is_some_and(|first| first == process);
+    /// The first process with this `role`, if there is one now.
+    pub fn find_process_now(&self, role: &str) -> Option<Survivor> {
+        let is_process = |it: &Survivor| it.args.first().is_some_and(|first| first == role);
         self.survivors().into_iter().find(is_process)
     }
 

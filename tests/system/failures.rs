@@ -219,7 +219,7 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
     ] {
         assert!(said(role).contains(words), "{}", said(role));
     }
-    assert!(!said("actor").contains("did not receive the leave"));
+    assert!(!said("actor").contains("did not receive this actor's"));
 }
 
 #[test]

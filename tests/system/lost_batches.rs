@@ -74,7 +74,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
             let (header, payload) = draft.unpack().into_payload();
             codec::encode(hash, &BatchReply::of(header), &payload).unwrap()
         }
-        Err(unready) => codec::encode(hash, &BatchReply::from(unready), &[]).unwrap(),
+        Err(not_ready) => codec::encode(hash, &BatchReply::from(not_ready), &[]).unwrap(),
     };
     session::answer(query, message.into());
 }

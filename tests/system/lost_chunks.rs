@@ -52,8 +52,8 @@ struct Server {
     replay: Mutex<Replay>,
     loses: Loses,
     messages: AtomicU32,
-    /// How often each actor has left.
-    goodbyes: Mutex<BTreeMap<u32, u32>>,
+    /// How often each actor sent `Leave`.
+    leaves: Mutex<BTreeMap<u32, u32>>,
     /// What is never answered; a query that is dropped would tell the actor so at once.
     lost: Mutex<Vec<Query>>,
 }
@@ -72,12 +72,12 @@ impl Server {
             replay: Mutex::new(replay),
             loses,
             messages: AtomicU32::new(0),
-            goodbyes: Mutex::default(),
+            leaves: Mutex::default(),
             lost: Mutex::default(),
         })
     }
 
-    /// Answers about chunks and goodbyes as a replay server does, but for what is lost.
+    /// Answers about chunks and leaves as a replay server does, but for what is lost.
     fn declare(self: &Arc<Self>, session: &Session, keys: &Keys) -> Vec<Queryable<()>> {
         let declare = |key, answer: fn(&Self, &[u8]) -> Option<Vec<u8>>| {
             let server = self.clone();
@@ -93,7 +93,7 @@ impl Server {
         let leave = |server: &Self, payload: &[u8]| {
             let hash = spec().hash();
             let leave = codec::decode::<Leave>(payload, Some(hash)).unwrap().0;
-            let tries = server.count_goodbye(leave.actor);
+            let tries = server.count_leave(leave.actor);
             // The first does not arrive, and the answer to the second does not.
             if tries > 1 {
                 let refused = server.replay.lock().unwrap().leave(&leave);
@@ -120,9 +120,9 @@ impl Server {
     }
 
     /// Counts a `Leave` of this actor; gives how often it has said it.
-    fn count_goodbye(&self, actor: u32) -> u32 {
-        let mut goodbyes = self.goodbyes.lock().unwrap();
-        let tries = goodbyes.entry(actor).or_default();
+    fn count_leave(&self, actor: u32) -> u32 {
+        let mut leaves = self.leaves.lock().unwrap();
+        let tries = leaves.entry(actor).or_default();
         *tries += 1;
         *tries
     }
@@ -137,11 +137,11 @@ impl Server {
         is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
     }
 
-    /// Checks that each actor has left until it was answered.
-    fn check_goodbyes(&self) {
-        let goodbyes = self.goodbyes.lock().unwrap();
-        assert_eq!(goodbyes.len(), ACTORS as usize, "{goodbyes:?}");
-        assert!(goodbyes.values().all(|&tries| tries >= 3), "{goodbyes:?}");
+    /// Checks that each actor sent `Leave` until it was answered.
+    fn check_leaves(&self) {
+        let leaves = self.leaves.lock().unwrap();
+        assert_eq!(leaves.len(), ACTORS as usize, "{leaves:?}");
+        assert!(leaves.values().all(|&tries| tries >= 3), "{leaves:?}");
     }
 
     /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.
@@ -194,7 +194,7 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
     let server = Server::new(Loses::TwoOfFive);
     deliver_all(&server, Duration::from_millis(100), false);
     server.check_numbers();
-    server.check_goodbyes();
+    server.check_leaves();
     let retried = server.replay.lock().unwrap().status().chunks_retried;
     // Some answers were lost; how many chunks came again for it, and were not just asked about, is the machine's.
     assert!(retried > 0, "answers were to get lost");
@@ -206,5 +206,5 @@ fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
     let server = Server::new(Loses::First(3 * ACTORS));
     deliver_all(&server, Duration::from_secs(15), true);
     server.check_numbers();
-    server.check_goodbyes();
+    server.check_leaves();
 }

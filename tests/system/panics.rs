@@ -1,5 +1,5 @@
 //! A panic in any thread of any process: the process ends, the launcher says which process and thread it was, nothing is left.
-//! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fault`).
+//! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fail_point`).
 
 use driml_protocol::fail_point;
 use driml_tests::{Ended, TestSystem};

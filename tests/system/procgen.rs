@@ -92,13 +92,13 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
         .run_ok("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table");
     let folder = system.path("table");
     let page = std::fs::read_to_string(folder.join("README.md")).unwrap();
-    for process in [
+    for line in [
         "| game | random | c51 training | c51 greedy | c51 paper |",
         "| 4.45 |\n",
         "* Interquartile mean of `driml-ada` over 1 games: 0.",
         "* Probability that `driml-ada` trains better than `c51`: ",
     ] {
-        assert!(page.contains(process), "{process}\n{page}");
+        assert!(page.contains(line), "{line}\n{page}");
     }
     let table = std::fs::read_to_string(folder.join("table.csv")).unwrap();
     assert!(

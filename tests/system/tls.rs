@@ -55,10 +55,10 @@ impl TlsSystem {
     }
 
     /// Starts an actor or a learner with the certificates in `folder`.
-    pub(crate) fn start(&self, role: &str, folder: &str) -> Process {
+    pub(crate) fn start(&self, command: &str, folder: &str) -> Process {
         let endpoint = &self.endpoint;
-        let role = format!("{role} --connect {endpoint} --tls-dir {folder}");
-        self.system.start_process(&role)
+        let args = format!("{command} --connect {endpoint} --tls-dir {folder}");
+        self.system.start_process(&args)
     }
 
     /// A client with the certificate of `role`, as this program opens its sessions.

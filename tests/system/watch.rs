@@ -230,7 +230,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(of("driml_losses").1["loss"], "dim_4t4");
     let actor = samples
         .iter()
-        .find(|it| it.0 == "driml_part_connected" && it.1["process"] == "actor-0");
+        .find(|it| it.0 == "driml_process_connected" && it.1["process"] == "actor-0");
     assert_eq!(actor.unwrap().2, 0.0, "it has left");
     drop(client);
     drop(server);

@@ -38,7 +38,7 @@ pub enum StepEnd {
     Terminal = 3,
 }
 
-/// Environments, stepped together.
+/// Environments of one game, stepped together.
 ///
 /// Deterministic: the same construction arguments and actions give the same frames, rewards and ends.
 /// An environment that ends resets by itself, so its next frame is the first of another episode (as in gym3 and Procgen).

@@ -20,7 +20,7 @@ pub const NUM_THREADS_MAX: usize = 256;
 pub struct Options {
     /// The game.
     pub game: Game,
-    /// Environments, stepped together: 1 to `NUM_ENVS_MAX`.
+    /// Environments of one game, stepped together: 1 to `NUM_ENVS_MAX`.
     pub num_envs: usize,
     /// Size of the set from which levels are drawn, `start_level..start_level + num_levels`; 0 means every level, `0..2^31 - 1`.
     pub num_levels: i32,

@@ -1,4 +1,4 @@
-//! Environments, stepped together: the safe face of the engine.
+//! Environments of one game, stepped together: the safe face of the engine.
 //! It passes the engine's flags on as they are and does not say what they mean for episodes.
 
 use std::ffi::c_void;
@@ -27,7 +27,7 @@ pub const RESET: i32 = -1;
 /// fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
 
-/// N environments. One thread at a time may use it; different ones may be used by different threads.
+/// N environments of one game. One thread at a time may use it; different ones may be used by different threads.
 pub struct VecGame {
     api: &'static Api,
     handle: Handle,

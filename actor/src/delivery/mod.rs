@@ -1,4 +1,4 @@
-//! Brings chunks to the replay server, each exactly once and in order, and leaves.
+//! Brings chunks to the replay server, each exactly once and in order, and says when the actor leaves.
 //! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
 
 mod state;
@@ -114,7 +114,7 @@ impl Delivery {
         self.queue.send(chunk).is_ok()
     }
 
-    /// Waits for the last chunk and leaves; gives the number of transitions that were not wanted any more.
+    /// Waits for the last chunk and sends `Leave`; gives the number of transitions that were not wanted any more.
     ///
     /// # Errors
     /// A chunk that could not be delivered.

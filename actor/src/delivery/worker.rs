@@ -24,7 +24,7 @@ const DRAIN_ACK_TIMEOUT: Duration = Duration::from_secs(4);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// How often a thread that waits for an answer looks whether the actor is to stop.
 const TICK: Duration = Duration::from_millis(50);
-/// How long leaving is tried, without the time in which the replay server reads its replay back.
+/// How long `Leave` is tried, without the time in which the replay server reads its replay back.
 const LEAVE_MAX: Duration = Duration::from_secs(5);
 /// How long one try waits for its answer: several must fit, as a message may be lost.
 const LEAVE_TRY_MAX: Duration = Duration::from_secs(1);
@@ -359,7 +359,7 @@ impl DeliveryWorker {
                 silent_since = Instant::now();
             }
             if silent_since.elapsed() > LEAVE_MAX {
-                tracing::warn!("the replay server did not receive the leave: {e}");
+                tracing::warn!("the replay server did not receive this actor's `Leave`: {e}");
                 return;
             }
             std::thread::sleep(RETRY_PAUSE);

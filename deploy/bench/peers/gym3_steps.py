@@ -1,6 +1,6 @@
 """Procgen's steps through gym3, as a Python program takes them: act, observe, frames at hand after each step.
 
-It is the same work as `driml bench env`: the same engine, games, copies, threads and options, actions drawn beforehand.
+It is the same work as `driml bench env`: the same engine, games, environments, threads and options, actions drawn beforehand.
 """
 
 import importlib.metadata
@@ -43,7 +43,7 @@ def main():
                     observation["rgb"]
 
             rate = ENVS * STEPS * effort.rate_overall(steps)
-            measure.found(figures, f"{game}, {ENVS} copies, {threads} engine threads", rate, "steps/s")
+            measure.found(figures, f"{game}, {ENVS} environments, {threads} engine threads", rate, "steps/s")
             env.close()
     versions = [f"{name} {importlib.metadata.version(name)}" for name in ("gym3", "procgen")]
     measure.report(", ".join(versions), figures)

@@ -31,7 +31,7 @@ def main():
 
     figures = {}
     rate = ENVS * STEPS * measure.Effort(quick).rate_overall(steps)
-    measure.found(figures, f"{args.env}, {ENVS} copies", rate, "steps/s")
+    measure.found(figures, f"{args.env}, {ENVS} environments", rate, "steps/s")
     measure.report(f"gymnasium {gymnasium.__version__}", figures)
 
 

@@ -161,7 +161,7 @@ class Learner:
         return kl.item(), {pair: loss.item() for pair, loss in dim.items()}, total.item(), norm.item()
 
 
-def made_up(config, rows, device):
+def synthetic(config, rows, device):
     """A batch that no world gave, in the host's memory; pinned if it will be copied to a device."""
     obs = config["obs"]
     shape = (rows, obs["height"], obs["width"], obs["channels"])
@@ -185,7 +185,7 @@ def bench(effort, device, compiled):
     for what, (rows, (height, width), pairs, torso) in CASES.items():
         config = dict(CONFIG, obs={"height": height, "width": width, "channels": 3}, model=CONFIG["model"] | torso)
         config["lambda"] = {pair: float(pair in pairs) for pair in CONFIG["lambda"]}
-        batch, rates = made_up(config, rows, device), {}
+        batch, rates = synthetic(config, rows, device), {}
         for bf16 in (False, True) if device.type == "cpu" else (False,):
             for name, memory_format in FORMATS.items():
                 learner = Learner(config, memory_format, device, compiled=compiled, bf16=bf16)

@@ -317,14 +317,14 @@ mod tests {
         assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
         let known = view(replay, Some(learner));
         let text = serde_json::to_string(&json(&known)).unwrap();
-        for process in [
+        for part in [
             r#""frames":7,"#,
             r#""c51_kl":0.5,"#,
             r#""losses":{"dim_4t4":2},"#,
             r#""rss_mib":{"actor-0":12.34},"#,
             r#""waiting":"neither side waits","#,
         ] {
-            assert!(text.contains(process), "{process} in {text}");
+            assert!(text.contains(part), "{part} in {text}");
         }
         let points = points(&known);
         let of = |name: &str| points.iter().find(|it| it.0 == name).map(|it| it.1);

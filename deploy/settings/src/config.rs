@@ -1,4 +1,4 @@
-//! The resolved settings of a run: one TOML with a table for each process, checked as a whole.
+//! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
 //! It fills in no number: `resolve` does.
 
 use driml_envs::WorldConfig;
@@ -108,7 +108,7 @@ pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Re
     derived::optional(table, name)?.ok_or_else(|| usage!("the settings have no [{name}] table"))
 }
 
-/// Reads every table as its process will.
+/// Reads every table as the part that uses it will.
 pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
     let tables = "run, world, input, actor, replay, learner, model, transport, local";
     let is_known = |key: &&String| tables.split(", ").any(|it| it == **key);

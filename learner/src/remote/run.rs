@@ -100,9 +100,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         progress.run = rand::random();
     }
     let progress = (updates, &*progress);
-    let process_in_run =
-        shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
-    let Some(membership) = process_in_run else {
+    let joined = shards.take_part(&clients, requests.learner, progress, args.restart, shutdown)?;
+    let Some(membership) = joined else {
         return Ok(());
     };
     learner.publish_above(membership.weights_version);

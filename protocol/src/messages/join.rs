@@ -73,7 +73,7 @@ pub enum JoinReply {
         /// Lives of this actor that were there before this one; 0 for a learner.
         earlier_incarnations: u32,
     },
-    /// Another process plays this process and is connected: ask again, it may be about to end.
+    /// Another process has this role and is connected: ask again, it may be about to end.
     Taken {
         /// Who, for a person.
         why: String,

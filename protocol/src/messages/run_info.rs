@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::wire::message::{Keyed, Kind, Message};
 
-/// What a joining part needs: the run's resolved settings, from the replay server.
+/// What a joining process needs: the run's resolved settings, from the replay server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunInfo {
     /// The resolved configuration, TOML.

@@ -1,5 +1,5 @@
 //! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
-//! It does not scout, gossip or mesh: one part listens, the others connect and redial.
+//! It does not scout, gossip or mesh: one process listens, the others connect and redial.
 
 mod error;
 mod questions;

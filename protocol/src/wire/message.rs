@@ -76,7 +76,7 @@ pub enum Kind {
     ReplayStatus = 9,
     /// The learner's account of itself.
     LearnerStatus = 10,
-    /// What a joining part needs to know.
+    /// What a joining process needs to know.
     RunInfo = 11,
     /// "Understood"; carries nothing.
     Ack = 12,

@@ -126,9 +126,9 @@ fn parts_of_stacks_are_merged() {
             ..STACKED
         }),
     ] {
-        let mut other_process = part.clone();
-        other_process.header.stacked = other;
-        assert_eq!(Batch::merged_header(&[part.clone(), other_process]), None);
+        let mut other_part = part.clone();
+        other_part.header.stacked = other;
+        assert_eq!(Batch::merged_header(&[part.clone(), other_part]), None);
     }
 }
 

@@ -171,8 +171,8 @@ fn huge_lengths_are_refused_without_taking_memory() {
         assert_eq!(read(lengths), expected);
     }
     // A header that claims more elements than any header has room for.
-    let poll = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
-    let bytes = forge_whole(Kind::Affinity, &poll, &[]);
+    let header = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
+    let bytes = forge_whole(Kind::Affinity, &header, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.

@@ -1,4 +1,4 @@
-//! The hash by which parts of one run know one another.
+//! The hash by which processes of one run know one another.
 //! Messages that carry another are refused in `damaged`.
 
 use driml_protocol::{Horizon, RunSpec, TimeoutRule};

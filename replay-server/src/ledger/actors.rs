@@ -30,7 +30,7 @@ struct Count {
     incarnation: u64,
     /// Transitions that it has produced, by its last report.
     produced: u64,
-    said_goodbye: bool,
+    has_left: bool,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -155,8 +155,8 @@ impl Actors {
         if header.sequence < expected {
             return Ok(Verdict::Retried);
         }
-        if actor.current.said_goodbye {
-            return Err(format!("actor {number} said leave before this chunk"));
+        if actor.current.has_left {
+            return Err(format!("actor {number} left before it sent this chunk"));
         }
         if header.sequence > expected {
             return Ok(Verdict::OutOfOrder { expected });
@@ -271,7 +271,7 @@ impl Actors {
         let mut lives = known.flat_map(|it| std::iter::once(&mut it.current).chain(&mut it.past));
         let life = lives.find(|life| life.incarnation == incarnation);
         let life = life.ok_or_else(|| format!("no such life of actor {actor} has joined"))?;
-        if std::mem::replace(&mut life.said_goodbye, true) {
+        if std::mem::replace(&mut life.has_left, true) {
             return Ok(Difference::default());
         }
         let stored = std::mem::replace(&mut life.produced, produced);

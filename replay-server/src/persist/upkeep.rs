@@ -18,7 +18,7 @@ use crate::{
 
 /// What is written, and what is reported of it.
 impl Replay {
-    /// Whether all notes are on disk; until then joins and goodbyes get no answer.
+    /// Whether all notes are on disk; until then joins and `Leave`s get no answer.
     pub(crate) fn is_ready(&mut self) -> bool {
         let log = self.log.as_mut();
         log.is_none_or(Journal::is_ready)

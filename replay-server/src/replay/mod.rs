@@ -34,8 +34,8 @@ pub enum NotReady {
 }
 
 impl From<NotReady> for BatchReply {
-    fn from(unready: NotReady) -> Self {
-        match unready {
+    fn from(not_ready: NotReady) -> Self {
+        match not_ready {
             NotReady::Wait(waiting) => Self::Wait(waiting),
             NotReady::Finished => Self::Finished,
             NotReady::Refused { why } => Self::Refused { why },

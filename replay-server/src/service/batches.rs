@@ -89,7 +89,7 @@ impl Service {
                     let (reply, payload) = (BatchReply::of(header), payload.freeze());
                     parked.question.reply_with(&reply, payload);
                 }
-                Err(unready) => parked.question.reply(&unready.into()),
+                Err(not_ready) => parked.question.reply(&not_ready.into()),
             }
         }
     }

@@ -63,7 +63,7 @@ impl Service {
         };
         let responder = incoming.into_responder();
         let question = Question { responder, arrived };
-        let answers = self.state().take_claim(&poll, question);
+        let answers = self.state().take_poll(&poll, question);
         self.changed.notify_all();
         self.answer_all(answers);
     }
@@ -139,14 +139,14 @@ impl State {
     }
 
     /// Says what became of a chunk, or notes who asks about a parked one; that of an actor that leaves is stored.
-    fn take_claim(&mut self, poll: &ChunkPoll, question: Question) -> Answers {
+    fn take_poll(&mut self, poll: &ChunkPoll, question: Question) -> Answers {
         if let Some(reply) = self.replay.poll(poll) {
             if let InsertReply::Refused { why } = &reply {
                 self.say("poll", &format!("a poll was refused: {why}"));
             }
             return vec![(question, reply)];
         }
-        let Some(parked) = self.chunks.claimed(poll) else {
+        let Some(parked) = self.chunks.polled(poll) else {
             return vec![(question, self.replay.wait(false))];
         };
         // An older question about it was given up.

@@ -88,10 +88,10 @@ impl<Q> ParkedChunks<Q> {
     }
 
     /// The parked chunk that `poll` is about.
-    pub(super) fn claimed(&mut self, poll: &ChunkPoll) -> Option<&mut ParkedChunk<Q>> {
+    pub(super) fn polled(&mut self, poll: &ChunkPoll) -> Option<&mut ParkedChunk<Q>> {
         let of = |it: &ChunkHeader| (it.actor, it.incarnation, it.sequence);
-        let claimed = (poll.actor, poll.incarnation, poll.sequence);
-        self.line.iter_mut().find(|it| of(it.header()) == claimed)
+        let polled = (poll.actor, poll.incarnation, poll.sequence);
+        self.line.iter_mut().find(|it| of(it.header()) == polled)
     }
 
     /// Takes an actor's chunk out of the line.
@@ -196,9 +196,9 @@ mod tests {
         let first = parked.line[0].question;
         assert_eq!(first, Some("a again"), "its place is kept");
         for other in [poll(1, 1), poll(3, 0)] {
-            assert!(parked.claimed(&other).is_none(), "{other:?}");
+            assert!(parked.polled(&other).is_none(), "{other:?}");
         }
-        assert!(parked.claimed(&poll(1, 0)).is_some());
+        assert!(parked.polled(&poll(1, 0)).is_some());
         // Of another actor, of an earlier one, and it.
         for (actor, sequence, copy) in [(3, 0, None), (4, 6, None), (4, 7, Some("d"))] {
             let taken = parked.take_copy(&chunk(actor, sequence, 1).chunk.header);

@@ -21,11 +21,11 @@ pub(super) struct Participants {
     weights_at: Option<Instant>,
     /// Those that have not joined too.
     connected: HashSet<Alive>,
-    processes: BTreeMap<ProcessName, Account>,
+    processes: BTreeMap<ProcessName, Participant>,
 }
 
-/// Of one process, over all its lives.
-struct Account {
+/// One participant, over all its lives.
+struct Participant {
     /// Its newest life.
     alive: Alive,
     lives: u32,
@@ -61,7 +61,7 @@ impl Participants {
         if earlier.is_some_and(|account| account.alive == who) {
             return;
         }
-        let account = Account {
+        let account = Participant {
             alive: who,
             lives: earlier.map_or(0, |account| account.lives) + 1,
             changed: now,
@@ -72,14 +72,14 @@ impl Participants {
         self.processes.insert(name(who), account);
     }
 
-    /// The account of this life, if it takes part.
-    fn of(&mut self, who: Alive) -> Option<&mut Account> {
+    /// The participant of this life, if it takes part.
+    fn of(&mut self, who: Alive) -> Option<&mut Participant> {
         let account = self.processes.get_mut(&name(who))?;
         (account.alive == who).then_some(account)
     }
 
-    /// Those of all actors, or the learner's.
-    fn all(&self, learner: bool) -> impl Iterator<Item = &Account> {
+    /// All actors, or the learner.
+    fn all(&self, learner: bool) -> impl Iterator<Item = &Participant> {
         let processes = self.processes.iter();
         let processes =
             processes.filter(move |(who, _)| (**who == ProcessName::Learner) == learner);
@@ -183,7 +183,7 @@ impl Participants {
         now: Instant,
         held_since: impl Fn(ProcessName) -> Option<Instant>,
     ) -> Vec<ProcessStatus> {
-        let process = |(&who, account): (&ProcessName, &Account)| {
+        let process = |(&who, account): (&ProcessName, &Participant)| {
             let report = account.report.as_ref();
             let report = report.map(|(report, at)| (report, seconds(now, *at)));
             ProcessStatus {
@@ -237,7 +237,7 @@ mod tests {
         let mut participants = Participants::new(start);
         participants.note_connected(actor(1), true, at(1));
         let processes = participants.processes(at(1), |_| None);
-        assert_eq!(processes, [], "who has not joined has no account");
+        assert_eq!(processes, [], "who has not joined is no participant");
         participants.joined(actor(1), at(2));
         participants.joined(actor(1), at(5));
         participants.seen(actor(1), Some(7), at(6));

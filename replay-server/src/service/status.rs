@@ -1,4 +1,4 @@
-//! The smaller messages: an actor's leave, the learner's affinity, reports and the status.
+//! The smaller messages: an actor's `Leave`, the learner's affinity, reports and the status.
 
 use std::{
     collections::HashSet,
@@ -28,7 +28,7 @@ impl Service {
         if let Some(leave) = self.read(&incoming) {
             let mut state = self.state();
             if let Some(why) = state.replay.leave(&leave) {
-                state.say("leave", &format!("a message `Leave` was refused: {why}"));
+                state.say("leave", &format!("a `Leave` was refused: {why}"));
             }
             let is_ready = state.replay.is_ready();
             drop(state);

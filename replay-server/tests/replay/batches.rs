@@ -224,8 +224,8 @@ proptest! {
                         check_batch(&batch, &history);
                         rows_sampled += 8;
                     }
-                    Err(unready) => {
-                        prop_assert_eq!(unready, NotReady::Wait(Waiting::LearnerWaitsForActors));
+                    Err(not_ready) => {
+                        prop_assert_eq!(not_ready, NotReady::Wait(Waiting::LearnerWaitsForActors));
                         prop_assert!(history.valid_anchors().is_empty());
                     }
                 },

@@ -187,7 +187,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
 }
 
 #[test]
-fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
+fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
     let mut replay = small(&unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.leave(&last_word(0, 1, 6));
@@ -209,7 +209,7 @@ fn after_goodbye_or_a_new_start_only_retries_are_answered_stored() {
     assert!(back.is_err(), "and it does not come back");
     let status = replay.status();
     assert_eq!((status.chunks_retried, status.transitions_lost), (1, 0));
-    assert_eq!(status.messages_refused, 4, "three chunks and a leave");
+    assert_eq!(status.messages_refused, 4, "three chunks and a `Leave`");
 }
 
 #[test]

@@ -27,7 +27,7 @@ const HEAD_BYTES: u64 = 32;
 const LENGTH_AT: usize = 16;
 
 /// A replay in a folder, everything that was stored in it, and those that talk to it.
-pub(crate) struct Participant {
+pub(crate) struct StoredReplay {
     pub(crate) args: PersistArgs,
     pub(crate) config: Config,
     pub(crate) replay: Replay,
@@ -94,7 +94,7 @@ pub(crate) fn stored(replay: &Replay) -> Vec<u8> {
     replay.stored_bytes().unwrap()
 }
 
-impl Participant {
+impl StoredReplay {
     /// Ends it: what its successor begins with.
     pub(crate) fn end(self) -> (PersistArgs, Config) {
         drop(self.replay);
@@ -197,7 +197,7 @@ fn record_end(bytes: &[u8], at: u64) -> u64 {
 }
 
 /// The log of a replay that died is used: what the learner says it has counts, and rows are right.
-fn check_continues(life: &Participant, mut replay: Replay) {
+fn check_continues(life: &StoredReplay, mut replay: Replay) {
     let rows = life.replay.counts().rows_sampled;
     replay.note_learned(learned(0, 0, rows)).unwrap();
     assert_eq!(replay.counts(), life.replay.counts());
@@ -234,7 +234,7 @@ proptest! {
         seed in any::<u64>(), config in configs(), segment_bytes in 500u64..20_000, actions in 1u32..120, cut in any::<u64>()
     ) {
         let root = tempfile::tempdir().unwrap();
-        let mut life = Participant::begin(&root.path().join("living"), config, segment_bytes, seed);
+        let mut life = StoredReplay::begin(&root.path().join("living"), config, segment_bytes, seed);
         for _ in 0..actions {
             life.act();
         }
@@ -290,7 +290,7 @@ proptest! {
 #[test]
 fn retries_are_recognised_after_a_restart() {
     let root = tempfile::tempdir().unwrap();
-    let mut life = Participant::begin(root.path(), unlimited(1000), 4000, 5);
+    let mut life = StoredReplay::begin(root.path(), unlimited(1000), 4000, 5);
     for _ in 0..20 {
         life.store(0);
     }
@@ -319,7 +319,7 @@ fn retries_are_recognised_after_a_restart() {
 fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     let root = tempfile::tempdir().unwrap();
     let config = unlimited(100);
-    let mut life = Participant::begin(&root.path().join("ring"), config, 2_000, 5);
+    let mut life = StoredReplay::begin(&root.path().join("ring"), config, 2_000, 5);
     for _ in 0..600 {
         life.store(0);
     }
@@ -332,7 +332,7 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
         disk_bytes_max: Some(4 << 20),
         ..unlimited(1_000_000)
     };
-    let mut life = Participant::begin(&root.path().join("budget"), config, 200_000, 5);
+    let mut life = StoredReplay::begin(&root.path().join("budget"), config, 200_000, 5);
     while life.history.inserted < 150_000 {
         life.store(1);
         let bytes = bytes_in(&life.args.dir);
@@ -357,7 +357,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
         warmup_transitions: 10,
         ..unlimited(1000)
     };
-    let mut life = Participant::begin(root.path(), config, 4000, 5);
+    let mut life = StoredReplay::begin(root.path(), config, 4000, 5);
     while life.history.inserted < 100 {
         life.store(0);
     }
@@ -401,7 +401,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
 #[test]
 fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let root = tempfile::tempdir().unwrap();
-    let mut life = Participant::begin(root.path(), unlimited(200), 2_000, 5);
+    let mut life = StoredReplay::begin(root.path(), unlimited(200), 2_000, 5);
     for _ in 0..60 {
         life.act();
     }

@@ -16,7 +16,7 @@ use crate::{
     batches::{check_batch, check_rows},
     calls::{header, is_stored},
     history::{History, unlimited},
-    persist::{Participant, ROWS, args, open, segments, stored, test_spec},
+    persist::{ROWS, StoredReplay, args, open, segments, stored, test_spec},
 };
 
 /// A log of a dozen segments of some transitions each, and what is in it.
@@ -31,7 +31,7 @@ struct Kept {
 impl Kept {
     fn new(capacity: u64) -> Self {
         let root = tempfile::tempdir().unwrap();
-        let mut life = Participant::begin(&root.path().join("log"), unlimited(capacity), 4_000, 3);
+        let mut life = StoredReplay::begin(&root.path().join("log"), unlimited(capacity), 4_000, 3);
         // Until the newest has some, too.
         let (mut newest, mut in_newest) = (None, 0);
         while life.history.inserted < 800 || in_newest < 5 {

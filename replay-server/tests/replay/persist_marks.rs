@@ -8,7 +8,7 @@ use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
     history::unlimited,
-    persist::{Participant, ROWS, copy, open, segments, test_spec},
+    persist::{ROWS, StoredReplay, copy, open, segments, test_spec},
     rows::prioritised,
 };
 
@@ -32,15 +32,15 @@ fn next_draws(replay: &mut Replay) -> Vec<Batch> {
 }
 
 /// A life whose ring of 60 is smaller than what is stored, and whose segments are full after a few chunks.
-fn begin(folder: &Path, config: Config, seed: u64) -> Participant {
-    let mut life = Participant::begin(folder, config, 600, seed);
+fn begin(folder: &Path, config: Config, seed: u64) -> StoredReplay {
+    let mut life = StoredReplay::begin(folder, config, 600, seed);
     for _ in 0..30 {
         life.act();
     }
     life
 }
 
-fn store_some(life: &mut Participant) {
+fn store_some(life: &mut StoredReplay) {
     for _ in 0..12 {
         life.store(0);
         life.store(1);

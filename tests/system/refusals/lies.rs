@@ -109,7 +109,7 @@ fn of_each_kind_of_message() {
 
     client.join_as_actor(STRANGER, LIFE);
     let row = |leave| Row::of(client, &leave, "Ack");
-    let goodbyes = [
+    let leaves = [
         leave(0, LIFE, 0),
         leave(0, LIFE, u64::MAX),
         leave(0, u64::MAX, 1000),
@@ -117,7 +117,7 @@ fn of_each_kind_of_message() {
         leave(STRANGER, LIFE, 1 << 60),
         leave(STRANGER + 1, LIFE, 1 << 60),
     ];
-    lied.sends(goodbyes.map(row), 6);
+    lied.sends(leaves.map(row), 6);
     lied.sends((0..1000).map(|_| row(leave(0, LIFE, 1))), 1000);
 
     let chunk = |change: &dyn Fn(&mut ChunkHeader), expected| {

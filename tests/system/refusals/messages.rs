@@ -192,10 +192,10 @@ fn everything_else_that_a_replay_server_takes() {
     let leave = leave(0, INCARNATION, 1000);
     let affinity = affinity(LEARNER, 1, 2);
     let batches = client.keys.of::<BatchRequest>();
-    let goodbyes = client.keys.of_actor::<Leave>(0);
+    let leaves = client.keys.of_actor::<Leave>(0);
     let affinities = client.keys.of::<AffinityUpdate>();
     let foreign_batch = codec::encode(hash ^ 1, &batch(16), &[]).unwrap();
-    let foreign_goodbye = codec::encode(hash ^ 1, &leave, &[]).unwrap();
+    let foreign_leave = codec::encode(hash ^ 1, &leave, &[]).unwrap();
     served.refuses([
         // Requests are answered with the reason.
         Row::new(&batches, garbage.clone(), "Refused {"),
@@ -203,8 +203,8 @@ fn everything_else_that_a_replay_server_takes() {
         Row::of(client, &batch(0), "a batch of"),
         Row::of(client, &batch(u32::MAX), "a batch of"),
         // What needs no answer gets none.
-        Row::new(&goodbyes, garbage.clone(), SILENCE),
-        Row::new(&goodbyes, foreign_goodbye, SILENCE),
+        Row::new(&leaves, garbage.clone(), SILENCE),
+        Row::new(&leaves, foreign_leave, SILENCE),
         Row::new(&affinities, garbage, SILENCE),
         Row::of(client, &affinity, SILENCE),
     ]);

@@ -1,4 +1,4 @@
-//! Weights that a replay server must not take and an actor must not act with, and greetings that no process must follow: of other
+//! Weights that a replay server must not take and an actor must not act with, and run infos that no process must follow: of other
 //! runs and versions, of strangers, damaged. The learner, or the replay server, is played by the test itself.
 
 use driml_learner::{Compute, Learner, LearnerConfig};
@@ -117,16 +117,16 @@ fn processes_of_another_protocol_version_do_not_join() {
         shared_memory: false,
     };
     let whole = codec::encode(0, &run_info, &[]).unwrap();
-    let greetings = [
+    let run_infos = [
         (
             newer(whole.clone()),
             "run the same build of driml everywhere",
         ),
-        (b"run_info?".to_vec(), "it was cut off or padded"),
+        (b"hello?".to_vec(), "it was cut off or padded"),
         (whole, "the settings that the replay server sent"),
     ];
     let key = Keys::new("driml").unwrap().of::<RunInfo>();
-    for (bytes, reason) in greetings {
+    for (bytes, reason) in run_infos {
         let answer = move |query| session::answer(&query, bytes.clone().into());
         let queryable = server
             .declare_queryable(&key)

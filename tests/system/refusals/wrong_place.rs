@@ -102,8 +102,8 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let words = "a process listens there, but does not answer at driml/run-info";
     for command in [COMMANDS[0], COMMANDS[1]] {
         let started = Instant::now();
-        let mut role = system.start_process(&format!("{command} {endpoint}"));
-        role.wait_for_stderr(words);
+        let mut process = system.start_process(&format!("{command} {endpoint}"));
+        process.wait_for_stderr(words);
         assert!(started.elapsed() < Duration::from_secs(30));
     }
     for command in [COMMANDS[2], COMMANDS[3]] {
@@ -120,16 +120,16 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     for command in [COMMANDS[0], COMMANDS[1]] {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
-            let mut role = system.start(&format!("{command} {}", system.endpoint()));
-            role.wait_for_stderr("waiting for 10 s: nothing listens on ");
-            role.signal(signal);
-            role.wait().expect_code(0);
+            let mut process = system.start(&format!("{command} {}", system.endpoint()));
+            process.wait_for_stderr("waiting for 10 s: nothing listens on ");
+            process.signal(signal);
+            process.wait().expect_code(0);
             // Something listens, and sends nothing.
             let (endpoint, listener) = listener();
-            let role = system.start(&format!("{command} {endpoint}"));
+            let process = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();
-            role.signal(signal);
-            role.wait().expect_code(0);
+            process.signal(signal);
+            process.wait().expect_code(0);
             drop(connection);
         }
     }

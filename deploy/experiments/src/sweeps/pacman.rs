@@ -10,7 +10,7 @@ use minijinja::{Value, context};
 
 use self::{
     results::{LOSSES, Results, Trace},
-    settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PROCESSES},
+    settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PARTS},
 };
 use crate::{
     cache::Session,
@@ -22,7 +22,7 @@ use crate::{
 /// Names of ghosts 0 to 3.
 const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 /// How the page names (b) and (c).
-const PANELS: [&str; PROCESSES] = ["(b)", "(c)"];
+const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
 /// Runs the experiment.
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
@@ -136,7 +136,7 @@ fn values(results: &Results) -> Value {
         let (rank, runs) = results.order_of_epsilon(column)?;
         Some(context! { what, rank, runs })
     });
-    let differences = (0..PROCESSES).flat_map(|part| differences(part, results));
+    let differences = (0..PARTS).flat_map(|part| differences(part, results));
     let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
     let mut sets = ghosts.sets.iter();
     let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));

@@ -249,7 +249,7 @@ impl Lockstep {
                             "the run folder cannot be written (the log has the reason): make room, then use --resume"
                         )
                     }
-                    Err(unready) => bail!("actor and learner wait for each other: {unready:?}"),
+                    Err(not_ready) => bail!("actor and learner wait for each other: {not_ready:?}"),
                 },
                 InsertReply::Finished { .. } => {
                     self.turn.unwanted[id] += chunk.header.transitions() as u64;

@@ -18,14 +18,14 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 const NAMED_MAX: usize = 4;
 
 /// The endpoint and the account of each replay server that answered.
-fn participants(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
+fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
     answered.filter_map(|server| Some((server, server.processes.as_ref()?)))
 }
 
-/// The learner's account, and all actors', each with the server that they are connected to.
+/// The learner's status, and all actors', each with the server that they are connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
-    participants(view).flat_map(|(server, account)| {
+    statuses(view).flat_map(|(server, account)| {
         account
             .processes
             .iter()
@@ -40,7 +40,7 @@ pub(super) fn waits(view: &RunView) -> Vec<String> {
         Waiting::Finished => Some(account.waiting.to_string()),
         waiting => Some(format!("{waiting} since {}", seconds(account.waiting_s))),
     };
-    let mut waits: Vec<_> = participants(view).filter_map(limiter).collect();
+    let mut waits: Vec<_> = statuses(view).filter_map(limiter).collect();
     waits.dedup();
     waits
 }
@@ -49,8 +49,8 @@ pub(super) fn waits(view: &RunView) -> Vec<String> {
 pub(crate) fn needed(view: &RunView) -> Vec<String> {
     let servers = view.servers.iter().filter(|_| !view.is_over());
     let mut needed: Vec<_> = servers.filter_map(of_server).collect();
-    needed.extend(participants(view).filter_map(of_disk));
-    if !view.is_over() && participants(view).next().is_some() {
+    needed.extend(statuses(view).filter_map(of_disk));
+    if !view.is_over() && statuses(view).next().is_some() {
         needed.extend(of_learner(view));
         if !view.replay.finished {
             needed.extend(of_actors(view));
@@ -159,7 +159,7 @@ pub(crate) fn notes(view: &RunView) -> Vec<String> {
     if let Some(replay) = silence("replay server", view.replay_last_seen) {
         return vec![replay];
     }
-    let is_known = participants(view).next().is_some();
+    let is_known = statuses(view).next().is_some();
     let has_joined =
         |learner| processes(view).any(|it| (it.1.who == ProcessName::Learner) == learner);
     let learner = match view.learner.finished {

@@ -153,10 +153,10 @@ impl Page {
     }
 
     fn processes(&mut self, view: &RunView) {
-        let participants = view.servers.iter().filter_map(|it| it.processes.as_ref());
+        let statuses = view.servers.iter().filter_map(|it| it.processes.as_ref());
         // With several shards the learner takes part in each.
         let mut seen = BTreeSet::new();
-        let processes = participants.flat_map(|it| &it.processes);
+        let processes = statuses.flat_map(|it| &it.processes);
         let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();
         let mut each = |kind, name, help, value: fn(&ProcessStatus) -> Option<f64>| {
             let known = processes.iter();

@@ -69,9 +69,9 @@ impl Poller {
             // An observer does not wait for a server that is still to come.
             reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let greeting = greeting(&session, &keys, endpoint, namespace)?;
-            let hash = greeting.config.run.hash();
-            if first.get_or_insert(greeting).config.run.hash() != hash {
+            let run_info = run_info(&session, &keys, endpoint, namespace)?;
+            let hash = run_info.config.run.hash();
+            if first.get_or_insert(run_info).config.run.hash() != hash {
                 return Err(usage!(
                     "{} and {endpoint} are of different runs: name the replay shards of one",
                     endpoints[0]
@@ -183,7 +183,7 @@ struct Greeting {
     after_updates: Option<u64>,
 }
 
-fn greeting(
+fn run_info(
     session: &Session,
     keys: &Keys,
     endpoint: &str,
@@ -199,7 +199,7 @@ fn greeting(
             ..
         })) => (config_toml, None),
         Err(SessionError::Unreadable { why, .. }) => {
-            let what = format!("the greeting of the replay server on {endpoint}");
+            let what = format!("the run info of the replay server on {endpoint}");
             return Err(why).context(what);
         }
         Err(SessionError::NoAnswerer { .. }) => {

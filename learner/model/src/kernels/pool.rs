@@ -145,7 +145,7 @@ mod tests {
         let (rows, cols, channels) = pooled(size);
         let len = rows * cols * channels;
         let grads: Vec<f32> = (1..=len).map(|at| at as f32).collect();
-        let of_unit = |simd| {
+        let of_simd = |simd| {
             let (mut largest, mut taken) = (vec![f32::NAN; len], vec![u8::MAX; len]);
             let mut grad_maps = vec![0.0; maps.len()];
             with_simd!(simd, simd => {
@@ -156,7 +156,7 @@ mod tests {
         };
         AnySimd::every(Precision::F32)
             .into_iter()
-            .map(of_unit)
+            .map(of_simd)
             .collect()
     }
 

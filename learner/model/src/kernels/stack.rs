@@ -195,8 +195,8 @@ mod tests {
         let grad_maps = values(count * last.map_len(), 17, 1.0);
         for images in [Pixels::Floats(&floats), Pixels::Bytes(&bytes)] {
             for precision in Precision::ALL {
-                let of_unit = |simd| with_simd!(simd, simd => passed(simd, &shapes, &parameters, images, &grad_maps));
-                let results: Vec<_> = AnySimd::every(precision).into_iter().map(of_unit).collect();
+                let of_simd = |simd| with_simd!(simd, simd => passed(simd, &shapes, &parameters, images, &grad_maps));
+                let results: Vec<_> = AnySimd::every(precision).into_iter().map(of_simd).collect();
                 let (wanted, others) = results.split_first().unwrap();
                 // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
                 let tolerance = match precision {

@@ -21,7 +21,7 @@ use crate::stability::{
 
 pub(super) const PROPERTIES: &[Property] = &[Property {
     routine: "values out of range",
-    range: "every setting and every number that a part receives",
+    range: "every setting and every number that a process receives",
     promises: &[("values not refused by name", 0.0)],
     extremes: &[("settings", Listed, settings), ("data", Listed, data)],
 }];

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::settings::{Continual, PROCESSES, Point, Settings};
+use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
     stats::{Spread, rank_correlation},
@@ -23,7 +23,7 @@ pub(super) struct Results {
     /// Of (a).
     pub(super) losses: Vec<Loss>,
     /// Of (b) and of (c).
-    pub(super) traces: [Vec<Trace>; PROCESSES],
+    pub(super) traces: [Vec<Trace>; PARTS],
     /// Runs that are missing.
     pub(super) missing: Vec<String>,
 }
@@ -55,7 +55,7 @@ pub(super) struct Trace {
 impl Results {
     /// Reads the metrics of the finished runs.
     pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
-        let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PROCESSES]);
+        let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
         for Made { point, plan, run } in swept.made {
             let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
             match point {

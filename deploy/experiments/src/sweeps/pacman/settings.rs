@@ -72,9 +72,9 @@ impl Continual {
 }
 
 /// (b) and (c).
-pub(super) const PROCESSES: usize = 2;
+pub(super) const PARTS: usize = 2;
 /// As files name them.
-pub(super) const PART_NAMES: [&str; PROCESSES] = ["ghosts", "noise"];
+pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
 
 /// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,7 +105,7 @@ impl Settings {
             let plan = PlannedRun::new(name, call, *frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
-        for (part, process_name) in PART_NAMES.iter().enumerate() {
+        for (part, part_name) in PART_NAMES.iter().enumerate() {
             let continual = self.tasks(part);
             let order: Vec<String> = continual.order.iter().map(u8::to_string).collect();
             let schedule = format!(
@@ -121,7 +121,7 @@ impl Settings {
             let episodes = continual.episodes();
             let frames = episodes * EPISODE_FRAMES_MAX;
             for agent in &self.agents {
-                let name = format!("{process_name}-{agent}-seed{seed}");
+                let name = format!("{part_name}-{agent}-seed{seed}");
                 let call = self.call(agent, seed, frames, &sets.concat());
                 let plan = PlannedRun {
                     episodes: Some(episodes),

@@ -11,7 +11,7 @@ pub(crate) const LANES: usize = 16;
 /// Instructions that round, and that put scalars in pairs.
 pub(crate) trait Rounding: Copy {
     /// The nearest bf16 of each of `values`, ties to even, into the first of `to`. A subnormal may become a 0 of its sign, which is
-    /// what such an instruction set's products take it for.
+    /// what products with these instructions take it for.
     #[inline(always)]
     fn round(self, values: &[f32], to: &mut [bf16]) {
         for (to, &value) in to.iter_mut().zip(values) {
@@ -62,7 +62,7 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// The nearest element, ties to even.
     fn of(value: f32) -> Self;
 
-    /// Stores `values` as [`Element::of`] in `to`, which is as long, with its own instructions.
+    /// Stores `values` as [`Element::of`] in `to`, which is as long, with the instructions of `simd`.
     fn store<R: Rounding>(rounding: R, values: &[f32], to: &mut [Self]);
 
     /// A pixel: times [`Element::BYTE_SCALE`] it is the byte / 255.

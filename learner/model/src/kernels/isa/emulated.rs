@@ -1,5 +1,5 @@
 //! Tiles in plain Rust, which do what AMX's instructions do: for tests on any processor.
-#![allow(unsafe_code, reason = "tiles are pointers")]
+#![allow(unsafe_code, reason = "tiles are read and written through pointers")]
 #![cfg(all(test, target_arch = "x86_64"))]
 
 use half::bf16;

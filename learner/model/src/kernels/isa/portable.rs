@@ -1,4 +1,4 @@
-//! Portable code for processors without an instruction set of their own, which the compiler vectorises as far as it can.
+//! Portable code for processors that have none of the other instruction sets, which the compiler vectorises as far as it can.
 
 use half::bf16;
 
@@ -19,7 +19,7 @@ macro_rules! simd {
     ($simd:ident, $element:ty) => {
         impl Rounding for $simd {}
 
-        #[allow(unsafe_code, reason = "tiles are pointers")]
+        #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
         impl Simd for $simd {
             type Element = $element;
             const VECS_MAX: usize = 1;
@@ -40,7 +40,7 @@ macro_rules! simd {
         }
 
         // SAFETY: reads and writes are of the addresses that the caller vouches for.
-        #[allow(unsafe_code, reason = "tiles are pointers")]
+        #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
         impl Vector for $simd {
             type Element = $element;
             type Sums = [f32; LANES];

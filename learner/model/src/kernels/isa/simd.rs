@@ -1,4 +1,4 @@
-//! What an instruction set has to offer: it computes one tile of a product in registers.
+//! What an instruction set must be able to do: compute one tile of a product in registers.
 //! It names none; the choice is in `dispatch`.
 
 pub(crate) use super::element::LANES;
@@ -47,7 +47,7 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     ///
     /// # Safety
     /// All that `tile` points to is as [`RawTile`] says; `rows` and `vecs` are within the limits above.
-    #[allow(unsafe_code, reason = "implemented with the simd's instructions")]
+    #[allow(unsafe_code, reason = "implemented with the processor's instructions")]
     unsafe fn compute(self, tile: &RawTile<Self::Element>, rows: usize, vecs: usize);
 
     /// Transposes a block of steps, [column, step] to [step, column].
@@ -91,7 +91,7 @@ macro_rules! vectorized {
                 $crate::kernels::isa::simd::Loop for Work<'a, $S $(, $E)*>
             {
                 #[inline(always)]
-                #[allow(unused_variables, reason = "few loops need the simd itself")]
+                #[allow(unused_variables, reason = "few loops need the value itself")]
                 fn run(self) {
                     let Self($simd, $($arg,)* _) = self;
                     $body

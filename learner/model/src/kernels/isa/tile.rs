@@ -98,7 +98,7 @@ pub(crate) fn multiply_tile<S: Simd>(
     };
     // SAFETY: the sizes are the instruction set's, and the asserts above are what `RawTile` asks for: the largest index of each operand
     // is inside its slice, and all others are smaller, as strides are not negative. `out` is exclusively borrowed.
-    #[allow(unsafe_code, reason = "tiles are pointers")]
+    #[allow(unsafe_code, reason = "tiles are read and written through pointers")]
     unsafe {
         simd.compute(&tile, rows, vecs);
     }

@@ -1,5 +1,5 @@
 //! The loop that all instruction sets with vector registers share: a tile's sums stay in registers while steps pass.
-//! It knows no instruction: an instruction set brings its own.
+//! It names no instruction: each instruction set brings its own.
 
 use super::{
     element::Element,
@@ -25,7 +25,7 @@ pub(super) trait Vector: Copy {
     unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool);
 }
 
-/// The loop of every set of vector instructions, to be compiled for its instructions.
+/// The loop of every instruction set with vectors, to be compiled for it.
 ///
 /// # Safety
 /// The processor has the instructions of `V`; otherwise as `Simd::compute`.
@@ -41,7 +41,7 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
         for _ in 0..tile.runs {
             let mut at = run;
             for _ in 0..tile.steps {
-                // No closure here: it may be compiled without the instruction set's instructions, and each is then a call.
+                // No closure here: it may be compiled without these instructions, and each is then a call.
                 let mut columns = [V::columns(panel); VECS];
                 for (v, columns) in columns.iter_mut().enumerate().skip(1) {
                     *columns = V::columns(panel.add(v * LANES * V::Element::DEPTH));
