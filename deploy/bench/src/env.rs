@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{effort::Effort, report::Measurement, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
-/// Environments.
+/// Environments that are stepped together.
 const ENVS: usize = 32;
 /// The engine's own threads; with 0 the caller's steps every environment.
 pub(super) const ENGINE_THREADS: [usize; 2] = [0, 2];

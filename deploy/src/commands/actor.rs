@@ -39,7 +39,7 @@ fn actor_id(text: &str) -> Result<u32, String> {
     };
     match std::env::var(name) {
         Ok(value) => value.trim().parse().map_err(|_| {
-            format!("the environment variable {name} is {value:?}, which is no actor's id")
+            format!("the environment variable {name} is {value:?}, not an actor's id")
         }),
         Err(_) => Err(format!(
             "the environment has no {name}: set it before you start this process"

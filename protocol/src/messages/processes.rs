@@ -31,7 +31,7 @@ impl std::fmt::Display for ProcessName {
 /// What a replay server knows of one process.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ProcessStatus {
-    /// Which process.
+    /// The learner, or an actor by its number.
     pub who: ProcessName,
     /// Whether it is connected.
     pub connected: bool,

@@ -237,7 +237,7 @@ mod tests {
         let mut participants = Participants::new(start);
         participants.note_connected(actor(1), true, at(1));
         let processes = participants.processes(at(1), |_| None);
-        assert_eq!(processes, [], "who has not joined is no participant");
+        assert_eq!(processes, [], "only who has joined takes part");
         participants.joined(actor(1), at(2));
         participants.joined(actor(1), at(5));
         participants.seen(actor(1), Some(7), at(6));

@@ -93,7 +93,7 @@ impl IsingWorld {
         })
     }
 
-    /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if there is no such environment.
+    /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if `env` is out of range.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
         self.envs.get(env).map(|field| field.origin)
     }

@@ -74,7 +74,7 @@ impl PacmanWorld {
         })
     }
 
-    /// Which ghosts are lethal in environment `env`'s current episode; `None` if there is no such environment.
+    /// Which ghosts are lethal in environment `env`'s current episode; `None` if `env` is out of range.
     pub fn lethal(&self, env: usize) -> Option<[bool; GHOSTS]> {
         self.envs.get(env).map(|game| game.lethal)
     }

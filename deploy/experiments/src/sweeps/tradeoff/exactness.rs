@@ -1,4 +1,4 @@
-//! How exact a level's arithmetic is: losses, gradients and values of its own run's weights on fixed rows, against f32 by candle's own
+//! How exact a level's arithmetic is: losses, gradients and values with its run's weights on fixed rows, against f32 by candle's own
 //! operations.
 //! It says nothing of what is learned: a level may be exact and learn less.
 

@@ -24,7 +24,7 @@ pub(crate) enum AnySimd {
     EmulatedAmx(super::emulated::EmulatedAmx),
 }
 
-/// `with_simd!(simd, s => expression)`: the expression with `s` as the instruction set of its own type.
+/// `with_simd!(simd, s => expression)`: the expression, with `s` as the instruction set of its concrete type.
 macro_rules! with_simd {
     ($simd:expr, $typed:ident => $body:expr) => {
         match $simd {
@@ -86,7 +86,7 @@ impl AnySimd {
     /// Every one that can be had here, the emulated one included.
     #[cfg(test)]
     pub(crate) fn every(precision: Precision) -> Vec<Self> {
-        #[allow(unused_mut, reason = "there is no emulated one elsewhere")]
+        #[allow(unused_mut, reason = "only x86-64 has an emulated one")]
         let mut all: Vec<_> = Self::there(precision).collect();
         #[cfg(target_arch = "x86_64")]
         if precision == Precision::Bf16 {
