@@ -4,7 +4,7 @@
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{
-    Convolution, gradient_panels, multiply_windows, weight_gradient,
+    Convolution, add_locations, gradient_panels, multiply_windows, weight_gradient,
 };
 use crate::kernels::images::{Images, Room};
 use crate::kernels::isa::{Element, Mode, Simd, vectorized};
@@ -188,15 +188,4 @@ fn turned(shape: &ConvShape, weight: &[f32]) -> Vec<f32> {
         }
     }
     turned
-}
-
-vectorized! {
-    /// Adds each location of `map` [locations, out] to `sums` [out].
-    fn add_locations<S>(simd, map: &'a [f32], sums: &'a mut [f32]) {
-        for location in map.chunks_exact(sums.len()) {
-            for (sum, value) in sums.iter_mut().zip(location) {
-                *sum += value;
-            }
-        }
-    }
 }

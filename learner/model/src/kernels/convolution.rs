@@ -67,6 +67,7 @@ pub(crate) struct Convolution<E: Element> {
     forward: Panels<E>,
     /// Of the product gradient x weight, for each row of the kernel; there if images get a gradient.
     backward: Vec<Panels<E>>,
+    /// For every location of a row: [out_width, out].
     pub(crate) bias: Vec<f32>,
 }
 
@@ -97,7 +98,7 @@ impl<E: Element> Convolution<E> {
             shape,
             forward: Panels::pack(simd, matrix, Threads::Caller),
             backward: backward.collect(),
-            bias: bias.to_vec(),
+            bias: bias.repeat(shape.out_width()),
         }
     }
 }
@@ -157,7 +158,7 @@ pub(crate) fn multiply_windows<S: Simd>(
 }
 
 vectorized! {
-    /// relu(scale * row + bias) for each location of `row` [locations, out], there and rounded into `maps`.
+    /// relu(scale * row + bias), there and rounded into `maps`.
     pub(crate) fn finish_row<S, M>(
         simd,
         row: &'a mut [f32],
@@ -165,10 +166,8 @@ vectorized! {
         scale: f32,
         maps: &'a mut [M],
     ) {
-        for row in row.chunks_exact_mut(bias.len()) {
-            for (value, &bias) in row.iter_mut().zip(bias) {
-                *value = relu_of(*value * scale + bias);
-            }
+        for (value, &bias) in row.iter_mut().zip(bias) {
+            *value = relu_of(*value * scale + bias);
         }
         M::store(simd, row, maps);
     }
@@ -263,7 +262,8 @@ impl<E: Element> Masked<E> {
         grad_maps: &[f32],
         bias: &mut [f32],
     ) {
-        mask(simd, maps, grad_maps, bias, &mut self.values);
+        mask(simd, maps, grad_maps, &mut self.values);
+        add_locations(simd, &self.values, bias);
     }
 
     fn write_rows<S: Simd<Element = E>>(&mut self, simd: S, out: usize) {
@@ -276,20 +276,39 @@ vectorized! {
         simd,
         maps: &'a [M],
         grad_maps: &'a [f32],
-        bias: &'a mut [f32],
         masked: &'a mut [f32],
     ) {
-        let out = bias.len();
-        let locations = maps.chunks_exact(out).zip(grad_maps.chunks_exact(out));
-        for (masked, (maps, grads)) in masked.chunks_exact_mut(out).zip(locations) {
-            for (((masked, bias), &map), &grad) in
-                masked.iter_mut().zip(&mut *bias).zip(maps).zip(grads)
-            {
-                *masked = relu_gradient(map.value(), grad);
-                *bias += *masked;
-            }
+        for ((masked, map), &grad) in masked.iter_mut().zip(maps).zip(grad_maps) {
+            *masked = relu_gradient(map.value(), grad);
         }
     }
+}
+
+vectorized! {
+    /// Adds each location of `map` [locations, out] to `sums` [out].
+    pub(crate) fn add_locations<S>(simd, map: &'a [f32], sums: &'a mut [f32]) {
+        let out = sums.len();
+        let whole = out - out % LANES;
+        for first in (0..whole).step_by(LANES) {
+            add_channels::<LANES>(map, first, out, sums);
+        }
+        for first in whole..out {
+            add_channels::<1>(map, first, out, sums);
+        }
+    }
+}
+
+/// [`add_locations`] of `N` channels, whose sums stay in a register.
+#[inline(always)]
+fn add_channels<const N: usize>(map: &[f32], first: usize, out: usize, sums: &mut [f32]) {
+    let mut each = [0.0; N];
+    each.copy_from_slice(&sums[first..][..N]);
+    for location in map.chunks_exact(out) {
+        for (sum, value) in each.iter_mut().zip(&location[first..][..N]) {
+            *sum += value;
+        }
+    }
+    sums[first..][..N].copy_from_slice(&each);
 }
 
 vectorized! {

@@ -9,38 +9,48 @@ use crate::kernels::isa::vectorized;
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
 
-/// A window's pixels inside the maps: the number of each, 0 to 8, and its first scalar in the maps.
-struct Pixels {
-    each: [(u32, usize); 9],
-    count: usize,
-}
-
-impl Pixels {
-    fn inside(&self) -> &[(u32, usize)] {
-        &self.each[..self.count]
-    }
-}
-
-/// For each window: its first scalar in the pooled maps, and its pixels.
-fn windows(size: Size) -> impl Iterator<Item = (usize, Pixels)> {
-    let (height, width, channels) = size;
-    let (rows, cols, _) = pooled(size);
-    (0..rows * cols).map(move |window| {
-        let (y, x) = (window / cols * 2, window % cols * 2);
-        let (mut each, mut count) = ([(0, 0); 9], 0);
-        for at in 0..9 {
-            let (row, col) = (y + at / 3, x + at % 3);
-            if (1..=height).contains(&row) && (1..=width).contains(&col) {
-                each[count] = (at as u32, ((row - 1) * width + col - 1) * channels);
-                count += 1;
-            }
-        }
-        (window * channels, Pixels { each, count })
+/// The windows of maps of this size, row by row.
+#[inline(always)]
+fn windows(size: Size) -> impl Iterator<Item = Window> {
+    let (rows, cols, channels) = pooled(size);
+    (0..rows).flat_map(move |y| {
+        (0..cols).map(move |x| Window {
+            start: (y * cols + x) * channels,
+            corner: (2 * y, 2 * x),
+            size,
+        })
     })
 }
 
+/// 3 x 3 pixels, some of which may lie beyond the maps.
+#[derive(Clone, Copy)]
+struct Window {
+    /// Its first scalar in the pooled maps.
+    start: usize,
+    /// The row and the column at which it begins, where those of the maps begin at 1.
+    corner: (usize, usize),
+    /// Of the maps.
+    size: Size,
+}
+
+impl Window {
+    /// The pixels inside the maps: the number of each, 0 to 8, and its first scalar in the maps.
+    #[inline(always)]
+    fn pixels(self) -> impl Iterator<Item = (u32, usize)> {
+        let (height, width, channels) = self.size;
+        let (y, x) = self.corner;
+        let inside = |first: usize, len: usize| usize::from(first == 0)..3.min(len + 1 - first);
+        let cols = inside(x, width);
+        inside(y, height).flat_map(move |row| {
+            let line = (y + row - 1) * width;
+            let each = cols.clone();
+            each.map(move |col| ((row * 3 + col) as u32, (line + x + col - 1) * channels))
+        })
+    }
+}
+
 /// Channels that are compared at once; the rest of an odd number goes one by one.
-const BLOCK: usize = 8;
+const BLOCK: usize = 16;
 
 vectorized! {
     /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
@@ -53,13 +63,14 @@ vectorized! {
     ) {
         let channels = size.2;
         let whole = channels - channels % BLOCK;
-        for (to, pixels) in windows(size) {
-            let (largest, taken) = (&mut largest[to..][..channels], &mut taken[to..][..channels]);
+        for window in windows(size) {
+            let to = window.start..window.start + channels;
+            let (largest, taken) = (&mut largest[to.clone()], &mut taken[to]);
             for first in (0..whole).step_by(BLOCK) {
-                pool_block::<BLOCK>(maps, &pixels, first, largest, taken);
+                pool_block::<BLOCK>(maps, window, first, largest, taken);
             }
             for first in whole..channels {
-                pool_block::<1>(maps, &pixels, first, largest, taken);
+                pool_block::<1>(maps, window, first, largest, taken);
             }
         }
     }
@@ -69,16 +80,16 @@ vectorized! {
 #[inline(always)]
 fn pool_block<const N: usize>(
     maps: &[f32],
-    pixels: &Pixels,
+    window: Window,
     first: usize,
     largest: &mut [f32],
     taken: &mut [u8],
 ) {
-    let (mut best, mut best_at) = ([f32::NEG_INFINITY; N], [0; N]);
-    for (index, &(at, from)) in pixels.inside().iter().enumerate() {
+    let (mut best, mut best_at) = ([f32::NEG_INFINITY; N], [u32::MAX; N]);
+    for (at, from) in window.pixels() {
         let values = &maps[from + first..][..N];
         for ((best, best_at), &value) in best.iter_mut().zip(&mut best_at).zip(values) {
-            let is_larger = index == 0 || value > *best || value.is_nan();
+            let is_larger = value > *best || value.is_nan() || *best_at == u32::MAX;
             *best = if is_larger { value } else { *best };
             *best_at = if is_larger { at } else { *best_at };
         }
@@ -100,13 +111,14 @@ vectorized! {
     ) {
         let channels = size.2;
         let whole = channels - channels % BLOCK;
-        for (from, pixels) in windows(size) {
-            let (grads, taken) = (&grads[from..][..channels], &taken[from..][..channels]);
+        for window in windows(size) {
+            let from = window.start..window.start + channels;
+            let (grads, taken) = (&grads[from.clone()], &taken[from]);
             for first in (0..whole).step_by(BLOCK) {
-                unpool_block::<BLOCK>(grads, &pixels, first, taken, grad_maps);
+                unpool_block::<BLOCK>(grads, window, first, taken, grad_maps);
             }
             for first in whole..channels {
-                unpool_block::<1>(grads, &pixels, first, taken, grad_maps);
+                unpool_block::<1>(grads, window, first, taken, grad_maps);
             }
         }
     }
@@ -116,7 +128,7 @@ vectorized! {
 #[inline(always)]
 fn unpool_block<const N: usize>(
     grads: &[f32],
-    pixels: &Pixels,
+    window: Window,
     first: usize,
     taken: &[u8],
     grad_maps: &mut [f32],
@@ -126,7 +138,7 @@ fn unpool_block<const N: usize>(
     for (at, &taken) in own_at.iter_mut().zip(&taken[first..][..N]) {
         *at = u32::from(taken);
     }
-    for &(at, to) in pixels.inside() {
+    for (at, to) in window.pixels() {
         let sums = &mut grad_maps[to + first..][..N];
         for ((sum, &grad), &own_at) in sums.iter_mut().zip(&own).zip(&own_at) {
             *sum += if own_at == at { grad } else { 0.0 };

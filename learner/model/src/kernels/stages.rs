@@ -256,25 +256,17 @@ fn cut_last<T>(values: &[T], len: usize) -> (&[T], &[T]) {
 }
 
 vectorized! {
-    /// scale * row + bias for each location of `row` [locations, out].
     fn add_bias<S>(simd, row: &'a [f32], scale: f32, bias: &'a [f32], to: &'a mut [f32]) {
-        let locations = row.chunks_exact(bias.len());
-        for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
-            for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
-                *to = value * scale + bias;
-            }
+        for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
+            *to = value * scale + bias;
         }
     }
 }
 
 vectorized! {
-    /// Adds row + bias for each location of `row` [locations, out].
     fn add_residual<S>(simd, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
-        let locations = row.chunks_exact(bias.len());
-        for (to, row) in to.chunks_exact_mut(bias.len()).zip(locations) {
-            for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
-                *to += value + bias;
-            }
+        for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
+            *to += value + bias;
         }
     }
 }

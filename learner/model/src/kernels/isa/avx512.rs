@@ -50,7 +50,11 @@ impl Bf16 {
 
 /// Rows of a tile: with its columns and one row they fill the 32 registers.
 const fn rows_max(vecs: usize) -> usize {
-    if vecs > 2 { 6 } else { 8 }
+    match vecs {
+        1 => 16,
+        2 => 12,
+        _ => 6,
+    }
 }
 
 macro_rules! simd {
@@ -90,8 +94,8 @@ macro_rules! simd {
             #[target_feature(enable = $features)]
             unsafe fn compute_sized(tile: &RawTile<$element>, rows: usize, vecs: usize) {
                 compute_sizes!(Self, tile, rows, vecs;
-                    1: 1 2 3 4 5 6 7 8;
-                    2: 1 2 3 4 5 6 7 8;
+                    1: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16;
+                    2: 1 2 3 4 5 6 7 8 9 10 11 12;
                     4: 1 2 3 4 5 6;
                 )
             }
@@ -269,12 +273,14 @@ impl Vector for Bf16 {
 
     #[inline(always)]
     unsafe fn mul_add(sums: __m512, row: __m512i, columns: __m512i) -> __m512 {
+        // The row is last, where the instruction itself can broadcast it from memory: as an instruction of its own that takes a third
+        // of the time.
         // SAFETY: two names of one register of 32 bf16.
         unsafe {
             _mm512_dpbf16_ps(
                 sums,
-                transmute::<__m512i, __m512bh>(row),
                 transmute::<__m512i, __m512bh>(columns),
+                transmute::<__m512i, __m512bh>(row),
             )
         }
     }
