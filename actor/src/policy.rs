@@ -193,6 +193,7 @@ pub(crate) mod tests {
             embedding_dim: 4,
             action_embed: 4,
             dim: DimHeads::NONE,
+            loss_layers: vec![],
             head: HeadConfig::PLAIN,
         }
     }

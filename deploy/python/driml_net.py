@@ -153,6 +153,8 @@ class Network(nn.Module):
         ]:
             if dim[name]:
                 self.dim[name] = Block(inputs, embedding_dim)
+        for layer in model.get("loss_layers", []):
+            self.dim[layer["name"]] = nn.Linear(layer["inputs"], layer["outputs"])
 
     def features(self, states):
         """f3 [B, c, h, w] after its ReLU and f4 [B, hidden] before it, of u8 states [B, H, W, C]."""

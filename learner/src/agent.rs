@@ -109,6 +109,12 @@ impl Agent {
         }
         let kernels = compute.kernels;
         let auxiliary = settings.auxiliary()?;
+        let (needed, built) = (auxiliary.layers(&model), &model.loss_layers);
+        if needed != *built {
+            return Err(UpdateError::Settings(format!(
+                "the auxiliary_loss uses the layers {needed:?}, the model builds {built:?}"
+            )));
+        }
         let key = match (auxiliary.key_tau(), key) {
             (None, None) => None,
             (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),

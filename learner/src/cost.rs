@@ -50,7 +50,7 @@ pub struct UpdateCost {
     pub states: u64,
     /// States through the key encoder, forward.
     pub keys: u64,
-    /// The auxiliary heads, forward and backward.
+    /// The auxiliary heads, forward and backward; a loss's own layers once a row.
     pub heads: u64,
     /// Dot products of all pairs of rows, and their gradients.
     pub scores: u64,
@@ -82,6 +82,12 @@ impl UpdateCost {
         // Forward, and the gradients of both sides; a key has none.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
+        let own = model
+            .loss_layers
+            .iter()
+            .map(|it| format!("dim.{}", it.name));
+        let own: Vec<_> = own.collect();
+        let own: Vec<_> = own.iter().map(String::as_str).collect();
         Self {
             online: rows * learning(&["torso"]),
             head: rows * learning(&["head"]) / actions,
@@ -91,7 +97,8 @@ impl UpdateCost {
             keys: rows * passes.keys * forward(&["torso", "dim.psi4"]),
             heads: rows
                 * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
-                    + passes.phi * learning(&["dim.phi3", "dim.phi4"])),
+                    + passes.phi * learning(&["dim.phi3", "dim.phi4"])
+                    + learning(&own)),
             scores: 2 * products * matrices * rows * rows * model.embedding_dim as u64,
         }
     }

@@ -25,7 +25,7 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let flags =
-        "--env island --agent slow --preset smoke --frames 1280 --set replay.replay_ratio=8";
+        "--env island --agent predictive --preset smoke --frames 1280 --set replay.replay_ratio=8";
     run(folder, &format!("local {flags} --actors 2 --run-dir run"));
     let trained = summary(&folder.join("run"));
     assert_eq!(trained["updates"], 540, "{trained}");
@@ -35,7 +35,10 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
         .lines()
         .map(|line| line.split(',').collect::<Vec<_>>());
     let column = rows.next().unwrap();
-    let column = column.iter().position(|&name| name == "slowness").unwrap();
+    let column = column
+        .iter()
+        .position(|&name| name == "prediction")
+        .unwrap();
     let last: f64 = rows.next_back().unwrap()[column].parse().unwrap();
     assert!(last.is_finite() && last >= 0.0, "{last}");
 
@@ -48,5 +51,8 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     let said = run(folder, "evaluate --run run --episodes 4");
     assert!(said.starts_with("island as trained on"), "{said}");
     let menu = run(folder, "presets");
-    assert!(menu.contains("slow") && menu.contains("island"), "{menu}");
+    assert!(
+        menu.contains("predictive") && menu.contains("island"),
+        "{menu}"
+    );
 }

@@ -4,7 +4,7 @@
 use driml_envs::{ActionSet, WorldConfig, WorldName};
 use driml_learner::LearnerSettings;
 use driml_machine::error::{Usage, usage};
-use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, TorsoName};
+use driml_model::{ConvLayer, FrameSize, InputRead, InputSize, ModelConfig, TorsoName};
 use driml_protocol::config::describe;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
@@ -15,7 +15,10 @@ const BY_ENV: &str = "is chosen by --env";
 const FROM_FRAME: &str = "follows from the world and what the torso reads";
 const FROM_ACTIONS: &str = "follows from the world and actor.actions";
 
-const FOLLOWS: [(&str, &str); 16] = [
+const FROM_LOSS: &str = "follows from learner.update";
+const LOSS_LAYERS: &str = "model.loss_layers";
+
+const FOLLOWS: [(&str, &str); 17] = [
     ("run.world", BY_ENV),
     ("run.agent", "is chosen by --agent"),
     ("run.frame_height", FROM_FRAME),
@@ -40,7 +43,8 @@ const FOLLOWS: [(&str, &str); 16] = [
         "follows from the world and run.frame_stack",
     ),
     ("model.num_actions", FROM_ACTIONS),
-    ("model.dim", "follows from learner.update"),
+    ("model.dim", FROM_LOSS),
+    (LOSS_LAYERS, FROM_LOSS),
 ];
 
 /// Where a whole frame's size is, if frames are cut.
@@ -180,9 +184,28 @@ pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
     ] {
         put(table, path, value);
     }
+    loss_layers(table, &update)?;
     visible_actions(table, &config, set);
     ladder(table);
     beta_updates(table);
+    Ok(())
+}
+
+/// Fills in the auxiliary loss's own layers, if it has any. Where the model or the loss cannot be, the checks that follow say why.
+fn loss_layers(table: &mut Table, update: &LearnerSettings) -> Result<(), Usage> {
+    if let Ok(model) = table_at::<ModelConfig>(table, "model")
+        && let Ok(loss) = update.auxiliary()
+    {
+        let layers = loss.layers(&model);
+        if !layers.is_empty() {
+            let layers = layers.into_iter().map(as_toml);
+            put(
+                table,
+                LOSS_LAYERS,
+                layers.collect::<Result<Vec<_>, _>>()?.into(),
+            );
+        }
+    }
     Ok(())
 }
 

@@ -59,9 +59,24 @@ pub struct ModelConfig {
     pub action_embed: usize,
     /// Which DIM heads exist.
     pub dim: DimHeads,
+    /// Layers of an auxiliary loss's own, beside those heads.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub loss_layers: Vec<LossLayer>,
     /// How the C51 head is made. Settings of earlier versions do not have it: one linear layer.
     #[serde(default, skip_serializing_if = "HeadConfig::is_plain")]
     pub head: HeadConfig,
+}
+
+/// A linear layer of an auxiliary loss's own, `dim.NAME` among the parameters. It starts as the C51 head does.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossLayer {
+    /// Its name: lower-case letters, digits and `_`, and none of a DIM head.
+    pub name: String,
+    /// Width of what it takes.
+    pub inputs: usize,
+    /// Width of what it makes.
+    pub outputs: usize,
 }
 
 /// Which DIM heads exist. Nothing is built that no lambda needs.
@@ -174,23 +189,35 @@ impl ModelConfig {
             };
             input = shape.output();
         }
+        for (index, LossLayer { name, .. }) in self.loss_layers.iter().enumerate() {
+            let is_word = |c| matches!(c, b'a'..=b'z' | b'0'..=b'9' | b'_');
+            let others = self.loss_layers[..index].iter().map(|it| it.name.as_str());
+            let mut taken = others.chain(["action", "psi3", "phi3", "psi4", "phi4"]);
+            if name.is_empty() || !name.bytes().all(is_word) || taken.any(|other| other == name) {
+                return fail(format!(
+                    "loss_layers[{index}].name is \"{name}\", must be lower-case letters, digits and _, and no other layer's name"
+                ));
+            }
+        }
         for (name, shape) in self.parameter_shapes() {
+            let is_empty = shape.contains(&0);
             let len = shape
                 .iter()
                 .try_fold(1usize, |len, &size| len.checked_mul(size));
-            if len.is_none_or(|len| len > PARAMETER_LEN_MAX) {
+            if is_empty || len.is_none_or(|len| len > PARAMETER_LEN_MAX) {
                 return fail(format!(
-                    "{name} would have shape {shape:?}, more than {PARAMETER_LEN_MAX} scalars"
+                    "{name} would have shape {shape:?}, must be 1 to {PARAMETER_LEN_MAX} scalars"
                 ));
             }
         }
         Ok(())
     }
 
-    /// The same network without its DIM heads: what target networks and actors hold.
+    /// The same network without its DIM heads and a loss's own layers: what target networks and actors hold.
     pub fn without_dim(&self) -> Self {
         Self {
             dim: DimHeads::NONE,
+            loss_layers: Vec::new(),
             ..self.clone()
         }
     }
@@ -231,7 +258,7 @@ impl ModelConfig {
             .collect()
     }
 
-    /// Names and PyTorch shapes of all parameters: torso first, then head, then the DIM heads that exist.
+    /// Names and PyTorch shapes of all parameters: torso first, then head, then the DIM heads that exist, then a loss's own layers.
     ///
     /// Linear weights are [out, in], convolutions [out, in, k, k], biases [out]. The order is the order in which initial
     /// weights are drawn, so the torso's and the head's do not depend on which DIM heads exist.
@@ -321,6 +348,10 @@ impl ModelConfig {
                 block(name, input, self.embedding_dim, false, initial);
             }
         }
+        for own in &self.loss_layers {
+            let name = format!("dim.{}", own.name);
+            layer(&name, vec![own.outputs, own.inputs], true, Uniform);
+        }
         layers
     }
 }
@@ -356,6 +387,7 @@ impl ModelConfig {
                 phi4: true,
                 action: true,
             },
+            loss_layers: vec![],
             head: HeadConfig::PLAIN,
         }
     }

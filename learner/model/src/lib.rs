@@ -17,7 +17,7 @@
 //!     height: 8, width: 8, input_channels: 1, num_actions: 3, atoms: 5, v_min: -1.0, v_max: 1.0,
 //!     torso: TorsoName::Nature, conv: vec![ConvLayer { out: 4, kernel: 4, stride: 2 }],
 //!     channels: vec![], scale_blocks: false,
-//!     hidden: 8, embedding_dim: 8, action_embed: 2, dim: no_heads, head: HeadConfig::PLAIN,
+//!     hidden: 8, embedding_dim: 8, action_embed: 2, dim: no_heads, loss_layers: vec![], head: HeadConfig::PLAIN,
 //! };
 //! let rng = &mut ChaCha8Rng::seed_from_u64(1);
 //! let parameters = Parameters::init(&config, rng, &Device::Cpu)?;
@@ -50,7 +50,7 @@ mod stored;
 mod torso;
 
 pub use compute::{Compute, DeviceError, DeviceName, Kernels};
-pub use config::{DimHeads, ModelConfig};
+pub use config::{DimHeads, LossLayer, ModelConfig};
 pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};

@@ -1,10 +1,12 @@
 //! The whole network with gradients, as the learner sees it.
 //! It owns no weights (it shares `Parameters`' storage) and computes no loss.
 
+use std::collections::BTreeMap;
+
 use candle_core::Tensor;
 
 use crate::compute::Kernels;
-use crate::config::ModelConfig;
+use crate::config::{LossLayer, ModelConfig};
 use crate::error::{ModelError, Result};
 use crate::features::FeatureLayers;
 use crate::heads::c51::C51Head;
@@ -61,6 +63,8 @@ pub struct Network {
     phi3: Option<Head>,
     psi4: Option<Head>,
     phi4: Option<Head>,
+    /// Weight and bias of each of a loss's own layers.
+    loss_layers: BTreeMap<String, (Tensor, Tensor)>,
 }
 
 impl Network {
@@ -88,8 +92,14 @@ impl Network {
             .embeds_action()
             .then(|| ActionEmbedding::new(config, parameters, kernels))
             .transpose()?;
+        let own = config.loss_layers.iter().map(|LossLayer { name, .. }| {
+            let layer = format!("dim.{name}");
+            let tensor = |part| parameters.tensor(&layer, part);
+            Ok((name.clone(), (tensor("weight")?, tensor("bias")?)))
+        });
         Ok(Self {
             kernels,
+            loss_layers: own.collect::<Result<_>>()?,
             torso: FeatureLayers::new(config, parameters, kernels)?,
             head: C51Head::new(config, parameters, kernels)?,
             action,
@@ -167,6 +177,15 @@ impl Network {
             .as_ref()
             .ok_or(ModelError::NoHead("phi4"))?
             .forward(f4, None)
+    }
+
+    /// W x + b [.., outputs] of `x` [.., inputs], by the loss's own layer of this name.
+    pub fn loss_layer(&self, name: &str, x: &Tensor) -> Result<Tensor> {
+        let layer = self.loss_layers.get(name);
+        let (weight, bias) = layer.ok_or_else(|| {
+            ModelError::Input(format!("{name} is no layer of this network's loss"))
+        })?;
+        Ok(self.kernels.linear(x, weight, bias)?)
     }
 
     fn embedded(&self, actions: &Tensor) -> Result<Option<Tensor>> {

@@ -220,7 +220,7 @@ impl Parameters {
 /// A tensor's shape and its values, row-major.
 type Shaped = (Vec<usize>, Vec<f32>);
 
-/// Whether a parameter belongs to the DIM heads.
+/// Whether a parameter belongs to the DIM heads or a loss's own layers.
 pub(crate) fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }

@@ -4,7 +4,7 @@
 use std::{borrow::Cow, fmt};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimHeads, Features, ModelConfig, Network};
+use driml_model::{DimHeads, Features, LossLayer, ModelConfig, Network};
 
 use super::{
     key_encoder::KeyEncoder,
@@ -36,6 +36,12 @@ pub struct MenuItem {
 pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     /// The heads that the online network needs; `action` says whether Psi is given a_t.
     fn heads(&self, action: bool) -> DimHeads;
+
+    /// Linear layers of its own, which the online network builds too and [`Network::loss_layer`] applies. `model` has the sizes of all
+    /// else: `hidden` is the width of f4.
+    fn layers(&self, _model: &ModelConfig) -> Vec<LossLayer> {
+        Vec::new()
+    }
 
     /// For a loss with a key encoder (a moving average of torso and Psi_4): the online network's share in its move after each
     /// update, in (0, 1].

@@ -177,6 +177,7 @@ impl Case {
             embedding_dim: it.model.embedding_dim,
             action_embed: it.model.action_embed,
             dim,
+            loss_layers: vec![],
             head: it.head,
         }
     }

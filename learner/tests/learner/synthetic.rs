@@ -53,6 +53,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         embedding_dim: 12,
         action_embed: 7,
         dim: lambda.dim_heads(true),
+        loss_layers: vec![],
         head: HeadConfig::PLAIN,
     }
 }

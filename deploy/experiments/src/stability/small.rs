@@ -36,6 +36,7 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
         embedding_dim: 1,
         action_embed: 1,
         dim: DimHeads::NONE,
+        loss_layers: vec![],
         head: HeadConfig::PLAIN,
     }
 }

@@ -138,6 +138,7 @@ pub(crate) fn small() -> ModelConfig {
             phi4: true,
             action: true,
         },
+        loss_layers: vec![],
         head: HeadConfig::PLAIN,
     }
 }

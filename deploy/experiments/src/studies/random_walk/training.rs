@@ -188,6 +188,7 @@ impl Heads {
             embedding_dim: settings.embedding_dim,
             action_embed: 1,
             dim: lambda.dim_heads(false),
+            loss_layers: vec![],
             head: HeadConfig::PLAIN,
         };
         let tanh_clip = settings.tanh_clip;

@@ -1,5 +1,6 @@
-//! An auxiliary loss of one's own: features of s_t and of s_{t+k} are to be close to each other, as in slow feature analysis.
+//! An auxiliary loss of one's own, with a layer of its own: features of s_t predict those of s_{t+1}.
 //! With nothing to hold them apart all features would become one: its weight stays small, and the return keeps them useful.
+//! Source: the latent dynamics of DeepMDP (Gelada et al. 2019), without the action; no gradient through what is predicted.
 
 use candle_core::{D, DType, Tensor};
 use driml_learner::{
@@ -9,45 +10,58 @@ use driml_learner::{
         settings::AuxiliarySettings,
     },
 };
-use driml_model::DimHeads;
+use driml_model::{DimHeads, LossLayer, ModelConfig};
 use serde::Deserialize;
 
-/// Its line of the menu: `learner.update.auxiliary_loss = "slowness"`, one later state a row, one column `slowness` in `metrics.csv`.
-pub(crate) static SLOWNESS: MenuItem = MenuItem {
-    name: "slowness",
+/// Its line of the menu: `learner.update.auxiliary_loss = "prediction"`, one later state a row, one column `prediction` in
+/// `metrics.csv`.
+pub(crate) static PREDICTION: MenuItem = MenuItem {
+    name: NAME,
     positives: Positives::One,
-    losses: &["slowness"],
+    losses: &[NAME],
     make,
 };
 
-/// Its own table, `[learner.update.slowness]`.
+/// The name of the loss, and of its layer.
+const NAME: &str = "prediction";
+
+/// Its own table, `[learner.update.prediction]`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct SlownessSettings {
+struct PredictionSettings {
     /// Weight of the loss in the total, above 0.
     weight: f64,
 }
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
     match settings.own()? {
-        Some(SlownessSettings { weight }) if weight > 0.0 && weight.is_finite() => {
-            Ok(Box::new(Slowness { weight }))
+        Some(PredictionSettings { weight }) if weight > 0.0 && weight.is_finite() => {
+            Ok(Box::new(Prediction { weight }))
         }
         _ => Err(UpdateError::AuxiliaryLoss(
-            "auxiliary_loss = slowness needs a weight above 0: --set learner.update.slowness.weight=0.01".into(),
+            "auxiliary_loss = prediction needs a weight above 0: --set learner.update.prediction.weight=0.01".into(),
         )),
     }
 }
 
 #[derive(Debug)]
-struct Slowness {
+struct Prediction {
     weight: f64,
 }
 
-impl AuxiliaryLoss for Slowness {
-    /// None: it compares the features themselves.
+impl AuxiliaryLoss for Prediction {
+    /// None of DIM's.
     fn heads(&self, _action: bool) -> DimHeads {
         DimHeads::NONE
+    }
+
+    /// From the features of s_t to those of s_{t+1}.
+    fn layers(&self, model: &ModelConfig) -> Vec<LossLayer> {
+        vec![LossLayer {
+            name: NAME.to_owned(),
+            inputs: model.hidden,
+            outputs: model.hidden,
+        }]
     }
 
     fn passes(&self, positives: usize, augmented: bool) -> Passes {
@@ -61,12 +75,13 @@ impl AuxiliaryLoss for Slowness {
         batch.positive_states(state_bytes)
     }
 
-    /// The mean over the rows with a later state of |f4(s_t) - f4(s_{t+k})|^2 / D, D the width of f4; 0 if no row has one.
+    /// The mean over the rows with a next state of |W f4(s_t) + b - f4(s_{t+1})|^2 / D, D the width of f4; 0 if no row has one.
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };
         let now = &inputs.features.anchors.f4;
+        let predicted = inputs.online.loss_layer(NAME, now)?;
         let valid = inputs.batch.positive_valid;
         let rows = valid.iter().filter(|&&valid| valid != 0).count().max(1);
         let weights: Vec<f32> = valid
@@ -74,10 +89,10 @@ impl AuxiliaryLoss for Slowness {
             .map(|&valid| f32::from(u8::from(valid != 0)) / rows as f32)
             .collect();
         let weights = Tensor::from_vec(weights, valid.len(), now.device())?;
-        let distances = (now - &later.f4)?.sqr()?.mean(D::Minus1)?;
-        let loss = (distances.to_dtype(DType::F32)? * weights)?.sum_all()?;
+        let errors = (predicted - later.f4.detach())?.sqr()?.mean(D::Minus1)?;
+        let loss = (errors.to_dtype(DType::F32)? * weights)?.sum_all()?;
         Ok(vec![WeightedLoss {
-            name: "slowness",
+            name: NAME,
             weight: self.weight,
             loss,
             dots: Vec::new(),
