@@ -148,10 +148,10 @@ pub(crate) fn multiply_windows<S: Simd>(
                 run_stride: shape.line(),
                 runs: shape.kernel,
             };
-            let to = &mut row[x * shape.channels_out..];
-            layer
-                .forward
-                .multiply(simd, windows, left, Mode::Replace, to);
+            let out = shape.channels_out;
+            let to = &mut row[x * out..];
+            let panels = &layer.forward;
+            panels.multiply(simd, windows, left, Mode::Replace, to, out);
         }
         then(y, row);
     }
@@ -421,7 +421,7 @@ fn image_gradient<S: Simd>(
                     ..left
                 };
                 let out = &mut image[line + x * shape.shift()..];
-                panels.multiply_apart(simd, windows, left, Mode::Add, out, shape.shift());
+                panels.multiply(simd, windows, left, Mode::Add, out, shape.shift());
             }
         }
     }

@@ -121,18 +121,6 @@ impl<E: Element> Panels<E> {
         self.vecs
     }
 
-    /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows are this operand's columns long.
-    pub(crate) fn multiply<S: Simd<Element = E>>(
-        &self,
-        simd: S,
-        rows: usize,
-        left: Left<'_, E>,
-        mode: Mode,
-        out: &mut [f32],
-    ) {
-        self.multiply_apart(simd, rows, left, mode, out, self.cols);
-    }
-
     /// Multiplies any number of rows of one run into `out`, whose rows begin `stride` scalars apart.
     ///
     /// A block of a panel stays in the first cache while all rows pass it.
@@ -173,8 +161,8 @@ impl<E: Element> Panels<E> {
         }
     }
 
-    /// [`Panels::multiply`] into rows of `out` that begin `stride` scalars apart.
-    pub(crate) fn multiply_apart<S: Simd<Element = E>>(
+    /// Multiplies `rows` rows, no more than a tile's, into `out`, whose rows begin `stride` scalars apart.
+    pub(crate) fn multiply<S: Simd<Element = E>>(
         &self,
         simd: S,
         rows: usize,
@@ -185,21 +173,15 @@ impl<E: Element> Panels<E> {
     ) {
         let width = self.vecs * LANES;
         let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
-        for (index, panel) in panels.enumerate() {
-            let first = index * width;
-            multiply_tile(
-                simd,
-                rows,
-                left,
-                panel,
-                Columns {
-                    out: &mut out[first..],
-                    stride,
-                    cols: width.min(self.cols - first),
-                    vecs: self.vecs,
-                    mode,
-                },
-            );
+        for (first, panel) in (0..).step_by(width).zip(panels) {
+            let columns = Columns {
+                out: &mut out[first..],
+                stride,
+                cols: width.min(self.cols - first),
+                vecs: self.vecs,
+                mode,
+            };
+            multiply_tile(simd, rows, left, panel, columns);
         }
     }
 }
