@@ -12,7 +12,7 @@ use crate::{
         recovering::Recovering,
         run_info::RunInfo,
     },
-    process::{log_limiter::LogLimiter, shutdown::Shutdown},
+    process::{log_limiter::LogLimiter, shutdown::Shutdown, silence::Silence},
     session::{self, SessionError},
     wire::{
         codec,
@@ -99,7 +99,7 @@ pub fn run_info_within(
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
 struct Patience {
-    silent_since: Instant,
+    silence: Silence,
     silence_said: LogLimiter,
     recovery_said: LogLimiter,
 }
@@ -107,7 +107,7 @@ struct Patience {
 impl Patience {
     fn begin() -> Self {
         Self {
-            silent_since: Instant::now(),
+            silence: Silence::begin(),
             silence_said: LogLimiter::default(),
             recovery_said: LogLimiter::default(),
         }
@@ -117,10 +117,10 @@ impl Patience {
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
         match e {
             SessionError::Recovering(recovering) => {
-                self.silent_since = Instant::now();
+                self.silence.heard();
                 self.say_recovering(&recovering);
             }
-            last if self.silent_since.elapsed() > SERVER_MAX => {
+            last if self.silence.unheard() > SERVER_MAX => {
                 return Err(JoinError::NoReplayServer { last });
             }
             e => self.say_silent(&e),
@@ -135,7 +135,7 @@ impl Patience {
     }
 
     fn say_silent(&mut self, e: &SessionError) {
-        let since = self.silent_since.elapsed();
+        let since = self.silence.passed();
         if since > SILENT_MAX && self.silence_said.due().is_some() {
             let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
             // A router may listen there, to which the replay server has yet to connect.

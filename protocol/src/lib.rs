@@ -69,6 +69,7 @@ pub use process::{
     atomic_write, fail_point, last_warning, lock_file,
     log_limiter::{LogLimiter, LogLimiters},
     shutdown::{GracefulShutdown, Shutdown, join_within},
+    silence::Silence,
     termination,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};

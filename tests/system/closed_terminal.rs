@@ -11,6 +11,7 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread::{self, JoinHandle},
+    time::Duration,
 };
 
 use driml_tests::{Process, TestSystem, wait_for};
@@ -194,6 +195,27 @@ fn a_run_that_is_to_ignore_hangups_does() {
     for role in PROCESSES {
         system.find_process(role).signal(Signal::SIGHUP);
     }
+    client.wait_for_updates(before.updates + 500);
+    process.stop().expect_code(130);
+    system.run_folder("run").check("interrupted");
+}
+
+/// Ctrl-Z, and `fg` after longer than the launcher waits for an answer.
+#[test]
+#[ignore = "three minutes: cargo nextest run --workspace --run-ignored only -E 'test(stopped_for_long)'"]
+fn a_run_that_was_stopped_for_long_goes_on() {
+    let system = system();
+    let process = launched(&system, 100);
+    let all: Vec<_> = PROCESSES.map(|role| system.find_process(role)).into();
+    let signal = |signal| {
+        process.signal(signal);
+        all.iter().for_each(|it| it.signal(signal));
+    };
+    signal(Signal::SIGSTOP);
+    thread::sleep(Duration::from_secs(140));
+    signal(Signal::SIGCONT);
+    let client = system.connect();
+    let before = client.wait_for_updates(100);
     client.wait_for_updates(before.updates + 500);
     process.stop().expect_code(130);
     system.run_folder("run").check("interrupted");

@@ -10,7 +10,7 @@ use std::{
 
 use driml_protocol::{
     Ack, BufferPool, Chunk, ChunkHeader, ChunkPoll, InsertReply, Leave, LogLimiter, PendingReply,
-    RunClient, Shutdown, fail_point, session::SessionError,
+    RunClient, Shutdown, Silence, fail_point, session::SessionError,
 };
 use zenoh::bytes::ZBytes;
 
@@ -70,7 +70,7 @@ pub(super) struct DeliveryWorker {
     outgoing: VecDeque<Outgoing>,
     /// Chunks that may be on their way: one after a chunk had to wait or go again, and one more with each that is stored at once.
     window: usize,
-    answered: Instant,
+    silence: Silence,
     /// When the chunk that waits at the rate limiter began to wait.
     held_since: Option<Instant>,
     draining_since: Option<Instant>,
@@ -94,7 +94,7 @@ impl DeliveryWorker {
             state,
             outgoing: VecDeque::new(),
             window: 1,
-            answered: Instant::now(),
+            silence: Silence::begin(),
             held_since: None,
             draining_since: None,
             retries_said: LogLimiter::default(),
@@ -150,7 +150,7 @@ impl DeliveryWorker {
             let Some(chunk) = next else { break };
             if self.outgoing.is_empty() {
                 // While there was nothing to say, the replay server could not answer.
-                self.answered = Instant::now();
+                self.silence.heard();
             }
             let header = chunk.header;
             let payload = chunk.into_payload();
@@ -187,7 +187,7 @@ impl DeliveryWorker {
             Err(e) => Err(e),
         };
         if reply.is_ok() {
-            self.answered = Instant::now();
+            self.silence.heard();
         }
         match reply {
             Ok(InsertReply::Stored {
@@ -227,7 +227,7 @@ impl DeliveryWorker {
                 "the replay server refused a chunk: {why}"
             ))),
             Err(SessionError::Recovering(recovering)) => {
-                self.answered = Instant::now();
+                self.silence.heard();
                 if let Some(more) = self.retries_said.due() {
                     tracing::warn!("chunk {sequence} waits: {recovering}{more}");
                 }
@@ -237,7 +237,7 @@ impl DeliveryWorker {
                 self.shutdown.wait_timeout(RETRY_PAUSE);
                 Ok(self.again())
             }
-            Err(e) if self.answered.elapsed() > self.limits.unreachable_max => {
+            Err(e) if self.silence.unheard() > self.limits.unreachable_max => {
                 Err(DeliveryError::OutOfReach {
                     within: self.limits.unreachable_max,
                     source: e,

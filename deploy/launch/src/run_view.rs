@@ -4,7 +4,9 @@
 use std::time::Instant;
 
 use driml_actor::Schedule;
-use driml_protocol::{LearnerStatus, ProcessesStatus, RecoveryProgress, ReplayStatus, Waiting};
+use driml_protocol::{
+    LearnerStatus, ProcessesStatus, RecoveryProgress, ReplayStatus, Silence, Waiting,
+};
 use driml_settings::config::RunConfig;
 use serde::Serialize;
 
@@ -135,9 +137,9 @@ pub struct RunView {
     pub learner: LearnerStatus,
     /// Whether the learner answered last time.
     pub(crate) learner_answers: bool,
-    /// When all replay servers answered last, and when the learner did; at first, when this was made.
-    pub(crate) replay_last_seen: Instant,
-    pub(crate) learner_last_seen: Instant,
+    /// For how long not all replay servers have answered, and the learner has not.
+    pub(crate) replay_silence: Silence,
+    pub(crate) learner_silence: Silence,
     /// Whether the learner has answered ever, or the counts at the start are known without it.
     is_learner_known: bool,
     /// What its recorder knew after the last counts; none where it is not recorded.
@@ -150,7 +152,6 @@ pub struct RunView {
 impl RunView {
     /// The view of a run without any report yet.
     pub fn new(plan: Plan) -> Self {
-        let now = Instant::now();
         Self {
             plan,
             after_updates: None,
@@ -159,8 +160,8 @@ impl RunView {
             replay: ReplayStatus::default(),
             learner: LearnerStatus::default(),
             learner_answers: false,
-            replay_last_seen: now,
-            learner_last_seen: now,
+            replay_silence: Silence::begin(),
+            learner_silence: Silence::begin(),
             is_learner_known: false,
             recorded: None,
             rates: Rates::default(),
@@ -174,7 +175,7 @@ impl RunView {
         this.after_updates = Some(updates);
         this.learner.updates = updates;
         this.is_learner_known = true;
-        this.rates.add(this.replay_last_seen, frames, updates);
+        this.rates.add(Instant::now(), frames, updates);
         this
     }
 
@@ -183,11 +184,13 @@ impl RunView {
         self.learner_answers = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
-            self.learner_last_seen = Instant::now();
+            self.learner_silence.heard();
             if !std::mem::replace(&mut self.is_learner_known, true) {
                 // Its updates did not come at once.
                 self.rates = Rates::default();
             }
+        } else {
+            self.learner_silence.unheard();
         }
         // Until the learner of a resumed run has answered, too.
         let before = self.after_updates.unwrap_or(0);
@@ -198,10 +201,10 @@ impl RunView {
     pub(crate) fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
-        self.replay_last_seen = Instant::now();
+        self.replay_silence.heard();
         self.recorded = None;
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
-        self.rates.add(self.replay_last_seen, frames, updates);
+        self.rates.add(Instant::now(), frames, updates);
         self.speed = self.rates.speed();
     }
 

@@ -12,8 +12,8 @@ use std::{
 
 use driml_protocol::{
     Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, PendingReply, ReplayStatus,
-    RequestId, RunClient, ShardCounts, Shutdown, Waiting, fail_point, session::SessionError,
-    shared_memory::Trust,
+    RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point,
+    session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -161,18 +161,18 @@ impl Fetcher {
     }
 
     pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
-        let mut answered = Instant::now();
+        let mut silence = Silence::begin();
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
             let fetched = match self.fetch() {
                 Ok(None) => {
-                    answered = Instant::now();
+                    silence.heard();
                     continue;
                 }
                 Ok(Some(fetched)) => fetched,
                 Err(e)
                     if !e.is_recovering()
-                        && answered.elapsed() > self.shared.requests.unreachable_max =>
+                        && silence.unheard() > self.shared.requests.unreachable_max =>
                 {
                     Fetched::Failed(BatchError::Unreachable {
                         unreachable_max: self.shared.requests.unreachable_max,
@@ -181,7 +181,7 @@ impl Fetcher {
                 }
                 Err(e) => {
                     if e.is_recovering() {
-                        answered = Instant::now();
+                        silence.heard();
                     }
                     if let Some(more) = self.said.due() {
                         tracing::warn!("asking for a batch again: {e}{more}");
@@ -202,7 +202,7 @@ impl Fetcher {
             if sender.send(fetched).is_err() || last {
                 return;
             }
-            answered = Instant::now();
+            silence.heard();
         }
     }
 

@@ -8,4 +8,5 @@ pub mod last_warning;
 pub mod lock_file;
 pub(crate) mod log_limiter;
 pub(crate) mod shutdown;
+pub(crate) mod silence;
 pub mod termination;

@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_machine::{error::Usage, units::duration};
-use driml_protocol::{Keys, RunClient, Waiting, config::Settings, session, shared_memory};
+use driml_protocol::{Keys, RunClient, Silence, Waiting, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -234,7 +234,7 @@ impl Launch<'_> {
 
     /// Asks, shows and records once a second until the run is over.
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
-        let mut progress = (Instant::now(), (0, 0));
+        let mut standstill = (Silence::begin(), (0, 0));
         loop {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
@@ -246,11 +246,11 @@ impl Launch<'_> {
             let poller = poller.expect("it was set before the run is watched");
             poller.ask();
             let view = &poller.view;
-            for (name, last_seen) in [
-                ("replay server", view.replay_last_seen),
-                ("learner", view.learner_last_seen),
+            for (name, silence) in [
+                ("replay server", view.replay_silence),
+                ("learner", view.learner_silence),
             ] {
-                let silent = last_seen.elapsed();
+                let silent = silence.passed();
                 if silent > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
                     let (silent, why) = (duration(silent), why.unwrap_or("no answer"));
@@ -275,9 +275,9 @@ impl Launch<'_> {
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);
             // While a replay server reads its replay back the others wait for it.
-            if counts != progress.1 || view.recovering().next().is_some() {
-                progress = (Instant::now(), counts);
-            } else if progress.0.elapsed() > STALL_MAX {
+            if counts != standstill.1 || view.recovering().next().is_some() {
+                standstill = (Silence::begin(), counts);
+            } else if standstill.0.unheard() > STALL_MAX {
                 bail!(
                     "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
                     duration(STALL_MAX),

@@ -1,11 +1,11 @@
 //! Who waits for whom, who does not respond, and what to do about it, in sentences.
 //! It knows no more than a view.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use driml_machine::units::duration;
 use driml_protocol::{
-    ProcessName, ProcessStatus, ProcessesStatus, RecoveryProgress, Waiting, session,
+    ProcessName, ProcessStatus, ProcessesStatus, RecoveryProgress, Silence, Waiting, session,
 };
 
 use crate::run_view::{RunView, ServerAnswer};
@@ -156,7 +156,7 @@ pub(crate) fn notes(view: &RunView) -> Vec<String> {
         return recovering;
     }
     // No other process can be asked while the replay server does not answer.
-    if let Some(replay) = silence("replay server", view.replay_last_seen) {
+    if let Some(replay) = silence("replay server", view.replay_silence) {
         return vec![replay];
     }
     let is_known = statuses(view).next().is_some();
@@ -165,7 +165,7 @@ pub(crate) fn notes(view: &RunView) -> Vec<String> {
     let learner = match view.learner.finished {
         true => None,
         false if is_known && !has_joined(true) => Some("no learner has joined yet".to_owned()),
-        false => silence("learner", view.learner_last_seen),
+        false => silence("learner", view.learner_silence),
     };
     let actor = (is_known && !has_joined(false)).then(|| "no actor has joined yet".to_owned());
     let mut notes: Vec<_> = learner.into_iter().chain(actor).collect();
@@ -179,8 +179,8 @@ pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
 }
 
 /// What to say of a process that answered last so long ago; nothing of one that answered just now.
-fn silence(process: &str, last_seen: Instant) -> Option<String> {
-    let silent = last_seen.elapsed();
+fn silence(process: &str, silence: Silence) -> Option<String> {
+    let silent = silence.passed();
     (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
 }
 

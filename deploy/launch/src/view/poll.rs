@@ -1,7 +1,7 @@
 //! The one poller: asks the processes of a run how they are, as any client would, and keeps what they answer in a [`RunView`].
 //! It judges nothing and changes nothing.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::Context;
 use driml_machine::error::usage;
@@ -105,13 +105,15 @@ impl Poller {
         let learner = first.and_then(|it| it.client.fetch(ANSWER_MAX).ok());
         view.take_learner(learner);
         let shards: Option<Vec<_>> = servers.iter().map(|it| it.replay.clone()).collect();
-        if let Some(shards) = shards {
-            view.take_replay(shards);
+        match shards {
+            Some(shards) => view.take_replay(shards),
+            None => _ = view.replay_silence.unheard(),
         }
         view.servers = servers;
         if view.recovering().next().is_some() {
             // It is there, and no other process can be asked through it.
-            (view.replay_last_seen, view.learner_last_seen) = (Instant::now(), Instant::now());
+            view.replay_silence.heard();
+            view.learner_silence.heard();
         }
         view
     }

@@ -3,11 +3,11 @@
 
 mod watched;
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::{LogLimiter, reach};
+use driml_protocol::{LogLimiter, Silence, reach};
 
 pub use self::watched::Outputs;
 use self::watched::Watched;
@@ -85,17 +85,19 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
 fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-    let (mut last_seen, mut said) = (Instant::now(), LogLimiter::default());
+    let (mut silence, mut said) = (Silence::begin(), LogLimiter::default());
     loop {
         let view = poller.ask();
         if view.is_answered() && view.after_updates.is_some() {
             return Ok(());
         }
         if view.is_answered() || view.recovering().next().is_some() {
-            last_seen = Instant::now();
+            silence.heard();
+        } else {
+            silence.unheard();
         }
         let is_another_run = view.servers.iter().any(|it| it.is_another_run);
-        if is_another_run || last_seen.elapsed() > silent_max {
+        if is_another_run || silence.passed() > silent_max {
             bail!("{}", needed(view).join("; "));
         }
         if said.due().is_some() {
