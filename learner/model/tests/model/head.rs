@@ -1,8 +1,8 @@
-//! The head: its streams, its noise, and values over the atoms of a support.
+//! The head: its streams, its noise, and values over the atoms of a support; and the layers of a loss.
 //! What comes before it is `network`'s.
 
 use candle_core::{Device, Result, Tensor};
-use driml_model::{DimHeads, HeadNoise, Kernels, ModelConfig, Network};
+use driml_model::{Backward, DimHeads, HeadNoise, Kernels, LossLayer, ModelConfig, Network};
 
 use crate::support::{
     DUELING, NOISY, assert_close, floats, frames, parameters, rng, small, small_with, values,
@@ -186,4 +186,65 @@ fn a_support_begins_and_ends_where_it_says() {
         assert_eq!((support[0], support[10]), (v_min, v_max));
         assert!(support.is_sorted(), "{support:?}");
     }
+}
+
+fn loss_layer(name: &str, inputs: usize, outputs: usize) -> LossLayer {
+    let name = name.to_owned();
+    LossLayer {
+        name,
+        inputs,
+        outputs,
+    }
+}
+
+#[test]
+fn a_loss_s_own_layer_is_linear_and_only_the_online_network_s() -> Result<()> {
+    let config = ModelConfig {
+        loss_layers: vec![loss_layer("next", 19, 6)],
+        ..small()
+    };
+    let parameters = parameters(&config, 1);
+    let network = Network::new(&config, &parameters).unwrap();
+    let f4 = network
+        .features(&frames(&config, 4, &mut rng(5)))
+        .unwrap()
+        .f4;
+    let next = network.loss_layer("next", &f4).unwrap();
+    let [weight, bias] =
+        ["weight", "bias"].map(|part| parameters.get(&format!("dim.next.{part}")).unwrap());
+    assert_close(
+        "next",
+        &next,
+        &f4.matmul(&weight.t()?)?.broadcast_add(bias)?,
+        1e-5,
+    );
+    let mut found = Backward::of(&next.sum_all()?)?;
+    assert_close(
+        "bias",
+        &found.remove(bias)?.unwrap(),
+        &Tensor::full(4f32, 6, &Device::Cpu)?,
+        1e-6,
+    );
+    assert!(network.loss_layer("other", &f4).is_err());
+    assert_eq!(
+        config.without_dim().parameter_shapes(),
+        small().without_dim().parameter_shapes()
+    );
+    Ok(())
+}
+
+#[test]
+fn a_loss_s_own_layer_has_a_size_and_a_name_that_no_other_layer_has() {
+    let fails = |layers: &[LossLayer]| {
+        let config = ModelConfig {
+            loss_layers: layers.to_vec(),
+            ..small()
+        };
+        assert!(config.validate().is_err(), "{layers:?}");
+    };
+    for name in ["", "psi3", "Next", "a.b"] {
+        fails(&[loss_layer(name, 1, 1)]);
+    }
+    fails(&[loss_layer("next", 1, 0)]);
+    fails(&[loss_layer("next", 1, 1), loss_layer("next", 1, 1)]);
 }

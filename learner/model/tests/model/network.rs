@@ -3,7 +3,7 @@
 
 use candle_core::{DType, Device, Result, Tensor};
 use driml_model::{
-    Backward, ConvLayer, DimHeads, HeadNoise, Kernels, LossLayer, ModelConfig, ModelError, Network,
+    Backward, ConvLayer, DimHeads, HeadNoise, Kernels, ModelConfig, ModelError, Network,
     Parameters, Precision, TorsoName,
 };
 
@@ -270,51 +270,6 @@ fn heads_that_are_left_out_are_not_there() {
     );
 }
 
-fn loss_layer(name: &str, inputs: usize, outputs: usize) -> LossLayer {
-    let name = name.to_owned();
-    LossLayer {
-        name,
-        inputs,
-        outputs,
-    }
-}
-
-#[test]
-fn a_loss_s_own_layer_is_linear_and_only_the_online_network_s() -> Result<()> {
-    let config = ModelConfig {
-        loss_layers: vec![loss_layer("next", 19, 6)],
-        ..small()
-    };
-    let parameters = parameters(&config, 1);
-    let network = Network::new(&config, &parameters).unwrap();
-    let f4 = network
-        .features(&frames(&config, 4, &mut rng(5)))
-        .unwrap()
-        .f4;
-    let next = network.loss_layer("next", &f4).unwrap();
-    let [weight, bias] =
-        ["weight", "bias"].map(|part| parameters.get(&format!("dim.next.{part}")).unwrap());
-    assert_close(
-        "next",
-        &next,
-        &f4.matmul(&weight.t()?)?.broadcast_add(bias)?,
-        1e-5,
-    );
-    let mut found = Backward::of(&next.sum_all()?)?;
-    assert_close(
-        "bias",
-        &found.remove(bias)?.unwrap(),
-        &Tensor::full(4f32, 6, &Device::Cpu)?,
-        1e-6,
-    );
-    assert!(network.loss_layer("other", &f4).is_err());
-    assert_eq!(
-        config.without_dim().parameter_shapes(),
-        small().without_dim().parameter_shapes()
-    );
-    Ok(())
-}
-
 #[test]
 fn inputs_that_do_not_fit_are_errors() {
     let config = small();
@@ -395,13 +350,6 @@ fn configurations_that_cannot_work_are_errors() {
     fails(|config| config.conv[0].stride = 0);
     fails(|config| config.conv[2].out = 0);
     fails(|config| (config.hidden, config.embedding_dim) = (65_536, 65_536));
-    for name in ["", "psi3", "Next", "a.b"] {
-        let mut config = small();
-        config.loss_layers = vec![loss_layer(name, 1, 1)];
-        assert!(config.validate().is_err(), "{name}");
-    }
-    fails(|config| config.loss_layers = vec![loss_layer("next", 1, 0)]);
-    fails(|config| config.loss_layers = vec![loss_layer("next", 1, 1); 2]);
 }
 
 #[test]
