@@ -62,7 +62,13 @@ fn calls(text: &str) -> Vec<Vec<String>> {
         let of_yaml = line
             .strip_prefix("command:")
             .or_else(|| line.strip_prefix("args:"));
-        let of_slurm = || Some(line.strip_prefix("part ")?.split_once("\"$program\" ")?.1);
+        let of_slurm = || {
+            Some(
+                line.strip_prefix("process ")?
+                    .split_once("\"$program\" ")?
+                    .1,
+            )
+        };
         let of_systemd = || line.strip_prefix("ExecStart=/usr/local/bin/driml ");
         let Some(call) = of_yaml.or_else(of_slurm).or_else(of_systemd) else {
             continue;

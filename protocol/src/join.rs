@@ -117,13 +117,15 @@ impl Patience {
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
         match e {
             SessionError::Recovering(recovering) => {
-                self.silence.heard();
+                self.silence.answered();
                 self.say_recovering(&recovering);
             }
-            last if self.silence.unheard() > SERVER_MAX => {
-                return Err(JoinError::NoReplayServer { last });
+            last => {
+                if self.silence.unanswered() > SERVER_MAX {
+                    return Err(JoinError::NoReplayServer { last });
+                }
+                self.say_silent(&last);
             }
-            e => self.say_silent(&e),
         }
         Ok(())
     }
@@ -135,7 +137,7 @@ impl Patience {
     }
 
     fn say_silent(&mut self, e: &SessionError) {
-        let since = self.silence.passed();
+        let since = self.silence.length();
         if since > SILENT_MAX && self.silence_said.due().is_some() {
             let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
             // A router may listen there, to which the replay server has yet to connect.

@@ -1,5 +1,5 @@
 //! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
-//! What Ctrl-C does is in `failures`.
+//! And one that is stopped, and resumes. What Ctrl-C does is in `failures`.
 
 use std::{
     fs::{File, OpenOptions},
@@ -203,7 +203,7 @@ fn a_run_that_is_to_ignore_hangups_does() {
 /// Ctrl-Z, and `fg` after longer than the launcher waits for an answer.
 #[test]
 #[ignore = "three minutes: cargo nextest run --workspace --run-ignored only -E 'test(stopped_for_long)'"]
-fn a_run_that_was_stopped_for_long_goes_on() {
+fn a_run_that_was_stopped_for_long_resumes() {
     let system = system();
     let process = launched(&system, 100);
     let all: Vec<_> = PROCESSES.map(|role| system.find_process(role)).into();

@@ -94,7 +94,7 @@ impl DeliveryWorker {
             state,
             outgoing: VecDeque::new(),
             window: 1,
-            silence: Silence::begin(),
+            silence: Silence::with_tries_of(limits.ack_timeout),
             held_since: None,
             draining_since: None,
             retries_said: LogLimiter::default(),
@@ -150,7 +150,7 @@ impl DeliveryWorker {
             let Some(chunk) = next else { break };
             if self.outgoing.is_empty() {
                 // While there was nothing to say, the replay server could not answer.
-                self.silence.heard();
+                self.silence.answered();
             }
             let header = chunk.header;
             let payload = chunk.into_payload();
@@ -187,7 +187,7 @@ impl DeliveryWorker {
             Err(e) => Err(e),
         };
         if reply.is_ok() {
-            self.silence.heard();
+            self.silence.answered();
         }
         match reply {
             Ok(InsertReply::Stored {
@@ -227,7 +227,7 @@ impl DeliveryWorker {
                 "the replay server refused a chunk: {why}"
             ))),
             Err(SessionError::Recovering(recovering)) => {
-                self.silence.heard();
+                self.silence.answered();
                 if let Some(more) = self.retries_said.due() {
                     tracing::warn!("chunk {sequence} waits: {recovering}{more}");
                 }
@@ -237,13 +237,11 @@ impl DeliveryWorker {
                 self.shutdown.wait_timeout(RETRY_PAUSE);
                 Ok(self.again())
             }
-            Err(e) if self.silence.unheard() > self.limits.unreachable_max => {
-                Err(DeliveryError::OutOfReach {
-                    within: self.limits.unreachable_max,
-                    source: e,
-                })
-            }
             Err(e) => {
+                let within = self.limits.unreachable_max;
+                if self.silence.unanswered() > within {
+                    return Err(DeliveryError::OutOfReach { within, source: e });
+                }
                 if let Some(more) = self.retries_said.due() {
                     tracing::warn!("chunk {sequence} will be sent again: {e}{more}");
                 }

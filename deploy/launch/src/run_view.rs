@@ -184,13 +184,13 @@ impl RunView {
         self.learner_answers = learner.is_some();
         if let Some(learner) = learner {
             self.learner = learner;
-            self.learner_silence.heard();
+            self.learner_silence.answered();
             if !std::mem::replace(&mut self.is_learner_known, true) {
                 // Its updates did not come at once.
                 self.rates = Rates::default();
             }
         } else {
-            self.learner_silence.unheard();
+            self.learner_silence.unanswered();
         }
         // Until the learner of a resumed run has answered, too.
         let before = self.after_updates.unwrap_or(0);
@@ -201,7 +201,7 @@ impl RunView {
     pub(crate) fn take_replay(&mut self, shards: Vec<ReplayStatus>) {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
-        self.replay_silence.heard();
+        self.replay_silence.answered();
         self.recorded = None;
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
         self.rates.add(Instant::now(), frames, updates);

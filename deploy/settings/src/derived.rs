@@ -196,14 +196,11 @@ fn loss_layers(table: &mut Table, update: &LearnerSettings) -> Result<(), Usage>
     if let Ok(model) = table_at::<ModelConfig>(table, "model")
         && let Ok(loss) = update.auxiliary()
     {
-        let layers = loss.layers(&model);
-        if !layers.is_empty() {
-            let layers = layers.into_iter().map(as_toml);
-            put(
-                table,
-                LOSS_LAYERS,
-                layers.collect::<Result<Vec<_>, _>>()?.into(),
-            );
+        let layers = loss.layers(&model).into_iter().map(as_toml);
+        let layers = layers.collect::<Result<Vec<_>, _>>()?;
+        match table.get_mut("model").and_then(Value::as_table_mut) {
+            Some(model) if layers.is_empty() => _ = model.remove("loss_layers"),
+            _ => put(table, LOSS_LAYERS, layers.into()),
         }
     }
     Ok(())
@@ -264,13 +261,14 @@ pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
     let mut right = read.clone();
     derive(&mut right).map_err(|e| usage!("{name}: {e}"))?;
     for (path, how) in FOLLOWS {
-        if let (Some(was), Some(is)) = (find(&read, path), find(&right, path))
-            && was != is
+        let is = find(&right, path);
+        if let Some(was) = find(&read, path)
+            && is != Some(was)
         {
             return Err(usage!(
                 "{name}: {path} = {}, but it {how} and is {}; correct the one or the other",
                 inline(was),
-                inline(is)
+                is.map_or("not there".into(), inline)
             ));
         }
     }

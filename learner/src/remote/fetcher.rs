@@ -166,28 +166,26 @@ impl Fetcher {
             fail_point::reach("batches");
             let fetched = match self.fetch() {
                 Ok(None) => {
-                    silence.heard();
+                    silence.answered();
                     continue;
                 }
                 Ok(Some(fetched)) => fetched,
-                Err(e)
-                    if !e.is_recovering()
-                        && silence.unheard() > self.shared.requests.unreachable_max =>
-                {
-                    Fetched::Failed(BatchError::Unreachable {
-                        unreachable_max: self.shared.requests.unreachable_max,
-                        source: Box::new(e),
-                    })
-                }
                 Err(e) => {
                     if e.is_recovering() {
-                        silence.heard();
+                        silence.answered();
                     }
-                    if let Some(more) = self.said.due() {
-                        tracing::warn!("asking for a batch again: {e}{more}");
+                    let unreachable_max = self.shared.requests.unreachable_max;
+                    if silence.unanswered() <= unreachable_max {
+                        if let Some(more) = self.said.due() {
+                            tracing::warn!("asking for a batch again: {e}{more}");
+                        }
+                        self.shared.shutdown.wait_timeout(RETRY_PAUSE);
+                        continue;
                     }
-                    self.shared.shutdown.wait_timeout(RETRY_PAUSE);
-                    continue;
+                    Fetched::Failed(BatchError::Unreachable {
+                        unreachable_max,
+                        source: Box::new(e),
+                    })
                 }
             };
             if let Fetched::Batch(served) = &fetched {
@@ -202,7 +200,7 @@ impl Fetcher {
             if sender.send(fetched).is_err() || last {
                 return;
             }
-            silence.heard();
+            silence.answered();
         }
     }
 
@@ -317,13 +315,14 @@ impl Fetcher {
             let batch = Batch::merge(parts, memory);
             parts.clear();
             let parts = std::mem::take(from);
-            partial.whole_at = Instant::now();
+            partial.since_whole.answered();
             return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
         }
         self.recount(&mut partial, |_, _| true)?;
         // A shard that has given its part knows of the others' transitions what they had then: it may be wrong about the end.
         let is_over = finished && partial.parts.is_empty();
-        if !is_over && partial.all_in && partial.whole_at.elapsed() > LAST_BATCH_MAX {
+        let waited = partial.since_whole.unanswered();
+        if !is_over && partial.all_in && waited > LAST_BATCH_MAX {
             let left = partial.pending.iter().enumerate();
             let left = left.filter(|(_, rows)| **rows > 0);
             let left: Vec<_> = left

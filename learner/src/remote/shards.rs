@@ -8,7 +8,8 @@ use std::{
 
 use anyhow::{Context, ensure};
 use driml_protocol::{
-    Alive, Batch, Keys, LearnerJoin, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, join,
+    Alive, Batch, Keys, LearnerJoin, RequestId, RunClient, RunInfo, ShardCounts, Shutdown, Silence,
+    join,
     session::{self, Endpoints},
     tls::Credentials,
 };
@@ -227,7 +228,7 @@ pub(super) struct PartialBatch {
     pub(super) from: Vec<ServedPart>,
     /// All transitions of the run are in.
     pub(super) all_in: bool,
-    pub(super) whole_at: Instant,
+    pub(super) since_whole: Silence,
 }
 
 impl PartialBatch {
@@ -240,7 +241,7 @@ impl PartialBatch {
             parts: Vec::new(),
             from: Vec::new(),
             all_in: false,
-            whole_at: Instant::now(),
+            since_whole: Silence::begin(),
         }
     }
 }

@@ -1,47 +1,56 @@
-//! For how long another process has not answered, by a clock that stands while this process is stopped.
+//! For how long another process has not answered. Of a time in which this process was stopped only a little counts.
 //! It sends nothing and gives up nothing.
 
 use std::time::{Duration, Instant};
 
-/// A process that runs asks again more often than this: what passes beyond it between two looks, it was stopped.
-const LOOK_MAX: Duration = Duration::from_secs(30);
+/// The longest time between two looks that counts, beside what one try waits: a process that runs asks again sooner.
+const LOOK_MAX: Duration = Duration::from_secs(15);
 
-/// For how long another process has not answered. What this one spends stopped (Ctrl-Z, a paused container) does not count: it could
-/// not hear the other, which may have been stopped with it.
+/// For how long another process has not answered.
+///
+/// Of what this process spends stopped (Ctrl-Z, a paused container) at most 15 s count: it could not ask, and the other may have been
+/// stopped with it.
 #[derive(Clone, Copy, Debug)]
 pub struct Silence {
-    passed: Duration,
+    length: Duration,
     looked: Instant,
+    look_max: Duration,
 }
 
 impl Silence {
-    /// A silence that begins now.
+    /// A silence that begins now; a try waits for its answer for no more than 10 s.
     pub fn begin() -> Self {
+        Self::with_tries_of(Duration::ZERO)
+    }
+
+    /// A silence that begins now; a try may wait for its answer as long as this.
+    pub fn with_tries_of(try_max: Duration) -> Self {
         Self {
-            passed: Duration::ZERO,
+            length: Duration::ZERO,
             looked: Instant::now(),
+            look_max: LOOK_MAX + try_max,
         }
     }
 
     /// The other answered: the silence begins again.
-    pub fn heard(&mut self) {
-        *self = Self::begin();
+    pub fn answered(&mut self) {
+        (self.length, self.looked) = (Duration::ZERO, Instant::now());
     }
 
     /// The other did not answer, when asked just now; gives the length of its silence.
-    pub fn unheard(&mut self) -> Duration {
-        self.unheard_at(Instant::now())
+    pub fn unanswered(&mut self) -> Duration {
+        self.unanswered_at(Instant::now())
     }
 
-    fn unheard_at(&mut self, now: Instant) -> Duration {
-        self.passed += (now - self.looked).min(LOOK_MAX);
+    fn unanswered_at(&mut self, now: Instant) -> Duration {
+        self.length += (now - self.looked).min(self.look_max);
         self.looked = now;
-        self.passed
+        self.length
     }
 
     /// The length of the silence when the other was asked last.
-    pub const fn passed(&self) -> Duration {
-        self.passed
+    pub const fn length(&self) -> Duration {
+        self.length
     }
 }
 
@@ -50,15 +59,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_time_in_which_this_process_was_stopped_does_not_count() {
-        let mut silence = Silence::begin();
-        let begin = silence.looked;
-        let at = |seconds| begin + Duration::from_secs(seconds);
-        for (now, passed) in [(10, 10), (20, 20), (500, 50), (511, 61)] {
-            assert_eq!(silence.unheard_at(at(now)).as_secs(), passed, "at {now} s");
+    fn of_the_time_in_which_this_process_was_stopped_little_counts() {
+        for (try_s, lengths) in [(0, [10, 20, 35, 46]), (120, [10, 20, 155, 166])] {
+            let mut silence = Silence::with_tries_of(Duration::from_secs(try_s));
+            let begin = silence.looked;
+            for (now, length) in [10, 20, 500, 511].into_iter().zip(lengths) {
+                let now = begin + Duration::from_secs(now);
+                assert_eq!(silence.unanswered_at(now).as_secs(), length, "at {now:?}");
+            }
+            silence.answered();
+            assert_eq!(silence.length(), Duration::ZERO);
         }
-        assert_eq!(silence.passed().as_secs(), 61);
-        silence.heard();
-        assert_eq!(silence.passed(), Duration::ZERO);
     }
 }

@@ -234,7 +234,7 @@ impl Launch<'_> {
 
     /// Asks, shows and records once a second until the run is over.
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
-        let mut standstill = (Silence::begin(), (0, 0));
+        let (mut standstill, mut counts_before) = (Silence::begin(), (0, 0));
         loop {
             if self.interrupts.wait_timeout(POLL) > 0 {
                 return Ok(Outcome::Interrupted);
@@ -250,7 +250,7 @@ impl Launch<'_> {
                 ("replay server", view.replay_silence),
                 ("learner", view.learner_silence),
             ] {
-                let silent = silence.passed();
+                let silent = silence.length();
                 if silent > SILENCE_MAX {
                     let why = view.servers.iter().find_map(|it| it.error.as_deref());
                     let (silent, why) = (duration(silent), why.unwrap_or("no answer"));
@@ -275,9 +275,10 @@ impl Launch<'_> {
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);
             // While a replay server reads its replay back the others wait for it.
-            if counts != standstill.1 || view.recovering().next().is_some() {
-                standstill = (Silence::begin(), counts);
-            } else if standstill.0.unheard() > STALL_MAX {
+            if counts != counts_before || view.recovering().next().is_some() {
+                standstill.answered();
+                counts_before = counts;
+            } else if standstill.unanswered() > STALL_MAX {
                 bail!(
                     "no frame and no update for {}, at {} frames and {} updates ({}): see {}",
                     duration(STALL_MAX),

@@ -180,7 +180,7 @@ pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
 
 /// What to say of a process that answered last so long ago; nothing of one that answered just now.
 fn silence(process: &str, silence: Silence) -> Option<String> {
-    let silent = silence.passed();
+    let silent = silence.length();
     (silent >= SILENT_MAX).then(|| format!("{process}: no answer for {}", duration(silent)))
 }
 

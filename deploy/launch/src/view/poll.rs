@@ -107,13 +107,13 @@ impl Poller {
         let shards: Option<Vec<_>> = servers.iter().map(|it| it.replay.clone()).collect();
         match shards {
             Some(shards) => view.take_replay(shards),
-            None => _ = view.replay_silence.unheard(),
+            None => _ = view.replay_silence.unanswered(),
         }
         view.servers = servers;
         if view.recovering().next().is_some() {
             // It is there, and no other process can be asked through it.
-            view.replay_silence.heard();
-            view.learner_silence.heard();
+            view.replay_silence.answered();
+            view.learner_silence.answered();
         }
         view
     }

@@ -92,12 +92,12 @@ fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Res
             return Ok(());
         }
         if view.is_answered() || view.recovering().next().is_some() {
-            silence.heard();
+            silence.answered();
         } else {
-            silence.unheard();
+            silence.unanswered();
         }
         let is_another_run = view.servers.iter().any(|it| it.is_another_run);
-        if is_another_run || silence.passed() > silent_max {
+        if is_another_run || silence.length() > silent_max {
             bail!("{}", needed(view).join("; "));
         }
         if said.due().is_some() {

@@ -102,7 +102,7 @@ impl Watched {
         if view.replay.finished && view.learner.finished {
             return Ok(true);
         }
-        let silent = view.replay_silence.passed();
+        let silent = view.replay_silence.length();
         // They end by themselves once the learner has saved. Another client may have had its last answer, or its launcher may have ended
         // it before it was asked again.
         if silent > FAREWELL_MAX && view.replay.waiting == Waiting::Finished {

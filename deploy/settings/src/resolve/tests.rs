@@ -178,6 +178,9 @@ fn a_file_at_odds_with_itself_is_refused() {
     let text = with("mspacman", "c51", &[]).unwrap().to_toml();
     let said = |text: String| of_file("x.toml", text, &[]).unwrap_err();
     expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
+    let layers =
+        format!("{text}\n[[model.loss_layers]]\nname = \"next\"\ninputs = 1\noutputs = 1\n");
+    expect![[r#"x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct the one or the other"#]].assert_eq(&said(layers));
     expect![
         "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
     ]

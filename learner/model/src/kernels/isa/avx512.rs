@@ -48,7 +48,7 @@ impl Bf16 {
     }
 }
 
-/// Rows of a tile: with its columns and one row they fill the 32 registers.
+/// Most rows of a tile: its sums, its columns and one row fit into the 32 registers.
 const fn rows_max(vecs: usize) -> usize {
     match vecs {
         1 => 16,
@@ -273,8 +273,8 @@ impl Vector for Bf16 {
 
     #[inline(always)]
     unsafe fn mul_add(sums: __m512, row: __m512i, columns: __m512i) -> __m512 {
-        // The row is last, where the instruction itself can broadcast it from memory: as an instruction of its own that takes a third
-        // of the time.
+        // The row is last: that operand the instruction can broadcast from memory. A separate broadcast takes a third of the loop's
+        // time.
         // SAFETY: two names of one register of 32 bf16.
         unsafe {
             _mm512_dpbf16_ps(
