@@ -1,4 +1,4 @@
-//! An auxiliary loss of one's own, with a layer of its own: features of s_t predict those of s_{t+1}.
+//! A custom auxiliary loss with an extra layer: features of s_t predict those of s_{t+1}.
 //! With nothing to hold them apart all features would become one: its weight stays small, and the return keeps them useful.
 //! Source: the latent dynamics of DeepMDP (Gelada et al. 2019), without the action; no gradient through what is predicted.
 

@@ -183,7 +183,7 @@ impl Network {
     pub fn loss_layer(&self, name: &str, x: &Tensor) -> Result<Tensor> {
         let layer = self.loss_layers.get(name);
         let (weight, bias) = layer.ok_or_else(|| {
-            ModelError::Input(format!("{name} is no layer of this network's loss"))
+            ModelError::Input(format!("the network has no loss layer named {name}"))
         })?;
         Ok(self.kernels.linear(x, weight, bias)?)
     }

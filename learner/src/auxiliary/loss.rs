@@ -37,7 +37,7 @@ pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
     /// The heads that the online network needs; `action` says whether Psi is given a_t.
     fn heads(&self, action: bool) -> DimHeads;
 
-    /// Linear layers of its own, which the online network builds too and [`Network::loss_layer`] applies. `model` has the sizes of all
+    /// Extra linear layers, which the online network builds and [`Network::loss_layer`] applies. `model` has the sizes of all
     /// else: `hidden` is the width of f4.
     fn layers(&self, _model: &ModelConfig) -> Vec<LossLayer> {
         Vec::new()
