@@ -79,6 +79,13 @@ pub struct LossLayer {
     pub outputs: usize,
 }
 
+impl LossLayer {
+    /// What the names of its parameters begin with.
+    pub fn layer(&self) -> String {
+        format!("dim.{}", self.name)
+    }
+}
+
 /// Which DIM heads exist. Nothing is built that no lambda needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -349,8 +356,7 @@ impl ModelConfig {
             }
         }
         for own in &self.loss_layers {
-            let name = format!("dim.{}", own.name);
-            layer(&name, vec![own.outputs, own.inputs], true, Uniform);
+            layer(&own.layer(), vec![own.outputs, own.inputs], true, Uniform);
         }
         layers
     }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use candle_core::Tensor;
 
 use crate::compute::Kernels;
-use crate::config::{LossLayer, ModelConfig};
+use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
 use crate::features::FeatureLayers;
 use crate::heads::c51::C51Head;
@@ -92,10 +92,9 @@ impl Network {
             .embeds_action()
             .then(|| ActionEmbedding::new(config, parameters, kernels))
             .transpose()?;
-        let own = config.loss_layers.iter().map(|LossLayer { name, .. }| {
-            let layer = format!("dim.{name}");
-            let tensor = |part| parameters.tensor(&layer, part);
-            Ok((name.clone(), (tensor("weight")?, tensor("bias")?)))
+        let own = config.loss_layers.iter().map(|own| {
+            let tensor = |part| parameters.tensor(&own.layer(), part);
+            Ok((own.name.clone(), (tensor("weight")?, tensor("bias")?)))
         });
         Ok(Self {
             kernels,
