@@ -82,12 +82,7 @@ impl UpdateCost {
         // Forward, and the gradients of both sides; a key has none.
         let products = if passes.keys > 0 { 2 } else { 3 };
         let value = forward(&["torso", "head"]);
-        let own = model
-            .loss_layers
-            .iter()
-            .map(|it| format!("dim.{}", it.name));
-        let own: Vec<_> = own.collect();
-        let own: Vec<_> = own.iter().map(String::as_str).collect();
+        let own = model.loss_layers.iter().map(|it| learning(&[&it.layer()]));
         Self {
             online: rows * learning(&["torso"]),
             head: rows * learning(&["head"]) / actions,
@@ -98,7 +93,7 @@ impl UpdateCost {
             heads: rows
                 * (passes.psi * learning(&["dim.psi3", "dim.psi4", "dim.action"])
                     + passes.phi * learning(&["dim.phi3", "dim.phi4"])
-                    + learning(&own)),
+                    + own.sum::<u64>()),
             scores: 2 * products * matrices * rows * rows * model.embedding_dim as u64,
         }
     }

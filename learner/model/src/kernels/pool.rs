@@ -4,7 +4,7 @@
 //! What lies beyond the maps is never the largest. Of equal values the first in row-major order is taken, as in PyTorch.
 
 use crate::geometry::pooled;
-use crate::kernels::isa::vectorized;
+use crate::kernels::isa::{LANES, vectorized};
 
 /// Height, width and channels of maps.
 pub(crate) type Size = (usize, usize, usize);
@@ -49,11 +49,9 @@ impl Window {
     }
 }
 
-/// Channels that are compared at once; the rest of an odd number goes one by one.
-const BLOCK: usize = 16;
-
 vectorized! {
     /// Writes the largest of each window of `maps` into `largest`, and which of its pixels that is into `taken`. A NaN is the largest.
+    /// Channels that do not fill a register go one by one.
     pub(crate) fn pool<S>(
         simd,
         maps: &'a [f32],
@@ -62,12 +60,12 @@ vectorized! {
         taken: &'a mut [u8],
     ) {
         let channels = size.2;
-        let whole = channels - channels % BLOCK;
+        let whole = channels - channels % LANES;
         for window in windows(size) {
             let to = window.start..window.start + channels;
             let (largest, taken) = (&mut largest[to.clone()], &mut taken[to]);
-            for first in (0..whole).step_by(BLOCK) {
-                pool_block::<BLOCK>(maps, window, first, largest, taken);
+            for first in (0..whole).step_by(LANES) {
+                pool_block::<LANES>(maps, window, first, largest, taken);
             }
             for first in whole..channels {
                 pool_block::<1>(maps, window, first, largest, taken);
@@ -110,12 +108,12 @@ vectorized! {
         grad_maps: &'a mut [f32],
     ) {
         let channels = size.2;
-        let whole = channels - channels % BLOCK;
+        let whole = channels - channels % LANES;
         for window in windows(size) {
             let from = window.start..window.start + channels;
             let (grads, taken) = (&grads[from.clone()], &taken[from]);
-            for first in (0..whole).step_by(BLOCK) {
-                unpool_block::<BLOCK>(grads, window, first, taken, grad_maps);
+            for first in (0..whole).step_by(LANES) {
+                unpool_block::<LANES>(grads, window, first, taken, grad_maps);
             }
             for first in whole..channels {
                 unpool_block::<1>(grads, window, first, taken, grad_maps);
