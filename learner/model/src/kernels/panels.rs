@@ -266,7 +266,7 @@ impl<'a, E: Element> Rows<'a, E> {
         );
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
         let steps = k.div_ceil(depth);
-        let (row_stride, step) = match a.transposed {
+        let (row_stride, step) = match a.transposed && !S::LEFT_STEPS_ADJOIN {
             false => (steps * depth, depth),
             true => (depth, m * depth),
         };
@@ -276,6 +276,9 @@ impl<'a, E: Element> Rows<'a, E> {
             let mut values = Buffer::new(m * steps * depth);
             if a.transposed {
                 pack_steps(simd, a.transposed(), &mut values, threads);
+                if S::LEFT_STEPS_ADJOIN {
+                    values = turned(simd, &values, m, threads);
+                }
             } else {
                 pack_rows(simd, a.data, k, row_stride, &mut values, threads);
             }
@@ -330,6 +333,54 @@ fn pack_rows<S: Simd>(
     }
 }
 
+/// Steps [steps, m] as [m, steps], 16 rows to a task.
+fn turned<S: Simd>(
+    simd: S,
+    values: &[S::Element],
+    m: usize,
+    threads: Threads,
+) -> Buffer<S::Element> {
+    let mut rows = Buffer::new(values.len());
+    let len = values.len() / m * LANES;
+    let turn = |(task, rows): (usize, &mut [S::Element])| {
+        turn_rows(simd, values, m, task * LANES, rows);
+    };
+    match threads {
+        Threads::Caller => rows.chunks_mut(len).enumerate().for_each(turn),
+        Threads::Pool => rows.par_chunks_mut(len).enumerate().for_each(turn),
+    }
+    rows
+}
+
+vectorized! {
+    /// Of `values` [steps, m] the columns from `first` on, at most [`LANES`], as `rows` [columns, steps].
+    fn turn_rows<S>(
+        simd,
+        values: &'a [S::Element],
+        m: usize,
+        first: usize,
+        rows: &'a mut [S::Element],
+    ) {
+        let depth = S::Element::DEPTH;
+        let row_len = values.len() / m;
+        for (part, steps) in values.chunks(LANES * m * depth).enumerate() {
+            let mut block = [[0; LANES]; LANES];
+            for (block, step) in block.iter_mut().zip(steps.chunks(m * depth)) {
+                for (bits, step) in block.iter_mut().zip(step[first * depth..].chunks(depth)) {
+                    *bits = S::Element::pack(step);
+                }
+            }
+            simd.transpose(&mut block);
+            for (row, block) in rows.chunks_mut(row_len).zip(block) {
+                let row = row[part * LANES * depth..].chunks_mut(depth);
+                for (step, bits) in row.zip(block) {
+                    S::Element::unpack(bits, step);
+                }
+            }
+        }
+    }
+}
+
 /// Packs all columns of `b` as one panel, a share of the steps on each thread.
 fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], threads: Threads) {
     let (depth, cols) = (S::Element::DEPTH, b.cols);
@@ -344,5 +395,41 @@ fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], thread
             .par_chunks_mut(steps * cols * depth)
             .zip(b.data.par_chunks(steps * cols * depth))
             .for_each(|(values, data)| pack(values, data)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::isa::{AnySimd, with_simd};
+    use crate::kernels::precision::Precision;
+
+    /// All scalars of `rows`, row by row.
+    fn scalars<E: Element>(rows: &Rows<'_, E>, m: usize) -> Vec<f32> {
+        let scalar = |row: usize, at: usize| {
+            let left = rows.left(row);
+            left.values[left.start + at / E::DEPTH * left.step + at % E::DEPTH].value()
+        };
+        let k = rows.steps * E::DEPTH;
+        (0..m * k).map(|at| scalar(at / k, at % k)).collect()
+    }
+
+    #[test]
+    fn every_instruction_set_packs_the_rows_of_a_transposed_matrix() {
+        for (m, k) in [(1, 1), (16, 32), (37, 75)] {
+            let value = |row: usize, at: usize| (row * k + at) as f32 % 251.0;
+            let dense: Vec<f32> = (0..m * k).map(|at| value(at / k, at % k)).collect();
+            let turned: Vec<f32> = (0..m * k).map(|at| value(at % m, at / m)).collect();
+            for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
+                for threads in [Threads::Caller, Threads::Pool] {
+                    with_simd!(simd, simd => {
+                        let wanted = Rows::pack(simd, Matrix::new(&dense, m, k), threads);
+                        let turned = Matrix::new(&turned, k, m).transposed();
+                        let turned = Rows::pack(simd, turned, threads);
+                        assert_eq!(scalars(&turned, m), scalars(&wanted, m), "{m}x{k}");
+                    });
+                }
+            }
+        }
     }
 }

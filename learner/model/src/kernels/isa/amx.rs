@@ -22,7 +22,7 @@ pub(super) const SUMS: usize = 4;
 
 /// Multiplies two small matrices whose product is exact in either order of the sum, in both ways that tiles are used, and looks at
 /// the result: a virtual machine may promise tiles that it does not keep.
-fn multiplies_right() -> bool {
+fn multiplies_right(simd: Bf16) -> bool {
     const K: usize = 2 * (STEPS + 3);
     let value = |at: usize| bf16::from_f32((at % 5) as f32 - 2.0);
     let (left, panel): (Vec<_>, Vec<_>) = (
@@ -46,7 +46,7 @@ fn multiplies_right() -> bool {
             mode: Mode::Replace,
         };
         // SAFETY: `Amx::new` has found the instructions and been granted the registers; the sizes are those of the vectors.
-        unsafe { compute(&mut Hardware, &tile, 20, 1) };
+        unsafe { compute(simd, &mut Hardware, &tile, 20, 1) };
         for (at, &got) in out.iter().enumerate() {
             let (row, col) = (at / LANES, at % LANES);
             let terms = (0..K).map(|k| {
@@ -196,9 +196,10 @@ impl Amx {
     /// registers.
     pub(super) fn new() -> Option<Self> {
         static IS_THERE: OnceLock<bool> = OnceLock::new();
-        let brain = Bf16::new()?;
-        let is_there = IS_THERE.get_or_init(|| has_amx_bf16() && granted() && multiplies_right());
-        is_there.then_some(Self(brain))
+        let vectors = Bf16::new()?;
+        let is_there =
+            IS_THERE.get_or_init(|| has_amx_bf16() && granted() && multiplies_right(vectors));
+        is_there.then_some(Self(vectors))
     }
 }
 
@@ -210,14 +211,23 @@ bf16_rounding!(Amx);
 impl Simd for Amx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
+    const LEFT_STEPS_ADJOIN: bool = true;
 
     fn rows_max(_: usize) -> usize {
         ROWS_MAX
     }
 
     unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        // SAFETY: `new` found the instructions; the rest is the caller's.
-        unsafe { compute(&mut Hardware, tile, rows, vecs) }
+        struct Work<'a>(Bf16, &'a RawTile<bf16>, usize, usize);
+        impl Loop for Work<'_> {
+            #[inline(always)]
+            fn run(self) {
+                let Self(simd, tile, rows, vecs) = self;
+                // SAFETY: `Amx::new` found the instructions; the rest is the caller's.
+                unsafe { compute(simd, &mut Hardware, tile, rows, vecs) }
+            }
+        }
+        self.vectorize(Work(self.0, tile, rows, vecs));
     }
 
     #[inline(always)]
@@ -231,11 +241,13 @@ impl Simd for Amx {
     }
 }
 
-/// Computes a tile of products.
+/// Computes a tile of products. `simd` is for what is not one.
 ///
 /// # Safety
 /// As for `Simd::compute`, on a processor that `tiles` is for.
-pub(super) unsafe fn compute<T: Tiles>(
+#[inline(always)]
+pub(super) unsafe fn compute<S: Simd, T: Tiles>(
+    simd: S,
     tiles: &mut T,
     tile: &RawTile<bf16>,
     rows: usize,
@@ -247,7 +259,7 @@ pub(super) unsafe fn compute<T: Tiles>(
         if tile.step == 2 {
             by_rows(tiles, tile, rows, vecs);
         } else {
-            by_columns(tiles, tile, rows, vecs);
+            by_columns(simd, tiles, tile, rows, vecs);
         }
     }
 }
@@ -256,6 +268,7 @@ pub(super) unsafe fn compute<T: Tiles>(
 ///
 /// # Safety
 /// As for `compute`, with a step of 2.
+#[inline(always)]
 unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
     let (whole, tail) = (tile.steps / STEPS, tile.steps % STEPS);
     let width = vecs * LANES;
@@ -278,13 +291,10 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
                     }
                 }
             }
-            let mut sums = [[0f32; LANES]; ROWS];
+            let mut sums = [[0; LANES]; ROWS];
             for vec in 0..vecs {
                 tiles.store(vec, sums.as_mut_ptr().cast(), LANES * 4);
-                let cols = tile.cols.saturating_sub(vec * LANES).min(LANES);
-                for (row, sums) in sums.iter().enumerate().take(count) {
-                    add_row(tile, first + row, vec * LANES, &sums[..cols]);
-                }
+                write_sums(tile, (first, count), vec, &sums);
             }
         }
     }
@@ -295,7 +305,14 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
 ///
 /// # Safety
 /// As for `compute`, with a row stride of 2.
-unsafe fn by_columns<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
+#[inline(always)]
+unsafe fn by_columns<S: Simd, T: Tiles>(
+    simd: S,
+    tiles: &mut T,
+    tile: &RawTile<bf16>,
+    rows: usize,
+    vecs: usize,
+) {
     assert!(
         tile.row_stride == 2,
         "neither steps nor rows lie side by side"
@@ -315,7 +332,6 @@ unsafe fn by_columns<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize,
             continue;
         }
         for vec in 0..vecs {
-            let cols = tile.cols.saturating_sub(vec * LANES).min(LANES);
             // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
             unsafe {
                 tiles.configure(LANES, lanes, tail);
@@ -324,9 +340,10 @@ unsafe fn by_columns<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize,
                         let steps = STEPS.min(tile.steps - part * STEPS);
                         let step = run * tile.steps + part * STEPS;
                         let panel = tile.panel.add((step * width + vec * LANES) * 2);
-                        let turned = turned(panel.cast(), width, steps);
+                        let mut block = block_of(panel.cast(), width, steps);
+                        simd.transpose(&mut block);
                         let in_tail = steps < STEPS;
-                        tiles.load_left(turned.as_ptr().cast(), STEPS * 4, in_tail);
+                        tiles.load_left(block.as_ptr().cast(), STEPS * 4, in_tail);
                         let left = tile
                             .left
                             .add(first * 2 + run * tile.run_stride + part * STEPS * tile.step);
@@ -335,64 +352,61 @@ unsafe fn by_columns<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize,
                         }
                     }
                 }
-                let mut sums = [[0f32; LANES]; LANES];
                 for group in 0..groups {
+                    let mut sums = [[0; LANES]; LANES];
                     tiles.store(group, sums.as_mut_ptr().cast(), LANES * 4);
-                    for row in 0..lanes {
-                        let sums: [f32; LANES] = std::array::from_fn(|col| sums[col][row]);
-                        add_row(
-                            tile,
-                            first + group * LANES + row,
-                            vec * LANES,
-                            &sums[..cols],
-                        );
-                    }
+                    simd.transpose(&mut sums);
+                    write_sums(tile, (first + group * LANES, lanes), vec, &sums);
                 }
             }
         }
     }
 }
 
-/// [column, step] of the first 16 columns and of `steps` rows of a panel [step, width], in pairs.
+/// The first 16 columns of `steps` rows of a panel [step, width], in pairs.
 ///
 /// # Safety
 /// The panel has them.
 #[inline(always)]
-unsafe fn turned(panel: *const u32, width: usize, steps: usize) -> [[u32; STEPS]; LANES] {
-    let mut turned = [[0; STEPS]; LANES];
-    for step in 0..steps {
+unsafe fn block_of(panel: *const u32, width: usize, steps: usize) -> [[u32; LANES]; STEPS] {
+    let mut block = [[0; LANES]; STEPS];
+    for (step, block) in block.iter_mut().enumerate().take(steps) {
         // SAFETY: the caller's; pairs of bf16 need no alignment.
-        let columns: [u32; LANES] = unsafe {
+        *block = unsafe {
             panel
                 .add(step * width)
                 .cast::<[u32; LANES]>()
                 .read_unaligned()
         };
-        for (turned, column) in turned.iter_mut().zip(columns) {
-            turned[step] = column;
-        }
     }
-    turned
+    block
 }
 
-/// Writes or adds `sums` to a row of the output, from column `first` on.
+/// Writes or adds the first of `sums` [row, column], the bits of f32, to the output's rows (first, count) and a register of columns.
 ///
 /// # Safety
-/// The output has them.
+/// The output has them, as far as `tile.cols` goes.
 #[inline(always)]
-unsafe fn add_row(tile: &RawTile<bf16>, row: usize, first: usize, sums: &[f32]) {
-    if sums.is_empty() {
+unsafe fn write_sums(
+    tile: &RawTile<bf16>,
+    (first, count): (usize, usize),
+    vec: usize,
+    sums: &[[u32; LANES]; ROWS],
+) {
+    let cols = tile.cols.saturating_sub(vec * LANES).min(LANES);
+    if cols == 0 {
         return;
     }
-    // SAFETY: the caller's; the output is exclusively borrowed by the tile.
-    let out = unsafe {
-        std::slice::from_raw_parts_mut(tile.out.add(row * tile.out_stride + first), sums.len())
-    };
-    for (out, sum) in out.iter_mut().zip(sums) {
-        *out = if tile.mode == Mode::Add {
-            *out + sum
-        } else {
-            *sum
-        };
+    for (row, sums) in sums.iter().enumerate().take(count) {
+        let at = (first + row) * tile.out_stride + vec * LANES;
+        // SAFETY: the caller's; the output is exclusively borrowed by the tile.
+        let out = unsafe { std::slice::from_raw_parts_mut(tile.out.add(at), cols) };
+        for (out, &sum) in out.iter_mut().zip(sums) {
+            let sum = f32::from_bits(sum);
+            *out = match tile.mode {
+                Mode::Add => *out + sum,
+                Mode::Replace => sum,
+            };
+        }
     }
 }

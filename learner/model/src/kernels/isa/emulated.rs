@@ -80,13 +80,14 @@ impl Rounding for EmulatedAmx {}
 impl Simd for EmulatedAmx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
+    const LEFT_STEPS_ADJOIN: bool = true;
 
     fn rows_max(_: usize) -> usize {
         ROWS_MAX
     }
 
     unsafe fn compute(self, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
-        unsafe { compute(&mut Registers::default(), tile, rows, vecs) }
+        unsafe { compute(self, &mut Registers::default(), tile, rows, vecs) }
     }
 
     fn vectorize<W: Loop>(self, work: W) {

@@ -40,6 +40,9 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     /// Most registers of columns in a tile.
     const VECS_MAX: usize;
 
+    /// Whether steps of a left operand are best side by side, even where copying them so means to transpose it.
+    const LEFT_STEPS_ADJOIN: bool = false;
+
     /// Most rows of a tile that is `vecs` registers wide.
     fn rows_max(vecs: usize) -> usize;
 
