@@ -205,18 +205,22 @@ fn a_run_that_is_to_ignore_hangups_does() {
 #[ignore = "three minutes: cargo nextest run --workspace --run-ignored only -E 'test(stopped_for_long)'"]
 fn a_run_that_was_stopped_for_long_resumes() {
     let system = system();
-    let process = launched(&system, 100);
-    let all: Vec<_> = PROCESSES.map(|role| system.find_process(role)).into();
-    let signal = |signal| {
-        process.signal(signal);
+    let mut process = launched(&system, 100);
+    let all = PROCESSES.map(|role| system.find_process(role));
+    let signal = |launcher: &Process, signal| {
+        launcher.signal(signal);
         all.iter().for_each(|it| it.signal(signal));
     };
-    signal(Signal::SIGSTOP);
+    signal(&process, Signal::SIGSTOP);
     thread::sleep(Duration::from_secs(140));
-    signal(Signal::SIGCONT);
+    signal(&process, Signal::SIGCONT);
     let client = system.connect();
     let before = client.wait_for_updates(100);
-    client.wait_for_updates(before.updates + 500);
+    wait_for("500 more updates", || {
+        assert!(process.is_running(), "{}", process.stderr());
+        let updates = client.learner()?.updates;
+        (updates > before.updates + 500).then_some(())
+    });
     process.stop().expect_code(130);
     system.run_folder("run").check("interrupted");
 }
