@@ -103,17 +103,21 @@ fn files_and_runs_that_are_not_there() {
 
 #[test]
 fn benches_give_figures_and_name_the_peer_that_is_missing() {
-    let output = driml("bench policy --quick --json -");
-    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    let figures = report["figures"].as_array().unwrap();
-    assert_eq!((figures.len(), &report["bench"]), (12, &"policy".into()));
-    assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
-
-    let output = driml("bench learner --growth --quick --precision bf16 --json -");
-    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    let figures = report["figures"].as_array().unwrap();
-    let speeds = figures.iter().filter(|it| it["unit"] == "GFLOP/s").count();
-    assert_eq!((figures.len(), speeds), (26, 13));
+    // How many figures, and how many of them are of arithmetic.
+    for (bench, count, of_arithmetic) in [
+        ("policy", 12, 0),
+        ("learner --growth --precision bf16", 26, 13),
+        ("learner --kernels --precision bf16", 6, 6),
+    ] {
+        let output = driml(&format!("bench {bench} --quick --json -"));
+        let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let figures = report["figures"].as_array().unwrap();
+        assert!(bench.starts_with(report["bench"].as_str().unwrap()));
+        assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
+        let of_unit = figures.iter().filter(|it| it["unit"] == "GFLOP/s");
+        let counts = (figures.len(), of_unit.count());
+        assert_eq!(counts, (count, of_arithmetic), "{bench}");
+    }
     let output = driml("bench peers --quick --only policy --python no-such-python");
     let table = String::from_utf8(output.stdout).unwrap();
     assert_eq!(output.status.code(), Some(0), "{table}");

@@ -85,6 +85,9 @@ pub struct BenchLearnerArgs {
     /// Measure C51 + global DIM with growing batch, observation, atoms and vectors instead
     #[arg(long)]
     pub(crate) growth: bool,
+    /// Measure GFLOP/s of convolutions and updates, and the most that the processor reaches, instead
+    #[arg(long, conflicts_with_all = ["growth", "device"])]
+    pub(crate) kernels: bool,
     #[command(flatten)]
     pub(crate) on: DeviceFlag,
 }

@@ -132,10 +132,7 @@ impl Bench<'_> {
     fn growth(&mut self) -> anyhow::Result<()> {
         for (name, sets) in SIZES {
             let sets = [sets, &["learner.deduplicate_states=false"]].concat();
-            let config = settings::of_run(WORLD, AGENT, "paper", &sets)?.with_whole_frames()?;
-            let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
-            let gflop = UpdateCost::of(&config.model, &shape).total() as f64 / 1e9;
-            let work = updates(&config, &self.compute, 0.0)?;
+            let (work, gflop) = counted_updates(AGENT, &sets, &self.compute)?;
             let (rate, name) = (
                 self.effort.rate_by_median(work)?,
                 format!("{name}: {gflop:.2} GFLOP"),
@@ -145,6 +142,18 @@ impl Bench<'_> {
         }
         Ok(())
     }
+}
+
+/// Updates of this agent with settings over those of the paper, and the GFLOP of one.
+pub(super) fn counted_updates(
+    agent: &str,
+    sets: &[&str],
+    compute: &Compute,
+) -> anyhow::Result<(Work<'static>, f64)> {
+    let config = settings::of_run(WORLD, agent, "paper", sets)?.with_whole_frames()?;
+    let shape = UpdateShape::of(&config.learner, config.run.horizon.positives());
+    let gflop = UpdateCost::of(&config.model, &shape).total() as f64 / 1e9;
+    Ok((updates(&config, compute, 0.0)?, gflop))
 }
 
 /// Updates of an agent of these settings on a batch that no world gave, of whose states this share repeats another one.

@@ -26,6 +26,7 @@ mod effort;
 mod env;
 pub mod flags;
 mod in_process;
+mod kernels;
 mod learner;
 mod peers;
 mod policy;
@@ -67,6 +68,9 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     let machine = MachineNote::this(device::gpu(on));
     let (effort, mut table) = (Effort::new(flags), None);
     let (bench, figures) = match command {
+        BenchCommand::Learner(args) if args.kernels => {
+            ("learner", kernels::measure(flags, &effort)?)
+        }
         BenchCommand::Learner(args) => ("learner", learner::measure(args, flags, &effort)?),
         BenchCommand::Policy => ("policy", policy::measure(flags, &effort)?),
         BenchCommand::Replay(args) => ("replay", replay::measure(args, &effort)?),

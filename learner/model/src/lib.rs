@@ -62,7 +62,7 @@ pub use heads::noise::HeadNoise;
 pub use input::{Enlarge, FrameSize, InputRead, InputSize};
 pub use kernels::conv::{conv_stack, conv2d_relu};
 pub use kernels::exponentials::{exp_below, soft_clip};
-pub use kernels::isa::{describe_kernels, is_bf16_fast};
+pub use kernels::isa::{describe_kernels, is_bf16_fast, multiply_in_first_cache};
 pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use network::{Features, Network};

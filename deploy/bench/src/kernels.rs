@@ -1,0 +1,62 @@
+//! How much of what the processor can multiply the kernels reach: convolutions alone, and whole updates.
+//! The convolutions are 3 x 3, of 256 maps of a residual stage with their border of zeros, and their ReLU.
+
+use candle_core::{Device, Tensor};
+use driml_learner::DeviceName;
+use driml_model::{conv2d_relu, multiply_in_first_cache};
+
+use crate::{
+    effort::Effort,
+    flags::BenchFlags,
+    learner::counted_updates,
+    report::{Measurement, named},
+};
+
+const ROWS: usize = 256;
+/// Side and channels of the maps of a stage, which has as many going in as coming out.
+const STAGES: [(usize, usize); 3] = [(32, 16), (16, 32), (8, 32)];
+/// Torsos of the updates, of C51.
+const TORSOS: [&str; 2] = ["nature", "impala"];
+/// Tiles in a call.
+const TILES: usize = 10_000;
+
+/// GFLOP/s in each precision.
+pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+    let mut figures = Vec::new();
+    for precision in flags.precisions(DeviceName::Cpu) {
+        let mut found = |what: &str, gflop: f64, calls: f64| {
+            let what = named(what, precision);
+            figures.push(Measurement::found(what, gflop * calls, "GFLOP/s"));
+        };
+        let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
+        let calls = effort.rate_by_median(|| {
+            multiply_in_first_cache(precision, TILES);
+            Ok(())
+        })?;
+        found("products in the first cache", gflop, calls);
+        for (side, channels) in STAGES {
+            let maps = numbers(&[ROWS, side + 2, side + 2, channels])?;
+            let (weight, bias) = (numbers(&[channels, channels, 3, 3])?, numbers(&[channels])?);
+            let gflop = (2 * ROWS * side * side * 9 * channels * channels) as f64 / 1e9;
+            let calls = effort.rate_by_median(|| {
+                conv2d_relu(&maps, &weight, &bias, 1, precision)?;
+                Ok(())
+            })?;
+            let what = format!("convolution of 256 maps, {side}x{side}x{channels}");
+            found(&what, gflop, calls);
+        }
+        let compute = DeviceName::Cpu.open(precision)?;
+        for torso in TORSOS {
+            let set = format!("model.torso={torso}");
+            let (work, gflop) = counted_updates("c51", &[&set], &compute)?;
+            let what = format!("update of C51, {torso}: {gflop:.2} GFLOP");
+            found(&what, gflop, effort.rate_by_median(work)?);
+        }
+    }
+    Ok(figures)
+}
+
+/// A tensor of numbers of a usual size.
+fn numbers(shape: &[usize]) -> candle_core::Result<Tensor> {
+    Tensor::rand(-1f32, 1.0, shape, &Device::Cpu)
+}

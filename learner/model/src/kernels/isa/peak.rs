@@ -1,0 +1,67 @@
+//! The most that a processor multiplies: a tile whose operands do not leave the first cache, over and over.
+//! It is what the kernels are held against, and computes nothing that is wanted.
+
+use rayon::prelude::*;
+
+use super::{AnySimd, Columns, Element, LANES, Left, Mode, Simd, multiply_tile, with_simd};
+use crate::kernels::precision::Precision;
+
+/// Scalars along the sum: with a panel of one register of columns 16 KiB of f32.
+const DEPTH: usize = 256;
+
+/// Multiplies the tallest tile that is a register wide so many times on every thread of the pool; the FLOPs that these are.
+pub fn multiply_in_first_cache(precision: Precision, times: usize) -> f64 {
+    with_simd!(AnySimd::of(precision), simd => multiply(simd, times))
+}
+
+fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
+    let rows = S::rows_max(1);
+    let depth = S::Element::DEPTH;
+    let threads = rayon::current_num_threads();
+    (0..threads).into_par_iter().with_max_len(1).for_each(|_| {
+        let (left, panel) = (
+            vec![S::Element::of(1.0); rows * DEPTH],
+            vec![S::Element::of(1.0); DEPTH * LANES],
+        );
+        let mut out = vec![0.0; rows * LANES];
+        for _ in 0..times {
+            let left = Left {
+                values: &left,
+                start: 0,
+                row_stride: DEPTH,
+                step: depth,
+                steps: DEPTH / depth,
+                run_stride: 0,
+                runs: 1,
+            };
+            let columns = Columns {
+                out: &mut out,
+                stride: LANES,
+                cols: LANES,
+                vecs: 1,
+                mode: Mode::Replace,
+            };
+            multiply_tile(simd, rows, left, &panel, columns);
+        }
+        std::hint::black_box(&out);
+    });
+    2.0 * (threads * times * rows * LANES * DEPTH) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_flops_are_those_of_the_tiles() {
+        for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
+            let (flops, rows) = with_simd!(simd, simd => (multiply(simd, 3), rows_max(simd)));
+            let each = (2 * rows * LANES * DEPTH * rayon::current_num_threads()) as f64;
+            assert_eq!(flops, 3.0 * each);
+        }
+    }
+
+    fn rows_max<S: Simd>(_: S) -> usize {
+        S::rows_max(1)
+    }
+}
