@@ -59,6 +59,7 @@ pub use messages::{
     run_info::RunInfo,
     shard_counts::ShardCounts,
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
+    table::Kind,
     weights::{
         Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
@@ -80,6 +81,6 @@ pub use wire::{
     codec::{self, PROTOCOL_VERSION},
     error::CodecError,
     keys::{Alive, Keys},
-    message::{Keyed, Kind, Message, Request},
+    message::{Keyed, Message, Request},
     shared_memory,
 };

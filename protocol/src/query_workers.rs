@@ -124,7 +124,7 @@ impl<M: Message> Responder<M> {
     fn send(&self, sealed: Result<Sealed<M>, CodecError>) {
         match sealed {
             Ok(sealed) => session::answer(&self.query, sealed.into_bytes()),
-            Err(e) => tracing::error!("a reply of kind {:?} was not sent: {e}", M::KIND),
+            Err(e) => tracing::error!("a reply of kind {} was not sent: {e}", M::NAME),
         }
     }
 }

@@ -2,13 +2,8 @@
 //! It does not estimate: how A comes about is the learner's.
 
 use serde::{Deserialize, Serialize};
-use zenoh::qos::Priority;
 
-use super::ack::Ack;
-use crate::wire::{
-    error::CodecError,
-    message::{Keyed, Kind, Message, Request},
-};
+use crate::wire::error::CodecError;
 
 /// A, row by row: `matrix[i * n + j]` is the softmax over j of q(a_i, a_j); rows sum to 1.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,19 +16,6 @@ pub struct AffinityUpdate {
     pub num_actions: u32,
     /// [n, n] probabilities.
     pub matrix: Vec<f32>,
-}
-
-impl Message for AffinityUpdate {
-    const KIND: Kind = Kind::Affinity;
-}
-
-impl Keyed for AffinityUpdate {
-    const KEY: &'static str = "affinity";
-    const PRIORITY: Priority = Priority::DataHigh;
-}
-
-impl Request for AffinityUpdate {
-    type Reply = Ack;
 }
 
 impl AffinityUpdate {

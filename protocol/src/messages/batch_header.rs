@@ -13,12 +13,7 @@ use super::{
 use crate::{
     run_spec::RunSpec,
     sampling::Sampling,
-    wire::{
-        codec::PAYLOAD_BYTES_MAX,
-        error::CodecError,
-        message::{Kind, Message, no_payload},
-        shared_memory,
-    },
+    wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_payload, shared_memory},
 };
 
 /// Batches that a replay server keeps in shared memory: those that are assembled, on their way, and being copied by the learner.
@@ -222,10 +217,9 @@ impl BatchReply {
     }
 }
 
-impl Message for BatchReply {
-    const KIND: Kind = Kind::BatchReply;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl BatchReply {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self.header() {
             Some(header) => header.check_payload(payload),
             None => no_payload(payload),

@@ -3,8 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{batch_header::BatchReply, shard_counts::ShardCounts};
-use crate::wire::message::{Keyed, Kind, Message, Request};
+use super::shard_counts::ShardCounts;
 
 /// The learner's request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,18 +32,6 @@ pub struct Learned {
     /// Rows of this shard that it has received since the start of the run, without those learned after its checkpoint by a learner
     /// before it.
     pub rows_received: u64,
-}
-
-impl Message for BatchRequest {
-    const KIND: Kind = Kind::BatchRequest;
-}
-
-impl Keyed for BatchRequest {
-    const KEY: &'static str = "batch";
-}
-
-impl Request for BatchRequest {
-    type Reply = BatchReply;
 }
 
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.

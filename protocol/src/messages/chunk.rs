@@ -5,12 +5,10 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::insert_reply::InsertReply;
 use crate::wire::{
     buffers::{Buffer, BufferPool},
     codec,
     error::CodecError,
-    message::{Keyed, Kind, Message, Request},
 };
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
@@ -72,10 +70,9 @@ pub struct ChunkHeader {
     pub frame_bytes: u32,
 }
 
-impl Message for ChunkHeader {
-    const KIND: Kind = Kind::Chunk;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl ChunkHeader {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
             return Ok(());
         }
@@ -87,19 +84,6 @@ impl Message for ChunkHeader {
             payload.len()
         )))
     }
-
-    fn actor(&self) -> Option<u32> {
-        Some(self.actor)
-    }
-}
-
-impl Keyed for ChunkHeader {
-    const KEY: &'static str = "ingest";
-    const BY_ACTOR: bool = true;
-}
-
-impl Request for ChunkHeader {
-    type Reply = InsertReply;
 }
 
 /// Transitions that a chunk of any run may have: an actor may step so many environments, whatever the settings say.
@@ -293,7 +277,7 @@ impl Chunk {
         payload: Buffer,
         num_actions: u32,
     ) -> Result<Self, CodecError> {
-        header.validate(&payload)?;
+        header.checked(&payload)?;
         let chunk = Self { header, payload };
         if let Some(action) = chunk
             .actions()

@@ -2,12 +2,8 @@
 //! Means over the newest of them are in `status`.
 
 use serde::{Deserialize, Serialize};
-use zenoh::qos::Priority;
 
-use crate::wire::{
-    error::CodecError,
-    message::{Keyed, Kind, Message, Request, no_payload},
-};
+use crate::wire::{error::CodecError, message::no_payload};
 
 /// Most episodes in one answer; those after it are asked for again. With the longest numbers it takes half of what a header may.
 pub const EPISODES_MAX: usize = 8_192;
@@ -17,19 +13,6 @@ pub const EPISODES_MAX: usize = 8_192;
 pub struct EpisodesRequest {
     /// Episodes that the asker knows of already.
     pub since: u64,
-}
-
-impl Message for EpisodesRequest {
-    const KIND: Kind = Kind::EpisodesRequest;
-}
-
-impl Keyed for EpisodesRequest {
-    const KEY: &'static str = "episodes";
-    const PRIORITY: Priority = Priority::InteractiveHigh;
-}
-
-impl Request for EpisodesRequest {
-    type Reply = EpisodesReply;
 }
 
 /// An episode that ended: by the rules of the world, or by its step limit.
@@ -72,10 +55,9 @@ impl EpisodesReply {
     }
 }
 
-impl Message for EpisodesReply {
-    const KIND: Kind = Kind::EpisodesReply;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl EpisodesReply {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.up_to() > self.ended || self.episodes.len() > EPISODES_MAX {
             return Err(CodecError::Header(format!(
                 "{} episodes after {}, where {} ended",

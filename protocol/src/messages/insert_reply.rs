@@ -3,8 +3,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Keyed, Kind, Message, Request};
-
 /// Asks what became of a chunk that the replay server keeps until its limiter opens: the chunk's header without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChunkPoll {
@@ -16,23 +14,6 @@ pub struct ChunkPoll {
     pub sequence: u64,
     /// The actor was told to stop: the rate limiter lets the chunk pass.
     pub leaving: bool,
-}
-
-impl Message for ChunkPoll {
-    const KIND: Kind = Kind::ChunkPoll;
-
-    fn actor(&self) -> Option<u32> {
-        Some(self.actor)
-    }
-}
-
-impl Keyed for ChunkPoll {
-    const KEY: &'static str = "poll";
-    const BY_ACTOR: bool = true;
-}
-
-impl Request for ChunkPoll {
-    type Reply = InsertReply;
 }
 
 /// The replay server's answer to a chunk or a poll.
@@ -69,8 +50,4 @@ pub enum InsertReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
-}
-
-impl Message for InsertReply {
-    const KIND: Kind = Kind::InsertReply;
 }

@@ -4,7 +4,6 @@
 use serde::{Deserialize, Serialize};
 
 use super::shard_counts::ShardCounts;
-use crate::wire::message::{Keyed, Kind, Message, Request};
 
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,23 +12,6 @@ pub struct ActorJoin {
     pub actor: u32,
     /// Which life of it: a random number, drawn anew at each start.
     pub incarnation: u64,
-}
-
-impl Message for ActorJoin {
-    const KIND: Kind = Kind::ActorJoin;
-
-    fn actor(&self) -> Option<u32> {
-        Some(self.actor)
-    }
-}
-
-impl Keyed for ActorJoin {
-    const KEY: &'static str = "join/actor";
-    const BY_ACTOR: bool = true;
-}
-
-impl Request for ActorJoin {
-    type Reply = JoinReply;
 }
 
 /// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
@@ -47,18 +29,6 @@ pub struct LearnerJoin {
     pub other_shards: ShardCounts,
     /// Begin again from the first update, where an earlier learner of the run has learned already.
     pub restart: bool,
-}
-
-impl Message for LearnerJoin {
-    const KIND: Kind = Kind::LearnerJoin;
-}
-
-impl Keyed for LearnerJoin {
-    const KEY: &'static str = "join/learner";
-}
-
-impl Request for LearnerJoin {
-    type Reply = JoinReply;
 }
 
 /// The replay server's answer to a process that joins.
@@ -83,8 +53,4 @@ pub enum JoinReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
-}
-
-impl Message for JoinReply {
-    const KIND: Kind = Kind::JoinReply;
 }

@@ -1,4 +1,4 @@
-//! Everything that is sent, one file a message.
+//! Everything that is sent: `table` lists it, and each message has a file.
 //! `wire` turns messages into bytes; each process decides what it answers.
 
 pub(crate) mod ack;
@@ -21,4 +21,5 @@ pub(crate) mod report;
 pub(crate) mod run_info;
 pub(crate) mod shard_counts;
 pub(crate) mod status;
+pub(crate) mod table;
 pub(crate) mod weights;

@@ -2,13 +2,8 @@
 //! What a priority is made of is the learner's business, what it does to later draws the replay server's.
 
 use serde::{Deserialize, Serialize};
-use zenoh::qos::Priority;
 
-use super::ack::Ack;
-use crate::wire::{
-    error::CodecError,
-    message::{Keyed, Kind, Message, Request, no_payload},
-};
+use crate::wire::{error::CodecError, message::no_payload};
 
 /// Which life of which replay server drew rows by priority: their numbers mean nothing to another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,10 +43,9 @@ impl PriorityUpdate {
     }
 }
 
-impl Message for PriorityUpdate {
-    const KIND: Kind = Kind::Priorities;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl PriorityUpdate {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)?;
         for part in &self.parts {
             let (transitions, priorities) = (part.transitions.len(), part.priorities.len());
@@ -70,13 +64,4 @@ impl Message for PriorityUpdate {
         }
         Ok(())
     }
-}
-
-impl Keyed for PriorityUpdate {
-    const KEY: &'static str = "priorities";
-    const PRIORITY: Priority = Priority::DataHigh;
-}
-
-impl Request for PriorityUpdate {
-    type Reply = Ack;
 }

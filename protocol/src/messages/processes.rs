@@ -2,10 +2,8 @@
 //! Counts and rates are in `status`; here are who is connected, who waits, and when each was last seen.
 
 use serde::{Deserialize, Serialize};
-use zenoh::qos::Priority;
 
 use super::{report::Warning, status::Waiting};
-use crate::wire::message::{Keyed, Kind, Message};
 
 /// Processes whose last warning is passed on: those with the newest ones.
 pub const WARNINGS_MAX: usize = 64;
@@ -93,13 +91,4 @@ pub struct ProcessesStatus {
     pub last_warning: Option<Warning>,
     /// The learner, then the actors by number.
     pub processes: Vec<ProcessStatus>,
-}
-
-impl Message for ProcessesStatus {
-    const KIND: Kind = Kind::ProcessesStatus;
-}
-
-impl Keyed for ProcessesStatus {
-    const KEY: &'static str = "status/processes";
-    const PRIORITY: Priority = Priority::InteractiveHigh;
 }

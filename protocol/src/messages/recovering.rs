@@ -5,10 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::{
-    error::CodecError,
-    message::{Kind, Message, no_payload},
-};
+use crate::wire::{error::CodecError, message::no_payload};
 
 /// How far a replay server is with reading its replay back from disk.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -60,10 +57,9 @@ impl fmt::Display for Recovering {
     }
 }
 
-impl Message for Recovering {
-    const KIND: Kind = Kind::Recovering;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl Recovering {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         let since_s = self.progress.since_s;
         if !since_s.is_finite() || since_s < 0.0 {
             return Err(CodecError::Header(format!(
@@ -92,11 +88,11 @@ mod tests {
             recovering.to_string(),
             "the replay server reads its replay back from disk, 3072 of 11264 MiB after 34 s"
         );
-        assert!(recovering.validate(&[]).is_ok());
-        assert!(recovering.validate(&[1]).is_err());
+        assert!(recovering.checked(&[]).is_ok());
+        assert!(recovering.checked(&[1]).is_err());
         for bad in [f64::NAN, f64::INFINITY, -1.0] {
             recovering.progress.since_s = bad;
-            assert!(recovering.validate(&[]).is_err(), "{bad}");
+            assert!(recovering.checked(&[]).is_err(), "{bad}");
         }
     }
 }

@@ -3,12 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::ack::Ack;
-use crate::wire::{
-    error::CodecError,
-    keys::Alive,
-    message::{Keyed, Kind, Message, Request, no_payload},
-};
+use crate::wire::{error::CodecError, keys::Alive, message::no_payload};
 
 /// Most bytes of the description of what a process does.
 const DOING_MAX: usize = 80;
@@ -95,10 +90,9 @@ fn cut(text: &str, bytes_max: usize) -> String {
     text[..end].to_owned()
 }
 
-impl Message for Report {
-    const KIND: Kind = Kind::Report;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl Report {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         let warning = self.last_warning.as_ref();
         let too_long = self.doing.len() > DOING_MAX
             || warning.is_some_and(|warning| warning.text.len() > WARNING_MAX);
@@ -116,21 +110,13 @@ impl Message for Report {
         no_payload(payload)
     }
 
-    fn actor(&self) -> Option<u32> {
+    /// The actor whose report it is.
+    pub(super) fn actor(&self) -> Option<u32> {
         match self.who {
             Participant::Actor { actor, .. } => Some(actor),
             Participant::Learner(_) => None,
         }
     }
-}
-
-impl Keyed for Report {
-    const KEY: &'static str = "report";
-    const BY_ACTOR: bool = true;
-}
-
-impl Request for Report {
-    type Reply = Ack;
 }
 
 #[cfg(test)]
@@ -159,7 +145,7 @@ mod tests {
         let long = "x".repeat(401);
         assert!(
             report("plays", 1.0, Some(("lost", 2.0)))
-                .validate(&[])
+                .checked(&[])
                 .is_ok()
         );
         for bad in [
@@ -169,15 +155,15 @@ mod tests {
             report("plays", 1.0, Some((&long, 0.0))),
             report("plays", 1.0, Some(("x", f64::INFINITY))),
         ] {
-            assert!(bad.validate(&[]).is_err(), "{bad:?}");
+            assert!(bad.checked(&[]).is_err(), "{bad:?}");
         }
-        assert!(report("plays", 1.0, None).validate(&[1]).is_err());
+        assert!(report("plays", 1.0, None).checked(&[1]).is_err());
         let cut = Report::new(
             Participant::Learner(1),
             &long,
             0.0,
             Some(Warning::new(&long, 0.0)),
         );
-        assert!(cut.validate(&[]).is_ok());
+        assert!(cut.checked(&[]).is_ok());
     }
 }

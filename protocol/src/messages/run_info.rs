@@ -3,8 +3,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::message::{Keyed, Kind, Message};
-
 /// What a joining process needs: the run's resolved settings, from the replay server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunInfo {
@@ -20,12 +18,4 @@ pub struct RunInfo {
     pub shard: (u32, u32),
     /// Whether chunks may come through shared memory: the replay server can read it.
     pub shared_memory: bool,
-}
-
-impl Message for RunInfo {
-    const KIND: Kind = Kind::RunInfo;
-}
-
-impl Keyed for RunInfo {
-    const KEY: &'static str = "run-info";
 }

@@ -2,9 +2,6 @@
 //! It computes nothing; each process fills in its own.
 
 use serde::{Deserialize, Serialize};
-use zenoh::qos::Priority;
-
-use crate::wire::message::{Keyed, Kind, Message};
 
 /// Who waits for whom at the rate limiter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -154,15 +151,6 @@ pub struct ReplayStatus {
     pub learner_finished: bool,
 }
 
-impl Message for ReplayStatus {
-    const KIND: Kind = Kind::ReplayStatus;
-}
-
-impl Keyed for ReplayStatus {
-    const KEY: &'static str = "status/replay";
-    const PRIORITY: Priority = Priority::InteractiveHigh;
-}
-
 impl ReplayStatus {
     /// The account of a replay of several shards from each shard's own. The newest returns are those of all shards, shard after
     /// shard; the mean age is weighted by rows.
@@ -299,15 +287,6 @@ impl LearnerStatus {
         let found = self.losses.iter().find(|(known, _)| known == name);
         found.map(|(_, loss)| *loss)
     }
-}
-
-impl Message for LearnerStatus {
-    const KIND: Kind = Kind::LearnerStatus;
-}
-
-impl Keyed for LearnerStatus {
-    const KEY: &'static str = "status/learner";
-    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 #[cfg(test)]

@@ -5,14 +5,8 @@
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use zenoh::qos::Priority;
 
-use super::ack::Ack;
-use crate::wire::{
-    codec::PAYLOAD_BYTES_MAX,
-    error::CodecError,
-    message::{Keyed, Kind, Message, Request, no_payload},
-};
+use crate::wire::{codec::PAYLOAD_BYTES_MAX, error::CodecError, message::no_payload};
 
 /// Bytes of weights in one message to an actor; the last piece has fewer.
 pub const PIECE_BYTES: usize = 1 << 18;
@@ -22,15 +16,6 @@ pub const PIECE_BYTES: usize = 1 << 18;
 pub struct WeightsVersion {
     /// Counts up from 1.
     pub version: u64,
-}
-
-impl Message for WeightsVersion {
-    const KIND: Kind = Kind::WeightsVersion;
-}
-
-impl Keyed for WeightsVersion {
-    const KEY: &'static str = "weights-version";
-    const PRIORITY: Priority = Priority::InteractiveHigh;
 }
 
 /// What weights say of themselves.
@@ -62,21 +47,11 @@ pub struct WeightsUpload {
     pub weights: WeightsHeader,
 }
 
-impl Message for WeightsUpload {
-    const KIND: Kind = Kind::WeightsUpload;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl WeightsUpload {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         self.weights.check(payload)
     }
-}
-
-impl Keyed for WeightsUpload {
-    const KEY: &'static str = "weights-upload";
-    const PRIORITY: Priority = Priority::DataHigh;
-}
-
-impl Request for WeightsUpload {
-    type Reply = Ack;
 }
 
 /// An actor's question.
@@ -91,19 +66,6 @@ pub enum WeightsRequest {
         /// Byte of the safetensors file, a multiple of [`PIECE_BYTES`].
         offset: u64,
     },
-}
-
-impl Message for WeightsRequest {
-    const KIND: Kind = Kind::WeightsRequest;
-}
-
-impl Keyed for WeightsRequest {
-    const KEY: &'static str = "weights";
-    const PRIORITY: Priority = Priority::DataLow;
-}
-
-impl Request for WeightsRequest {
-    type Reply = WeightsReply;
 }
 
 /// The answer to a [`WeightsRequest`].
@@ -124,10 +86,9 @@ pub enum WeightsReply {
     },
 }
 
-impl Message for WeightsReply {
-    const KIND: Kind = Kind::Weights;
-
-    fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
+impl WeightsReply {
+    /// Checks a received one with its payload.
+    pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
             // Which piece is due is for [`Assembly`] to know.
             Self::Piece { .. } => Ok(()),

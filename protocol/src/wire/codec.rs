@@ -8,7 +8,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use super::{
     buffers::{Buffer, BufferPool},
     error::CodecError,
-    message::{Kind, Message},
+    message::Message,
     prefix::Prefix,
 };
 
@@ -95,7 +95,7 @@ pub fn seal<M: Message>(
     let mut prefix = Prefix {
         magic: Prefix::MAGIC,
         version: PROTOCOL_VERSION,
-        kind: M::KIND as u16,
+        kind: M::KIND,
         spec_hash,
         header_bytes: header.len() as u32,
         payload_bytes: payload.len() as u64,
@@ -244,16 +244,16 @@ impl Prefix {
     fn check(
         &self,
         sum: crc32fast::Hasher,
-        kind: Kind,
+        kind: u16,
         spec_hash: Option<u64>,
     ) -> Result<(), CodecError> {
         if sum.finalize() != self.checksum {
             return Err(CodecError::Checksum);
         }
-        if self.kind != kind as u16 {
+        if self.kind != kind {
             return Err(CodecError::Kind {
                 theirs: self.kind,
-                ours: kind as u16,
+                ours: kind,
             });
         }
         match spec_hash {

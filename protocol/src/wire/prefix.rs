@@ -45,7 +45,7 @@ prefix! {
     magic: u32,
     /// The protocol's version; others are refused.
     version: u16,
-    /// Which message it is: a [`Kind`](super::message::Kind).
+    /// Which message it is: a [`Kind`](crate::Kind).
     kind: u16,
     /// The hash of the run's spec, so that runs are not mixed.
     spec_hash: u64,

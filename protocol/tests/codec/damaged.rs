@@ -101,7 +101,7 @@ fn every_flipped_bit_is_refused() {
 fn each_mismatch_has_its_own_error() {
     let header = [5u8];
     let read = |bytes: &[u8], hash| codec::decode::<WeightsVersion>(bytes, hash).map(|_| ());
-    let good = forge_whole(Kind::WeightsVersion, &header, &[]);
+    let good = forge_whole(Kind::WeightsVersion as u16, &header, &[]);
     assert_eq!(
         good,
         codec::encode(SPEC, &WeightsVersion { version: 5 }, &[]).unwrap()
@@ -136,7 +136,7 @@ fn each_mismatch_has_its_own_error() {
     let nothing = CodecError::Length { have, need };
     assert_eq!(read(b"", Some(SPEC)), Err(nothing));
     assert_eq!(read(&[0; 64], Some(SPEC)), Err(CodecError::Magic));
-    let longer = forge_whole(Kind::WeightsVersion, &[5, 0], &[]);
+    let longer = forge_whole(Kind::WeightsVersion as u16, &[5, 0], &[]);
     assert!(
         matches!(read(&longer, Some(SPEC)), Err(CodecError::Header(_))),
         "a byte after the header's end"
@@ -172,7 +172,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     }
     // A header that claims more elements than any header has room for.
     let header = [&[1u8, 3, 253][..], &u64::MAX.to_le_bytes()].concat();
-    let bytes = forge_whole(Kind::Affinity, &header, &[]);
+    let bytes = forge_whole(Kind::Affinity as u16, &header, &[]);
     let refused = codec::decode::<AffinityUpdate>(&bytes, Some(SPEC)).unwrap_err();
     assert!(matches!(refused, CodecError::Header(_)), "{refused}");
     // The sender keeps to the limit too.

@@ -1,7 +1,7 @@
 //! Messages that no process of this project sends: right checksums over whatever header and payload.
 //! What becomes of them is tested in `damaged`.
 
-use driml_protocol::{Kind, PROTOCOL_VERSION};
+use driml_protocol::PROTOCOL_VERSION;
 
 use crate::samples::SPEC;
 
@@ -29,10 +29,10 @@ pub(crate) fn forge(
     bytes
 }
 
-pub(crate) fn forge_whole(kind: Kind, header: &[u8], payload: &[u8]) -> Vec<u8> {
+pub(crate) fn forge_whole(kind: u16, header: &[u8], payload: &[u8]) -> Vec<u8> {
     forge(
         PROTOCOL_VERSION,
-        kind as u16,
+        kind,
         (header.len() as u32, payload.len() as u64),
         header,
         payload,

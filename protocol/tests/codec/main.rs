@@ -93,7 +93,7 @@ fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
     for kind in 1..=Kind::Recovering as u16 {
         assert!(
-            samples.iter().any(|sample| sample.kind as u16 == kind),
+            samples.iter().any(|sample| sample.kind == kind),
             "kind {kind}"
         );
     }

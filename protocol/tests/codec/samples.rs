@@ -20,7 +20,7 @@ pub(crate) const ACTIONS: u32 = 15;
 /// A message of one type, and whether some bytes are accepted in its place.
 pub(crate) struct Sample {
     pub(crate) name: String,
-    pub(crate) kind: Kind,
+    pub(crate) kind: u16,
     pub(crate) bytes: Vec<u8>,
     pub(crate) read: fn(&[u8]) -> Result<(), CodecError>,
 }
@@ -439,7 +439,7 @@ pub(crate) fn samples() -> Vec<Sample> {
     ];
     samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
         name: name.into(),
-        kind,
+        kind: kind as u16,
         bytes,
         read,
     }));

@@ -87,7 +87,7 @@ impl Service {
     pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
         incoming
             .read()
-            .inspect_err(|e| self.refuse(&format!("a message of kind {:?}", R::KIND), e))
+            .inspect_err(|e| self.refuse(&format!("a message of kind {}", R::NAME), e))
             .ok()
     }
 
