@@ -119,7 +119,7 @@ impl RunSpec {
 
     /// The hash that is in every message and checkpoint of this run: the first 8 bytes of the SHA-256 of `FIELDS` and the fields.
     pub fn hash(&self) -> u64 {
-        let bytes = codec::canonical_bytes(&(FIELDS, self))
+        let bytes = codec::encode_value(&(FIELDS, self))
             .expect("a run spec is a few short fields, far below the limit");
         let digest = Sha256::digest(&bytes);
         u64::from_le_bytes(digest[..8].try_into().expect("SHA-256 has 32 bytes"))

@@ -141,11 +141,8 @@ impl Assembly {
     /// # Errors
     /// More bytes than any weights have.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
-        let max = PAYLOAD_BYTES_MAX;
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
-        if bytes > max {
-            return Err(CodecError::TooLarge { have: bytes, max });
-        }
+        CodecError::check_size(bytes, PAYLOAD_BYTES_MAX)?;
         Ok(Self {
             weights,
             bytes,

@@ -1,5 +1,5 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
-//! It does not know what a message means, and it is the only file of what travels that calls bincode.
+//! It does not know what a message means; it and `prefix` alone call bincode for what travels.
 //!
 //! The prefix's fields are in `prefix`.
 
@@ -25,41 +25,34 @@ pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
-/// Encodes `header` with bincode, refusing more than [`HEADER_BYTES_MAX`].
-fn encode_header<H: Serialize>(header: &H) -> Result<Vec<u8>, CodecError> {
-    let bytes = bincode::serde::encode_to_vec(header, bincode::config::standard())
-        .map_err(|e| CodecError::Header(e.to_string()))?;
-    if bytes.len() > HEADER_BYTES_MAX {
-        return Err(CodecError::TooLarge {
-            have: bytes.len(),
-            max: HEADER_BYTES_MAX,
-        });
-    }
-    Ok(bytes)
-}
-
-/// The bincode bytes of a value, for hashing and for small files of our own.
-pub(crate) fn canonical_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
-    encode_header(value)
-}
-
 /// Longest value of [`encode_value`], bytes.
 const VALUE_BYTES_MAX: usize = 1 << 28;
 
-/// The bytes of a value that travels in no message, for files.
+/// The bincode bytes of `value`, no more than `max`.
+fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecError> {
+    let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    CodecError::check_size(bytes.len(), max)?;
+    Ok(bytes)
+}
+
+/// The value of all of `bytes`, which claims no more than `MAX` bytes of memory.
+fn decode_within<T: DeserializeOwned, const MAX: usize>(bytes: &[u8]) -> Result<T, CodecError> {
+    let config = bincode::config::standard().with_limit::<MAX>();
+    let (value, used) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|e| CodecError::Header(e.to_string()))?;
+    match bytes.len() - used {
+        0 => Ok(value),
+        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
+    }
+}
+
+/// The bytes of a value that travels in no message, for files and hashes.
 ///
 /// # Errors
 /// A value over the limit, or one that serde cannot write.
 pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
-    let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
-        .map_err(|e| CodecError::Header(e.to_string()))?;
-    if bytes.len() > VALUE_BYTES_MAX {
-        return Err(CodecError::TooLarge {
-            have: bytes.len(),
-            max: VALUE_BYTES_MAX,
-        });
-    }
-    Ok(bytes)
+    encode_within(value, VALUE_BYTES_MAX)
 }
 
 /// Reads what [`encode_value`] wrote. That the bytes are undamaged is the caller's to check.
@@ -67,13 +60,7 @@ pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
 /// # Errors
 /// Bytes that are no such value, or more than one.
 pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
-    let config = bincode::config::standard().with_limit::<VALUE_BYTES_MAX>();
-    let (value, used) = bincode::serde::decode_from_slice(bytes, config)
-        .map_err(|e| CodecError::Header(e.to_string()))?;
-    match bytes.len() - used {
-        0 => Ok(value),
-        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
-    }
+    decode_within::<T, VALUE_BYTES_MAX>(bytes)
 }
 
 /// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
@@ -85,13 +72,8 @@ pub fn seal<M: Message>(
     message: &M,
     payload: &[u8],
 ) -> Result<Vec<u8>, CodecError> {
-    if payload.len() > PAYLOAD_BYTES_MAX {
-        return Err(CodecError::TooLarge {
-            have: payload.len(),
-            max: PAYLOAD_BYTES_MAX,
-        });
-    }
-    let header = encode_header(message)?;
+    CodecError::check_size(payload.len(), PAYLOAD_BYTES_MAX)?;
+    let header = encode_within(message, HEADER_BYTES_MAX)?;
     let mut prefix = Prefix {
         magic: Prefix::MAGIC,
         version: PROTOCOL_VERSION,
@@ -135,7 +117,7 @@ pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[
     sum.update(header);
     sum.update(payload);
     prefix.check(sum, M::KIND, spec_hash)?;
-    let message: M = decode_header(header)?;
+    let message: M = decode_within::<_, HEADER_BYTES_MAX>(header)?;
     message.validate(payload)?;
     Ok((message, payload))
 }
@@ -165,7 +147,7 @@ pub fn receive<'a, M: Message>(
     let mut payload = pool.take_own(prefix.payload_len());
     pieces.copy_to(&mut payload, Some(&mut sum));
     prefix.check(sum, M::KIND, spec_hash)?;
-    let message: M = decode_header(&header)?;
+    let message: M = decode_within::<_, HEADER_BYTES_MAX>(&header)?;
     message.validate(&payload)?;
     Ok((message, payload))
 }
@@ -218,14 +200,8 @@ impl Prefix {
                 ours: PROTOCOL_VERSION,
             });
         }
-        for (have, max) in [
-            (this.header_len(), HEADER_BYTES_MAX),
-            (this.payload_len(), PAYLOAD_BYTES_MAX),
-        ] {
-            if have > max {
-                return Err(CodecError::TooLarge { have, max });
-            }
-        }
+        CodecError::check_size(this.header_len(), HEADER_BYTES_MAX)?;
+        CodecError::check_size(this.payload_len(), PAYLOAD_BYTES_MAX)?;
         let need = PREFIX_BYTES + this.header_len() + this.payload_len();
         if len != need {
             return Err(CodecError::Length { have: len, need });
@@ -263,15 +239,5 @@ impl Prefix {
             }),
             _ => Ok(()),
         }
-    }
-}
-
-fn decode_header<H: DeserializeOwned>(bytes: &[u8]) -> Result<H, CodecError> {
-    let config = bincode::config::standard().with_limit::<HEADER_BYTES_MAX>();
-    let (header, used) = bincode::serde::decode_from_slice(bytes, config)
-        .map_err(|e| CodecError::Header(e.to_string()))?;
-    match bytes.len() - used {
-        0 => Ok(header),
-        over => Err(CodecError::Header(format!("{over} bytes after its end"))),
     }
 }

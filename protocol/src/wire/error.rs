@@ -75,3 +75,13 @@ pub enum CodecError {
         max: usize,
     },
 }
+
+impl CodecError {
+    /// Refuses more than `max` bytes.
+    pub(crate) const fn check_size(have: usize, max: usize) -> Result<(), Self> {
+        match have > max {
+            true => Err(Self::TooLarge { have, max }),
+            false => Ok(()),
+        }
+    }
+}
