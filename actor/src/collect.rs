@@ -222,7 +222,7 @@ mod tests {
                 num_actions: 3,
                 n_step: 1,
                 gamma: 0.9,
-                horizon: Horizon::None,
+                horizon: Horizon::None {},
                 timeout: TimeoutRule::Terminal,
             },
             world: WorldConfig::Chain(ChainConfig {

@@ -46,10 +46,7 @@ pub struct RunArgs {
 /// No run to join, settings or weights that do not fit, a world that fails, chunks that cannot be delivered.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let keys = Keys::new(&args.namespace).map_err(anyhow::Error::msg)?;
-    let endpoints = Endpoints {
-        listen: Vec::new(),
-        connect: args.connect,
-    };
+    let endpoints = Endpoints::to(args.connect);
     let Some(session) = session::open_unless(
         shutdown,
         endpoints,
@@ -89,7 +86,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let alive = client
         .declare_alive(who.alive())
         .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
-    let Some(welcome) = join::as_actor(&client, join, shutdown)? else {
+    let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
         return Ok(());
     };
     if welcome.earlier_incarnations > 0 && !settings.world.is_resumable() {

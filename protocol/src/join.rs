@@ -8,7 +8,7 @@ use zenoh::{Session, bytes::ZBytes};
 use crate::{
     client::RunClient,
     messages::{
-        join::{ActorJoin, JoinReply, LearnerJoin},
+        join::{JoinReply, Welcome},
         recovering::Recovering,
         run_info::RunInfo,
     },
@@ -47,17 +47,6 @@ pub enum JoinError {
     /// Another process has the same role and does not end, or the replay server refuses.
     #[error("{0}")]
     Refused(String),
-}
-
-/// What the replay server tells a process that it admits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Welcome {
-    /// Transitions that the run has stored.
-    pub inserted_total: u64,
-    /// Version of the newest weights that the replay server has; 0 before the first.
-    pub weights_version: u64,
-    /// Lives of this actor that were there before this one; 0 for a learner.
-    pub earlier_incarnations: u32,
 }
 
 /// Asks the replay server for the run's settings, waiting for it if it is not there yet, and for as long as it reads its replay back
@@ -154,31 +143,11 @@ impl Patience {
     }
 }
 
-/// Takes part as an actor; `None` if told to stop before.
+/// Takes part as an actor or as the run's learner; `None` if told to stop before.
 ///
 /// # Errors
-/// Another process is this actor and stays; the replay server refuses, or does not answer for a minute.
-pub fn as_actor(
-    client: &RunClient,
-    join: ActorJoin,
-    shutdown: &Shutdown,
-) -> Result<Option<Welcome>, JoinError> {
-    take_part(client, &join, shutdown)
-}
-
-/// Takes part as the run's learner; `None` if told to stop before.
-///
-/// # Errors
-/// Another learner takes part and stays; the replay server refuses, or does not answer for a minute.
-pub fn as_learner(
-    client: &RunClient,
-    join: LearnerJoin,
-    shutdown: &Shutdown,
-) -> Result<Option<Welcome>, JoinError> {
-    take_part(client, &join, shutdown)
-}
-
-fn take_part(
+/// Another process has this role and stays; the replay server refuses, or does not answer for a minute.
+pub fn take_part(
     client: &RunClient,
     join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
@@ -187,17 +156,7 @@ fn take_part(
     let mut taken_since = None;
     loop {
         match client.ask(join, TRY_MAX) {
-            Ok(JoinReply::Welcome {
-                inserted_total,
-                weights_version,
-                earlier_incarnations,
-            }) => {
-                return Ok(Some(Welcome {
-                    inserted_total,
-                    weights_version,
-                    earlier_incarnations,
-                }));
-            }
+            Ok(JoinReply::Welcome(welcome)) => return Ok(Some(welcome)),
             Ok(JoinReply::Refused { why }) => {
                 let why = format!("the replay server refuses: {why}");
                 return Err(JoinError::Refused(why));

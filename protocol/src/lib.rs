@@ -50,7 +50,7 @@ pub use messages::{
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
     episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
     insert_reply::{ChunkPoll, InsertReply},
-    join::{ActorJoin, JoinReply, LearnerJoin},
+    join::{ActorJoin, JoinReply, LearnerJoin, Welcome},
     leave::Leave,
     priorities::{Origin, PriorityPart, PriorityUpdate},
     processes::{LogStatus, ProcessName, ProcessStatus, ProcessesStatus, WARNINGS_MAX},

@@ -22,8 +22,8 @@ pub const FRAME_STACK_MAX: u32 = 16;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Horizon {
-    /// No positive is served: the agent looks at no later state.
-    None,
+    /// No positive is served: the agent looks at no later state. Serde lets a variant without a list of fields have any.
+    None {},
     /// k, or the steps left in the episode if fewer.
     Fixed {
         /// Environment steps ahead, at least 1.
@@ -50,7 +50,7 @@ impl Horizon {
     /// Positives a row carries: frames s_{t+k} served beside s_t.
     pub const fn positives(&self) -> usize {
         match self {
-            Self::None => 0,
+            Self::None {} => 0,
             Self::Fixed { .. } | Self::Uniform { .. } | Self::Nhg { .. } => 1,
             Self::All { k_max } => *k_max as usize,
         }
@@ -59,7 +59,7 @@ impl Horizon {
     /// The largest k that can be served, environment steps; 0 where none is.
     pub const fn k_max(&self) -> u32 {
         match *self {
-            Self::None => 0,
+            Self::None {} => 0,
             Self::Fixed { k } => k,
             Self::Uniform { k_max } | Self::Nhg { k_max } | Self::All { k_max } => k_max,
         }
@@ -158,7 +158,7 @@ impl RunSpec {
         let why = "a discount lies between 0 and 1";
         check(fits, "run.gamma", self.gamma, || why)?;
         let (horizon, k_max) = (self.horizon, self.horizon.k_max());
-        let fits = horizon == Horizon::None || (1..=1000).contains(&k_max);
+        let fits = horizon == Horizon::None {} || (1..=1000).contains(&k_max);
         check(fits, "run.horizon", k_max, || "k lies between 1 and 1000")?;
         let fits = horizon.positives() <= POSITIVES_MAX;
         let why = "a row carries at most 32 positives";

@@ -6,12 +6,11 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check};
 
 /// By which rule the replay draws the rows of a batch: `replay.sampling`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "rule", rename_all = "kebab-case", from = "Read")]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Sampling {
-    /// Each transition that can be an anchor is equally likely.
-    #[default]
-    Uniform,
+    /// Each transition that can be an anchor is equally likely. Serde lets a variant without a list of fields have any.
+    Uniform {},
     /// By priority, the proportional rule of Schaul et al. 2016: P(i) = p_i^alpha / sum_j p_j^alpha, where p_i is the C51 loss of
     /// transition i when it was learned from last. A row's loss is weighted by (N P(i))^-beta, over the batch's largest.
     Prioritised {
@@ -26,35 +25,9 @@ pub enum Sampling {
     },
 }
 
-/// [`Sampling`] as it is read: serde would let a variant without fields have any.
-#[derive(Deserialize)]
-#[serde(tag = "rule", rename_all = "kebab-case", deny_unknown_fields)]
-enum Read {
-    Uniform {},
-    Prioritised {
-        alpha: f64,
-        beta_start: f64,
-        beta_end: f64,
-        beta_updates: u64,
-    },
-}
-
-impl From<Read> for Sampling {
-    fn from(read: Read) -> Self {
-        match read {
-            Read::Uniform {} => Self::Uniform,
-            Read::Prioritised {
-                alpha,
-                beta_start,
-                beta_end,
-                beta_updates,
-            } => Self::Prioritised {
-                alpha,
-                beta_start,
-                beta_end,
-                beta_updates,
-            },
-        }
+impl Default for Sampling {
+    fn default() -> Self {
+        Self::Uniform {}
     }
 }
 
@@ -67,7 +40,7 @@ impl Sampling {
     /// beta at the update that follows `updates`.
     pub fn beta(&self, updates: u64) -> f64 {
         match *self {
-            Self::Uniform => 0.0,
+            Self::Uniform {} => 0.0,
             Self::Prioritised {
                 beta_start,
                 beta_end,
@@ -135,13 +108,13 @@ mod tests {
         near(300, 0.7);
         near(600, 1.0);
         near(u64::MAX, 1.0);
-        assert_eq!(Sampling::Uniform.beta(7), 0.0);
+        assert_eq!(Sampling::Uniform {}.beta(7), 0.0);
     }
 
     #[test]
     fn numbers_out_of_range_are_named() {
         assert_eq!(rainbow(|_| ()).validate(), Ok(()));
-        assert_eq!(Sampling::Uniform.validate(), Ok(()));
+        assert_eq!(Sampling::Uniform {}.validate(), Ok(()));
         for (at, value, key) in [
             (0, -0.1, "alpha"),
             (0, f64::NAN, "alpha"),

@@ -56,7 +56,7 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         shards: 1,
         compression,
         compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
+        sampling: Sampling::Uniform {},
         disk_bytes_max: None,
         fsync_ms: None,
         since: None,

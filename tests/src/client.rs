@@ -38,14 +38,7 @@ const NOTHING: ShardCounts = ShardCounts {
 
 /// A session with the process that listens at an endpoint, in one try.
 pub fn connect(endpoint: &str) -> Session {
-    session::open(&to(endpoint)).unwrap()
-}
-
-fn to(endpoint: &str) -> Endpoints {
-    Endpoints {
-        listen: Vec::new(),
-        connect: vec![endpoint.to_owned()],
-    }
+    session::open(&Endpoints::to(vec![endpoint.to_owned()])).unwrap()
 }
 
 /// A session that listens at an endpoint, in the place of a replay server.
@@ -103,7 +96,7 @@ impl Client {
         let deadline = Instant::now() + DEADLINE;
         // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
         loop {
-            match session::open(&to(endpoint)) {
+            match session::open(&Endpoints::to(vec![endpoint.to_owned()])) {
                 Ok(session) => return Self::over(session),
                 Err(e) => assert!(Instant::now() < deadline, "{e}"),
             }
@@ -186,7 +179,7 @@ impl Client {
     pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
         let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
-        join::as_actor(&self.run(), join, &never).unwrap();
+        join::take_part(&self.run(), &join, &never).unwrap();
     }
 
     /// Takes part as the learner, which has learned nothing yet.
@@ -195,7 +188,7 @@ impl Client {
     /// If the replay server does not take it.
     pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
-        join::as_learner(&self.run(), new_learner(learner), &never).unwrap();
+        join::take_part(&self.run(), &new_learner(learner), &never).unwrap();
     }
 
     /// Sends a chunk as an actor would.

@@ -35,7 +35,7 @@ const SAMPLED: u64 = 64;
 const ROWS: u32 = 64;
 
 fn spec() -> RunSpec {
-    tiny_replay::spec("c51", Horizon::None)
+    tiny_replay::spec("c51", Horizon::None {})
 }
 
 /// What the network does to messages about chunks.

@@ -32,7 +32,7 @@ pub(crate) fn config(transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
+        sampling: Sampling::Uniform {},
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 1.0,

@@ -64,10 +64,7 @@ impl TlsSystem {
     /// A client with the certificate of `role`, as this program opens its sessions.
     pub(crate) fn client(&self, role: Role) -> Client {
         let credentials = Credentials::read(self.good.folder(), role).unwrap();
-        let endpoints = Endpoints {
-            listen: Vec::new(),
-            connect: vec![self.endpoint.clone()],
-        };
+        let endpoints = Endpoints::to(vec![self.endpoint.clone()]);
         let keys = Keys::new("driml").unwrap();
         let session = session::open_as(
             &endpoints,

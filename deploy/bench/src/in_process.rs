@@ -74,7 +74,7 @@ pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measure
         config.replay.sampling = sampling;
         Filled::new(&config, held, &blank)
     };
-    let mut uniform = filled(Sampling::Uniform)?;
+    let mut uniform = filled(Sampling::Uniform {})?;
     let mut prioritised = filled(PRIORITISED)?;
     let mut learned_from = filled(PRIORITISED)?;
     let rows = uniform.rows;

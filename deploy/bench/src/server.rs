@@ -16,7 +16,7 @@ use driml_learner::{
 };
 use driml_protocol::{
     ActorJoin, Alive, Keys, LearnerJoin, RunClient, ShardCounts, Shutdown, join,
-    session::{self, MESSAGE_BYTES_MAX},
+    session::{self, Endpoints, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
@@ -25,7 +25,7 @@ use crate::{
     effort::Effort,
     recording::{ChunkShape, INCARNATION, Recording},
     settings,
-    subprocess::{connect, reach, start},
+    subprocess::{reach, start},
 };
 
 /// The number of a bench's learner.
@@ -80,7 +80,10 @@ impl Server {
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let credentials = wire.credentials(Role::Observer)?;
         let session = reach(&mut process, || {
-            let (endpoints, credentials) = (connect(&wire.endpoint), credentials.as_ref());
+            let (endpoints, credentials) = (
+                Endpoints::to(vec![wire.endpoint.clone()]),
+                credentials.as_ref(),
+            );
             session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)
         })?;
         let run_info = join::run_info(&session, &keys, &Shutdown::default())?
@@ -170,7 +173,7 @@ impl Server {
         let session = match self.wire.credentials(role)? {
             None => self.sessions[0].clone(),
             own => {
-                let endpoints = connect(&self.wire.endpoint);
+                let endpoints = Endpoints::to(vec![self.wire.endpoint.clone()]);
                 let session =
                     session::open_as(&endpoints, &self.keys, own.as_ref(), MESSAGE_BYTES_MAX)?;
                 self.sessions.push(session.clone());
@@ -211,7 +214,7 @@ fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessTok
         actor,
         incarnation: INCARNATION,
     };
-    join::as_actor(client, join, &Shutdown::default())?
+    join::take_part(client, &join, &Shutdown::default())?
         .context("this client was not told to stop")?;
     Ok(alive)
 }
@@ -227,7 +230,7 @@ fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
         other_shards: ShardCounts::default(),
         restart: false,
     };
-    join::as_learner(client, join, &Shutdown::default())?
+    join::take_part(client, &join, &Shutdown::default())?
         .context("this client was not told to stop")?;
     Ok(alive)
 }

@@ -12,7 +12,7 @@ use driml_launch::{
     managed_process::{ManagedProcess, Surroundings, THREADS},
 };
 use driml_machine::process_env;
-use driml_protocol::session::{Endpoints, SessionError};
+use driml_protocol::session::SessionError;
 use zenoh::Session;
 
 use crate::settings;
@@ -49,14 +49,6 @@ pub(super) fn start(
     };
     let args: Vec<_> = args.into_iter().map(String::from).collect();
     ManagedProcess::start(name, &args, 1, surroundings)
-}
-
-/// Where a client connects that does not listen.
-pub(super) fn connect(endpoint: &str) -> Endpoints {
-    Endpoints {
-        listen: Vec::new(),
-        connect: vec![endpoint.to_owned()],
-    }
 }
 
 /// A session to a process as soon as it listens.

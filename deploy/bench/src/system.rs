@@ -15,14 +15,17 @@ use driml_launch::{
     view::{Poller, Reached},
 };
 use driml_machine::units::number;
-use driml_protocol::{Keys, LearnerStatus, ReplayStatus, RunClient, session};
+use driml_protocol::{
+    Keys, LearnerStatus, ReplayStatus, RunClient,
+    session::{self, Endpoints},
+};
 use tempfile::TempDir;
 
 use crate::{
     flags::BenchFlags,
     report::Measurement,
     settings::{self, AGENT, WORLD},
-    subprocess::{connect, reach, start},
+    subprocess::{reach, start},
 };
 
 /// Frames of the run, and of a quick one.
@@ -215,7 +218,7 @@ impl Run {
         ];
         let args = [&listen[..], flags].concat();
         let mut launcher = start("launcher", &args, sets, folder.path())?;
-        let endpoints = connect(&endpoint);
+        let endpoints = Endpoints::to(vec![endpoint.clone()]);
         let session = reach(&mut launcher, || session::open(&endpoints))?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let reached = Reached {

@@ -111,10 +111,7 @@ pub(crate) fn connect(
     interrupts: &Interrupts,
     mut check_alive: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<Option<zenoh::Session>> {
-    let endpoints = Endpoints {
-        listen: Vec::new(),
-        connect: vec![endpoint.to_owned()],
-    };
+    let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
     let deadline = Instant::now() + LISTEN_MAX;
     let (tell, told) = sync_channel(0);
     // Opening may take seconds, in which the replay server may end: so it runs on another thread.

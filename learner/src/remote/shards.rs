@@ -46,10 +46,7 @@ impl Shards {
         let mut sessions = Vec::new();
         let mut run_infos = Vec::new();
         for endpoint in connect {
-            let endpoints = Endpoints {
-                listen: Vec::new(),
-                connect: vec![endpoint.clone()],
-            };
+            let endpoints = Endpoints::to(vec![endpoint.clone()]);
             let max = session::MESSAGE_BYTES_MAX;
             let opened = session::open_unless(shutdown, endpoints, keys, credentials, max)?;
             let Some(session) = opened else {
@@ -101,7 +98,7 @@ impl Shards {
                 other_shards: progress.other_shards(shard),
                 restart,
             };
-            let joined = join::as_learner(client, join, shutdown)?;
+            let joined = join::take_part(client, &join, shutdown)?;
             let Some(welcome) = joined else {
                 return Ok(None);
             };

@@ -31,7 +31,7 @@ pub(crate) fn config(
     let horizon = match auxiliary_loss.name() {
         "cpc" => Horizon::All { k_max: 3 },
         "dim" => Horizon::Fixed { k: 1 },
-        _ => Horizon::None,
+        _ => Horizon::None {},
     };
     LearnerConfig {
         spec: RunSpec {
@@ -74,7 +74,7 @@ pub(crate) fn config(
                 exact: None,
             },
         },
-        sampling: Sampling::Uniform,
+        sampling: Sampling::Uniform {},
         transport: TransportConfig {
             shared_memory: false,
         },

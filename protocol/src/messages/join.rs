@@ -35,14 +35,7 @@ pub struct LearnerJoin {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum JoinReply {
     /// It takes part.
-    Welcome {
-        /// Transitions that the run has stored.
-        inserted_total: u64,
-        /// Version of the newest weights that the replay server has; 0 before the first.
-        weights_version: u64,
-        /// Lives of this actor that were there before this one; 0 for a learner.
-        earlier_incarnations: u32,
-    },
+    Welcome(Welcome),
     /// Another process has this role and is connected: ask again, it may be about to end.
     Taken {
         /// Who, for a person.
@@ -53,4 +46,15 @@ pub enum JoinReply {
         /// The replay server's reason, a sentence.
         why: String,
     },
+}
+
+/// What the replay server tells a process that it admits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Welcome {
+    /// Transitions that the run has stored.
+    pub inserted_total: u64,
+    /// Version of the newest weights that the replay server has; 0 before the first.
+    pub weights_version: u64,
+    /// Lives of this actor that were there before this one; 0 for a learner.
+    pub earlier_incarnations: u32,
 }

@@ -6,7 +6,6 @@ mod questions;
 
 use std::{sync::Arc, time::Duration};
 
-use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
 
 pub use self::{
@@ -23,8 +22,7 @@ use crate::{
 };
 
 /// How a process reaches the others.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoints {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447` or `unixsock-stream//tmp/driml.sock`.
     pub listen: Vec<String>,
@@ -106,6 +104,12 @@ pub fn open_unless(
 }
 
 impl Endpoints {
+    /// Only to connect.
+    pub fn to(connect: Vec<String>) -> Self {
+        let listen = Vec::new();
+        Self { listen, connect }
+    }
+
     fn not_opened(&self, why: &str) -> SessionError {
         let Self { listen, connect } = self;
         SessionError::Failed(format!(

@@ -35,7 +35,7 @@ fn the_hash_knows_every_field() {
         |it| it.horizon = Horizon::Uniform { k_max: 5 },
         |it| it.horizon = Horizon::Fixed { k: 5 },
         |it| it.horizon = Horizon::All { k_max: 5 },
-        |it| it.horizon = Horizon::None,
+        |it| it.horizon = Horizon::None {},
         |it| it.timeout = TimeoutRule::Bootstrap,
     ];
     let mut hashes: Vec<u64> = changes

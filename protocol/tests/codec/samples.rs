@@ -10,7 +10,7 @@ use driml_protocol::{
     NO_ACTION, Origin, Participant, Played, PriorityPart, PriorityUpdate, ProcessName,
     ProcessStatus, ProcessesStatus, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
     Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Waiting, Warning, WeightsHeader,
-    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion,
+    WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, Welcome,
     codec::{self},
 };
 
@@ -331,11 +331,11 @@ pub(crate) fn samples() -> Vec<Sample> {
     };
     let mut samples: Vec<Sample> = replies.iter().map(Sample::of).collect();
     let joined = [
-        JoinReply::Welcome {
+        JoinReply::Welcome(Welcome {
             inserted_total: 3,
             weights_version: 4,
             earlier_incarnations: 5,
-        },
+        }),
         JoinReply::Taken { why: "a".into() },
         JoinReply::Refused { why: "b".into() },
     ];

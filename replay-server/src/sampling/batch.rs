@@ -29,7 +29,7 @@ impl BatchSampler {
     pub(crate) fn new(spec: &RunSpec, sampling: &Sampling, capacity: u64) -> Result<Self, u64> {
         let episodes = Episodes::new(spec);
         let rows: Box<dyn RowSampler> = match *sampling {
-            Sampling::Uniform => Box::new(Uniform::new(episodes)),
+            Sampling::Uniform {} => Box::new(Uniform::new(episodes)),
             Sampling::Prioritised { alpha, .. } => {
                 Box::new(Priorities::new(alpha, capacity, episodes)?)
             }

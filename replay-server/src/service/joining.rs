@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, Responder, RunInfo,
+    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, Responder, RunInfo, Welcome,
 };
 use zenoh::sample::SampleKind;
 
@@ -65,10 +65,12 @@ impl Service {
             return;
         }
         let inserted_total = state.replay.inserted_total();
-        let reply = joined.map(|earlier_incarnations| JoinReply::Welcome {
-            inserted_total,
-            weights_version,
-            earlier_incarnations,
+        let reply = joined.map(|earlier_incarnations| {
+            JoinReply::Welcome(Welcome {
+                inserted_total,
+                weights_version,
+                earlier_incarnations,
+            })
         });
         if let Err(JoinReply::Refused { why }) = &reply {
             state.refuse("join", &format!("a process was not admitted: {why}"));

@@ -128,7 +128,7 @@ fn check_frames(batch: &Batch, spec: &RunSpec) {
 
 fn horizons() -> impl Strategy<Value = Horizon> {
     prop_oneof![
-        Just(Horizon::None),
+        Just(Horizon::None {}),
         (1u32..7).prop_map(|k| Horizon::Fixed { k }),
         (1u32..7).prop_map(|k_max| Horizon::Uniform { k_max }),
         (1u32..7).prop_map(|k_max| Horizon::Nhg { k_max }),

@@ -9,7 +9,7 @@ use driml_replay_server::{Config, Replay};
 use crate::history::spec;
 
 pub(crate) fn small_spec() -> RunSpec {
-    spec(3, 1, 1, Horizon::None)
+    spec(3, 1, 1, Horizon::None {})
 }
 
 /// The first shard of a replay of `small_spec`, for batches of 8 rows.

@@ -65,7 +65,7 @@ fn every_rule_stays_within_k_max_and_the_episode() {
             assert!((1..=expected).contains(&drawn));
         }
     }
-    assert_eq!(draw(Horizon::None, 3), None);
+    assert_eq!(draw(Horizon::None {}, 3), None);
 }
 
 #[test]

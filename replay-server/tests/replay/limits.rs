@@ -164,7 +164,7 @@ fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
         transitions_max: Some(60),
         ..unlimited(10_000)
     };
-    let mut replay = Replay::new(&spec(3, 1, 4, Horizon::None), &config, 64).unwrap();
+    let mut replay = Replay::new(&spec(3, 1, 4, Horizon::None {}), &config, 64).unwrap();
     let chunk = |sequence| ChunkHeader {
         streams: 20,
         steps: 1,

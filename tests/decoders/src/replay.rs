@@ -96,7 +96,7 @@ pub(crate) fn replay(bytes: &[u8]) {
     };
     let shards = 1 + u32::from(byte % 2);
     let sampling = match byte / 2 % 2 {
-        0 => Sampling::Uniform,
+        0 => Sampling::Uniform {},
         _ => PRIORITISED,
     };
     let mut replay = Replay::new(&spec(2), &config(shards, sampling), 4).unwrap();

@@ -58,7 +58,7 @@ fn config() -> Config {
         warmup_transitions: 0,
         slack_transitions: 1 << 40,
         transitions_max: None,
-        ..replay::config(1, Sampling::Uniform)
+        ..replay::config(1, Sampling::Uniform {})
     }
 }
 

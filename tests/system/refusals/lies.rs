@@ -233,7 +233,10 @@ fn of_4096_strangers() {
         .map(|mark| client.run().declare_alive(Alive::Learner { mark }).unwrap())
         .collect();
     let joins = (0..2 * 4096).map(|number| actor_join(STRANGER + number, LIFE));
-    send(client, joins.map(|it| Row::of(client, &it, "Welcome {")));
+    send(
+        client,
+        joins.map(|it| Row::of(client, &it, "Welcome(Welcome {")),
+    );
     drop(tokens);
     assert_eq!(lied.status().actors, 1);
     let mut actor = lied.system.start_actor(7);

@@ -156,7 +156,7 @@ impl<'a> Counted<'a> {
         let run = &self.run;
         let (batch, all_states) = (size(header(run)), states(run));
         let first_states = states(&RunSpec {
-            horizon: Horizon::None,
+            horizon: Horizon::None {},
             ..run.clone()
         });
         let transition = (run.frame_bytes() + TRANSITION_BYTES) as u64;

@@ -62,10 +62,7 @@ impl Poller {
         let mut servers = Vec::new();
         let mut first: Option<Greeting> = None;
         for endpoint in endpoints {
-            let reached = Endpoints {
-                listen: Vec::new(),
-                connect: vec![endpoint.clone()],
-            };
+            let reached = Endpoints::to(vec![endpoint.clone()]);
             // An observer does not wait for a server that is still to come.
             reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;

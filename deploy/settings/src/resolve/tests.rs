@@ -284,11 +284,29 @@ fn a_compressed_replay_says_what_its_frames_may_take() {
 fn by_which_rule_rows_are_drawn_is_for_replay_and_learner_alone() {
     let all = "replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
     let [uniform, prioritised] = [&[][..], &[all]].map(|it| with("chain", "c51", it).unwrap());
-    assert_eq!(uniform.replay.sampling, Sampling::Uniform);
+    assert_eq!(uniform.replay.sampling, Sampling::Uniform {});
     assert!(prioritised.replay.sampling.is_prioritised());
     let learner = driml_learner::LearnerConfig::from_toml(&prioritised.to_toml()).unwrap();
     assert_eq!(learner.sampling, prioritised.replay.sampling);
     assert_eq!(prioritised.run, uniform.run);
+}
+
+#[test]
+fn a_rule_takes_its_own_settings_alone() {
+    for (set, unknown) in [
+        ("run.horizon={rule=\"none\",k=3}", "unknown field `k`"),
+        (
+            "run.horizon={rule=\"fixed\",k=3,k_max=3}",
+            "unknown field `k_max`",
+        ),
+        (
+            "replay.sampling={rule=\"uniform\",alpha=0.5}",
+            "unknown field `alpha`",
+        ),
+    ] {
+        let said = with("chain", "c51", &[set]).unwrap_err().to_string();
+        assert!(said.contains(unknown), "{set}: {said}");
+    }
 }
 
 #[test]

@@ -23,7 +23,7 @@ pub fn draw_k(
     let steps_left = actions.len() as u32;
     assert!(steps_left > 0, "an anchor with a positive has a successor");
     match horizon {
-        Horizon::None => None,
+        Horizon::None {} => None,
         // DRIML-fix, and CPC, which has a positive for each k up to the furthest.
         Horizon::Fixed { k } | Horizon::All { k_max: k } => Some(k.min(steps_left)),
         // DRIML-randk.

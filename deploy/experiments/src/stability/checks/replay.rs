@@ -48,7 +48,7 @@ pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
         num_actions: 2,
         n_step,
         gamma,
-        horizon: Horizon::None,
+        horizon: Horizon::None {},
         timeout,
     }
 }
@@ -60,7 +60,7 @@ pub(super) const fn config(capacity_transitions: u64) -> Config {
         shards: 1,
         compression: Compression::None,
         compressed_bytes_max: None,
-        sampling: Sampling::Uniform,
+        sampling: Sampling::Uniform {},
         disk_bytes_max: None,
         fsync_ms: None,
         replay_ratio: 8.0,
