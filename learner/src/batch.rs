@@ -38,6 +38,43 @@ pub struct Batch<'a> {
     pub importance_weight: Option<&'a [f32]>,
 }
 
+/// The planes of a [`Batch`] in memory of their own, named as there.
+#[derive(Clone, Debug, Default)]
+#[allow(missing_docs, reason = "Batch has them")]
+pub struct OwnedBatch {
+    pub states_t: Vec<u8>,
+    pub anchors: Option<Vec<u8>>,
+    pub states_k: Vec<u8>,
+    pub states_n: Vec<u8>,
+    pub action: Vec<u8>,
+    pub next_action: Vec<u8>,
+    pub n_step_return: Vec<f32>,
+    pub bootstrap_discount: Vec<f32>,
+    pub positive_valid: Vec<u8>,
+    pub importance_weight: Option<Vec<f32>>,
+}
+
+impl OwnedBatch {
+    /// The batch; it has as many rows as actions.
+    pub fn batch(&self) -> Batch<'_> {
+        let rows = self.action.len();
+        Batch {
+            rows,
+            states_t: &self.states_t,
+            anchors: self.anchors.as_deref(),
+            positives: self.positive_valid.len().checked_div(rows).unwrap_or(0),
+            states_k: &self.states_k,
+            states_n: &self.states_n,
+            action: &self.action,
+            next_action: &self.next_action,
+            n_step_return: &self.n_step_return,
+            bootstrap_discount: &self.bootstrap_discount,
+            positive_valid: &self.positive_valid,
+            importance_weight: self.importance_weight.as_deref(),
+        }
+    }
+}
+
 impl<'a> Batch<'a> {
     /// Checks lengths against `model`, positives against what the auxiliary loss `wants`, actions, returns and discounts.
     pub fn validate(&self, model: &ModelConfig, wants: Positives) -> Result<(), UpdateError> {

@@ -79,7 +79,7 @@ pub use affinity::{
 pub use agent::{Agent, NetworkParameters};
 pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
-pub use batch::Batch;
+pub use batch::{Batch, OwnedBatch};
 pub use config::{
     AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
     LearnerConfigError,

@@ -2,7 +2,7 @@
 //! Nothing but the update is timed; batches of sizes are made up.
 
 use driml_learner::{
-    Agent, Batch, Compute, DeviceName, Kernels, Precision,
+    Agent, Compute, DeviceName, Kernels, OwnedBatch, Precision,
     cost::{UpdateCost, UpdateShape},
 };
 use driml_settings::config::RunConfig;
@@ -159,8 +159,8 @@ pub(super) fn counted_updates(
 /// Updates of an agent of these settings on a batch that no world gave, of whose states this share repeats another one.
 fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Result<Work<'static>> {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut rows = SyntheticBatch::draw(config, &mut rng);
-    rows.repeat(repeated);
+    let mut rows = synthetic(config, &mut rng);
+    repeat(&mut rows, repeated);
     let (model, update) = (config.model.clone(), config.learner.update.clone());
     let agent = Agent::new(model, update, compute, &mut rng)?;
     let mut agent = agent.with_deduplication(config.learner.deduplicate_states);
@@ -170,73 +170,49 @@ fn updates(config: &RunConfig, compute: &Compute, repeated: f64) -> anyhow::Resu
     }))
 }
 
-/// A batch that no world gave: random bytes, actions and returns.
-struct SyntheticBatch {
-    /// s_t, s_{t+k} and s_{t+n}.
-    frames: [Vec<u8>; 3],
-    action: Vec<u8>,
-    next_action: Vec<u8>,
-    n_step_return: Vec<f32>,
-    bootstrap_discount: Vec<f32>,
-    positive_valid: Vec<u8>,
+/// A batch that no world gave: as many rows, random bytes and actions as `config` has, and random returns.
+fn synthetic(config: &RunConfig, rng: &mut ChaCha8Rng) -> OwnedBatch {
+    let rows = config.learner.batch_size as usize;
+    let mut states = || {
+        let mut states = vec![0; rows * config.model.frame_len()];
+        rng.fill_bytes(&mut states);
+        states
+    };
+    let [states_t, states_k, states_n] = [states(), states(), states()];
+    let mut actions = || {
+        let draw = |_| rng.random_range(0..config.model.num_actions) as u8;
+        (0..rows).map(draw).collect()
+    };
+    let (action, next_action) = (actions(), actions());
+    let gamma_n = config.run.gamma.powi(config.run.n_step as i32) as f32;
+    OwnedBatch {
+        states_t,
+        states_k,
+        states_n,
+        action,
+        next_action,
+        n_step_return: (0..rows).map(|_| rng.random_range(-2.0..2.0)).collect(),
+        bootstrap_discount: vec![gamma_n; rows],
+        positive_valid: vec![1; rows],
+        ..OwnedBatch::default()
+    }
 }
 
-impl SyntheticBatch {
-    /// As many rows, bytes and actions as `config` has.
-    fn draw(config: &RunConfig, rng: &mut ChaCha8Rng) -> Self {
-        let rows = config.learner.batch_size as usize;
-        let frames = std::array::from_fn(|_| {
-            let mut frames = vec![0; rows * config.model.frame_len()];
-            rng.fill_bytes(&mut frames);
-            frames
-        });
-        let mut actions = || {
-            let draw = |_| rng.random_range(0..config.model.num_actions) as u8;
-            (0..rows).map(draw).collect::<Vec<_>>()
-        };
-        let (action, next_action) = (actions(), actions());
-        let gamma_n = config.run.gamma.powi(config.run.n_step as i32) as f32;
-        Self {
-            frames,
-            action,
-            next_action,
-            n_step_return: (0..rows).map(|_| rng.random_range(-2.0..2.0)).collect(),
-            bootstrap_discount: vec![gamma_n; rows],
-            positive_valid: vec![1; rows],
-        }
-    }
-
-    /// Makes this share of s_t and s_{t+k} together, and of s_{t+n}, copies of states before them, spread evenly.
-    fn repeat(&mut self, share: f64) {
-        let len = self.frames[0].len() / self.action.len();
-        for plane in &mut self.frames {
-            let mut owed = 0.0;
-            for row in 1..plane.len() / len {
-                owed += share;
-                if owed >= 1.0 {
-                    owed -= 1.0;
-                    plane.copy_within((row - 1) * len..row * len, row * len);
-                }
+/// Makes this share of s_t and s_{t+k} together, and of s_{t+n}, copies of states before them, spread evenly.
+fn repeat(batch: &mut OwnedBatch, share: f64) {
+    let len = batch.states_t.len() / batch.action.len();
+    for plane in [
+        &mut batch.states_t,
+        &mut batch.states_k,
+        &mut batch.states_n,
+    ] {
+        let mut owed = 0.0;
+        for row in 1..plane.len() / len {
+            owed += share;
+            if owed >= 1.0 {
+                owed -= 1.0;
+                plane.copy_within((row - 1) * len..row * len, row * len);
             }
-        }
-    }
-
-    /// The rows as a learner takes them.
-    fn batch(&self) -> Batch<'_> {
-        let [states_t, states_k, states_n] = &self.frames;
-        Batch {
-            rows: self.action.len(),
-            states_t,
-            anchors: None,
-            positives: 1,
-            states_k,
-            states_n,
-            action: &self.action,
-            next_action: &self.next_action,
-            n_step_return: &self.n_step_return,
-            bootstrap_discount: &self.bootstrap_discount,
-            positive_valid: &self.positive_valid,
-            importance_weight: None,
         }
     }
 }

@@ -16,7 +16,7 @@ use serde::Deserialize;
 
 use crate::{
     auxiliary::{AuxiliaryKind, dim::DIM, positives::Positives, settings::Lambda},
-    batch::Batch,
+    batch::{Batch, OwnedBatch},
     error::UpdateError,
     noise::UpdateNoise,
     optimiser::adam::AdamSettings,
@@ -110,24 +110,11 @@ struct Sizes {
     action_embed: usize,
 }
 
-struct Inputs {
-    states_t: Vec<u8>,
-    anchors: Option<Vec<u8>>,
-    states_k: Vec<u8>,
-    states_n: Vec<u8>,
-    action: Vec<u8>,
-    next_action: Vec<u8>,
-    n_step_return: Vec<f32>,
-    bootstrap_discount: Vec<f32>,
-    positive_valid: Vec<u8>,
-    importance_weight: Option<Vec<f32>>,
-}
-
 /// One case: a batch, all parameters before the update, and every tensor that must come out.
 pub(super) struct Case {
     config: Config,
     pub(super) settings: LearnerSettings,
-    inputs: Inputs,
+    inputs: OwnedBatch,
     tensors: Tensors,
     /// Expectations that were asked for.
     used: RefCell<BTreeSet<String>>,
@@ -151,7 +138,7 @@ impl Case {
         );
         let settings = config.settings();
         Ok(Self {
-            inputs: Inputs::read(&tensors, &config.obs, &settings)?,
+            inputs: inputs(&tensors, &config.obs, &settings)?,
             used: RefCell::default(),
             config,
             settings,
@@ -199,25 +186,7 @@ impl Case {
     }
 
     pub(super) fn batch(&self) -> Batch<'_> {
-        let it = &self.inputs;
-        Batch {
-            rows: it.action.len(),
-            states_t: &it.states_t,
-            anchors: it.anchors.as_deref(),
-            positives: it
-                .positive_valid
-                .len()
-                .checked_div(it.action.len())
-                .unwrap_or(0),
-            states_k: &it.states_k,
-            states_n: &it.states_n,
-            action: &it.action,
-            next_action: &it.next_action,
-            n_step_return: &it.n_step_return,
-            bootstrap_discount: &it.bootstrap_discount,
-            positive_valid: &it.positive_valid,
-            importance_weight: it.importance_weight.as_deref(),
-        }
+        self.inputs.batch()
     }
 
     fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a Tensor)> {
@@ -301,50 +270,49 @@ impl Config {
     }
 }
 
-impl Inputs {
-    fn read(
-        tensors: &Tensors,
-        obs: &Observation,
-        settings: &LearnerSettings,
-    ) -> Result<Self, ParityError> {
-        let rows = tensors.get("input.action")?.elem_count();
-        let state = [rows, obs.height, obs.width, obs.channels];
-        let bytes = |name: &str, shape: &[usize]| tensors.read::<u8>(name, DType::U8, shape);
-        let floats = |name: &str| tensors.read::<f32>(name, DType::F32, &[rows]);
-        let mut anchors = None;
-        let (states_k, positive_valid) =
-            if settings.auxiliary_loss.positives() == Positives::OtherView {
-                anchors = Some(bytes("input.view_query", &state)?);
-                (bytes("input.view_key", &state)?, vec![1; rows])
-            } else {
-                // [B] where a row has one positive, else [P, B].
-                let dims = tensors.get("input.positive_valid")?.dims();
-                let several = if dims.len() > 1 { &dims[..1] } else { &[] };
-                let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
-                let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
-                (states_k, valid)
-            };
-        let actions = tensors.read::<i64>("input.action", DType::I64, &[rows])?;
-        let narrow = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
-        let action: Option<Vec<u8>> = actions.iter().map(narrow).collect();
-        let weight = "input.importance_weight";
-        let is_weighted = tensors.0.contains_key(weight);
-        Ok(Self {
-            states_t: bytes("input.frames_t", &state)?,
-            anchors,
-            states_k,
-            states_n: bytes("input.frames_n", &state)?,
-            action: action.ok_or_else(|| {
-                let why = format!("its actions {actions:?} are not all in 0..255");
-                ParityError::tensor("input.action", why)
-            })?,
-            next_action: vec![NO_ACTION; rows],
-            n_step_return: floats("input.n_step_return")?,
-            bootstrap_discount: floats("input.bootstrap_discount")?,
-            positive_valid,
-            importance_weight: is_weighted.then(|| floats(weight)).transpose()?,
-        })
-    }
+/// The batch of a case.
+fn inputs(
+    tensors: &Tensors,
+    obs: &Observation,
+    settings: &LearnerSettings,
+) -> Result<OwnedBatch, ParityError> {
+    let rows = tensors.get("input.action")?.elem_count();
+    let state = [rows, obs.height, obs.width, obs.channels];
+    let bytes = |name: &str, shape: &[usize]| tensors.read::<u8>(name, DType::U8, shape);
+    let floats = |name: &str| tensors.read::<f32>(name, DType::F32, &[rows]);
+    let mut anchors = None;
+    let (states_k, positive_valid) = if settings.auxiliary_loss.positives() == Positives::OtherView
+    {
+        anchors = Some(bytes("input.view_query", &state)?);
+        (bytes("input.view_key", &state)?, vec![1; rows])
+    } else {
+        // [B] where a row has one positive, else [P, B].
+        let dims = tensors.get("input.positive_valid")?.dims();
+        let several = if dims.len() > 1 { &dims[..1] } else { &[] };
+        let states_k = bytes("input.frames_k", &[several, &state[..]].concat())?;
+        let valid = bytes("input.positive_valid", &[several, &[rows]].concat())?;
+        (states_k, valid)
+    };
+    let actions = tensors.read::<i64>("input.action", DType::I64, &[rows])?;
+    let narrow = |&action: &i64| u8::try_from(action).ok().filter(|it| *it != NO_ACTION);
+    let action: Option<Vec<u8>> = actions.iter().map(narrow).collect();
+    let weight = "input.importance_weight";
+    let is_weighted = tensors.0.contains_key(weight);
+    Ok(OwnedBatch {
+        states_t: bytes("input.frames_t", &state)?,
+        anchors,
+        states_k,
+        states_n: bytes("input.frames_n", &state)?,
+        action: action.ok_or_else(|| {
+            let why = format!("its actions {actions:?} are not all in 0..255");
+            ParityError::tensor("input.action", why)
+        })?,
+        next_action: vec![NO_ACTION; rows],
+        n_step_return: floats("input.n_step_return")?,
+        bootstrap_discount: floats("input.bootstrap_discount")?,
+        positive_valid,
+        importance_weight: is_weighted.then(|| floats(weight)).transpose()?,
+    })
 }
 
 /// The tensors of a file by name.

@@ -2,7 +2,7 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Batch, Compute, Lambda, LearnerSettings,
+    Compute, Lambda, LearnerSettings, OwnedBatch,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
 use driml_model::{ConvLayer, ModelConfig, Parameters};
@@ -138,24 +138,21 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     let returns: Vec<f32> = returns.collect();
     let discounts: Vec<f32> = (0..rows).map(|_| one_of(&[0.0, 0.93, 1.0], rng)).collect();
     let valid: Vec<u8> = (0..rows).map(|_| rng.random_bool(0.8).into()).collect();
-    let batch = Batch {
-        rows,
-        states_t: &states_t,
-        anchors: None,
-        positives: 1,
-        states_k: &states_k,
-        states_n: &states_n,
-        action: &action,
-        next_action: &next_action,
-        n_step_return: &returns,
-        bootstrap_discount: &discounts,
-        positive_valid: &valid,
-        importance_weight: None,
+    let batch = OwnedBatch {
+        states_t,
+        states_k,
+        states_n,
+        action,
+        next_action,
+        n_step_return: returns,
+        bootstrap_discount: discounts,
+        positive_valid: valid,
+        ..OwnedBatch::default()
     };
     let (mut losses, mut gradients) = (Vec::new(), Vec::new());
     for deduplicate in [false, true] {
         agent = agent.with_deduplication(deduplicate);
-        let found = ErrorOfUpdate::of(&agent, &batch, &reference)?;
+        let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
         let share = found.reference_loss.abs() / (1.0 + found.reference_loss.abs());
         losses.push(found.loss * share);
         gradients.push((found.same_next_action == 1.0).then_some(found.gradient));

@@ -12,7 +12,7 @@ use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-use super::fixed_batch::FixedBatch;
+use super::fixed_batch;
 
 /// Rows of the batch whose loss and gradient are compared, at most.
 const ROWS_MAX: usize = 64;
@@ -66,12 +66,12 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
         .with_deduplication(config.learner.deduplicate_states);
     let weights = agent.weights()?;
     let (rows, states) = sizes(config);
-    let held = FixedBatch::play(config, Some(&weights), rows)?;
+    let held = fixed_batch::play(config, Some(&weights), rows)?;
     let found = ErrorOfUpdate::of(&agent, &held.batch(), &reference)?;
     let published = agent.weights_as(config.learner.publish_dtype)?;
     let mut policy = PolicyNetwork::new(model, &published, config.actor.precision)?;
-    let held = FixedBatch::play(config, Some(&weights), states)?;
-    let mut acted = vec![0.0; held.rows() * model.num_actions];
+    let held = fixed_batch::play(config, Some(&weights), states)?;
+    let mut acted = vec![0.0; held.action.len() * model.num_actions];
     policy.q_values(&held.states_t, &mut acted)?;
     let expected = reference.q_values_t(&held.batch())?;
     let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]

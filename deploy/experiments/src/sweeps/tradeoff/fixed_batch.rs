@@ -5,7 +5,7 @@
 use anyhow::Context;
 use driml_actor::{Acting, NetworkPolicy, Policy, RandomPolicy};
 use driml_envs::{RestrictedWorld, StepEnd};
-use driml_learner::Batch;
+use driml_learner::OwnedBatch;
 use driml_protocol::NO_ACTION;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
@@ -20,20 +20,6 @@ const EPSILON: f64 = 0.1;
 /// Seed of the world and the actions: the same rows for every level of a dial that leaves the world alone.
 const SEED: u64 = 1_000_003;
 
-/// Rows as an update reads them.
-#[derive(Default)]
-pub(super) struct FixedBatch {
-    pub(super) states_t: Vec<u8>,
-    states_k: Vec<u8>,
-    states_n: Vec<u8>,
-    action: Vec<u8>,
-    next_action: Vec<u8>,
-    n_step_return: Vec<f32>,
-    bootstrap_discount: Vec<f32>,
-    positive_valid: Vec<u8>,
-    positives: usize,
-}
-
 /// What all environments saw and did at one step.
 struct Moment {
     /// [N, H, W, C] at the network's size; empty where no row has them.
@@ -43,78 +29,53 @@ struct Moment {
     ends: Vec<StepEnd>,
 }
 
-impl FixedBatch {
-    /// Plays the world of `config` for `rows` rows, greedily with `weights` but for one action in ten, else at random.
-    pub(super) fn play(
-        config: &RunConfig,
-        weights: Option<&[u8]>,
-        rows: usize,
-    ) -> anyhow::Result<Self> {
-        let (n, k) = (config.run.n_step as usize, 1);
-        let of_env = rows.div_ceil(ENVS);
-        let apart = SPAN.div_ceil(of_env);
-        let steps = of_env * apart + n.max(k);
-        let wanted_at = |step: usize| {
-            let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % apart == 0);
-            [0, k, n].into_iter().any(of_row)
-        };
-        let history = history(config, weights, steps + 1, wanted_at)?;
-        let len = config.model.frame_len();
-        let mut batch = Self {
-            positives: config.run.horizon.positives().min(1),
-            ..Self::default()
-        };
-        for row in 0..rows {
-            let (env, t) = (row % ENVS, row / ENVS * apart);
-            let state = |t: usize| &history[t].states[env * len..][..len];
-            let mut n_step_return = 0.0;
-            let mut discount = 1.0;
-            for moment in &history[t..t + n] {
-                n_step_return += discount * f64::from(moment.rewards[env]);
-                discount *= config.run.gamma;
-                if ends(moment.ends[env]) {
-                    discount = 0.0;
-                    break;
-                }
-            }
-            batch.states_t.extend_from_slice(state(t));
-            batch.states_n.extend_from_slice(state(t + n));
-            batch.action.push(history[t].actions[env]);
-            batch.next_action.push(match ends(history[t].ends[env]) {
-                true => NO_ACTION,
-                false => history[t + 1].actions[env],
-            });
-            batch.n_step_return.push(n_step_return as f32);
-            batch.bootstrap_discount.push(discount as f32);
-            if batch.positives > 0 {
-                batch.states_k.extend_from_slice(state(t + k));
-                let is_running = history[t].ends[env] == StepEnd::Running;
-                batch.positive_valid.push(u8::from(is_running));
+/// Plays the world of `config` for `rows` rows, greedily with `weights` but for one action in ten, else at random.
+pub(super) fn play(
+    config: &RunConfig,
+    weights: Option<&[u8]>,
+    rows: usize,
+) -> anyhow::Result<OwnedBatch> {
+    let (n, k) = (config.run.n_step as usize, 1);
+    let of_env = rows.div_ceil(ENVS);
+    let apart = SPAN.div_ceil(of_env);
+    let steps = of_env * apart + n.max(k);
+    let wanted_at = |step: usize| {
+        let of_row = |offset: usize| step.checked_sub(offset).is_some_and(|t| t % apart == 0);
+        [0, k, n].into_iter().any(of_row)
+    };
+    let history = history(config, weights, steps + 1, wanted_at)?;
+    let len = config.model.frame_len();
+    let mut batch = OwnedBatch::default();
+    let has_positive = config.run.horizon.positives() > 0;
+    for row in 0..rows {
+        let (env, t) = (row % ENVS, row / ENVS * apart);
+        let state = |t: usize| &history[t].states[env * len..][..len];
+        let mut n_step_return = 0.0;
+        let mut discount = 1.0;
+        for moment in &history[t..t + n] {
+            n_step_return += discount * f64::from(moment.rewards[env]);
+            discount *= config.run.gamma;
+            if ends(moment.ends[env]) {
+                discount = 0.0;
+                break;
             }
         }
-        Ok(batch)
-    }
-
-    pub(super) fn batch(&self) -> Batch<'_> {
-        Batch {
-            rows: self.action.len(),
-            states_t: &self.states_t,
-            anchors: None,
-            positives: self.positives,
-            states_k: &self.states_k,
-            states_n: &self.states_n,
-            action: &self.action,
-            next_action: &self.next_action,
-            n_step_return: &self.n_step_return,
-            bootstrap_discount: &self.bootstrap_discount,
-            positive_valid: &self.positive_valid,
-            importance_weight: None,
+        batch.states_t.extend_from_slice(state(t));
+        batch.states_n.extend_from_slice(state(t + n));
+        batch.action.push(history[t].actions[env]);
+        batch.next_action.push(match ends(history[t].ends[env]) {
+            true => NO_ACTION,
+            false => history[t + 1].actions[env],
+        });
+        batch.n_step_return.push(n_step_return as f32);
+        batch.bootstrap_discount.push(discount as f32);
+        if has_positive {
+            batch.states_k.extend_from_slice(state(t + k));
+            let is_running = history[t].ends[env] == StepEnd::Running;
+            batch.positive_valid.push(u8::from(is_running));
         }
     }
-
-    pub(super) fn rows(&self) -> usize {
-        self.action.len()
-    }
+    Ok(batch)
 }
 
 /// Whether the return ends there.

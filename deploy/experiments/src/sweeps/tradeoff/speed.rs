@@ -3,14 +3,14 @@
 
 use std::time::{Duration, Instant};
 
-use driml_learner::{Agent, Compute};
+use driml_learner::{Agent, Compute, OwnedBatch};
 use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::fixed_batch::FixedBatch;
+use super::fixed_batch;
 
 /// Times of one update and one action, of a level and of its base in turns with it. Medians over the turns.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -32,7 +32,7 @@ pub(super) struct Speed {
 /// What is timed.
 struct Side {
     agent: Agent,
-    held: FixedBatch,
+    held: OwnedBatch,
     policy: PolicyNetwork,
     /// Frames of a round of all environments of an actor.
     frames: Vec<u8>,
@@ -41,7 +41,7 @@ struct Side {
 
 impl Side {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
-        let held = FixedBatch::play(config, None, config.learner.batch_size as usize)?;
+        let held = fixed_batch::play(config, None, config.learner.batch_size as usize)?;
         let agent = Agent::new(
             config.model.clone(),
             config.learner.update.clone(),
@@ -105,7 +105,7 @@ pub(super) fn measure(base: &RunConfig, level: &RunConfig, smoke: bool) -> anyho
         acts.push(act);
         act_gains.push(base_act / act);
     }
-    let rows = to.held.rows() as f64 / from.held.rows() as f64;
+    let rows = to.held.action.len() as f64 / from.held.action.len() as f64;
     let run = &level.run;
     Ok(Speed {
         update_seconds: median(&mut updates),
