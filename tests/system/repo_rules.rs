@@ -10,11 +10,11 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 9_055),
+    ("protocol", 8_760),
     ("actor", 13_110),
     ("replay-server", 11_460),
-    ("learner", 26_740),
-    ("deploy", 34_920),
+    ("learner", 26_930),
+    ("deploy", 34_950),
     ("tests", 11_550),
 ];
 /// Most lines of one file.
@@ -296,7 +296,7 @@ fn dangerous_words_stay_where_they_are_needed() {
         // What travels, and how a world is kept.
         (
             "bincode",
-            &["protocol/src/wire/codec.rs", "actor/envs/src/saved.rs"],
+            &["protocol/src/wire/", "actor/envs/src/saved.rs"],
         ),
         // A panic ends the process: nothing of the program may count on catching one.
         ("catch_unwind", &["replay-server/tests/"]),

@@ -3,7 +3,12 @@
 
 use rayon::prelude::*;
 
-use super::{AnySimd, Columns, Element, LANES, Left, Mode, Simd, multiply_tile, with_simd};
+use super::{
+    dispatch::{AnySimd, with_simd},
+    element::Element,
+    simd::{LANES, Mode, Simd},
+    tile::{Columns, Left, multiply_tile},
+};
 use crate::kernels::precision::Precision;
 
 /// Scalars along the sum: with a panel of one register of columns 16 KiB of f32.
