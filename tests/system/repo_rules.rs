@@ -14,7 +14,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_110),
     ("replay-server", 11_460),
     ("learner", 26_930),
-    ("deploy", 34_950),
+    ("deploy", 34_970),
     ("tests", 11_550),
 ];
 /// Most lines of one file.

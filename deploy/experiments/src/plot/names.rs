@@ -74,7 +74,21 @@ fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>
         let value = own.get(*key).map_or("unset", String::as_str);
         format!("{}={value}", short(key, &keys))
     };
-    let mut told: Vec<String> = keys.iter().take(TOLD_MAX).map(setting).collect();
+    // Choices by name first, as others often follow from them; then numbers; last what some do not have, and lists.
+    let rank = |key: &&&String| {
+        let mut values = peers.iter().map(|peer| peer.get(**key));
+        if !values
+            .clone()
+            .all(|it| it.is_some_and(|it| !it.starts_with('[')))
+        {
+            return 2;
+        }
+        i32::from(values.all(|it| it.is_some_and(|it| it.parse::<f64>().is_ok())))
+    };
+    let mut in_order: Vec<&&String> = keys.iter().collect();
+    in_order.sort_by_key(rank);
+    let told = in_order.into_iter().take(TOLD_MAX);
+    let mut told: Vec<String> = told.map(setting).collect();
     if keys.len() > TOLD_MAX {
         told.push(format!("and {} more settings", keys.len() - TOLD_MAX));
     }
@@ -119,6 +133,15 @@ mod tests {
             ["actor.lr=3", "adam.lr=0.2", "x=[1]"]
         );
         assert_eq!(differences(&a, &[a.clone(), a.clone()]), [""; 0]);
+        let [wide, deep] = [
+            "conv = [8]\nheight = 60\ntorso = 'nature'\n",
+            "height = 64\ntorso = 'impala'\n",
+        ]
+        .map(settings);
+        assert_eq!(
+            differences(&deep, &[wide, deep.clone()]),
+            ["torso=impala", "height=64", "conv=unset"]
+        );
         let many = settings("a = 1\nb = 1\nc = 1\nd = 1\ne = 1\n");
         let none = BTreeMap::new();
         assert_eq!(
