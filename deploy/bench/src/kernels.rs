@@ -4,6 +4,8 @@
 use candle_core::{Device, Tensor};
 use driml_learner::DeviceName;
 use driml_model::{conv2d_relu, multiply_in_first_cache};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use crate::{
     effort::Effort,
@@ -58,5 +60,7 @@ pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec
 
 /// A tensor of numbers of a usual size.
 fn numbers(shape: &[usize]) -> candle_core::Result<Tensor> {
-    Tensor::rand(-1f32, 1.0, shape, &Device::Cpu)
+    let rng = ChaCha8Rng::seed_from_u64(1);
+    let values = rng.random_iter::<f32>().map(|it| 2.0 * it - 1.0);
+    Tensor::from_iter(values.take(shape.iter().product()), &Device::Cpu)?.reshape(shape)
 }

@@ -65,6 +65,7 @@ macro_rules! messages {
 
             $(impl Keyed for $message {
                 const KEY: &'static str = $key;
+                // True where the row names an actor: a macro repeats only what uses a name.
                 $(const BY_ACTOR: bool = !stringify!($actor).is_empty();)?
                 $(const BY_ACTOR: bool = !stringify!($who).is_empty();)?
                 $(const PRIORITY: Priority = Priority::$priority;)?

@@ -4,7 +4,7 @@
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use serde::{Deserialize, Serialize};
 
-/// As integers lie in memory: each of its own width, without gaps.
+/// Integers of fixed width, without gaps.
 const FIXED: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 

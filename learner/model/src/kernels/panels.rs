@@ -7,7 +7,7 @@ use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{
     Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
-use crate::kernels::rounding::write_rows;
+use crate::kernels::rounding::{transpose, write_rows};
 
 /// A matrix laid over a slice: its rows are runs of it, or its columns if it is transposed.
 #[derive(Clone, Copy)]
@@ -274,11 +274,12 @@ impl<'a, E: Element> Rows<'a, E> {
             Operand::InPlace(values)
         } else {
             let mut values = Buffer::new(m * steps * depth);
-            if a.transposed {
+            if a.transposed && S::LEFT_STEPS_ADJOIN {
+                let mut turned = Buffer::new(m * k);
+                transpose(simd, a.data, k, m, &mut turned);
+                pack_rows(simd, &turned, k, row_stride, &mut values, threads);
+            } else if a.transposed {
                 pack_steps(simd, a.transposed(), &mut values, threads);
-                if S::LEFT_STEPS_ADJOIN {
-                    values = turned(simd, &values, m, threads);
-                }
             } else {
                 pack_rows(simd, a.data, k, row_stride, &mut values, threads);
             }
@@ -330,54 +331,6 @@ fn pack_rows<S: Simd>(
             .par_chunks_mut(rows * stride)
             .zip(data.par_chunks(rows * cols))
             .for_each(|(values, data)| pack(values, data)),
-    }
-}
-
-/// Steps [steps, m] as [m, steps], 16 rows to a task.
-fn turned<S: Simd>(
-    simd: S,
-    values: &[S::Element],
-    m: usize,
-    threads: Threads,
-) -> Buffer<S::Element> {
-    let mut rows = Buffer::new(values.len());
-    let len = values.len() / m * LANES;
-    let turn = |(task, rows): (usize, &mut [S::Element])| {
-        turn_rows(simd, values, m, task * LANES, rows);
-    };
-    match threads {
-        Threads::Caller => rows.chunks_mut(len).enumerate().for_each(turn),
-        Threads::Pool => rows.par_chunks_mut(len).enumerate().for_each(turn),
-    }
-    rows
-}
-
-vectorized! {
-    /// Of `values` [steps, m] the columns from `first` on, at most [`LANES`], as `rows` [columns, steps].
-    fn turn_rows<S>(
-        simd,
-        values: &'a [S::Element],
-        m: usize,
-        first: usize,
-        rows: &'a mut [S::Element],
-    ) {
-        let depth = S::Element::DEPTH;
-        let row_len = values.len() / m;
-        for (part, steps) in values.chunks(LANES * m * depth).enumerate() {
-            let mut block = [[0; LANES]; LANES];
-            for (block, step) in block.iter_mut().zip(steps.chunks(m * depth)) {
-                for (bits, step) in block.iter_mut().zip(step[first * depth..].chunks(depth)) {
-                    *bits = S::Element::pack(step);
-                }
-            }
-            simd.transpose(&mut block);
-            for (row, block) in rows.chunks_mut(row_len).zip(block) {
-                let row = row[part * LANES * depth..].chunks_mut(depth);
-                for (step, bits) in row.zip(block) {
-                    S::Element::unpack(bits, step);
-                }
-            }
-        }
     }
 }
 

@@ -90,9 +90,6 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// The scalars of a step, into `step` [DEPTH].
     fn unpack(bits: u32, step: &mut [Self]);
 
-    /// A step [DEPTH] as 32 bits: the inverse of [`Element::unpack`].
-    fn pack(step: &[Self]) -> u32;
-
     /// Scalars that need no rounding, as they are.
     fn in_place(values: &[f32]) -> Option<&[Self]>;
 }
@@ -155,11 +152,6 @@ impl Element for f32 {
     #[inline(always)]
     fn unpack(bits: u32, step: &mut [Self]) {
         step[0] = Self::from_bits(bits);
-    }
-
-    #[inline(always)]
-    fn pack(step: &[Self]) -> u32 {
-        step[0].to_bits()
     }
 
     fn in_place(values: &[f32]) -> Option<&[Self]> {
@@ -250,11 +242,6 @@ impl Element for bf16 {
     fn unpack(bits: u32, step: &mut [Self]) {
         step[0] = Self::from_bits(bits as u16);
         step[1] = Self::from_bits((bits >> 16) as u16);
-    }
-
-    #[inline(always)]
-    fn pack(step: &[Self]) -> u32 {
-        u32::from(step[0].to_bits()) | u32::from(step[1].to_bits()) << 16
     }
 
     fn in_place(_: &[f32]) -> Option<&[Self]> {
