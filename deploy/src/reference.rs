@@ -121,7 +121,7 @@ fn presets(folder: &str) -> Vec<(String, PathBuf)> {
 fn settings() -> String {
     let base = root().join("deploy/settings/presets/base.toml");
     let mut page = format!("# Settings\n\n{GENERATED}\n\n");
-    page += "Settings are layered: base, world, agent, preset, then `--set` and the flags. The result stands in the run's `config.toml`.\n\
+    page += "Settings are layered: base, world, preset, agent, then the flags and `--set`. The result stands in the run's `config.toml`.\n\
         `driml presets --game bigfish --agent driml-fix` prints it with the source of every value.\n\n\
         ## Base\n\n```toml\n";
     page += &fs::read_to_string(base).unwrap();

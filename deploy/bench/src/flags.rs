@@ -41,7 +41,7 @@ pub enum BenchCommand {
     /// Runs with more and more actors: throughput, waiting time, age of weights
     Scale {
         /// Numbers of actors, such as 1,8,32 [default: 1,2,4,8,16,32, or 1,2 with --quick]
-        #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=4096))]
+        #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=256))]
         actors: Vec<u32>,
         /// Seconds per number of actors [default: 5, or 2 with --quick]
         #[arg(long, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=86_400))]

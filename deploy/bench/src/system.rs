@@ -282,7 +282,11 @@ impl Run {
         }
         match (first, last) {
             (Some(first), Some(last)) => Ok([first, last]),
-            _ => bail!("the run was over within {WARMUP_UPDATES} updates: give it more --frames"),
+            _ => {
+                let failed = self.launcher.end().is_some_and(|end| !end.success());
+                ensure!(!failed, "{}", self.launcher.exit_report());
+                bail!("the run was over within {WARMUP_UPDATES} updates: give it more --frames")
+            }
         }
     }
 

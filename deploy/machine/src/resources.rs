@@ -1,7 +1,7 @@
 //! What this machine offers, and the sizes of a run that follow from it.
 //! It measures no speed: how long a run takes is estimated in `plan`.
 
-use std::fs;
+use std::{fs, path::Path};
 
 use serde::{Deserialize, Serialize};
 
@@ -11,11 +11,11 @@ use crate::units::kib;
 pub const ENVS: u32 = 16;
 /// Share of the free memory that a replay sized by the machine may take; the learner and the system need the rest.
 const REPLAY_SHARE: f64 = 0.5;
-/// Share of the free memory that a replay may take whose size was asked for.
+/// Share of the free memory that a replay may take whose size was asked for, where more of the run starts beside it.
 const REPLAY_SHARE_MAX: f64 = 0.9;
 
 /// What a learner takes on Procgen (266 MiB measured), and some room.
-const LEARNER_BYTES: u64 = 512 << 20;
+pub const LEARNER_BYTES: u64 = 512 << 20;
 /// What an actor of 16 environments takes on Procgen, whose engine holds its pictures (410 to 423 MiB measured), and elsewhere (97 MiB
 /// on Ms. PacMan).
 const ACTOR_BYTES: (u64, u64) = (430 << 20, 100 << 20);
@@ -61,25 +61,22 @@ impl Machine {
         }
     }
 
-    /// Bytes that a replay sized by the machine may take, where the actors take `actors_bytes`.
-    pub fn replay_bytes(&self, actors_bytes: u64) -> u64 {
-        self.share(REPLAY_SHARE, actors_bytes)
+    /// Bytes that a replay sized by the machine may take, where what starts beside it takes `beside` bytes.
+    pub fn replay_bytes(&self, beside: u64) -> u64 {
+        self.share(REPLAY_SHARE, beside)
     }
 
-    /// Bytes that a replay may take whose size was asked for, where the actors take `actors_bytes`.
-    pub fn replay_bytes_max(&self, actors_bytes: u64) -> u64 {
-        self.share(REPLAY_SHARE_MAX, actors_bytes)
+    /// Bytes that a replay may take whose size was asked for, where what starts beside it takes `beside` bytes.
+    pub fn replay_bytes_max(&self, beside: u64) -> u64 {
+        match beside {
+            0 => self.memory_bytes,
+            _ => self.share(REPLAY_SHARE_MAX, beside),
+        }
     }
 
-    fn share(&self, share: f64, actors_bytes: u64) -> u64 {
+    fn share(&self, share: f64, beside: u64) -> u64 {
         let bytes = (self.memory_bytes as f64 * share) as u64;
-        bytes.min(self.beside_actors(actors_bytes))
-    }
-
-    /// Bytes that actors and learner leave.
-    pub const fn beside_actors(&self, actors_bytes: u64) -> u64 {
-        let taken = actors_bytes.saturating_add(LEARNER_BYTES);
-        self.memory_bytes.saturating_sub(taken)
+        bytes.min(self.memory_bytes.saturating_sub(beside))
     }
 }
 
@@ -126,14 +123,48 @@ fn processor_in(cpuinfo: &str) -> Option<&str> {
     Some(name.trim())
 }
 
-/// The kernel's estimate of available memory, or what the control group leaves, if that is less.
+/// The kernel's estimate of available memory, or what the control groups leave, if that is less.
 fn free_memory_bytes() -> Option<u64> {
     let system = kib(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:")? << 10;
-    let number = |path: &str| fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
-    let group = number("/sys/fs/cgroup/memory.max")
-        .zip(number("/sys/fs/cgroup/memory.current"))
-        .map(|(max, used)| max.saturating_sub(used));
-    Some(group.map_or(system, |group| group.min(system)))
+    let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let left = left_by_groups(Path::new("/sys/fs/cgroup"), &groups);
+    Some(left.map_or(system, |left| left.min(system)))
+}
+
+/// Bytes that the control groups of a process leave it: the least of its own and those around it, of either version.
+/// `groups` is the process's `/proc/PID/cgroup`. Pages of files count as free: the kernel takes them back.
+fn left_by_groups(mount: &Path, groups: &str) -> Option<u64> {
+    let left = |group: &Path, [max, used, cache]: [&str; 3]| {
+        let text = |file: &str| fs::read_to_string(group.join(file)).ok();
+        let number = |file| text(file)?.trim().parse::<u64>().ok();
+        let stat = text("memory.stat").unwrap_or_default();
+        let of_files = ["active_file", "inactive_file"].map(|list| {
+            let line = stat
+                .lines()
+                .find_map(|it| it.strip_prefix(cache)?.strip_prefix(list));
+            line.and_then(|bytes| bytes.trim().parse().ok())
+                .unwrap_or(0)
+        });
+        let used = number(used)?.saturating_sub(of_files.iter().sum());
+        Some(number(max)?.saturating_sub(used))
+    };
+    let lines = groups.lines().filter_map(|line| {
+        let mut parts = line.splitn(3, ':').skip(1);
+        let (controllers, group) = (parts.next()?, parts.next()?.trim_start_matches('/'));
+        let (mount, files) = match controllers {
+            "" => (mount.to_owned(), ["memory.max", "memory.current", ""]),
+            _ if controllers.split(',').any(|it| it == "memory") => (
+                mount.join("memory"),
+                ["memory.limit_in_bytes", "memory.usage_in_bytes", "total_"],
+            ),
+            _ => return None,
+        };
+        // In a container the mount may be the process's own group, whatever it is called outside.
+        let all = Path::new(group).ancestors();
+        all.filter_map(|group| left(&mount.join(group), files))
+            .min()
+    });
+    lines.min()
 }
 
 #[cfg(test)]
@@ -146,6 +177,49 @@ mod tests {
         let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
         assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
         assert_eq!(processor_in(""), None);
+    }
+
+    #[test]
+    fn control_groups_leave_what_the_tightest_leaves_and_cached_files_are_free() {
+        let root = tempfile::tempdir().unwrap();
+        let group = |path: &str, files: &[(&str, &str)]| {
+            let folder = root.path().join(path);
+            fs::create_dir_all(&folder).unwrap();
+            for (name, text) in files {
+                fs::write(folder.join(name), format!("{text}\n")).unwrap();
+            }
+        };
+        let left = |groups| left_by_groups(root.path(), groups);
+        assert_eq!(left("0::/\n"), None);
+        let stat = "anon 500\nfile 450\nactive_file 200\ninactive_file 100";
+        group(
+            "job",
+            &[
+                ("memory.max", "1000"),
+                ("memory.current", "900"),
+                ("memory.stat", stat),
+            ],
+        );
+        group(
+            "job/step",
+            &[("memory.max", "max"), ("memory.current", "800")],
+        );
+        // The parent's limit holds, less what is in use beside 300 bytes of files.
+        assert_eq!(left("0::/job/step\n"), Some(400));
+        group("", &[("memory.max", "700"), ("memory.current", "600")]);
+        assert_eq!(left("0::/job/step\n"), Some(100));
+        assert_eq!(left("0::/of/the/host\n"), Some(100));
+        let stat = "active_file 1\ntotal_active_file 30\ntotal_inactive_file 20";
+        let limits = [
+            ("memory.limit_in_bytes", "90"),
+            ("memory.usage_in_bytes", "80"),
+        ];
+        group(
+            "memory/job",
+            &[&limits[..], &[("memory.stat", stat)]].concat(),
+        );
+        assert_eq!(left("4:cpu,cpuacct:/job\n3:memory:/job\n"), Some(60));
+        assert_eq!(left("4:cpu,cpuacct:/job\n"), None);
     }
 
     #[test]

@@ -5,13 +5,16 @@ use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};
 use driml_machine::error::{Usage, usage};
 use driml_model::{InputSize, ModelConfig};
-use driml_protocol::{Horizon, RunSpec, config::TransportConfig};
+use driml_protocol::{
+    Horizon, RunSpec,
+    config::{TransportConfig, describe},
+};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
-use toml::Table;
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
 
-use crate::{derived, presets};
+use crate::derived;
 
 /// How many processes the launcher starts, and with what.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,7 +81,8 @@ impl EvaluationConfig {
 }
 
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
 pub struct RunConfig {
     /// What all processes of the run agree on.
     pub run: RunSpec,
@@ -103,32 +107,10 @@ pub struct RunConfig {
     pub notes: Vec<String>,
 }
 
-/// Reads one table of the settings.
-pub(crate) fn read<T: DeserializeOwned>(table: &Table, name: &'static str) -> Result<T, Usage> {
-    derived::optional(table, name)?.ok_or_else(|| usage!("the settings have no [{name}] table"))
-}
-
 /// Reads every table as the part that uses it will.
 pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
-    let tables = "run, world, input, actor, replay, learner, model, transport, local";
-    let is_known = |key: &&String| tables.split(", ").any(|it| it == **key);
-    if let Some(other) = table.keys().find(|key| !is_known(key)) {
-        return Err(usage!(
-            "the settings have an unknown field {other:?}; their tables are {tables}"
-        ));
-    }
-    Ok(RunConfig {
-        run: read(table, "run")?,
-        world: read(table, "world")?,
-        input: read(table, "input")?,
-        actor: read(table, "actor")?,
-        replay: read(table, "replay")?,
-        learner: read(table, "learner")?,
-        model: read(table, "model")?,
-        transport: read(table, "transport")?,
-        local: read(table, "local")?,
-        notes: Vec::new(),
-    })
+    let read = Value::Table(table.clone()).try_into();
+    read.map_err(|e| usage!("in the settings: {}", describe(&e)))
 }
 
 impl RunConfig {
@@ -139,9 +121,8 @@ impl RunConfig {
     }
 
     pub(crate) fn from_table(table: &Table) -> Result<Self, Usage> {
-        let mut config = parts_read(table)?;
+        let config = parts_read(table)?;
         config.validate()?;
-        config.notes = presets::notes(&config.run.agent, &config.run.world);
         Ok(config)
     }
 

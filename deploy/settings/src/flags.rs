@@ -16,8 +16,10 @@ use crate::{
     resolve::{self, Flags, Source},
 };
 
-const ENV: &str = "procgen:coinrun";
-const AGENT: &str = "driml-ada";
+/// World where none is given.
+pub const ENV: &str = "procgen:coinrun";
+/// Agent where none is given.
+pub const AGENT: &str = "driml-ada";
 
 /// What to train, and with which settings.
 #[derive(Clone, Debug, Args)]

@@ -11,7 +11,7 @@ use driml_replay_server::Compression;
 use toml::Table;
 
 use crate::{
-    config::{LocalConfig, read},
+    config::{RunConfig, parts_read},
     derived::{derive, put_number},
 };
 
@@ -19,15 +19,20 @@ use crate::{
 pub(crate) fn fit(
     table: &mut Table,
     capacity_set: bool,
+    server_alone: bool,
     machine: &Machine,
 ) -> Result<Option<String>, Usage> {
     let mut derived = table.clone();
     derive(&mut derived)?;
-    let run: RunSpec = read(&derived, "run")?;
-    let replay: driml_replay_server::Config = read(&derived, "replay")?;
-    let local: LocalConfig = read(&derived, "local")?;
+    let RunConfig {
+        run, replay, local, ..
+    } = parts_read(&derived)?;
     let actors = resources::actors_bytes(local.actors, &run.world);
-    if machine.beside_actors(actors) == 0 {
+    let (beside, parts) = match server_alone {
+        true => (0, u64::from(replay.shards)),
+        false => (actors + resources::LEARNER_BYTES, 1),
+    };
+    if machine.memory_bytes <= beside {
         return Err(usage!(
             "{} actors of {} take about {}, and {} are free: use fewer --actors, with more --envs each",
             local.actors,
@@ -36,21 +41,29 @@ pub(crate) fn fit(
             gib(machine.memory_bytes)
         ));
     }
+    let room = Room {
+        free: gib(machine.memory_bytes),
+        bytes: machine.replay_bytes(beside).saturating_mul(parts),
+        bytes_max: machine.replay_bytes_max(beside).saturating_mul(parts),
+    };
     if replay.compression != Compression::None {
-        return fit_compressed(table, &run, &replay, machine, actors);
+        return fit_compressed(table, &run, &replay, &room);
     }
     let bytes_each = replay_bytes_each(&run) + sampling_bytes_each(&replay);
-    let fits = |bytes: u64| bytes / bytes_each;
-    let free = gib(machine.memory_bytes);
+    let Room {
+        free,
+        bytes,
+        bytes_max,
+    } = &room;
     let asked = replay.capacity_transitions;
-    if capacity_set && asked > fits(machine.replay_bytes_max(actors)) {
+    let capacity = bytes / bytes_each;
+    if capacity_set && asked > bytes_max / bytes_each {
         return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {}, and {free} are free: --set replay.capacity_transitions={}",
+            "replay.capacity_transitions = {asked} needs {}, and may take {}, as {free} are free: --set replay.capacity_transitions={capacity}",
             gib(asked.saturating_mul(bytes_each)),
-            fits(machine.replay_bytes(actors))
+            gib(*bytes_max),
         ));
     }
-    let capacity = fits(machine.replay_bytes(actors));
     if capacity_set || asked <= capacity {
         return Ok(None);
     }
@@ -64,6 +77,16 @@ pub(crate) fn fit(
     Ok(is_smaller_than_the_run.then_some(note))
 }
 
+/// Bytes for the replay, all shards together.
+struct Room {
+    /// What is free on this machine, in words.
+    free: String,
+    /// For a replay that the machine sizes.
+    bytes: u64,
+    /// For one whose size was asked for.
+    bytes_max: u64,
+}
+
 /// Bounds the bytes of a compressed replay, as it is not known beforehand how well its frames compress.
 ///
 /// Half the free memory is taken, or what the settings allow; nothing is bounded where even frames that do not compress fit.
@@ -71,24 +94,23 @@ fn fit_compressed(
     table: &mut Table,
     run: &RunSpec,
     replay: &driml_replay_server::Config,
-    machine: &Machine,
-    actors: u64,
+    room: &Room,
 ) -> Result<Option<String>, Usage> {
-    let free = gib(machine.memory_bytes);
+    let free = &room.free;
     let asked = replay.capacity_transitions;
     let fields_each = COMPRESSED_FIELDS_BYTES + sampling_bytes_each(replay);
     let fields = asked.saturating_mul(fields_each);
     let frames = asked.saturating_mul(run.frame_bytes() as u64);
-    let bytes = machine.replay_bytes(actors).saturating_sub(fields);
-    if fields > machine.replay_bytes(actors) / 2 {
+    let bytes = room.bytes.saturating_sub(fields);
+    if fields > room.bytes / 2 {
         return Err(usage!(
             "replay.capacity_transitions = {asked} needs {} beside the frames, and {free} are free: --set replay.capacity_transitions={}",
             gib(fields),
-            machine.replay_bytes(actors) / 2 / fields_each
+            room.bytes / 2 / fields_each
         ));
     }
     match replay.compressed_bytes_max {
-        Some(max) if max.min(frames) > machine.replay_bytes_max(actors) => Err(usage!(
+        Some(max) if max.min(frames) > room.bytes_max => Err(usage!(
             "replay.compressed_bytes_max = {max} is {}, and {free} are free: --set replay.compressed_bytes_max={bytes}",
             gib(max)
         )),

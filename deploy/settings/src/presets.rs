@@ -234,7 +234,7 @@ fn names(name: &str, all: impl Iterator<Item = &'static str>) -> (String, String
     (nearest(name, all.iter().copied()), all.join(", "))
 }
 
-/// Lays base, world, agent and preset over one another, in this order: a later one wins.
+/// Lays base, world, preset and agent over one another, in this order: a later one wins.
 pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
     if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
         return Err(usage!(
@@ -266,15 +266,6 @@ fn lay(table: &mut Table, layer: &Layer, world: &str) {
     }
 }
 
-/// Notes on an agent in a world, to be printed before the run starts.
-pub fn notes(name: &str, world: &str) -> Vec<String> {
-    let blocks = agent(name)
-        .map(|agent| agent.layer.read().1)
-        .unwrap_or_default();
-    let here = blocks.into_iter().filter(|it| it.is_for(world));
-    here.filter_map(|block| block.note).collect()
-}
-
 /// An `[[only]]` block of a layer.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -282,7 +273,6 @@ pub struct Only {
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
-    note: Option<String>,
 }
 
 impl Only {

@@ -48,6 +48,9 @@ pub struct Flags {
     /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
+    /// Whether one replay server starts on this machine, and the rest of the run is elsewhere or started before.
+    #[arg(skip)]
+    pub server_alone: bool,
 }
 
 /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
@@ -104,12 +107,14 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     }
     let capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
     derived::precision(&mut table, machine.fast_bf16);
-    let note = memory::fit(&mut table, capacity_set, machine)?;
-    derive(&mut table)?;
-    let mut config = RunConfig::from_table(&table).map_err(|e| match source {
+    let of_file = |e| match source {
         Source::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
         _ => e,
-    })?;
+    };
+    let note =
+        memory::fit(&mut table, capacity_set, flags.server_alone, machine).map_err(of_file)?;
+    derive(&mut table)?;
+    let mut config = RunConfig::from_table(&table).map_err(of_file)?;
     config.notes.extend(note);
     if let Source::Layers(preset, ..) = source {
         config.notes.extend(preset.price.map(str::to_owned));
@@ -130,7 +135,9 @@ fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
             let mut derived = tried.clone();
             derived::precision(&mut derived, false);
             let read = derive(&mut derived).and_then(|()| parts_read(&derived));
-            if read.is_err_and(|e| e.0.contains("unknown field")) {
+            let key = one.path.rsplit('.').next().unwrap_or_default();
+            let unknown = format!("unknown field `{key}`");
+            if read.is_err_and(|e| e.0.contains(&unknown)) {
                 return Err(one.unknown(table));
             }
         }

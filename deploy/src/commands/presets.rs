@@ -3,18 +3,14 @@
 use clap::Args;
 use driml_launch::console::print;
 use driml_machine::error::usage;
-use driml_settings::{menu, presets};
-
-/// World and agent where none is given: those of `driml train`.
-const GAME: &str = "bigfish";
-const AGENT: &str = "driml-ada";
+use driml_settings::{flags, menu, presets};
 
 #[derive(Debug, Args)]
 pub(crate) struct PresetsArgs {
-    /// Print the settings for this game of Procgen, or another world
+    /// Print the settings for this game of Procgen, or another world [default: coinrun]
     #[arg(long, value_name = "GAME")]
     pub(crate) game: Option<String>,
-    /// Print the settings of this agent
+    /// Print the settings of this agent [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub(crate) agent: Option<String>,
     /// Print the settings of this preset
@@ -27,9 +23,9 @@ pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
     if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);
     }
-    let game = args.game.as_deref().unwrap_or(GAME);
+    let game = args.game.as_deref().unwrap_or(flags::ENV);
     let world = presets::world(game).map_err(|e| usage!("--game: {e}"))?;
     let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-    let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
+    let agent = presets::agent(args.agent.as_deref().unwrap_or(flags::AGENT))?;
     print(&menu::sourced(preset, world, agent)?)
 }

@@ -40,11 +40,12 @@ pub(crate) struct ReplayServerArgs {
     pub(crate) join: JoinFlags,
 }
 
-pub(crate) fn run(args: ReplayServerArgs) -> anyhow::Result<()> {
+pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
     check_listening(&args.listen, args.network.guard(&args.tls))?;
     check_unused(&args.listen)?;
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;
+    args.run.over.server_alone = true;
     let (config, _) = flags::resolve(&args.run, &Machine::this())?;
     if args.replay_dir.is_none() {
         let checked = config.replay.check_in_memory("--replay-dir DIR");

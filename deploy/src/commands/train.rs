@@ -26,6 +26,8 @@ use driml_settings::{
 
 use super::join::{NetworkFlag, TlsFlags};
 
+/// Characters of a world's name that stand in the name of a run's folder.
+const WORLD_CHARS_MAX: usize = 40;
 const RESUMED: [&str; 10] = [
     "env",
     "agent",
@@ -111,6 +113,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
                 Found::Resumed(found) => found,
             };
             args.lockstep = found.lockstep;
+            if args.lockstep && args.listen.is_some() {
+                return Err(usage!("a run in lockstep is one process: leave --listen out").into());
+            }
             let from = format!("its checkpoint after {} updates", found.point.updates);
             (found.config, from, Some(found.point))
         }
@@ -198,8 +203,31 @@ fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
 }
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {
-    let world = run.world.replace(':', "-");
-    let (agent, seed) = (&run.agent, run.seed);
+    let (world, agent, seed) = (file_name_of(&run.world), &run.agent, run.seed);
     let time = jiff::Timestamp::now().strftime("%Y%m%d-%H%M%S");
     PathBuf::from(format!("runs/{world}-{agent}-seed{seed}-{time}"))
+}
+
+/// A world's name as a part of a file's: the command of `exec:` has blanks and slashes, and any length.
+fn file_name_of(world: &str) -> String {
+    let is_kept = |it: char| it.is_ascii_alphanumeric() || "._-".contains(it);
+    let chars = world.chars().map(|it| if is_kept(it) { it } else { '-' });
+    chars.take(WORLD_CHARS_MAX).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_folder_of_a_run_is_named_after_its_world() {
+        let exec = "exec:python3 deploy/driml_env.py ALE/Pong-v5 --atari";
+        for (world, name) in [
+            ("procgen:coinrun", "procgen-coinrun"),
+            (exec, "exec-python3-deploy-driml_env.py-ALE-Pon"),
+            ("exec:/höhle", "exec--h-hle"),
+        ] {
+            assert_eq!(file_name_of(world), name);
+        }
+    }
 }

@@ -171,6 +171,8 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         Some(why) => why.clone(),
         None => format!("{peer} was not measured"),
     };
+    // In a later round: what it measured before is not the whole comparison.
+    let failed = pair.of_ours.is_none() && sides.absent.is_some();
     Some(Row {
         component: pair.component.name().into(),
         what: pair.ours.clone(),
@@ -180,7 +182,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
         ratio: theirs.map(|_| median(&ratios)),
         ratios,
         goal: pair.goal,
-        skipped: theirs.is_none().then(absent),
+        skipped: (theirs.is_none() || failed).then(absent),
         peer,
     })
 }
@@ -193,7 +195,7 @@ fn describe(comparison: &Comparison) -> String {
     for row in &comparison.rows {
         let number = |value: Option<f64>| value.map_or("-".into(), number);
         let verdict = match (row.ratio, row.goal) {
-            (None, _) => "skipped",
+            _ if row.skipped.is_some() => "skipped",
             (_, None) => "",
             (Some(ratio), Some(goal)) if ratio >= goal => "reached",
             _ => "missed",

@@ -8,7 +8,10 @@ use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
 use super::fact::{Fact, State};
-use crate::{resources::Machine, units::gib};
+use crate::{
+    resources::{LEARNER_BYTES, Machine},
+    units::gib,
+};
 
 /// Below this a run's three processes do not fit, bytes: they take 0.9 GiB with a small replay.
 const MEMORY_MIN: u64 = 1 << 30;
@@ -90,7 +93,7 @@ fn kernels() -> Fact {
 }
 
 fn memory(machine: &Machine) -> Fact {
-    let (free, replay) = (machine.memory_bytes, machine.replay_bytes(0));
+    let (free, replay) = (machine.memory_bytes, machine.replay_bytes(LEARNER_BYTES));
     let text = format!(
         "{} free; a replay sized by the machine takes {}, {:.2} million of Procgen's frames",
         gib(free),
@@ -142,7 +145,7 @@ fn locked_memory(limit: Option<u64>) -> Fact {
                  \"USER - memlock unlimited\" to /etc/security/limits.conf and log in again; a service needs LimitMEMLOCK=infinity, a \
                  container --ulimit memlock=-1",
                 limit >> 10,
-                SHARED_MEMORY_ENOUGH >> 10
+                SHARED_MEMORY_ENOUGH >> 20
             ),
         ),
     }
@@ -213,6 +216,7 @@ mod tests {
         }
         let locked = locked_memory(Some(8 << 20)).text;
         assert!(locked.contains("`ulimit -l` allows 8192 KiB"), "{locked}");
+        assert!(locked.contains(" locks up to 256 MiB"), "{locked}");
     }
 
     #[test]

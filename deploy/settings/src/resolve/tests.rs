@@ -194,7 +194,7 @@ fn a_file_at_odds_with_itself_is_refused() {
     .assert_eq(&said("= 3".into()));
     expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
         .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings' [actor] table: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
+    expect!["x.toml: in the settings: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
 }
 
 #[test]
@@ -272,6 +272,31 @@ fn the_replay_fits_the_memory_and_says_so() {
 }
 
 #[test]
+fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
+    let of = |server_alone, actors, replay_shards, set: &[&str]| {
+        let flags = Flags {
+            actors: Some(actors),
+            replay_shards: Some(replay_shards),
+            server_alone,
+            ..frames(50_000_000, set)
+        };
+        let config = resolve(&source("paper", "procgen:heist", "c51"), &flags, &MACHINE);
+        config
+            .map(|it| it.replay.capacity_transitions)
+            .map_err(|e| e.to_string())
+    };
+    // Actors on other machines take none of its memory, and two shards have that of two machines.
+    assert!(of(false, 64, 1, &[]).unwrap_err().contains("64 actors"));
+    let [one, two] = [1, 2].map(|shards| of(true, 64, shards, &[]).unwrap());
+    assert_eq!((one, two), (793_014, 1_000_000));
+    // A server that starts again holds what was found to fit beside actors and learner, which now run.
+    let most = "replay.capacity_transitions=1400000";
+    let said = of(false, 4, 1, &[most]).unwrap_err();
+    expect!["replay.capacity_transitions = 1400000 needs 14.1 GiB, and may take 13.8 GiB, as 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said);
+    assert_eq!(of(true, 4, 1, &[most]), Ok(1_400_000));
+}
+
+#[test]
 fn a_compressed_replay_says_what_its_frames_may_take() {
     let lz4 = "replay.compression=lz4";
     let million = "replay.transitions_max=1000000";
@@ -302,6 +327,10 @@ fn a_rule_takes_its_own_settings_alone() {
         (
             "replay.sampling={rule=\"uniform\",alpha=0.5}",
             "unknown field `alpha`",
+        ),
+        (
+            "model.head={dueling=true,noise_sigma=0.5}",
+            "unknown field `noise_sigma`",
         ),
     ] {
         let said = with("chain", "c51", &[set]).unwrap_err().to_string();
