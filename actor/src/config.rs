@@ -34,7 +34,7 @@ pub struct Config {
     /// Which of the world's actions are chosen among. Settings of earlier versions do not have it: all.
     #[serde(default)]
     pub actions: driml_envs::ActionSet,
-    /// Threads that step the environments; 0 steps them in the acting thread.
+    /// Threads that step the environments of Procgen, which alone uses them; 0 steps them in the acting thread.
     pub world_threads: u32,
     /// Probability of a random action at the run's first frame.
     pub epsilon_start: f64,
@@ -163,7 +163,8 @@ impl ActorSettings {
             steps_per_chunk,
             ..
         } = self.actor;
-        let bytes = u64::from(envs) * u64::from(steps_per_chunk) * self.transition_bytes() as u64;
+        let steps = self.actor.chunk_steps(1);
+        let bytes = u64::from(envs) * u64::from(steps) * self.transition_bytes() as u64;
         check(
             bytes <= PAYLOAD_BYTES_MAX as u64,
             "actor.steps_per_chunk",

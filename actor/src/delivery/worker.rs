@@ -234,7 +234,7 @@ impl DeliveryWorker {
                 // A question of a few bytes, in the place of chunks again and again: the answer to it says that they are wanted.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
                 self.outgoing[0].is_kept = true;
-                self.shutdown.wait_timeout(RETRY_PAUSE);
+                self.pause();
                 Ok(self.again())
             }
             Err(e) => {
@@ -275,7 +275,7 @@ impl DeliveryWorker {
         self.state.is_held.store(true, Ordering::Relaxed);
         self.outgoing[0].is_kept = kept;
         if !kept {
-            self.shutdown.wait_timeout(RETRY_PAUSE);
+            self.pause();
         }
         let seconds = since.elapsed().as_secs();
         if seconds >= 10
@@ -284,6 +284,14 @@ impl DeliveryWorker {
             tracing::info!(
                 "waiting for the learner, which is behind by the replay ratio: a chunk has waited {seconds} s{more}"
             );
+        }
+    }
+
+    /// Before the next try; an actor that is to leave does not ask faster for it.
+    fn pause(&self) {
+        match self.shutdown.is_set() {
+            true => std::thread::sleep(RETRY_PAUSE),
+            false => _ = self.shutdown.wait_timeout(RETRY_PAUSE),
         }
     }
 

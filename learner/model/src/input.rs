@@ -57,7 +57,8 @@ impl InputSize {
     /// all of it if they do not fit.
     pub fn read(&self, torso: TorsoName, conv: &[ConvLayer], frame: (usize, usize)) -> InputRead {
         let whole = self.whole_input();
-        let Some(input) = torso.reach(conv, whole) else {
+        let reach = torso.reach(conv, whole);
+        let Some(input) = reach.filter(|&(rows, cols)| rows.min(cols) > 0) else {
             return InputRead {
                 input: whole,
                 frame,

@@ -120,7 +120,7 @@ impl Actors {
         }
         known.past.push_back(known.current);
         known.earlier_incarnations = known.earlier_incarnations.saturating_add(1);
-        (known.current, known.expected) = (current, 0);
+        (known.current, known.expected, known.insisted) = (current, 0, None);
         known.streams.clear();
         Ok(known.earlier_incarnations)
     }
@@ -278,13 +278,21 @@ impl Actors {
         Ok(Difference::between(produced, stored))
     }
 
-    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors.
-    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
-        if self.actors.len() >= ACTORS_MAX {
-            self.actors.retain(|&number, actor| {
-                let has_sent = actor.expected > 0 || !actor.past.is_empty();
-                has_sent || is_connected(number, actor.current.incarnation)
-            });
+    /// Actors that never sent a chunk and are not connected, if the run has its largest number of actors.
+    pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
+        if self.actors.len() < ACTORS_MAX {
+            return Vec::new();
+        }
+        let absent = self.actors.iter().filter(|&(&number, actor)| {
+            let has_sent = actor.expected > 0 || !actor.past.is_empty();
+            !has_sent && !is_connected(number, actor.current.incarnation)
+        });
+        absent.map(|(&number, _)| number).collect()
+    }
+
+    pub(crate) fn forget(&mut self, actors: &[u32]) {
+        for actor in actors {
+            self.actors.remove(actor);
         }
     }
 }

@@ -7,13 +7,13 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{atomic_write, lock_file};
+use driml_protocol::{PROTOCOL_VERSION, atomic_write, lock_file};
 use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
 
-/// Form of the log; one of another form is refused.
-pub(super) const FORMAT: u32 = 4;
+/// Form of the log, and of the messages in it, in thousands and ones; one of another form is refused.
+pub(super) const FORMAT: u32 = 5_000 + PROTOCOL_VERSION as u32;
 /// The file that says which log it is.
 const ID: &str = "log.toml";
 /// Highest number of a segment; files of higher ones are none of a log's.

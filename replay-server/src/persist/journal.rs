@@ -68,7 +68,7 @@ pub(crate) struct Journal {
     id: LogId,
     /// All in the folder, the oldest first; the last one is written.
     segments: VecDeque<Segment>,
-    file: Arc<File>,
+    pub(super) file: Arc<File>,
     ordinal: u64,
     limits: Limits,
     /// Bytes of the largest record so far, by which a segment may become larger than it should.
@@ -247,6 +247,10 @@ impl Journal {
 
     /// Begins another segment with `snapshot`. If the disk refuses, the newest one grows.
     pub(super) fn rotate(&mut self, snapshot: &Snapshot) {
+        // What waits to be written has its place before the end of the old one.
+        if !self.is_ready() {
+            return;
+        }
         let number = self.newest().number + 1;
         // The record that closes the old one comes first.
         let begun = begin_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
@@ -269,9 +273,7 @@ impl Journal {
     /// Begins another segment with `snapshot`, which is on the disk when this returns and stays.
     pub(super) fn mark(&mut self, snapshot: &Snapshot) -> Result<Mark, PersistError> {
         let before = self.newest().number;
-        if self.is_ready() {
-            self.rotate(snapshot);
-        }
+        self.rotate(snapshot);
         let mark = Mark(self.newest().number);
         if mark.0 == before {
             let full = io::Error::other("it refuses to be written, as the log says");

@@ -20,6 +20,9 @@ pub(crate) mod snapshot;
 mod sync;
 mod upkeep;
 
+#[cfg(test)]
+mod tests;
+
 pub use folder::{Mark, PersistError};
 pub(crate) use opening::shard_dir;
 pub use opening::{KeptReplay, PersistArgs};

@@ -4,7 +4,7 @@
 use std::{
     borrow::Cow,
     fs,
-    path::Path,
+    path::{Path, PathBuf},
     sync::atomic::{AtomicU64, Ordering},
     time::{Duration, Instant},
 };
@@ -19,6 +19,8 @@ use super::{
 };
 use crate::{replay::Replay, storage::frame_store::Packer};
 
+/// What a segment's name ends in that cannot be used.
+const UNUSABLE: &str = "unusable";
 /// How often it is logged how far the reading is.
 const SAY: Duration = Duration::from_secs(5);
 
@@ -122,6 +124,7 @@ pub(super) fn recover(
         oldest: 0,
         same_capacity: false,
         mark,
+        aside: Vec::new(),
     };
     let bytes = |&number| fs::metadata(folder.segment(number)).map_or(0, |it| it.len());
     let total: u64 = numbers.iter().map(bytes).sum();
@@ -165,6 +168,8 @@ struct Reader<'a> {
     same_capacity: bool,
     /// The last record of the log, if it is a mark: then everything is restored.
     mark: Option<Mark>,
+    /// Segments that cannot be used: they get another name once it is known that others can.
+    aside: Vec<PathBuf>,
 }
 
 impl Reader<'_> {
@@ -191,7 +196,7 @@ impl Reader<'_> {
             header.ok().map(|it| (it, first.ordinal, first.bytes()))
         });
         let Some((header, ordinal, at)) = header else {
-            self.set_aside(&path, "its beginning is damaged");
+            self.set_aside(path, "its beginning is damaged");
             return Ok(());
         };
         if header.log != self.id {
@@ -201,7 +206,7 @@ impl Reader<'_> {
         let is_first = !self.recovery.found;
         let follows = is_first || ordinal >= self.place.ordinal;
         if header.number != number || !follows {
-            self.set_aside(&path, "it is not the segment that belongs here");
+            self.set_aside(path, "it is not the segment that belongs here");
             return Ok(());
         }
         let unusable =
@@ -260,15 +265,13 @@ impl Reader<'_> {
         }
     }
 
-    /// Gives a segment that cannot be used another name.
-    fn set_aside(&mut self, path: &Path, why: &str) {
-        let name = file_name(path);
-        let aside = path.with_extension("unusable");
-        let so = match fs::rename(path, &aside) {
-            Ok(()) => format!("it is now {}", file_name(&aside)),
-            Err(e) => format!("it stays there, as it cannot be renamed: {e}"),
-        };
-        self.warn(format!("{name} cannot be used, {why}: {so}"));
+    /// Notes that a segment cannot be used.
+    fn set_aside(&mut self, path: PathBuf, why: &str) {
+        self.warn(format!(
+            "{} cannot be used, {why}: its name now ends in {UNUSABLE}",
+            file_name(&path)
+        ));
+        self.aside.push(path);
     }
 
     /// Takes the records of a segment from byte `at` on. Gives where the last one ends that is of use, and whether it says that another
@@ -313,6 +316,10 @@ impl Reader<'_> {
             RecordKind::Note => {
                 match codec::decode_value(record.body).map_err(|e| e.to_string())? {
                     Note::ActorJoined(join) => self.replay.join_actor(join).map(drop),
+                    Note::Forgotten(actors) => {
+                        self.replay.state.actors.forget(&actors);
+                        Ok(())
+                    }
                     Note::Leave(leave) => self.replay.leave(&leave).map_or(Ok(()), Err),
                     Note::LearnerJoined(join) => self.replay.join_learner(join).map(drop),
                 }
@@ -327,6 +334,11 @@ impl Reader<'_> {
                 "cannot be used: no segment can be read ({why}); to begin a new replay there, remove them"
             );
             return Err(PersistError::Unusable(self.folder.path.clone(), why));
+        }
+        for path in std::mem::take(&mut self.aside) {
+            if let Err(e) = fs::rename(&path, path.with_extension(UNUSABLE)) {
+                self.warn(format!("{} cannot be renamed: {e}", file_name(&path)));
+            }
         }
         // Older segments are removed once none of their transitions is held.
         let ring = &self.replay.ring;

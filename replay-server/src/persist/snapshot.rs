@@ -20,9 +20,11 @@ const COUNT_MAX: u64 = 1 << 60;
 const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");
 
 /// Who came and went: what the log holds beside chunks and snapshots.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) enum Note {
     ActorJoined(ActorJoin),
+    /// Actors that made room for others.
+    Forgotten(Vec<u32>),
     Leave(Leave),
     LearnerJoined(LearnerJoin),
 }

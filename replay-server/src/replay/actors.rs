@@ -34,6 +34,15 @@ impl Replay {
         Ok(earlier_incarnations)
     }
 
+    /// Forgets actors that never sent a chunk and are not connected, if the run has its largest number of actors.
+    pub(crate) fn forget_absent(&mut self, is_connected: impl Fn(u32, u64) -> bool) {
+        let absent = self.state.actors.absent(is_connected);
+        if !absent.is_empty() {
+            self.state.actors.forget(&absent);
+            self.note(Note::Forgotten(absent));
+        }
+    }
+
     /// The life of `actor` whose chunks are stored; none before it joins.
     pub fn actor_incarnation(&self, actor: u32) -> Option<u64> {
         self.state.actors.current_incarnation(actor)

@@ -128,7 +128,7 @@ impl State {
             return Err(JoinReply::Taken { why });
         }
         // Else a process that joins under one number after the other would use them up.
-        self.replay.state.actors.forget_absent(is_connected);
+        self.replay.forget_absent(is_connected);
         let earlier_incarnations = self.replay.join_actor(join).map_err(refused)?;
         participants.joined(Alive::actor(actor, incarnation), Instant::now());
         self.count_actors();

@@ -51,7 +51,7 @@ pub(super) struct Patience {
 
 /// A world's process, with its guard.
 ///
-/// They are a process group of their own, which the guard leads: what the command starts ends with it.
+/// They are a process group of their own, which the guard leads: what the command starts ends with it, unless it leaves the group.
 pub(super) struct WorldProcess {
     command: String,
     guard: Child,
@@ -264,11 +264,18 @@ impl WorldProcess {
 
     /// Kills it, what it started, and the guard; waits for their end.
     fn kill(&mut self) {
-        if let Ok(group) = i32::try_from(self.guard.id())
-            && !matches!(self.guard.try_wait(), Ok(Some(_)))
-            && let Err(e) = killpg(Pid::from_raw(group), Signal::SIGKILL)
-        {
-            tracing::debug!("killing the world `{}`: {e}", self.command);
+        // The world itself may have made a group of its own, as `timeout` does.
+        for process in [&mut self.guard, &mut self.child] {
+            if matches!(process.try_wait(), Ok(Some(_))) {
+                continue;
+            }
+            let group = i32::try_from(process.id()).map(Pid::from_raw);
+            if let Err(e) = group.map(|group| killpg(group, Signal::SIGKILL)) {
+                tracing::debug!("killing the world `{}`: {e}", self.command);
+            }
+            if let Err(e) = process.kill() {
+                tracing::debug!("killing the world `{}`: {e}", self.command);
+            }
         }
         for process in [&mut self.child, &mut self.guard] {
             if let Err(e) = process.wait() {

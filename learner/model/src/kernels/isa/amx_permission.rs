@@ -6,12 +6,15 @@
 use std::arch::asm;
 
 /// CPUID leaf 7: EDX bit 22 is AMX_BF16, bit 24 AMX_TILE. That the operating system knows tiles is asked by `granted`.
+#[allow(
+    unused_unsafe,
+    reason = "the instruction is unsafe in Rust 1.90 and safe in later ones"
+)]
 pub(super) fn has_amx_bf16() -> bool {
-    let leaves = std::arch::x86_64::__cpuid(0).eax;
-    leaves >= 7 && {
-        let edx = std::arch::x86_64::__cpuid_count(7, 0).edx;
-        edx & (1 << 22) != 0 && edx & (1 << 24) != 0
-    }
+    use std::arch::x86_64::{__cpuid, __cpuid_count};
+    // SAFETY: every processor of this architecture has the instruction.
+    let leaf_7 = unsafe { (__cpuid(0).eax >= 7).then(|| __cpuid_count(7, 0)) };
+    leaf_7.is_some_and(|it| it.edx & (1 << 22) != 0 && it.edx & (1 << 24) != 0)
 }
 
 /// Asks Linux for the 8 KiB of state that tiles are (`arch_prctl(ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA)`), for all threads.
