@@ -1,7 +1,7 @@
 //! Everything that one update depends on beside the network's sizes: the table `[learner.update]`.
 //! It fills in no number: presets do, with their sources.
 
-use std::{cell::Cell, ops::RangeInclusive};
+use std::ops::RangeInclusive;
 
 use driml_model::DimHeads;
 use serde::{Deserialize, Deserializer, Serialize, de::Error};
@@ -90,7 +90,6 @@ impl LearnerSettings {
             condition_on_action: self.condition_on_action,
             tanh_clip: self.tanh_clip,
             own: &self.own,
-            has_own: Cell::new(false),
         }
     }
 

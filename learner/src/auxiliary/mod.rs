@@ -79,14 +79,11 @@ impl AuxiliaryKind {
         self,
         settings: &AuxiliarySettings<'_>,
     ) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
-        let (name, loss) = (self.name(), (self.0.make)(settings)?);
-        let is_used = |table: &str| table == name && settings.has_own.get();
-        match settings.own.keys().find(|table| !is_used(table)) {
-            Some(table) if table == name => Err(UpdateError::AuxiliaryLoss(format!(
-                "auxiliary_loss = {name} has no settings of its own: take {name} out of learner.update"
-            ))),
+        let loss = (self.0.make)(settings)?;
+        match settings.own.keys().find(|other| *other != self.name()) {
             Some(other) => Err(UpdateError::AuxiliaryLoss(format!(
-                "auxiliary_loss = {name} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}"
+                "auxiliary_loss = {} has no use for the table {other}: take the table {other} out of learner.update, or take the agent {other}",
+                self.name()
             ))),
             None => Ok(loss),
         }

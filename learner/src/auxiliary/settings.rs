@@ -1,8 +1,6 @@
 //! What auxiliary losses take from the settings: weights, the scores' clip, and a table of each loss's own numbers.
 //! Which loss there is stands in `super`.
 
-use std::cell::Cell;
-
 use driml_model::DimHeads;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -82,7 +80,7 @@ impl Lambda {
 }
 
 /// The settings from which a loss is made.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 pub struct AuxiliarySettings<'a> {
     /// The loss's name in the menu.
     pub auxiliary_loss: &'static str,
@@ -94,14 +92,11 @@ pub struct AuxiliarySettings<'a> {
     pub tanh_clip: f64,
     /// Tables of losses' own numbers, by the loss's name: `[learner.update.<name>]`.
     pub own: &'a toml::Table,
-    /// Whether the loss has asked for its table.
-    pub(crate) has_own: Cell<bool>,
 }
 
 impl AuxiliarySettings<'_> {
     /// The loss's own table; `None` if it is not there.
     pub fn own<T: DeserializeOwned>(&self) -> Result<Option<T>, UpdateError> {
-        self.has_own.set(true);
         let Some(table) = self.own.get(self.auxiliary_loss) else {
             return Ok(None);
         };

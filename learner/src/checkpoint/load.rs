@@ -5,7 +5,6 @@ use std::path::Path;
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
-use serde_json::Value;
 
 use super::{
     contents::{
@@ -74,22 +73,18 @@ pub fn load(
         });
     }
     let has_key = settings.auxiliary()?.key_tau().is_some();
+    check_model(path, model)?;
     let tensors = |name: &str| read_file(path, &state, name);
-    let decoded = |model: &ModelConfig, part: fn(&str) -> bool, name: &str, bytes: &[u8]| {
-        let loaded = Parameters::load_part(model, part, bytes, &compute.device);
+    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
+        let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
-        decoded(model, part, name, &tensors(name)?)
-    };
-    let online = tensors(ONLINE)?;
-    check_model(path, &online, model)?;
     let key = has_key.then(|| parameters(model, Encoder::has, KEY));
     let has_average = state.sha256.contains_key(AVERAGE);
     let average = (settings.average_tau.is_some() && has_average)
         .then(|| parameters(&model.without_dim(), |_| true, AVERAGE));
     let networks = NetworkParameters {
-        online: decoded(model, |_| true, ONLINE, &online)?,
+        online: parameters(model, |_| true, ONLINE)?,
         target: parameters(&model.without_dim(), |_| true, TARGET)?,
         key: key.transpose()?,
     };
@@ -115,14 +110,12 @@ pub fn load(
 }
 
 /// Checks that a checkpoint's network has the sizes of `model`, as far as its description says.
-fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
-    let described = description::described(online);
+fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> {
+    let described = description::described(&read(&path.join(ONLINE))?);
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
-    // As text, as there: a value would widen numbers of 32 bits to 64.
-    let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
-    let ours: Value = ours.unwrap_or_default();
+    let ours = serde_json::to_value(model).unwrap_or_default();
     // What follows from another torso is not worth a word beside it.
     let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::difference("model", saved, &ours)) {

@@ -48,7 +48,7 @@ pub struct RunState<'a> {
 ///
 /// # Errors
 /// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
-/// of the new one is left. An older one that cannot be removed stays, with a warning.
+/// of the new one is left.
 pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
@@ -67,9 +67,7 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     }
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        if let Err(e) = remove_if_there(old) {
-            tracing::warn!("the checkpoint is saved, but an older one stays: {e}");
-        }
+        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
     }
     Ok(path)
 }

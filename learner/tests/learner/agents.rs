@@ -408,14 +408,6 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
     assert!(said(CURL, ALL_DIM, false).contains("lambda.4t4 alone"));
     assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
     assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
-    for kind in [DIM, CPC] {
-        let mut settings = with(kind, GLOBAL, false, None);
-        settings
-            .own
-            .insert(kind.name().into(), toml::Value::Float(0.01));
-        let said = settings.validate().unwrap_err().to_string();
-        assert!(said.contains("has no settings of its own"), "{said}");
-    }
     assert!(said(AuxiliaryKind::NONE, NO_DIM, true).contains("has no use for the table curl"));
     let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
     let missing = curl(None).unwrap_err().to_string();
