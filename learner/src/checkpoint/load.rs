@@ -5,6 +5,7 @@ use std::path::Path;
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
 use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
 
 use super::{
     contents::{
@@ -115,7 +116,9 @@ fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> 
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
-    let ours = serde_json::to_value(model).unwrap_or_default();
+    // Through text, as the description went: as a value, a number of 32 bits would have more digits.
+    let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
+    let ours: Value = ours.unwrap_or_default();
     // What follows from another torso is not worth a word beside it.
     let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::difference("model", saved, &ours)) {
