@@ -409,6 +409,27 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
     assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
     assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
     assert!(said(AuxiliaryKind::NONE, NO_DIM, true).contains("has no use for the table curl"));
+    for kind in [AuxiliaryKind::NONE, DIM, CPC] {
+        let (name, lambda) = (
+            kind.name(),
+            if kind == DIM || kind == CPC {
+                GLOBAL
+            } else {
+                NO_DIM
+            },
+        );
+        for own in ["= 0.01", "= { tanh_clip = 5.0 }", "= {}"] {
+            let settings = LearnerSettings {
+                own: format!("{name} {own}").parse().unwrap(),
+                ..with(kind, lambda, false, None)
+            };
+            let said = settings.validate().unwrap_err().to_string();
+            assert!(
+                said.contains(&format!("take {name} out of learner.update")),
+                "{said}"
+            );
+        }
+    }
     let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
     let missing = curl(None).unwrap_err().to_string();
     assert!(
