@@ -16,7 +16,7 @@ use super::{
     },
     description,
     error::{CheckpointError, io_error},
-    folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
+    folder::{PREFIX, list, put_in_place, remove_or_warn, sync, tidy, write_durably},
 };
 use crate::{affinity::AffinityEstimator, agent::Agent, error::UpdateError, progress::Progress};
 
@@ -60,14 +60,12 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     let saved = write(&aside, state).and_then(|()| put_in_place(&aside, &path));
     if let Err(error) = saved {
         // It would keep a full disk full.
-        if let Err(e) = remove_if_there(&aside) {
-            tracing::warn!("a checkpoint was not saved, and a part of it stays: {e}");
-        }
+        remove_or_warn(&aside);
         return Err(error);
     }
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+        remove_or_warn(old);
     }
     Ok(path)
 }

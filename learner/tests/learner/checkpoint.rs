@@ -282,6 +282,24 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
     assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 3);
 }
 
+/// The new one is there: whether an old one can be removed says nothing of it.
+#[test]
+fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
+    let folder = Folder::new("stuck");
+    fs::create_dir_all(&folder.0).unwrap();
+    // What removes a folder does not remove this.
+    let stuck = folder.0.join("checkpoint-000000000000");
+    fs::write(&stuck, "").unwrap();
+    let mut run = Run::new();
+    for updates in 1..=3 {
+        run.updates(1);
+        run.save(&folder.0, 1);
+        let all = list(&folder.0).unwrap();
+        let all: Vec<u64> = all.iter().map(|(updates, _)| *updates).collect();
+        assert_eq!(all, [0, updates], "the others are removed all the same");
+    }
+}
+
 #[test]
 fn what_a_cut_off_save_left_is_gone_after_the_next() {
     let folder = Folder::new("cut-off");
