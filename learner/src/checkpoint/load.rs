@@ -74,19 +74,20 @@ pub fn load(
         });
     }
     let has_key = settings.auxiliary()?.key_tau().is_some();
-    check_model(path, model)?;
     let tensors = |name: &str| read_file(path, &state, name);
-    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
-        let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
+    let online = tensors(ONLINE)?;
+    check_model(path, &online, model)?;
+    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str, bytes: &[u8]| {
+        let loaded = Parameters::load_part(model, part, bytes, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = has_key.then(|| parameters(model, Encoder::has, KEY));
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY, &tensors(KEY)?));
     let has_average = state.sha256.contains_key(AVERAGE);
     let average = (settings.average_tau.is_some() && has_average)
-        .then(|| parameters(&model.without_dim(), |_| true, AVERAGE));
+        .then(|| parameters(&model.without_dim(), |_| true, AVERAGE, &tensors(AVERAGE)?));
     let networks = NetworkParameters {
-        online: parameters(model, |_| true, ONLINE)?,
-        target: parameters(&model.without_dim(), |_| true, TARGET)?,
+        online: parameters(model, |_| true, ONLINE, &online)?,
+        target: parameters(&model.without_dim(), |_| true, TARGET, &tensors(TARGET)?)?,
         key: key.transpose()?,
     };
     let average = average.transpose()?;
@@ -110,9 +111,9 @@ pub fn load(
     })
 }
 
-/// Checks that a checkpoint's network has the sizes of `model`, as far as its description says.
-fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> {
-    let described = description::described(&read(&path.join(ONLINE))?);
+/// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, as far as its description says.
+fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
+    let described = description::described(online);
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };

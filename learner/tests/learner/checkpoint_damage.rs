@@ -11,7 +11,7 @@ use driml_model::Compute;
 use crate::{
     checkpoint::{DESCRIPTION, Folder, Run, change_state, load, sha256},
     errors::diverged,
-    synthetic::{ACTIONS, CANDLE},
+    synthetic::{ACTIONS, ALL_DIM, CANDLE, model},
 };
 
 #[test]
@@ -19,7 +19,8 @@ fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = Folder::new("damage");
     let mut run = Run::new();
     run.updates(1);
-    let path = run.save(&folder.0, 1);
+    let description = serde_json::json!({ "model": model(ALL_DIM) }).to_string();
+    let path = run.try_save(&folder.0, 1, &description).unwrap();
     for name in [
         "online.safetensors",
         "target.safetensors",
@@ -37,11 +38,23 @@ fn every_kind_of_damage_is_reported_with_its_file() {
         };
         fs::write(&file, &whole[..whole.len() / 2]).unwrap();
         reported();
-        let mut flipped = whole.clone();
-        flipped[whole.len() / 2] ^= 1;
-        fs::write(&file, &flipped).unwrap();
-        if name != "state.json.sha256" || whole.len() / 2 < 64 {
-            reported();
+        // The last digit of a size that the network's description has.
+        let size = br#"hidden\":16"#;
+        let size = whole.windows(size.len()).position(|it| it == size);
+        assert_eq!(
+            size.is_some(),
+            name == "online.safetensors" || name == "target.safetensors"
+        );
+        for at in [Some(whole.len() / 2), size.map(|at| at + 10)]
+            .into_iter()
+            .flatten()
+        {
+            let mut flipped = whole.clone();
+            flipped[at] ^= 1;
+            fs::write(&file, &flipped).unwrap();
+            if name != "state.json.sha256" || at < 64 {
+                reported();
+            }
         }
         fs::remove_file(&file).unwrap();
         reported();
