@@ -209,7 +209,7 @@ impl Learner {
             learner,
             version: self.agent.updates(),
             num_actions: affinity.num_actions() as u32,
-            matrix: affinity.matrix().to_vec(),
+            matrix: affinity.matrix(),
         })
     }
 

@@ -11,7 +11,7 @@ use crate::{
     progress::{COUNT_MAX, Progress},
 };
 
-pub(super) const FORMAT: u32 = 3;
+pub(super) const FORMAT: u32 = 4;
 pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
 /// CURL's key encoder; there for that auxiliary loss alone.
