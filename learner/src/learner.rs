@@ -12,7 +12,7 @@ use crate::{
     affinity::{AffinityError, AffinityEstimator},
     agent::Agent,
     checkpoint::{self, CheckpointError, RunState},
-    config::{ConfigError, LearnerConfig},
+    config::LearnerConfig,
     error::UpdateError,
     evaluation::UpdateReport,
     importance::drawn_evenly,
@@ -34,7 +34,7 @@ pub enum LearnerError {
     Affinity(#[from] AffinityError),
     /// Settings of the learner that cannot work.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(#[from] driml_protocol::config::ConfigError),
     /// Sizes that no network can have.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
