@@ -2,7 +2,7 @@
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
 use driml_learner::{Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, UpdateError};
-use driml_model::{Compute, ModelConfig, Parameters};
+use driml_model::{Compute, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -230,11 +230,6 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
         }
     }
     assert_ne!(average, start);
-    // Actors get none of it.
-    let acting = agent.model().without_dim();
-    let weights = agent.weights().unwrap();
-    let device = candle_core::Device::Cpu;
-    Parameters::load_safetensors(&acting, &weights, &device).unwrap();
 }
 
 /// So that a comparison of agents compares the auxiliary loss alone.
