@@ -4,39 +4,22 @@ use std::path::Path;
 
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
-use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 
 use super::{
     contents::{
-        AVERAGE, COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
-        sha256_of,
+        AVERAGE, COMPANION, KEY, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile,
+        TARGET, hex_of, sha256_of,
     },
     description,
     error::{CheckpointError, damaged},
     folder::{list, read},
 };
 use crate::{
-    affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
     progress::Progress,
     settings::LearnerSettings,
 };
-
-/// What a checkpoint gave.
-#[derive(Debug)]
-pub struct Restored {
-    /// Networks, optimiser, count of updates.
-    pub agent: Agent,
-    /// The affinity estimate, if the run had one.
-    pub affinity: Option<AffinityEstimator>,
-    /// The generator behind augmentation and affinity.
-    pub rng: ChaCha8Rng,
-    /// Newest version of the weights that had been published.
-    pub weights_version: u64,
-    /// What the run had done.
-    pub progress: Progress,
-}
 
 /// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
 pub fn load_latest(
@@ -45,7 +28,7 @@ pub fn load_latest(
     settings: &LearnerSettings,
     compute: &Compute,
     run_spec_hash: u64,
-) -> Result<Option<Restored>, CheckpointError> {
+) -> Result<Option<LearnerState>, CheckpointError> {
     match list(folder)?.last() {
         Some((_, path)) => load(path, model, settings, compute, run_spec_hash).map(Some),
         None => Ok(None),
@@ -62,7 +45,7 @@ pub fn load(
     settings: &LearnerSettings,
     compute: &Compute,
     run_spec_hash: u64,
-) -> Result<Restored, CheckpointError> {
+) -> Result<LearnerState, CheckpointError> {
     let state = read_state(path)?;
     let expected = hex_of(run_spec_hash);
     if state.run_spec_hash != expected {
@@ -102,7 +85,7 @@ pub fn load(
     agent
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
-    Ok(Restored {
+    Ok(LearnerState {
         agent,
         affinity: state.affinity,
         rng: state.rng,

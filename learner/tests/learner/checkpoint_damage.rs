@@ -4,12 +4,13 @@ use std::fs;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, checkpoint::CheckpointError,
+    AffinityEstimator, Alphabet, ExactAffinity, ExactSettings,
+    checkpoint::{CheckpointError, LearnerState},
 };
 use driml_model::Compute;
 
 use crate::{
-    checkpoint::{DESCRIPTION, Folder, Run, change_state, load, sha256},
+    checkpoint::{DESCRIPTION, Folder, change_state, learn, load, save, sha256, start, try_save},
     errors::diverged,
     synthetic::{ACTIONS, ALL_DIM, CANDLE, model},
 };
@@ -17,10 +18,10 @@ use crate::{
 #[test]
 fn every_kind_of_damage_is_reported_with_its_file() {
     let folder = Folder::new("damage");
-    let mut run = Run::new();
-    run.updates(1);
+    let mut run = start();
+    learn(&mut run, 1);
     let description = serde_json::json!({ "model": model(ALL_DIM) }).to_string();
-    let path = run.try_save(&folder.0, 1, &description).unwrap();
+    let path = try_save(&run, &folder.0, 1, &description).unwrap();
     for name in [
         "online.safetensors",
         "target.safetensors",
@@ -66,7 +67,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
 #[test]
 fn a_checkpoint_of_another_format_is_rejected() {
     let folder = Folder::new("format");
-    let path = Run::new().save(&folder.0, 1);
+    let path = save(&start(), &folder.0, 1);
     for unknown in [0, 3, 5] {
         change_state(&path, |state| state["format"] = unknown.into());
         let said = load(&folder.0).unwrap_err().to_string();
@@ -82,11 +83,11 @@ fn a_checkpoint_of_another_format_is_rejected() {
 fn a_state_that_is_not_finite_is_not_saved() {
     for compute in [&Compute::CPU, &CANDLE] {
         let folder = Folder::new("not-finite");
-        let mut run = Run::new();
-        run.save(&folder.0, 1);
+        let mut run = start();
+        save(&run, &folder.0, 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
             run.agent = diverged(compute, name).0;
-            let said = run.try_save(&folder.0, 1, DESCRIPTION);
+            let said = try_save(&run, &folder.0, 1, DESCRIPTION);
             let said = said.unwrap_err().to_string();
             assert!(
                 said.starts_with("nothing is saved") && said.contains(name),
@@ -107,11 +108,11 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         smoothing: 1.0,
     };
     let exact = ExactAffinity::new(Alphabet::raw(ACTIONS).unwrap(), exact).unwrap();
-    let mut run = Run::new();
-    let learned = run.affinity.clone();
-    let refused = |run: &Run, change: &dyn Fn(&mut serde_json::Value), said: &str| {
+    let mut run = start();
+    let learned = run.affinity.clone().unwrap();
+    let refused = |run: &LearnerState, change: &dyn Fn(&mut serde_json::Value), said: &str| {
         let folder = Folder::new("arrays");
-        let path = run.save(&folder.0, 1);
+        let path = save(run, &folder.0, 1);
         load(&folder.0).unwrap().unwrap();
         change_state(&path, change);
         let error = load(&folder.0).map(|_| ()).unwrap_err();
@@ -133,8 +134,8 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         (AffinityEstimator::Exact(exact), &["counts"]),
     ];
     for (affinity, arrays) in kinds {
-        run.affinity = affinity;
-        run.updates(1);
+        run.affinity = Some(affinity);
+        learn(&mut run, 1);
         for name in arrays {
             let change = |change: fn(&mut Vec<serde_json::Value>)| {
                 move |state: &mut serde_json::Value| {
@@ -164,7 +165,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     }
     let huge = |state: &mut serde_json::Value| state["affinity"]["settings"]["decay"] = 2.into();
     refused(&run, &huge, "a decay of 2");
-    run.affinity = Run::new().affinity;
+    run.affinity = start().affinity;
     for (key, value) in [("hidden", u64::MAX), ("lr", 0), ("keep", 1)] {
         let change =
             |state: &mut serde_json::Value| state["affinity"]["settings"][key] = value.into();
@@ -186,9 +187,9 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
 #[test]
 fn moments_that_no_optimiser_has_are_damage() {
     let folder = Folder::new("moments");
-    let mut run = Run::new();
-    run.updates(1);
-    let path = run.save(&folder.0, 1);
+    let mut run = start();
+    learn(&mut run, 1);
+    let path = save(&run, &folder.0, 1);
     let file = path.join("optimizer.safetensors");
     let whole = fs::read(&file).unwrap();
     for (name, number) in [
