@@ -196,17 +196,15 @@ impl Config {
 
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerConfigError {
     /// Not TOML, a table that is missing or does not fit, or a value of `[run]` or `[learner]` that cannot work.
     #[error(transparent)]
     Tables(#[from] ConfigError),
-    /// The network cannot exist.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// The `[learner.update]` table cannot work.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// Two tables are at odds.
     #[error(
         "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml train`"
     )]

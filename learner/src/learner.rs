@@ -25,23 +25,18 @@ const NOISE: &str = "noisy layers";
 
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerError {
-    /// The update was not taken.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// The pairs of actions do not fit the affinity's alphabet, or the estimate left the finite numbers.
     #[error(transparent)]
     Affinity(#[from] AffinityError),
-    /// Settings of the learner that cannot work.
     #[error(transparent)]
     Config(#[from] driml_protocol::config::ConfigError),
-    /// Sizes that no network can have.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// A checkpoint was not written or not read.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The checkpoint's affinity is estimated in another way than this run's.
     #[error(
         "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
         .0.display()
