@@ -1,6 +1,7 @@
 //! Augmentation: what the auxiliary loss sees of a state, cropped and recoloured at random; bytes in, bytes out.
 //! C51 never sees it. It knows neither networks nor losses, and keeps no generator.
 
+use driml_protocol::config::{ConfigError, check};
 use rand::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -38,47 +39,27 @@ impl AugmentSettings {
     /// Checks each strength against its range.
     ///
     /// # Errors
-    /// The first setting out of its range: its name, its value, the range.
-    pub fn validate(&self) -> Result<(), (&'static str, f64, &'static str)> {
-        let strength = |x: f64| (0.0..=1.0).contains(&x);
-        let from_0_to_1 = "it must lie between 0 and 1";
-        for (name, value, fine, range) in [
-            (
-                "augment.crop_side",
-                self.crop_side,
-                self.crop_side > 0.0 && self.crop_side <= 1.0,
-                "it must lie above 0 and be at most 1, which crops nothing",
-            ),
-            (
-                "augment.brightness",
-                self.brightness,
-                strength(self.brightness),
-                from_0_to_1,
-            ),
-            (
-                "augment.contrast",
-                self.contrast,
-                strength(self.contrast),
-                from_0_to_1,
-            ),
-            (
-                "augment.saturation",
-                self.saturation,
-                strength(self.saturation),
-                from_0_to_1,
-            ),
-            (
-                "augment.hue",
-                self.hue,
-                (0.0..=0.5).contains(&self.hue),
-                "it must lie between 0 and 0.5, half a turn either way",
-            ),
+    /// The first setting out of its range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let side = self.crop_side;
+        let why = || "it must lie above 0 and be at most 1, which crops nothing";
+        check(
+            side > 0.0 && side <= 1.0,
+            "learner.augment.crop_side",
+            side,
+            why,
+        )?;
+        for (key, strength) in [
+            ("learner.augment.brightness", self.brightness),
+            ("learner.augment.contrast", self.contrast),
+            ("learner.augment.saturation", self.saturation),
         ] {
-            if !fine {
-                return Err((name, value, range));
-            }
+            let is_fine = (0.0..=1.0).contains(&strength);
+            check(is_fine, key, strength, || "it must lie between 0 and 1")?;
         }
-        Ok(())
+        let is_fine = (0.0..=0.5).contains(&self.hue);
+        let why = || "it must lie between 0 and 0.5, half a turn either way";
+        check(is_fine, "learner.augment.hue", self.hue, why)
     }
 }
 

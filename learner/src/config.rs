@@ -4,7 +4,7 @@
 use driml_model::{InputSize, ModelConfig, Precision, StoredAs};
 use driml_protocol::{
     RunSpec, Sampling,
-    config::{Settings, TransportConfig},
+    config::{ConfigError, Settings, TransportConfig, check},
 };
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -98,42 +98,36 @@ impl AffinityConfig {
         num_actions: usize,
         rng: &mut ChaCha8Rng,
     ) -> Result<Option<AffinityEstimator>, ConfigError> {
-        let missing = |key| ConfigError {
-            key,
-            value: "(missing)".into(),
-            why: "the chosen estimator needs it: start from a preset".into(),
+        let missing = |key: &str| {
+            let why = "the chosen estimator needs it: start from a preset";
+            ConfigError::of(&format!("learner.affinity.{key}"), "(missing)", why)
         };
-        let bad = |e: AffinityError| ConfigError {
-            key: "affinity",
-            value: format!("{:?}", self.estimator),
-            why: e.to_string(),
-        };
+        let name = format!("{:?}", self.estimator);
+        let bad = |e: AffinityError| ConfigError::of("learner.affinity", &name, e);
         if self.estimator == EstimatorKind::None {
             return Ok(None);
         }
-        let alphabet = match self.alphabet.ok_or_else(|| missing("affinity.alphabet"))? {
+        let alphabet = match self.alphabet.ok_or_else(|| missing("alphabet"))? {
             AlphabetKind::Raw => Alphabet::raw(num_actions),
-            AlphabetKind::Visible => Alphabet::new(
-                self.visible
-                    .as_ref()
-                    .ok_or_else(|| missing("affinity.visible"))?,
-            ),
+            AlphabetKind::Visible => {
+                Alphabet::new(self.visible.as_ref().ok_or_else(|| missing("visible"))?)
+            }
         }
         .map_err(bad)?;
-        if alphabet.num_actions() != num_actions {
-            return Err(ConfigError {
-                key: "affinity.visible",
-                value: format!("{} actions", alphabet.num_actions()),
-                why: format!("the world has {num_actions}"),
-            });
-        }
+        let found = alphabet.num_actions();
+        check(
+            found == num_actions,
+            "learner.affinity.visible",
+            format!("{found} actions"),
+            || format!("the world has {num_actions}"),
+        )?;
         let estimator = match self.estimator {
             EstimatorKind::Exact => {
-                let settings = self.exact.ok_or_else(|| missing("affinity.exact"))?;
+                let settings = self.exact.ok_or_else(|| missing("exact"))?;
                 AffinityEstimator::Exact(ExactAffinity::new(alphabet, settings).map_err(bad)?)
             }
             _ => {
-                let settings = self.learned.ok_or_else(|| missing("affinity.learned"))?;
+                let settings = self.learned.ok_or_else(|| missing("learned"))?;
                 AffinityEstimator::Learned(
                     LearnedAffinity::new(alphabet, settings, rng).map_err(bad)?,
                 )
@@ -143,22 +137,13 @@ impl AffinityConfig {
     }
 }
 
-/// Why the learner's settings cannot work.
-#[derive(Debug, thiserror::Error, PartialEq)]
-#[error("learner.{key} = {value} cannot work: {why}")]
-pub struct ConfigError {
-    key: &'static str,
-    value: String,
-    why: String,
-}
-
 impl Config {
     /// Checks every field's range but those of `update`, which checks itself.
     ///
     /// # Errors
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        for (key, value, max) in [
+        for (key, value, most) in [
             ("batch_size", u64::from(self.batch_size), 65_536),
             ("batches_in_flight", u64::from(self.batches_in_flight), 64),
             (
@@ -178,45 +163,32 @@ impl Config {
             ),
             ("unreachable_max_ms", self.unreachable_max_ms, 86_400_000),
         ] {
-            if value == 0 || value > max {
-                let why = format!("it must lie between 1 and {max}");
-                return Err(ConfigError {
-                    key,
-                    value: value.to_string(),
-                    why,
-                });
-            }
+            let why = || format!("it must lie between 1 and {most}");
+            check(
+                (1..=most).contains(&value),
+                &format!("learner.{key}"),
+                value,
+                why,
+            )?;
         }
         if let Some(augment) = &self.augment {
-            augment
-                .validate()
-                .map_err(|(key, value, why)| ConfigError {
-                    key,
-                    value: value.to_string(),
-                    why: why.into(),
-                })?;
+            augment.validate()?;
         }
-        let bad = |value: &str, why: &str| {
-            Err(ConfigError {
-                key: "augment",
-                value: value.into(),
-                why: why.into(),
-            })
-        };
-        let auxiliary_loss = self.update.auxiliary_loss;
-        match (auxiliary_loss.positives(), self.augment) {
-            (Positives::OtherView, None) => bad(
+        let name = self.update.auxiliary_loss.name();
+        match (self.update.auxiliary_loss.positives(), self.augment) {
+            (Positives::OtherView, None) => Err(ConfigError::of(
+                "learner.augment",
                 "(missing)",
-                &format!(
-                    "{} compares two augmentations of a state: take the agent {}, or set all of learner.augment",
-                    auxiliary_loss.name().to_uppercase(),
-                    auxiliary_loss.name()
+                format!(
+                    "{} compares two augmentations of a state: take the agent {name}, or set all of learner.augment",
+                    name.to_uppercase()
                 ),
-            ),
-            (Positives::None, Some(_)) => bad(
+            )),
+            (Positives::None, Some(_)) => Err(ConfigError::of(
+                "learner.augment",
                 "(there)",
                 "nothing but an auxiliary loss sees augmented states, and this agent has none",
-            ),
+            )),
             _ => Ok(()),
         }
     }
@@ -224,20 +196,15 @@ impl Config {
 
 /// Why a run's settings are none that a learner can work with.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerConfigError {
-    /// Not TOML, a table that is missing or does not fit, or what all processes agree on cannot work.
+    /// Not TOML, a table that is missing or does not fit, or a value of `[run]` or `[learner]` that cannot work.
     #[error(transparent)]
-    Tables(#[from] driml_protocol::config::ConfigError),
-    /// The network cannot exist.
+    Tables(#[from] ConfigError),
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// The `[learner]` table cannot work.
-    #[error(transparent)]
-    Learner(#[from] ConfigError),
-    /// The `[learner.update]` table cannot work.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// Two tables are at odds.
     #[error(
         "the [model] table's sizes do not follow from [run] and [input]: write the settings anew with `driml train`"
     )]

@@ -9,10 +9,10 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    affinity::{AffinityError, AffinityEstimator},
+    affinity::AffinityError,
     agent::Agent,
-    checkpoint::{self, CheckpointError, RunState},
-    config::{ConfigError, LearnerConfig},
+    checkpoint::{self, CheckpointError, Label, LearnerState},
+    config::LearnerConfig,
     error::UpdateError,
     evaluation::UpdateReport,
     importance::drawn_evenly,
@@ -25,23 +25,18 @@ const NOISE: &str = "noisy layers";
 
 /// Why a learner could not be made, learn or be saved.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum LearnerError {
-    /// The update was not taken.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// The pairs of actions do not fit the affinity's alphabet, or the estimate left the finite numbers.
     #[error(transparent)]
     Affinity(#[from] AffinityError),
-    /// Settings of the learner that cannot work.
     #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// Sizes that no network can have.
+    Config(#[from] driml_protocol::config::ConfigError),
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// A checkpoint was not written or not read.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The checkpoint's affinity is estimated in another way than this run's.
     #[error(
         "the checkpoint in {} estimated the action affinity otherwise: resume with the settings it was made with, or choose another folder",
         .0.display()
@@ -49,16 +44,19 @@ pub enum LearnerError {
     OtherAffinity(PathBuf),
 }
 
-/// Everything that a learner changes while it learns.
+/// A learner's state, and what it learns by.
 pub struct Learner {
     config: LearnerConfig,
     spec_hash: u64,
-    agent: Agent,
-    affinity: Option<AffinityEstimator>,
-    rng: ChaCha8Rng,
+    state: LearnerState,
     preparation: Preparation,
-    weights_version: u64,
-    progress: Progress,
+}
+
+/// What of an agent is no part of its state.
+fn configured(agent: Agent, config: &LearnerConfig) -> Agent {
+    agent
+        .with_deduplication(config.learner.deduplicate_states)
+        .with_noise_seed(config.spec.seed_for(NOISE, 0))
 }
 
 impl Learner {
@@ -67,26 +65,20 @@ impl Learner {
         let spec = &config.spec;
         let mut init = ChaCha8Rng::from_seed(spec.seed_for("weights", 0));
         let mut rng = ChaCha8Rng::from_seed(spec.seed_for("learner", 0));
-        let agent = Agent::new(
-            config.model.clone(),
-            config.learner.update.clone(),
-            compute,
-            &mut init,
-        )?
-        .with_deduplication(config.learner.deduplicate_states)
-        .with_noise_seed(spec.seed_for(NOISE, 0));
-        let affinity = config
-            .learner
-            .affinity
-            .estimator(config.model.num_actions, &mut rng)?;
+        let (model, update) = (config.model.clone(), config.learner.update.clone());
+        let agent = Agent::new(model, update, compute, &mut init)?;
+        let affinity = &config.learner.affinity;
+        let affinity = affinity.estimator(config.model.num_actions, &mut rng)?;
         Ok(Self {
             spec_hash: spec.hash(),
-            agent,
-            affinity,
-            rng,
+            state: LearnerState {
+                agent: configured(agent, &config),
+                affinity,
+                rng,
+                weights_version: 0,
+                progress: Progress::default(),
+            },
             preparation: Preparation::new(&config)?,
-            weights_version: 0,
-            progress: Progress::default(),
             config,
         })
     }
@@ -111,7 +103,7 @@ impl Learner {
         let Some(restored) = restored else {
             return Ok(this);
         };
-        let same_affinity = match (&this.affinity, &restored.affinity) {
+        let same_affinity = match (&this.state.affinity, &restored.affinity) {
             (Some(fresh), Some(found)) => found.has_settings_of(fresh),
             (None, None) => true,
             _ => false,
@@ -119,14 +111,10 @@ impl Learner {
         if !same_affinity {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
-        this.weights_version = restored.weights_version;
-        this.progress = restored.progress;
-        this.agent = restored
-            .agent
-            .with_deduplication(this.config.learner.deduplicate_states)
-            .with_noise_seed(this.config.spec.seed_for(NOISE, 0));
-        this.affinity = restored.affinity;
-        this.rng = restored.rng;
+        this.state = LearnerState {
+            agent: configured(restored.agent, &this.config),
+            ..restored
+        };
         tracing::info!(
             "resumed after {} updates from {}",
             this.updates(),
@@ -137,7 +125,7 @@ impl Learner {
 
     /// The networks, and how they learn.
     pub const fn agent(&self) -> &Agent {
-        &self.agent
+        &self.state.agent
     }
 
     /// Hash of the run spec.
@@ -147,17 +135,17 @@ impl Learner {
 
     /// Updates taken since the run began, those before a restart included.
     pub const fn updates(&self) -> u64 {
-        self.agent.updates()
+        self.state.agent.updates()
     }
 
     /// What the run has done beside its updates.
     pub const fn progress(&self) -> &Progress {
-        &self.progress
+        &self.state.progress
     }
 
     /// The same, to add to: [`Learner::update`] does not know where a batch comes from.
     pub const fn progress_mut(&mut self) -> &mut Progress {
-        &mut self.progress
+        &mut self.state.progress
     }
 
     /// Learns from one batch: the network and the affinity.
@@ -169,10 +157,10 @@ impl Learner {
         let beta = self.config.sampling.beta(self.updates());
         let columns = Columns::of(batch, beta);
         // Kept only if the update succeeds.
-        let mut rng = self.rng.clone();
+        let mut rng = self.state.rng.clone();
         let batch = self.preparation.prepare(&columns, &mut rng);
-        self.agent.check(&batch)?;
-        let mut affinity = self.affinity.clone();
+        self.state.agent.check(&batch)?;
+        let mut affinity = self.state.affinity.clone();
         if let Some(affinity) = &mut affinity {
             // Of rows drawn by priority it would be the affinity of surprising transitions.
             let pairs = match &columns.probabilities {
@@ -181,8 +169,8 @@ impl Learner {
             };
             affinity.observe(&pairs, &mut rng)?;
         }
-        let report = self.agent.update_checked(&batch)?;
-        (self.rng, self.affinity) = (rng, affinity);
+        let report = self.state.agent.update_checked(&batch)?;
+        (self.state.rng, self.state.affinity) = (rng, affinity);
         Ok(report)
     }
 
@@ -200,22 +188,23 @@ impl Learner {
     /// The next weights get a version above `version`: actors take what is newer than theirs, which may be those of a learner
     /// that died after its last checkpoint.
     pub fn publish_above(&mut self, version: u64) {
-        self.weights_version = self.weights_version.max(version);
+        self.state.weights_version = self.state.weights_version.max(version);
     }
 
     /// The affinity matrix after the last update, if this agent has one, as `learner` sends it.
     pub fn affinity_update(&self, learner: u64) -> Option<AffinityUpdate> {
-        self.affinity.as_ref().map(|affinity| AffinityUpdate {
+        self.state.affinity.as_ref().map(|affinity| AffinityUpdate {
             learner,
-            version: self.agent.updates(),
+            version: self.state.agent.updates(),
             num_actions: affinity.num_actions() as u32,
-            matrix: affinity.matrix().to_vec(),
+            matrix: affinity.matrix(),
         })
     }
 
     /// Whether the actors are due newer weights after this many updates.
     pub const fn publication_is_due(&self) -> bool {
-        self.agent
+        self.state
+            .agent
             .updates()
             .is_multiple_of(self.config.learner.publish_period_updates)
     }
@@ -230,9 +219,12 @@ impl Learner {
 
     /// The present weights as a new version.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
-        let safetensors = self.agent.weights_as(self.config.learner.publish_dtype)?;
-        self.weights_version += 1;
-        let header = WeightsHeader::new(self.weights_version, self.updates(), &safetensors);
+        let safetensors = self
+            .state
+            .agent
+            .weights_as(self.config.learner.publish_dtype)?;
+        self.state.weights_version += 1;
+        let header = WeightsHeader::new(self.state.weights_version, self.updates(), &safetensors);
         Ok(Weights {
             header,
             safetensors,
@@ -252,21 +244,13 @@ impl Learner {
         let LearnerConfig {
             spec, model, input, ..
         } = &self.config;
-        let state = RunState {
-            description: &checkpoint::describe(spec, model, input),
-            agent: &self.agent,
-            affinity: self.affinity.as_ref(),
-            rng: &self.rng,
-            weights_version: self.weights_version,
-            progress: &self.progress,
+        let label = Label {
             run_spec_hash: self.spec_hash,
+            description: &checkpoint::describe(spec, model, input),
             companion,
         };
-        let path = checkpoint::save(
-            folder,
-            &state,
-            self.config.learner.checkpoints_kept as usize,
-        )?;
+        let keep = self.config.learner.checkpoints_kept as usize;
+        let path = checkpoint::save(folder, &self.state, label, keep)?;
         tracing::info!("saved {}", path.display());
         Ok(())
     }

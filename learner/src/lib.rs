@@ -81,8 +81,7 @@ pub use augment::{Augment, AugmentSettings};
 pub use auxiliary::{AuxiliaryKind, positives::Positives, settings::Lambda};
 pub use batch::{Batch, OwnedBatch};
 pub use config::{
-    AffinityConfig, AlphabetKind, Config, ConfigError, EstimatorKind, LearnerConfig,
-    LearnerConfigError,
+    AffinityConfig, AlphabetKind, Config, EstimatorKind, LearnerConfig, LearnerConfigError,
 };
 pub use driml_model::{Compute, DeviceName, Kernels, Precision};
 pub use error::UpdateError;

@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use super::{
     alphabet::Alphabet,
     arrays::{AffinityError, check_array, check_probabilities},
-    bits,
 };
 
 /// Decay and smoothing of the pair counts.
@@ -35,11 +34,7 @@ pub struct ExactAffinity {
     pub(super) alphabet: Alphabet,
     pub(super) settings: ExactSettings,
     /// [m, m] by dense visible indices.
-    #[serde(with = "bits")]
     counts: Vec<f64>,
-    /// [n, n] by raw actions.
-    #[serde(with = "bits")]
-    pub(super) matrix: Vec<f32>,
 }
 
 impl ExactSettings {
@@ -69,25 +64,27 @@ impl ExactAffinity {
     pub fn new(alphabet: Alphabet, settings: ExactSettings) -> Result<Self, AffinityError> {
         settings.check_valid()?;
         let m = alphabet.len();
-        let mut exact = Self {
+        Ok(Self {
             counts: vec![0.0; m * m],
-            matrix: Vec::new(),
             alphabet,
             settings,
-        };
-        exact.matrix = exact.alphabet.expand(&exact.ratios());
-        Ok(exact)
+        })
     }
 
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
-        let (m, n) = (self.alphabet.len(), self.alphabet.num_actions());
+        let m = self.alphabet.len();
         check_array("counts", &self.counts, m * m)?;
         if let Some(at) = self.counts.iter().position(|&count| count < 0.0) {
             return Err(AffinityError(format!("counts is below 0 at index {at}")));
         }
-        check_probabilities("matrix", &self.matrix, n * n)
+        check_probabilities("matrix", &self.ratios(), m * m)
+    }
+
+    /// A by raw actions [n, n].
+    pub(super) fn matrix(&self) -> Vec<f32> {
+        self.alphabet.expand(&self.ratios())
     }
 
     pub(super) fn observe(&mut self, pairs: &[(u8, u8)]) -> Result<(), AffinityError> {
@@ -101,7 +98,6 @@ impl ExactAffinity {
         for (i, j) in pairs {
             self.counts[usize::from(i) * self.alphabet.len() + usize::from(j)] += 1.0;
         }
-        self.matrix = self.alphabet.expand(&self.ratios());
         Ok(())
     }
 
@@ -156,7 +152,7 @@ mod tests {
             [4.0 / (16.0 / 7.0 + 1.0), 2.0 / (12.0 / 7.0 + 1.0)],
             [2.0 / (12.0 / 7.0 + 1.0), 3.0 / (9.0 / 7.0 + 1.0)],
         ];
-        for (row, [a, b]) in exact.matrix.chunks_exact(2).zip(ratios) {
+        for (row, [a, b]) in exact.matrix().chunks_exact(2).zip(ratios) {
             assert!((f64::from(row[0]) - a / (a + b)).abs() < 1e-7);
             assert!((row[0] + row[1] - 1.0).abs() < 1e-6);
         }
@@ -183,7 +179,7 @@ mod tests {
                 .unwrap();
         }
         for exact in [always_1, odd_ones] {
-            for (action, row) in exact.matrix.chunks_exact(15).enumerate() {
+            for (action, row) in exact.matrix().chunks_exact(15).enumerate() {
                 assert!(uniform(row), "action {action}: {row:?}");
             }
         }

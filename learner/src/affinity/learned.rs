@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use super::{
     alphabet::Alphabet,
     arrays::{AffinityError, check_array, check_probabilities, row_softmax},
-    bits,
 };
 
 /// Sizes, optimiser and smoothing of the learned estimate.
@@ -35,19 +34,12 @@ pub struct LearnedAffinity {
     pub(super) alphabet: Alphabet,
     pub(super) settings: LearnedSettings,
     /// w_from [m, hidden], w_to [m, hidden], b [hidden], out [hidden], c [1], one after the other.
-    #[serde(with = "bits")]
     parameters: Vec<f64>,
-    #[serde(with = "bits")]
     first_moments: Vec<f64>,
-    #[serde(with = "bits")]
     second_moments: Vec<f64>,
     updates: u64,
     /// [m, m] by dense visible indices.
-    #[serde(with = "bits")]
     smoothed: Vec<f64>,
-    /// [n, n] by raw actions.
-    #[serde(with = "bits")]
-    pub(super) matrix: Vec<f32>,
 }
 
 /// Most hidden units; settings beyond it are refused.
@@ -111,7 +103,6 @@ impl LearnedAffinity {
         let zeros = vec![0.0; parameters.len()];
         let smoothed = vec![1.0 / m as f64; m * m];
         Ok(Self {
-            matrix: alphabet.expand(&smoothed),
             first_moments: zeros.clone(),
             second_moments: zeros,
             updates: 0,
@@ -125,7 +116,7 @@ impl LearnedAffinity {
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
         self.alphabet.check_valid()?;
         self.settings.check_valid()?;
-        let (m, n) = (self.alphabet.len(), self.alphabet.num_actions());
+        let m = self.alphabet.len();
         let count = parameter_count(m, self.settings.hidden);
         check_array("parameters", &self.parameters, count)?;
         check_array("first_moments", &self.first_moments, count)?;
@@ -134,8 +125,12 @@ impl LearnedAffinity {
             let why = format!("second_moments is below 0 at index {at}");
             return Err(AffinityError(why));
         }
-        check_probabilities("smoothed", &self.smoothed, m * m)?;
-        check_probabilities("matrix", &self.matrix, n * n)
+        check_probabilities("smoothed", &self.smoothed, m * m)
+    }
+
+    /// A by raw actions [n, n].
+    pub(super) fn matrix(&self) -> Vec<f32> {
+        self.alphabet.expand(&self.smoothed)
     }
 
     /// One Adam step up the bound `E_joint[-softplus(-q)] - E_marginal[softplus(q)]`, whose optimum is the log ratio
@@ -170,7 +165,6 @@ impl LearnedAffinity {
         for (old, new) in self.smoothed.iter_mut().zip(new) {
             *old = keep * *old + (1.0 - keep) * new;
         }
-        self.matrix = self.alphabet.expand(&self.smoothed);
         Ok(())
     }
 
@@ -302,7 +296,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let mut learned =
             LearnedAffinity::new(Alphabet::new(&[1, 1, 2]).unwrap(), SETTINGS, &mut rng).unwrap();
-        assert_eq!(learned.matrix, [0.5; 9]);
+        assert_eq!(learned.matrix(), [0.5; 9]);
         learned
             .observe(&[(0, 1), (2, 2), (1, 2)], &mut rng)
             .unwrap();

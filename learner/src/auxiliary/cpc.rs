@@ -24,6 +24,7 @@ pub const CPC: MenuItem = MenuItem {
     positives: Positives::Several,
     losses: &NAMES,
     make: |settings| {
+        settings.check_no_own()?;
         settings.check_weighted()?;
         let pairs = Dim::new(settings);
         Ok(Box::new(Cpc { pairs }))

@@ -25,6 +25,7 @@ pub const DIM: MenuItem = MenuItem {
     positives: Positives::One,
     losses: &NAMES,
     make: |settings| {
+        settings.check_no_own()?;
         settings.check_weighted()?;
         Ok(Box::new(Dim::new(settings)))
     },

@@ -18,6 +18,7 @@ pub const NONE: MenuItem = MenuItem {
 };
 
 fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, UpdateError> {
+    settings.check_no_own()?;
     let wanted = settings.lambda.wanted();
     match PAIRS.iter().zip(wanted).find(|(_, wanted)| *wanted) {
         Some((pair, _)) => Err(UpdateError::AuxiliaryLoss(format!(

@@ -107,6 +107,17 @@ impl AuxiliarySettings<'_> {
         })
     }
 
+    /// Checks that a loss that has no numbers of its own is given none.
+    pub fn check_no_own(&self) -> Result<(), UpdateError> {
+        let name = self.auxiliary_loss;
+        if !self.own.contains_key(name) {
+            return Ok(());
+        }
+        Err(UpdateError::AuxiliaryLoss(format!(
+            "auxiliary_loss = {name} has no numbers of its own: take {name} out of learner.update"
+        )))
+    }
+
     /// Checks that a loss that is weighed by lambda has a weight.
     pub fn check_weighted(&self) -> Result<(), UpdateError> {
         if self.lambda.wanted().contains(&true) {

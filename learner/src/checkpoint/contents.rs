@@ -8,10 +8,11 @@ use sha2::{Digest, Sha256};
 
 use crate::{
     affinity::AffinityEstimator,
+    agent::Agent,
     progress::{COUNT_MAX, Progress},
 };
 
-pub(super) const FORMAT: u32 = 3;
+pub(super) const FORMAT: u32 = 4;
 pub(super) const ONLINE: &str = "online.safetensors";
 pub(super) const TARGET: &str = "target.safetensors";
 /// CURL's key encoder; there for that auxiliary loss alone.
@@ -24,6 +25,21 @@ pub(super) const COMPANION: &str = "companion.bin";
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which has those of the other files.
 pub(super) const STATE_SUM: &str = "state.json.sha256";
+
+/// All that a learner changes while it learns.
+#[derive(Debug)]
+pub struct LearnerState {
+    /// Networks, optimiser, count of updates.
+    pub agent: Agent,
+    /// The affinity estimate, if the run has one.
+    pub affinity: Option<AffinityEstimator>,
+    /// The generator behind augmentation and affinity.
+    pub rng: ChaCha8Rng,
+    /// Newest version of the weights that was published.
+    pub weights_version: u64,
+    /// What the run has done.
+    pub progress: Progress,
+}
 
 /// The contents of `state.json`: all of a checkpoint that is not a tensor.
 #[derive(Debug, Serialize, Deserialize)]

@@ -9,54 +9,36 @@ use crate::error::UpdateError;
 
 /// Why a checkpoint was not written or not read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum CheckpointError {
-    /// The file system refused.
     #[error("cannot {what} {path}: {why}")]
     Io {
-        /// What was being done.
         what: &'static str,
-        /// The file or folder to which it was being done.
         path: PathBuf,
-        /// What the file system said.
         why: io::Error,
     },
-    /// A file is not what was written.
     #[error(
         "{file} is damaged: {why}. To resume from the checkpoint before it, remove the folder it is in; \
          to begin anew, remove all checkpoint-* folders beside it"
     )]
-    Damaged {
-        /// The damaged file.
-        file: PathBuf,
-        /// What is wrong with it.
-        why: String,
-    },
-    /// The checkpoint is another run's.
+    Damaged { file: PathBuf, why: String },
     #[error(
         "{folder} belongs to a run with specification {found}, this run's is {expected}: \
          resume with the settings it was made with, or choose another folder"
     )]
     OtherRun {
-        /// The folder of the checkpoint.
         folder: PathBuf,
-        /// Hash of the run that wrote it.
         found: String,
-        /// Hash of this run.
         expected: String,
     },
-    /// The checkpoint's network is another one.
     #[error(
         "the checkpoint {} was saved with {key} = {found}, this run has {key} = {expected}: \
          resume with the settings it was made with, or choose another folder", folder.display()
     )]
     OtherModel {
-        /// The folder of the checkpoint.
         folder: PathBuf,
-        /// The setting that differs.
         key: String,
-        /// Its value in the checkpoint.
         found: String,
-        /// Its value in this run.
         expected: String,
     },
     /// A learner cannot be restored from this state.
@@ -65,10 +47,8 @@ pub enum CheckpointError {
     /// The state does not fit the network or the settings.
     #[error("checkpoint: {0}")]
     Update(#[from] UpdateError),
-    /// Another learner saves in the folder.
     #[error("another learner saves in {}: wait until it has ended, or choose another folder", .0.display())]
     InUse(PathBuf),
-    /// The number of checkpoints to keep is 0.
     #[error("at least one checkpoint must be kept")]
     KeepNone,
 }

@@ -77,7 +77,8 @@ pub(super) fn put_in_place(aside: &Path, path: &Path) -> Result<(), CheckpointEr
     }
     fs::rename(aside, path).map_err(io_error("move", aside))?;
     sync(folder)?;
-    remove_if_there(&older)
+    remove_or_warn(&older);
+    Ok(())
 }
 
 /// Removes what saves that were cut off have left, and gives a checkpoint that was to be replaced its name back.
@@ -130,9 +131,16 @@ pub(super) fn sync(folder: &Path) -> Result<(), CheckpointError> {
         .map_err(io_error("flush", folder))
 }
 
-pub(super) fn remove_if_there(folder: &Path) -> Result<(), CheckpointError> {
+fn remove_if_there(folder: &Path) -> Result<(), CheckpointError> {
     match fs::remove_dir_all(folder) {
         Err(why) if why.kind() != io::ErrorKind::NotFound => Err(io_error("remove", folder)(why)),
         _ => Ok(()),
+    }
+}
+
+/// Removes a folder whose removal decides nothing: what is saved, or is not, stays so.
+pub(super) fn remove_or_warn(folder: &Path) {
+    if let Err(e) = remove_if_there(folder) {
+        tracing::warn!("a checkpoint that is not needed stays: {e}");
     }
 }

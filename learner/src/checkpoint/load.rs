@@ -4,38 +4,22 @@ use std::path::Path;
 
 use candle_core::Device;
 use driml_model::{Compute, Encoder, ModelConfig, Parameters};
-use rand_chacha::ChaCha8Rng;
+use serde_json::Value;
 
 use super::{
     contents::{
-        AVERAGE, COMPANION, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET, hex_of,
-        sha256_of,
+        AVERAGE, COMPANION, KEY, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile,
+        TARGET, hex_of, sha256_of,
     },
     description,
     error::{CheckpointError, damaged},
     folder::{list, read},
 };
 use crate::{
-    affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
     progress::Progress,
     settings::LearnerSettings,
 };
-
-/// What a checkpoint gave.
-#[derive(Debug)]
-pub struct Restored {
-    /// Networks, optimiser, count of updates.
-    pub agent: Agent,
-    /// The affinity estimate, if the run had one.
-    pub affinity: Option<AffinityEstimator>,
-    /// The generator behind augmentation and affinity.
-    pub rng: ChaCha8Rng,
-    /// Newest version of the weights that had been published.
-    pub weights_version: u64,
-    /// What the run had done.
-    pub progress: Progress,
-}
 
 /// Loads the newest checkpoint in `folder` onto the device of `compute`; `None` if there is none. A damaged one is an error, not skipped.
 pub fn load_latest(
@@ -44,7 +28,7 @@ pub fn load_latest(
     settings: &LearnerSettings,
     compute: &Compute,
     run_spec_hash: u64,
-) -> Result<Option<Restored>, CheckpointError> {
+) -> Result<Option<LearnerState>, CheckpointError> {
     match list(folder)?.last() {
         Some((_, path)) => load(path, model, settings, compute, run_spec_hash).map(Some),
         None => Ok(None),
@@ -61,7 +45,7 @@ pub fn load(
     settings: &LearnerSettings,
     compute: &Compute,
     run_spec_hash: u64,
-) -> Result<Restored, CheckpointError> {
+) -> Result<LearnerState, CheckpointError> {
     let state = read_state(path)?;
     let expected = hex_of(run_spec_hash);
     if state.run_spec_hash != expected {
@@ -73,19 +57,20 @@ pub fn load(
         });
     }
     let has_key = settings.auxiliary()?.key_tau().is_some();
-    check_model(path, model)?;
     let tensors = |name: &str| read_file(path, &state, name);
-    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str| {
-        let loaded = Parameters::load_part(model, part, &tensors(name)?, &compute.device);
+    let online = tensors(ONLINE)?;
+    check_model(path, &online, model)?;
+    let parameters = |model: &ModelConfig, part: fn(&str) -> bool, name: &str, bytes: &[u8]| {
+        let loaded = Parameters::load_part(model, part, bytes, &compute.device);
         loaded.map_err(|why| damaged(path, name, why.to_string()))
     };
-    let key = has_key.then(|| parameters(model, Encoder::has, KEY));
+    let key = has_key.then(|| parameters(model, Encoder::has, KEY, &tensors(KEY)?));
     let has_average = state.sha256.contains_key(AVERAGE);
     let average = (settings.average_tau.is_some() && has_average)
-        .then(|| parameters(&model.without_dim(), |_| true, AVERAGE));
+        .then(|| parameters(&model.without_dim(), |_| true, AVERAGE, &tensors(AVERAGE)?));
     let networks = NetworkParameters {
-        online: parameters(model, |_| true, ONLINE)?,
-        target: parameters(&model.without_dim(), |_| true, TARGET)?,
+        online: parameters(model, |_| true, ONLINE, &online)?,
+        target: parameters(&model.without_dim(), |_| true, TARGET, &tensors(TARGET)?)?,
         key: key.transpose()?,
     };
     let average = average.transpose()?;
@@ -100,7 +85,7 @@ pub fn load(
     agent
         .restore_progress(state.updates, state.adam_step, moments)
         .map_err(|why| damaged(path, OPTIMIZER, why.to_string()))?;
-    Ok(Restored {
+    Ok(LearnerState {
         agent,
         affinity: state.affinity,
         rng: state.rng,
@@ -109,13 +94,15 @@ pub fn load(
     })
 }
 
-/// Checks that a checkpoint's network has the sizes of `model`, as far as its description says.
-fn check_model(path: &Path, model: &ModelConfig) -> Result<(), CheckpointError> {
-    let described = description::described(&read(&path.join(ONLINE))?);
+/// Checks that the network `online` of the checkpoint at `path` has the sizes of `model`, as far as its description says.
+fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), CheckpointError> {
+    let described = description::described(online);
     let Some(saved) = described.as_ref().and_then(|it| it.get("model")) else {
         return Ok(());
     };
-    let ours = serde_json::to_value(model).unwrap_or_default();
+    // Through text, as the description went: as a value, a number of 32 bits would have more digits.
+    let ours = serde_json::to_string(model).and_then(|text| serde_json::from_str(&text));
+    let ours: Value = ours.unwrap_or_default();
     // What follows from another torso is not worth a word beside it.
     let torso = description::difference("model.torso", &saved["torso"], &ours["torso"]);
     match torso.or_else(|| description::difference("model", saved, &ours)) {

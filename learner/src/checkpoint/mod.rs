@@ -8,9 +8,9 @@ mod folder;
 mod load;
 mod save;
 
-pub use contents::{AVERAGE, check_state};
+pub use contents::{AVERAGE, LearnerState, check_state};
 pub use description::{KEY as DESCRIPTION, describe, described};
 pub use error::CheckpointError;
 pub use folder::{FOLDER, list, lock};
-pub use load::{Restored, companion, load, load_latest, progress};
-pub use save::{RunState, save};
+pub use load::{companion, load, load_latest, progress};
+pub use save::{Label, save};

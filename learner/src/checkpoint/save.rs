@@ -7,32 +7,21 @@ use std::{
 };
 
 use driml_model::{Parameters, StoredAs};
-use rand_chacha::ChaCha8Rng;
 
 use super::{
     contents::{
-        AVERAGE, COMPANION, FORMAT, KEY, ONLINE, OPTIMIZER, STATE, STATE_SUM, StateFile, TARGET,
-        hex_of, sha256_of,
+        AVERAGE, COMPANION, FORMAT, KEY, LearnerState, ONLINE, OPTIMIZER, STATE, STATE_SUM,
+        StateFile, TARGET, hex_of, sha256_of,
     },
     description,
     error::{CheckpointError, io_error},
-    folder::{PREFIX, list, put_in_place, remove_if_there, sync, tidy, write_durably},
+    folder::{PREFIX, list, put_in_place, remove_or_warn, sync, tidy, write_durably},
 };
-use crate::{affinity::AffinityEstimator, agent::Agent, error::UpdateError, progress::Progress};
+use crate::{agent::Agent, error::UpdateError};
 
-/// What a checkpoint holds, borrowed for saving.
+/// What a checkpoint has beside the learner's state.
 #[derive(Clone, Copy, Debug)]
-pub struct RunState<'a> {
-    /// Networks, optimiser, count of updates.
-    pub agent: &'a Agent,
-    /// The affinity estimate, if the run has one.
-    pub affinity: Option<&'a AffinityEstimator>,
-    /// The generator behind augmentation and affinity.
-    pub rng: &'a ChaCha8Rng,
-    /// Newest version of the weights that was published.
-    pub weights_version: u64,
-    /// What the run has done.
-    pub progress: &'a Progress,
+pub struct Label<'a> {
     /// Hash of the run's specification.
     pub run_spec_hash: u64,
     /// What [`describe`](super::describe) says, for the networks' metadata.
@@ -49,7 +38,12 @@ pub struct RunState<'a> {
 /// # Errors
 /// A state that is not finite, or a failing file system, such as a full disk; nothing older has then been removed, and nothing
 /// of the new one is left.
-pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf, CheckpointError> {
+pub fn save(
+    folder: &Path,
+    state: &LearnerState,
+    label: Label<'_>,
+    keep: usize,
+) -> Result<PathBuf, CheckpointError> {
     if keep == 0 {
         return Err(CheckpointError::KeepNone);
     }
@@ -57,26 +51,24 @@ pub fn save(folder: &Path, state: &RunState<'_>, keep: usize) -> Result<PathBuf,
     tidy(folder)?;
     let name = format!("{PREFIX}{:012}", state.agent.updates());
     let (path, aside) = (folder.join(&name), folder.join(format!("{name}.tmp")));
-    let saved = write(&aside, state).and_then(|()| put_in_place(&aside, &path));
+    let saved = write(&aside, state, label).and_then(|()| put_in_place(&aside, &path));
     if let Err(error) = saved {
         // It would keep a full disk full.
-        if let Err(e) = remove_if_there(&aside) {
-            tracing::warn!("a checkpoint was not saved, and a part of it stays: {e}");
-        }
+        remove_or_warn(&aside);
         return Err(error);
     }
     let all = list(folder)?;
     for (_, old) in &all[..all.len().saturating_sub(keep)] {
-        fs::remove_dir_all(old).map_err(io_error("remove", old))?;
+        remove_or_warn(old);
     }
     Ok(path)
 }
 
 /// Writes a checkpoint's files into the folder `aside`, which is made.
-fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
-    let agent = state.agent;
-    let mut files = tensor_files(agent, state.description).map_err(CheckpointError::Unsound)?;
-    files.extend(state.companion.map(|bytes| (COMPANION, bytes.to_vec())));
+fn write(aside: &Path, state: &LearnerState, label: Label<'_>) -> Result<(), CheckpointError> {
+    let agent = &state.agent;
+    let mut files = tensor_files(agent, label.description).map_err(CheckpointError::Unsound)?;
+    files.extend(label.companion.map(|bytes| (COMPANION, bytes.to_vec())));
     fs::create_dir(aside).map_err(io_error("create", aside))?;
     let mut sha256 = BTreeMap::new();
     for (name, bytes) in files {
@@ -85,13 +77,13 @@ fn write(aside: &Path, state: &RunState<'_>) -> Result<(), CheckpointError> {
     }
     let file = StateFile {
         format: FORMAT,
-        run_spec_hash: hex_of(state.run_spec_hash),
+        run_spec_hash: hex_of(label.run_spec_hash),
         updates: agent.updates(),
         adam_step: agent.adam.step_count(),
         weights_version: state.weights_version,
         progress: state.progress.clone(),
         rng: state.rng.clone(),
-        affinity: state.affinity.cloned(),
+        affinity: state.affinity.clone(),
         sha256,
     };
     let text = serde_json::to_vec_pretty(&file).map_err(|why| CheckpointError::Io {

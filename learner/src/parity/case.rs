@@ -25,33 +25,22 @@ use crate::{
 
 /// Why a case could not be checked.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum ParityError {
-    /// The file could not be read.
     #[error("cannot read {file}: {source}")]
-    Read {
-        /// The case's file.
-        file: PathBuf,
-        /// What the file system reported.
-        source: io::Error,
-    },
-    /// The file was read, but cannot be checked.
+    Read { file: PathBuf, source: io::Error },
     #[error("{file}: {why}")]
     InFile {
-        /// The case's file.
         file: PathBuf,
-        /// What is wrong with it.
         why: Box<ParityError>,
     },
     /// The file is not a whole case, or not one that this check knows.
     #[error("{0}")]
     Case(String),
-    /// The update rejects the case.
     #[error(transparent)]
     Update(#[from] UpdateError),
-    /// The model rejects the case's parameters.
     #[error(transparent)]
     Model(#[from] driml_model::ModelError),
-    /// The tensor library rejects it.
     #[error(transparent)]
     Candle(#[from] candle_core::Error),
 }

@@ -403,14 +403,11 @@ fn nan_or_larger(largest: f64, d: f64) -> f64 {
 mod tests {
     use driml_model::{PolicyNetwork, Precision};
 
-    use super::{
-        deviation::{ErrorOfUpdate, REFERENCE},
-        *,
-    };
+    use super::*;
 
-    /// Beside the report: an actor's values, and the same update by candle's operations.
+    /// Beside the report.
     #[test]
-    fn actors_and_candle_s_operations_agree_with_every_case() {
+    fn an_actor_s_values_agree_with_every_case() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/parity");
         for entry in std::fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
@@ -419,15 +416,7 @@ mod tests {
             }
             let case = Case::parse(&std::fs::read(&path).unwrap()).unwrap();
             let (batch, name) = (case.batch(), path.display());
-            let [agent, reference] =
-                [Compute::CPU, REFERENCE].map(|it| agent_of(&case, &it).unwrap());
-            let error = ErrorOfUpdate::of(&agent, &batch, &reference).unwrap();
-            assert!(
-                error.loss < 1e-5 && error.gradient < 1e-4,
-                "{name}: {error:?}"
-            );
-            assert_eq!(error.same_next_action, 1.0, "{name}");
-
+            let agent = agent_of(&case, &Compute::CPU).unwrap();
             let shape = [batch.rows, agent.model().num_actions];
             let expected = case.expected("q_values_t", &shape).unwrap();
             let weights = agent.weights().unwrap();

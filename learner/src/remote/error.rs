@@ -6,13 +6,11 @@ use driml_protocol::{CodecError, session::SessionError};
 
 /// What keeps a learner from its batches.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum BatchError {
-    /// Every try failed for so long that the learner gives up.
     #[error("no batch and no answer for {unreachable_max:?}")]
     Unreachable {
-        /// How long it has tried.
         unreachable_max: Duration,
-        /// Why the last try failed.
         source: Box<Self>,
     },
     /// The replay server will not give what is asked for; it would refuse again.
@@ -21,13 +19,10 @@ pub enum BatchError {
     /// A request that cannot be sent, or an answer that did not come.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// A shard does not say how much it holds.
     #[error("a shard's status: {0}")]
     Status(SessionError),
-    /// A batch that is damaged.
     #[error(transparent)]
     Damaged(#[from] CodecError),
-    /// The shards gave batches of different kinds.
     #[error("the shards' parts do not fit together")]
     DifferentShards,
     /// The threads are gone although nothing has stopped them.

@@ -1,10 +1,8 @@
 //! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views.
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
-use driml_learner::{
-    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, NetworkParameters, UpdateError,
-};
-use driml_model::{Compute, ModelConfig, Parameters};
+use driml_learner::{Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, UpdateError};
+use driml_model::{Compute, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -86,58 +84,6 @@ fn cpc_with_one_offset_is_dim() {
         assert!((a - b).abs() < 1e-5, "{cpc} {a} {b}");
     }
     assert!((one.total - dim.total).abs() < 1e-4);
-}
-
-#[test]
-fn cpc_is_the_mean_over_its_offsets() {
-    let rows = Rows::random(6, 3);
-    let states_k = later(&rows);
-    let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 0], [0, 0, 0, 1, 0, 0]].concat();
-    let agent = agent(CPC, ALL_DIM);
-    let all = agent.evaluate(&cpc(&rows, &states_k, &valid)).unwrap();
-    let mut sums = [0.0; 4];
-    for (frames, valid) in rows.frames.iter().zip(valid.chunks(6)) {
-        let batch = Batch {
-            positives: 1,
-            states_k: frames,
-            positive_valid: valid,
-            ..rows.batch()
-        };
-        let one = agent.evaluate(&batch).unwrap();
-        assert_eq!(one.losses.len(), 4);
-        for (sum, (_, loss)) in sums.iter_mut().zip(one.losses) {
-            *sum += loss;
-        }
-    }
-    assert_eq!(all.losses.len(), 4);
-    for ((_, loss), sum) in all.losses.iter().zip(sums) {
-        assert!((loss - sum / 3.0).abs() < 1e-5, "{loss} {sum}");
-    }
-}
-
-#[test]
-fn positives_that_are_missing_change_nothing() {
-    let mut rows = Rows::random(6, 4);
-    rows.positive_valid = vec![1, 0, 1, 1, 0, 1];
-    let several = later(&rows);
-    let valid = [[0, 1, 1, 1, 1, 1], [0, 1, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]].concat();
-    for (kind, whole) in [(DIM, rows.batch()), (CPC, cpc(&rows, &several, &valid))] {
-        let agent = agent(kind, ALL_DIM);
-        let before = agent.evaluate(&whole).unwrap();
-        let mut states_k = whole.states_k.to_vec();
-        let bytes = states_k.len() / whole.positive_valid.len();
-        for (state, valid) in states_k.chunks_exact_mut(bytes).zip(whole.positive_valid) {
-            if *valid == 0 {
-                state.fill(99);
-            }
-        }
-        let batch = Batch {
-            states_k: &states_k,
-            ..whole
-        };
-        let after = agent.evaluate(&batch).unwrap();
-        assert_eq!((before.losses, before.total), (after.losses, after.total));
-    }
 }
 
 /// `states` without those that are not `there`.
@@ -284,11 +230,6 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
         }
     }
     assert_ne!(average, start);
-    // Actors get none of it.
-    let acting = agent.model().without_dim();
-    let weights = agent.weights().unwrap();
-    let device = candle_core::Device::Cpu;
-    Parameters::load_safetensors(&acting, &weights, &device).unwrap();
 }
 
 /// So that a comparison of agents compares the auxiliary loss alone.
@@ -332,36 +273,6 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
             }
         }
     }
-}
-
-#[test]
-fn a_target_network_that_moves_leaves_curl_s_keys_where_they_are() {
-    let rows = Rows::random(8, 12);
-    let loss = |target_tau| {
-        let (model, mut settings) = of(CURL, GLOBAL);
-        (settings.target_period_updates, settings.target_tau) = (1, target_tau);
-        // So small a step that the key encoder stands still.
-        settings.adam.lr = 1e-30;
-        let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let mut parameters = Agent::new(model.clone(), settings.clone(), &Compute::CPU, rng)
-            .map(|agent| NetworkParameters {
-                online: agent.online().copy().unwrap(),
-                target: agent.target().copy().unwrap(),
-                key: agent.key().map(|key| key.copy().unwrap()),
-            })
-            .unwrap();
-        // A target network of another seed.
-        let rng = &mut ChaCha8Rng::seed_from_u64(2);
-        parameters.target =
-            Parameters::init(&model.without_dim(), rng, &Compute::CPU.device).unwrap();
-        let mut agent = Agent::from_parameters(model, settings, &Compute::CPU, parameters).unwrap();
-        let first = agent.update(&curl(&rows)).unwrap();
-        let second = agent.update(&curl(&rows)).unwrap();
-        assert_ne!(first.c51_kl, second.c51_kl, "the target network has moved");
-        (first.losses, second.losses)
-    };
-    let (first, second) = loss(1.0);
-    assert_eq!(first, second);
 }
 
 #[test]
@@ -409,6 +320,27 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
     assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
     assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
     assert!(said(AuxiliaryKind::NONE, NO_DIM, true).contains("has no use for the table curl"));
+    for kind in [AuxiliaryKind::NONE, DIM, CPC] {
+        let (name, lambda) = (
+            kind.name(),
+            if kind == DIM || kind == CPC {
+                GLOBAL
+            } else {
+                NO_DIM
+            },
+        );
+        for own in ["= 0.01", "= { tanh_clip = 5.0 }", "= {}"] {
+            let settings = LearnerSettings {
+                own: format!("{name} {own}").parse().unwrap(),
+                ..with(kind, lambda, false, None)
+            };
+            let said = settings.validate().unwrap_err().to_string();
+            assert!(
+                said.contains(&format!("take {name} out of learner.update")),
+                "{said}"
+            );
+        }
+    }
     let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
     let missing = curl(None).unwrap_err().to_string();
     assert!(

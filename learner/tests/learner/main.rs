@@ -13,6 +13,5 @@ mod deduplicate;
 mod errors;
 mod ranges;
 mod served;
-mod stacked;
 mod synthetic;
 mod update;

@@ -102,15 +102,6 @@ pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64)
     Agent::new(model, settings, &Compute::CPU, rng).unwrap()
 }
 
-pub(crate) const DUELING: HeadConfig = HeadConfig {
-    dueling: true,
-    noisy_sigma: None,
-};
-pub(crate) const NOISY: HeadConfig = HeadConfig {
-    dueling: false,
-    noisy_sigma: Some(0.5),
-};
-
 pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
     dueling: true,
     noisy_sigma: Some(0.5),

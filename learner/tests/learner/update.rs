@@ -1,5 +1,5 @@
-//! What holds for every update: slopes, zeros, and finiteness.
-//! It compares with no outside numbers.
+//! What holds for every update: zeros, and what nothing may touch.
+//! It compares with no outside numbers: `parity` does, and at extreme inputs the property "whole update" of `driml experiment stability`.
 
 use candle_core::Device;
 use driml_learner::{Agent, LearnerSettings, UpdateNoise};
@@ -9,81 +9,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, DUELING, NO_DIM, NOISY, NOISY_DUELING, Rows, Values, agent, agent_on,
-    agent_with, changed, model, settings, values,
+    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, Rows, agent, agent_on, agent_with, changed, model,
+    settings, values,
 };
-
-#[test]
-fn the_gradient_is_the_slope_of_the_total_in_every_part() {
-    let every = [
-        "torso.conv1",
-        "torso.conv2",
-        "torso.fc",
-        "head",
-        "dim.action",
-        "dim.psi3",
-        "dim.phi3",
-        "dim.psi4",
-        "dim.phi4",
-    ];
-    is_the_slope(&agent(ALL_DIM, 1), &every);
-    let dueling = agent_with(DUELING, settings(ALL_DIM), 1);
-    is_the_slope(&dueling, &["torso.fc", "head.value", "head.advantage"]);
-    let both = LearnerSettings {
-        double_dqn: true,
-        ..settings(ALL_DIM)
-    };
-    let noisy = agent_with(NOISY, both.clone(), 1);
-    let parts = ["weight_mu", "weight_sigma", "bias_mu", "bias_sigma"];
-    is_the_slope(&noisy, &parts.map(|part| format!("head.{part}")));
-    let rainbow = agent_with(NOISY_DUELING, both, 1);
-    for stream in ["value", "advantage"] {
-        is_the_slope(&rainbow, &parts.map(|part| format!("head.{stream}.{part}")));
-    }
-}
-
-/// Whether the gradient is the slope of the total in each of these parts of the network.
-fn is_the_slope(agent: &Agent, parts: &[impl AsRef<str>]) {
-    let rows = Rows::random(9, 2);
-    let evaluation = agent.evaluate(&rows.batch()).unwrap();
-    for part in parts.iter().map(AsRef::as_ref) {
-        let mut direction = Values::new();
-        for (name, _) in agent
-            .online()
-            .iter()
-            .filter(|(name, _)| name.starts_with(part))
-        {
-            let gradient = evaluation
-                .gradients
-                .get(name)
-                .expect("every part is in the total");
-            direction.insert(
-                name.to_owned(),
-                gradient.flatten_all().unwrap().to_vec1().unwrap(),
-            );
-        }
-        let square = |values: &Vec<f32>| values.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>();
-        let norm = direction.values().map(square).sum::<f64>().sqrt();
-        assert!(norm > 1e-5, "{part} has a gradient of {norm}");
-        let step = 2e-3;
-        let total = |by: f64| {
-            let moved = changed(agent, |name, values| {
-                if let Some(gradient) = direction.get(name) {
-                    values
-                        .iter_mut()
-                        .zip(gradient)
-                        .for_each(|(v, g)| *v += (by * f64::from(*g) / norm) as f32);
-                }
-            });
-            f64::from(moved.evaluate(&rows.batch()).unwrap().total)
-        };
-        let slope = (total(step) - total(-step)) / (2.0 * step);
-        assert!(
-            (slope - norm).abs() < 0.02 * norm + 1e-3,
-            "{part}: slope {slope}, gradient {norm}"
-        );
-    }
-}
 
 #[test]
 fn repeated_updates_on_one_batch_bring_the_losses_down() {
@@ -172,31 +100,6 @@ fn rows_without_a_bootstrap_ignore_what_comes_after() {
             }
         }
     }
-}
-
-#[test]
-fn saturated_scores_and_extreme_returns_stay_finite() {
-    let mut rows = Rows::random(6, 13);
-    rows.n_step_return
-        .copy_from_slice(&[1e30, -1e30, 5.0, -5.0, 0.0, 1e-30]);
-    let mut agent = changed(&agent(ALL_DIM, 14), |name, values| {
-        if name.starts_with("dim.") {
-            values.iter_mut().for_each(|v| *v *= 30.0);
-        }
-        if name.starts_with("head") {
-            values.iter_mut().for_each(|v| *v *= 300.0);
-        }
-    });
-    for _ in 0..5 {
-        let report = agent.update(&rows.batch()).unwrap();
-        assert!(report.total.is_finite() && report.grad_norm.is_finite());
-    }
-    assert!(
-        values(agent.online())
-            .values()
-            .flatten()
-            .all(|v| v.is_finite())
-    );
 }
 
 #[test]

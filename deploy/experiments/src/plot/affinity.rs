@@ -43,7 +43,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
     let affinity = affinity
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
-    let values = affinity.matrix().iter().map(|&a| Some(f64::from(a)));
+    let values = affinity.matrix().into_iter().map(|a| Some(f64::from(a)));
     let title = format!("{}, {updates} updates", folder_name(folder.path()));
     Ok(Heat {
         names: action_names(folder, side),

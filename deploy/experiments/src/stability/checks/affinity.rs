@@ -119,7 +119,7 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let (used, count, pair) = cases.each(&USES);
     let exact = ExactAffinity::new(Alphabet::raw(actions)?, settings)?;
     let mut state = serde_json::to_value(AffinityEstimator::Exact(exact))?;
-    state["counts"] = vec![start.to_bits(); actions * actions].into();
+    state["counts"] = vec![start; actions * actions].into();
     let mut estimate: AffinityEstimator = serde_json::from_value(state)?;
     let mut counts = vec![start; actions * actions];
     for _ in 0..8 {
@@ -135,7 +135,7 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = estimate.matrix();
     let expected = closed_form(&counts, actions, settings.smoothing);
     let of_entries = found.iter().zip(expected).map(|(&a, it)| off(a, it));
-    let errors = [worst(of_entries), row_sum_error(found, actions)];
+    let errors = [worst(of_entries), row_sum_error(&found, actions)];
     let input = format_args!("{actions} actions, {used}, counts from {start:e}, {settings:?}");
     cases.see(input, errors)
 }
@@ -156,7 +156,7 @@ fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let pairs = (0..count).map(|_| pair(actions, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
         estimate.observe(&pairs, &mut cases.rng)?;
-        let error = row_sum_error(estimate.matrix(), actions.into());
+        let error = row_sum_error(&estimate.matrix(), actions.into());
         let input = format_args!("{actions} actions, {used}, update {update}");
         cases.see(input, [error])?;
     }

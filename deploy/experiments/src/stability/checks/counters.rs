@@ -243,7 +243,7 @@ fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let mut estimate: AffinityEstimator = serde_json::from_value(state.clone())?;
         let (pairs, mut rng) = ([(0, 1), (1, 2), (2, 0)], cases.rng.clone());
         let is_taken = (0..20).all(|_| estimate.observe(&pairs, &mut rng).is_ok());
-        Ok((is_taken, estimate.matrix().to_vec()))
+        Ok((is_taken, estimate.matrix()))
     });
     let [settled, found] = after;
     let (settled, found) = (settled?, found?);

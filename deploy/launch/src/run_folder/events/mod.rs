@@ -124,7 +124,7 @@ impl Events {
             serde_json::from_value(state["affinity"].take()).ok()?;
         self.drawn = Some(updates);
         let affinity = affinity?;
-        let picture = draw(affinity.num_actions(), affinity.matrix()).ok()?;
+        let picture = draw(affinity.num_actions(), &affinity.matrix()).ok()?;
         let (width, height) = picture.size();
         let png = picture.png().ok()?;
         let image = Value::Image {
