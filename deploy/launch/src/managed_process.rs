@@ -9,7 +9,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::units::kib;
+use driml_machine::{process_env::program, units::kib};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -62,11 +62,10 @@ impl ManagedProcess {
         surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
         let log = ProcessLog::open(name, surroundings.logs)?;
-        let program = std::env::current_exe().context("finding this program's own file")?;
         let held = surroundings.rendezvous.map(Rendezvous::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
-        let mut command = Command::new(program);
+        let mut command = Command::new(program());
         // Everything else that it needs of its environment it has from this one.
         command
             .env(THREADS, threads.to_string())
