@@ -168,9 +168,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         )
         .into());
     }
-    // Where nothing was learned, nothing is behind it.
+    // Where nothing was learned, only a run in lockstep keeps what it has.
     let (frames, rows) = match updates {
-        0 => (0, 0),
+        0 if !lockstep => (0, 0),
         _ => (progress.frames(), progress.rows()),
     };
     let has_other_pace = before.learner.batch_size != config.learner.batch_size

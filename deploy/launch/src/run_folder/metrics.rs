@@ -41,8 +41,10 @@ pub(super) fn rows_up_to(
         let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
             return Err(usage!("{}: {row:?} is not a row of metrics", path.display()).into());
         };
-        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-        Ok(updates <= resume_point.updates && frames <= frames_max)
+        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows. A replay that is filled
+        // anew counts from the checkpoint's frames.
+        let is_counted = resume_point.replay_is_kept || frames <= resume_point.frames;
+        Ok(updates <= resume_point.updates && frames <= frames_max && is_counted)
     })?;
     let places: Vec<_> = header.iter().map(|name| found.place(name)).collect();
     let rows = found.rows.iter().map(|row| {
