@@ -11,7 +11,7 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_machine::{error::Usage, units::duration};
-use driml_protocol::{Keys, RunClient, Silence, Waiting, config::Settings, session, shared_memory};
+use driml_protocol::{Keys, RunClient, Silence, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -25,7 +25,7 @@ use crate::{
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
-    run_view::{Plan, RunView},
+    run_view::{Plan, RunView, updates_served},
     view::{Display, Poller, Reached, TEMPLATE, notes},
 };
 
@@ -268,7 +268,7 @@ impl Launch<'_> {
             let view = &poller.view;
             self.display.show(view, &notes(view));
             self.evaluator.look(&self.screen);
-            if view.replay.finished && view.learner.finished {
+            if view.is_learned() {
                 self.display
                     .show_alone("all frames and updates are done: the processes exit");
                 return Ok(Outcome::Finished);
@@ -358,10 +358,8 @@ impl Launch<'_> {
     /// Whether all transitions are in and learned from, and the result saved, by the last answers.
     fn is_complete(&self) -> bool {
         self.poller.as_ref().is_some_and(|Poller { view, .. }| {
-            let rows = view.learner.updates * u64::from(self.config.learner.batch_size);
-            view.replay.waiting == Waiting::Finished
-                && view.learner.finished
-                && rows >= view.replay.rows_sampled
+            let served = updates_served(self.config, view.replay.rows_sampled);
+            view.is_learned() && view.learner.updates >= served
         })
     }
 
