@@ -14,7 +14,7 @@ use crate::{
     console::Screen,
     evaluate::{Levels, Player, Who, levels, play_on},
     managed_process::{ManagedProcess, Surroundings},
-    run_folder::{Candidate, Evaluated, RunFolder, sweep},
+    run_folder::{Candidate, Evaluated, RunFolder},
     stats::mean_and_deviation,
 };
 
@@ -39,7 +39,7 @@ pub struct Judged {
 /// does not take its place.
 pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
     let path = checkpoint_at(folder, which)?;
-    let candidate = Candidate::hold(folder, &path)?;
+    let candidate = Candidate::read(&path)?;
     let play = |path: &Path| -> anyhow::Result<Evaluated> {
         let player = Player::read(config_of(folder)?, path, Weights::default())?;
         let world = levels(&player.config.world, Levels::Train)?;
@@ -206,13 +206,5 @@ impl Evaluator {
         };
         screen.line(&said);
         self.playing = None;
-    }
-}
-
-impl Drop for Evaluator {
-    fn drop(&mut self) {
-        // Which kills it.
-        self.playing = None;
-        sweep(&self.run_dir);
     }
 }
