@@ -3,6 +3,7 @@
 
 use std::{
     os::unix::process::ExitStatusExt,
+    process::ExitStatus,
     sync::mpsc::sync_channel,
     time::{Duration, Instant},
 };
@@ -54,8 +55,10 @@ impl Processes {
             }
         }
         for actor in &mut self.actors {
-            let comes_back = revived.actors && actor.may_be_started_again();
-            if actor.end().is_some_and(|status| !status.success()) && !comes_back {
+            let is_needed = revived.actors_are_needed;
+            let comes_back = revived.actors && actor.may_be_started_again(is_needed);
+            let is_missed = |status: ExitStatus| is_needed || !status.success();
+            if actor.end().is_some_and(is_missed) && !comes_back {
                 bail!("{}", actor.exit_report());
             }
         }
@@ -69,6 +72,8 @@ pub(crate) struct Revived {
     pub(crate) servers: bool,
     /// Actors that had lived for a while.
     pub(crate) actors: bool,
+    /// An actor that has exited was asked to by someone else, as frames are missing.
+    pub(crate) actors_are_needed: bool,
 }
 
 /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
@@ -149,6 +154,26 @@ pub(crate) fn connect(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_actor_that_exits_before_the_run_is_over_is_missed() {
+        let logs = tempfile::tempdir().unwrap();
+        let mut actor = ManagedProcess::of_script("exit 0", logs.path());
+        actor.wait_until(Instant::now() + Duration::from_secs(60), || false);
+        let mut processes = Processes {
+            actors: vec![actor],
+            ..Processes::default()
+        };
+        for actors_are_needed in [false, true] {
+            let revived = Revived {
+                actors_are_needed,
+                ..Revived::default()
+            };
+            let said = processes.check_alive(revived).map_err(|e| e.to_string());
+            let is_missed = said.is_err_and(|it| it.starts_with("script exited with code 0"));
+            assert_eq!(is_missed, actors_are_needed);
+        }
+    }
 
     #[test]
     fn a_process_that_dies_of_the_request_to_stop_has_stopped() {

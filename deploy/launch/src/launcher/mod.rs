@@ -113,6 +113,7 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
+        actors_are_needed: false,
         poller: None,
     };
 
@@ -178,6 +179,8 @@ struct Launch<'a> {
     evaluator: Evaluator,
     server_restarts: u32,
     actor_restarts: u32,
+    /// An actor that has exited is to come back.
+    actors_are_needed: bool,
     poller: Option<Poller>,
 }
 
@@ -240,6 +243,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
+            self.actors_are_needed = self.is_actor_missed();
             self.revive()?;
             self.processes.check_alive(self.revived())?;
             let poller = self.poller.as_mut();

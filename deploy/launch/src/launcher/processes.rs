@@ -93,10 +93,23 @@ impl Launch<'_> {
         self.start(&self.servers[shard], &args, PROCESS_THREADS)
     }
 
+    /// Whether an actor has exited though frames are missing, by an answer that is newer than its end.
+    pub(super) fn is_actor_missed(&mut self) -> bool {
+        let Some(poller) = &mut self.poller else {
+            return false;
+        };
+        let mut ends = self.processes.actors.iter_mut().map(ManagedProcess::end);
+        if poller.view.replay.finished || !ends.any(|it| it.is_some()) {
+            return false;
+        }
+        poller.ask_replay().is_ok() && !poller.view.replay.finished
+    }
+
     pub(super) fn revived(&self) -> Revived {
         Revived {
             servers: self.config.local.durable && self.server_restarts < RESTARTS_MAX,
             actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
+            actors_are_needed: self.actors_are_needed,
         }
     }
 
@@ -119,7 +132,7 @@ impl Launch<'_> {
         }
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
-            if !actor.may_be_started_again() || !self.revived().actors {
+            if !actor.may_be_started_again(self.actors_are_needed) || !self.revived().actors {
                 continue;
             }
             let report = self.processes.actors[id].exit_report();
