@@ -2,17 +2,20 @@
 //! What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
 
 use std::{
+    ops::ControlFlow,
     path::Path,
     time::{Duration, Instant},
 };
 
+use driml_actor::Step;
 use driml_learner::checkpoint;
+use driml_machine::error::Interrupted;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     chosen::{Weights, Which, checkpoint_at, config_of},
     console::Screen,
-    evaluate::{Levels, Player, Who, levels, play_on},
+    evaluate::{Levels, Player, Who, levels},
     managed_process::{ManagedProcess, Surroundings},
     run_folder::{Candidate, Evaluated, RunFolder},
     stats::mean_and_deviation,
@@ -37,14 +40,29 @@ pub struct Judged {
 ///
 /// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
 /// does not take its place.
-pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
+///
+/// # Errors
+/// A file system error; [`Interrupted`] once it `is_stopped`, and nothing is kept.
+pub fn keep(
+    folder: &RunFolder,
+    which: Which,
+    episodes: u32,
+    is_stopped: &dyn Fn() -> bool,
+) -> anyhow::Result<Judged> {
     let path = checkpoint_at(folder, which)?;
     let candidate = Candidate::read(&path)?;
     let play = |path: &Path| -> anyhow::Result<Evaluated> {
         let player = Player::read(config_of(folder)?, path, Weights::default())?;
         let world = levels(&player.config.world, Levels::Train)?;
-        let (count, watch) = (episodes as usize, &mut play_on);
+        let count = episodes as usize;
+        let watch = &mut |_: &Step<'_>, _: &[f64]| match is_stopped() {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        };
         let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
+        if returns.len() < count {
+            return Err(Interrupted.into());
+        }
         let earned = mean_and_deviation(&returns);
         Ok(Evaluated::at(folder, player.updates, episodes, earned))
     };

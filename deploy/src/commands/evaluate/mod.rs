@@ -104,7 +104,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     if args.keep {
         end_when_asked(args.exit_with_parent)?;
-        let judged = keep(&folder, which, args.episodes)?;
+        let judged = keep(&folder, which, args.episodes, &|| false)?;
         let earned = judged.earned.describe();
         return print(&format!("{earned}{}\n", verdict(&judged)));
     }
