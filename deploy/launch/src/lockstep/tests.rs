@@ -1,5 +1,7 @@
 //! What a run in lockstep computes, and that one that was interrupted computes the same.
 
+use driml_settings::resolve::Flags;
+
 use super::*;
 use crate::testing;
 
@@ -184,11 +186,20 @@ fn what_cannot_go_on_says_why() {
     std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
     let why = refused(&config, &run_dir);
     assert!(why.contains("cannot resume to the same weights"), "{why}");
-    // A learner's own checkpoint.
+    // Of a world that cannot be saved.
     let (_folder, run_dir, _) = begun(&config, 9);
+    std::fs::write(run_dir.config(), config.to_toml()).unwrap();
+    assert!(resume::is_resumable(&config.world, &run_dir));
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();
     unkept.save(&run_dir.checkpoints()).unwrap();
+    assert!(!resume::is_resumable(&config.world, &run_dir));
+    let found = resume::find(&run_dir, &Flags::default(), &testing::MACHINE);
+    let why = found.unwrap_err().to_string();
+    assert!(
+        why.contains("the state of its world cannot be saved"),
+        "{why}"
+    );
     let why = refused(&config, &run_dir);
     assert!(why.contains("not a checkpoint of a lockstep run"), "{why}");
 }

@@ -287,7 +287,9 @@ fn next_steps_stand_in_columns() {
           driml plot runs/x --out plot.png            return, losses, k and speed
           driml train --resume runs/x --frames 2560   trains on
     "#]]
-    .assert_eq(&summary.next_steps(&RunFolder::new("runs/x")));
+    .assert_eq(&summary.next_steps(&RunFolder::new("runs/x"), true));
+    let repeated_alone = summary.next_steps(&RunFolder::new("runs/x"), false);
+    assert!(!repeated_alone.contains("--resume"), "{repeated_alone}");
 }
 
 #[test]
