@@ -98,10 +98,10 @@ pub(crate) struct Due {
 impl Due {
     /// Those after the checkpoints that the run's folder lists as played.
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
-        Ok(Self {
-            config: config.local.evaluation,
-            newest: Evaluated::newest(run_dir)?,
-        })
+        let config = config.local.evaluation;
+        let newest = config.map(|_| Evaluated::newest(run_dir));
+        let newest = newest.transpose()?.unwrap_or(0);
+        Ok(Self { config, newest })
     }
 
     /// How many episodes the checkpoint after so many updates is now played for, if it is due.

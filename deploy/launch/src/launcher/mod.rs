@@ -74,9 +74,9 @@ pub fn run(
     let restarts_before = before.map_or([0; 2], |it| {
         [it.replay_servers_restarted, it.actors_restarted]
     });
+    let evaluator = Evaluator::new(config, run_dir)?;
     let mut recorder = RunRecorder::open(run_dir, config, process_names(config), resumed)?;
     let resume_point = resumed.unwrap_or_default();
-    let evaluator = Evaluator::new(config, run_dir)?;
     let rendezvous = Rendezvous::create()?;
     let mut endpoints: Vec<_> = servers
         .iter()
