@@ -292,6 +292,18 @@ fn next_steps_stand_in_columns() {
     assert!(!repeated_alone.contains("--resume"), "{repeated_alone}");
 }
 
+/// It may come from a file or another process.
+#[test]
+fn a_time_that_cannot_be_is_described_as_none() {
+    for wall_seconds in [-1.0, 1e300, f64::NAN] {
+        let summary = Summary {
+            wall_seconds,
+            ..summary(&ReplayStatus::default())
+        };
+        assert!(summary.counts().contains(" in 0 s ("), "{wall_seconds}");
+    }
+}
+
 #[test]
 fn a_run_without_an_episode_has_no_mean_return() {
     expect!["finished: 0 frames and 0 updates in 2 s (0 frames/s, 0.00 updates/s), replay ratio -, no episode ended"]

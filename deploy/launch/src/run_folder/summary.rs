@@ -278,7 +278,7 @@ impl Summary {
             "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
             self.frames,
             self.updates,
-            duration(Duration::from_secs_f64(self.wall_seconds)),
+            duration(Duration::try_from_secs_f64(self.wall_seconds).unwrap_or_default()),
             self.frames_per_second,
             self.updates_per_second,
             ratio.as_deref().unwrap_or("-"),
