@@ -47,7 +47,6 @@ pub(super) fn start(
         screen: &Screen::plain(),
         rendezvous: None,
     };
-    let args: Vec<_> = args.into_iter().map(String::from).collect();
     ManagedProcess::start(name, &args, 1, surroundings)
 }
 

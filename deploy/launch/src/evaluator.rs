@@ -2,6 +2,7 @@
 //! What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
 
 use std::{
+    ffi::OsStr,
     ops::ControlFlow,
     path::Path,
     time::{Duration, Instant},
@@ -187,14 +188,15 @@ impl Evaluator {
         episodes: u32,
         screen: &Screen,
     ) -> anyhow::Result<ManagedProcess> {
+        let [updates, episodes] = [updates, episodes.into()].map(|it: u64| it.to_string());
         let args = [
-            "evaluate".into(),
-            self.run_dir.display().to_string(),
-            "--keep".into(),
-            "--checkpoint".into(),
-            updates.to_string(),
-            "--episodes".into(),
-            episodes.to_string(),
+            OsStr::new("evaluate"),
+            self.run_dir.path().as_os_str(),
+            OsStr::new("--keep"),
+            OsStr::new("--checkpoint"),
+            OsStr::new(&updates),
+            OsStr::new("--episodes"),
+            OsStr::new(&episodes),
         ];
         let surroundings = Surroundings {
             logs: &self.run_dir.logs(),

@@ -2,6 +2,7 @@
 //! It does not know what the processes do or in which order they end.
 
 use std::{
+    ffi::OsStr,
     os::unix::process::{CommandExt, ExitStatusExt},
     path::Path,
     process::{Child, Command, ExitStatus, Stdio},
@@ -57,7 +58,7 @@ impl ManagedProcess {
     /// this process does.
     pub fn start(
         name: &str,
-        args: &[String],
+        args: &[impl AsRef<OsStr>],
         threads: u32,
         surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
@@ -152,7 +153,7 @@ impl ManagedProcess {
         }
     }
 
-    /// Waits for its end until `deadline`, or until `hurry` says that there is no time for that.
+    /// Waits for its end until `deadline`, or until `abort` says that there is no time for that.
     pub fn wait_until(
         &mut self,
         deadline: Instant,

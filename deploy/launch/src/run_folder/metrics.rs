@@ -25,7 +25,7 @@ pub struct ResumePoint {
 }
 
 /// Bytes at the end of the file in which its last row lies.
-const LAST_ROW_BYTES: u64 = 4096;
+const LAST_ROW_BYTES: u64 = 1 << 16;
 
 /// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames, under this header; none where there is no
 /// such file. The others, which contradict what the run will do, are set aside.
@@ -106,11 +106,18 @@ mod tests {
         assert_eq!(progress(&folder), None);
         write("seconds,frames,updates,a,b,c,episodes\n");
         assert_eq!(progress(&folder), None);
-        write("seconds,frames,updates,a,b,c,episodes\n1,200,3,,,,7\n2,30");
         let found = Progress {
             frames: 200,
             episodes: 7,
         };
-        assert_eq!(progress(&folder), Some(found));
+        // With the memory of as many processes as a run may have, too.
+        for processes in [3, 512] {
+            let [names, memory] =
+                [",rss_mib_actor_255", ",12345.678"].map(|it| it.repeat(processes));
+            write(&format!(
+                "seconds,frames,updates,episodes{names}\n1,200,3,7{memory}\n2,30"
+            ));
+            assert_eq!(progress(&folder), Some(found));
+        }
     }
 }
