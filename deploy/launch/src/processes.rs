@@ -1,25 +1,23 @@
-//! The processes of a run, as far as they were started: replay servers, learner and actors; and the first session to them.
+//! The processes of a run, as far as they were started: replay servers, learner and actors.
 //! It does not know when they start or why they end.
 
 use std::{
     os::unix::process::ExitStatusExt,
     process::ExitStatus,
-    sync::mpsc::sync_channel,
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
-use driml_protocol::{
-    fail_point,
-    session::{self, Endpoints},
-};
+use driml_protocol::reach;
 use nix::sys::signal::Signal;
 
 use crate::{interrupts::Interrupts, managed_process::ManagedProcess};
 
 /// How long the replay server may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(30);
+const LISTEN_MAX: Duration = Duration::from_secs(60);
+/// How often it is looked whether it does.
+const LOOK: Duration = Duration::from_millis(20);
 const KILLED_MAX: Duration = Duration::from_secs(30);
 
 #[derive(Default)]
@@ -110,45 +108,23 @@ pub(crate) fn stop(
     late
 }
 
-/// A session to the replay server as soon as it listens; none after an interrupt. `check_alive` says whether it still can.
-pub(crate) fn connect(
+/// Waits until something listens at `endpoint`; false after an interrupt. `check_alive` says whether it still can.
+pub fn wait_until_listening(
     endpoint: &str,
     interrupts: &Interrupts,
     mut check_alive: impl FnMut() -> anyhow::Result<()>,
-) -> anyhow::Result<Option<zenoh::Session>> {
-    let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
+) -> anyhow::Result<bool> {
     let deadline = Instant::now() + LISTEN_MAX;
-    let (tell, told) = sync_channel(0);
-    // Opening may take seconds, in which the replay server may end: so it runs on another thread.
-    let open = move || {
-        loop {
-            fail_point::reach("connect");
-            let opened = session::open(&endpoints);
-            let is_open = opened.is_ok();
-            // The receiver is gone if the run has ended meanwhile.
-            if tell.send(opened).is_err() || is_open {
-                return;
-            }
-        }
-    };
-    let thread = std::thread::Builder::new().name("connect".into());
-    thread.spawn(open).context("starting a thread")?;
-    while interrupts.count() == 0 {
+    while let Err(e) = reach::look(endpoint) {
         check_alive()?;
-        let opened = told.recv_timeout(Duration::from_millis(50));
-        let is_late = Instant::now() > deadline;
-        match opened {
-            Ok(Ok(session)) => return Ok(Some(session)),
-            Ok(Err(e)) if is_late => return Err(e).context("reaching the replay server"),
-            Ok(Err(e)) => tracing::debug!("the replay server does not listen yet: {e}"),
-            Err(_) if is_late => bail!(
-                "the replay server does not listen on {endpoint} after {}",
-                duration(LISTEN_MAX)
-            ),
-            Err(_) => {}
+        if Instant::now() > deadline {
+            return Err(e).context("waiting for the replay server");
+        }
+        if interrupts.wait_timeout(LOOK) > 0 {
+            return Ok(false);
         }
     }
-    Ok(None)
+    Ok(true)
 }
 
 #[cfg(test)]

@@ -11,7 +11,12 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_machine::{error::Usage, units::duration};
-use driml_protocol::{Keys, RunClient, Silence, config::Settings, session, shared_memory};
+use driml_protocol::{
+    Keys, RunClient, Silence,
+    config::Settings,
+    session::{self, Endpoints},
+    shared_memory,
+};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -21,7 +26,7 @@ use crate::{
     evaluator::Evaluator,
     interrupts::Interrupts,
     last_play, open_files,
-    processes::{Processes, Revived, connect, stop},
+    processes::{Processes, Revived, stop, wait_until_listening},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
@@ -213,9 +218,10 @@ impl Launch<'_> {
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
             let check_alive = || self.processes.check_alive(Revived::default());
-            let Some(session) = connect(endpoint, &self.interrupts, check_alive)? else {
+            if !wait_until_listening(endpoint, &self.interrupts, check_alive)? {
                 return Ok(Outcome::Interrupted);
-            };
+            }
+            let session = session::open(&Endpoints::to(vec![endpoint.clone()]))?;
             reached.push(Reached {
                 name: name.clone(),
                 endpoint: endpoint.clone(),
