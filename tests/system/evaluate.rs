@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{TestSystem, updates_of};
+use driml_tests::{TestSystem, updates_of, wait_for};
 
 use crate::{SHORT, system};
 
@@ -229,6 +229,27 @@ fn it_plays_checkpoints_while_the_run_continues() {
             "plot {name} --column evaluated_return --out {name}.svg"
         ));
     }
+}
+
+#[test]
+fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
+    let system = system();
+    let flags = "--agent c51 --eval-interval 100 --eval-episodes 1000000";
+    let process = system.start(&format!("local --lockstep {SHORT} {flags} --run-dir run"));
+    wait_for("a checkpoint", || {
+        let saved = fs::read_dir(system.path("run/checkpoints")).ok()?;
+        let is_checkpoint = |it: fs::DirEntry| !it.path().ends_with(".lock");
+        saved.flatten().any(is_checkpoint).then_some(())
+    });
+    process
+        .interrupt()
+        .expect_code(130)
+        .expect_said("an evaluation was left out");
+    fs::write(system.path("run/best"), "not a folder").unwrap();
+    system
+        .run_ok("local --resume run --set local.evaluation.episodes=2")
+        .expect_said("the run continues without an evaluation: ");
+    system.run_folder("run").check_finished();
 }
 
 #[test]

@@ -145,12 +145,12 @@ fn a_dead_actor_is_started_again() {
         system.endpoint()
     ));
     let client = system.connect();
-    for restarts in 1..=2 {
+    for (restarts, signal) in [(1, Signal::SIGKILL), (2, Signal::SIGTERM)] {
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
         client.wait_for_replay("some transitions", |replay| {
             replay.transitions_inserted > restarts * 500
         });
-        system.find_process("actor").signal(Signal::SIGKILL);
+        system.find_process("actor").signal(signal);
         process.wait_for_stderr(&format!(
             "is started again ({restarts} of 16 times in a run)"
         ));

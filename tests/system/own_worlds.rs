@@ -146,11 +146,14 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     ] {
         let system = system();
         let process = start(&system, &format!("{flags} --run-dir run"), &numbered(fault));
-        process
-            .wait()
-            .expect_code(0)
+        let ended = process.wait().expect_code(0);
+        assert!(!ended.stdout.contains("--resume"), "{}", ended.stdout);
+        ended
             .expect_said(sentence)
             .expect_said(": the run cannot be resumed, only repeated");
+        let cannot =
+            "the run in run cannot be resumed, because the state of its world cannot be saved";
+        system.refuses("local --resume run --frames 1280", cannot);
         let run = system.run_folder("run");
         run.check_finished();
         assert!(!run.path().join("replay").exists());

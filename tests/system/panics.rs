@@ -109,7 +109,7 @@ fn a_panic_in_the_launcher_ends_the_run() {
     if skipped() {
         return;
     }
-    for point in ["interrupts", "connect", "log of learner"] {
+    for point in ["interrupts", "log of learner"] {
         let system = system();
         let run = format!("local --agent driml-ada {LONG} --run-dir run");
         let ended = system.start_with(fail_point::VARIABLE, point, &run).wait();

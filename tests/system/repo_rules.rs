@@ -14,8 +14,8 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_110),
     ("replay-server", 11_460),
     ("learner", 26_340),
-    ("deploy", 34_975),
-    ("tests", 11_550),
+    ("deploy", 35_150),
+    ("tests", 11_580),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -25,7 +25,7 @@ use crate::{
     effort::Effort,
     recording::{ChunkShape, INCARNATION, Recording},
     settings,
-    subprocess::{reach, start},
+    subprocess::{start, wait_for},
 };
 
 /// The number of a bench's learner.
@@ -79,13 +79,10 @@ impl Server {
         let mut process = start("replay-server", &args, &sets, folder)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let credentials = wire.credentials(Role::Observer)?;
-        let session = reach(&mut process, || {
-            let (endpoints, credentials) = (
-                Endpoints::to(vec![wire.endpoint.clone()]),
-                credentials.as_ref(),
-            );
-            session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)
-        })?;
+        wait_for(&mut process, &wire.endpoint)?;
+        let endpoints = Endpoints::to(vec![wire.endpoint.clone()]);
+        let credentials = credentials.as_ref();
+        let session = session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)?;
         let run_info = join::run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;
         Ok(Self {

@@ -1,24 +1,18 @@
 //! This program as another process: a replay server, a whole run, or itself with other threads.
 //! What is asked of a process that runs is for `server` and `system`.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_launch::{
     console::Screen,
+    interrupts::Interrupts,
     managed_process::{ManagedProcess, Surroundings, THREADS},
+    processes::wait_until_listening,
 };
 use driml_machine::process_env;
-use driml_protocol::session::SessionError;
-use zenoh::Session;
 
 use crate::settings;
-
-/// How long a process may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(60);
 
 /// Makes sure that this process has `threads` threads for arithmetic, as the launcher gives those of a run: with others it starts
 /// again in the same process, with the same arguments.
@@ -47,22 +41,15 @@ pub(super) fn start(
         screen: &Screen::plain(),
         rendezvous: None,
     };
-    let args: Vec<_> = args.into_iter().map(String::from).collect();
     ManagedProcess::start(name, &args, 1, surroundings)
 }
 
-/// A session to a process as soon as it listens.
-pub(super) fn reach(
-    process: &mut ManagedProcess,
-    open: impl Fn() -> Result<Session, SessionError>,
-) -> anyhow::Result<Session> {
-    let deadline = Instant::now() + LISTEN_MAX;
-    loop {
-        match open() {
-            Ok(session) => return Ok(session),
-            Err(e) if Instant::now() > deadline => return Err(e.into()),
-            Err(_) if process.end().is_some() => bail!("{}", process.exit_report()),
-            Err(e) => tracing::debug!("{} does not listen yet: {e}", process.name),
-        }
-    }
+/// Waits until a process listens at `endpoint`.
+pub(super) fn wait_for(process: &mut ManagedProcess, endpoint: &str) -> anyhow::Result<()> {
+    let check_alive = || match process.end() {
+        Some(_) => bail!("{}", process.exit_report()),
+        None => Ok(()),
+    };
+    // A benchmark does not listen for signals.
+    wait_until_listening(endpoint, &Interrupts::default(), check_alive).map(drop)
 }

@@ -25,7 +25,7 @@ use crate::{
     flags::BenchFlags,
     report::Measurement,
     settings::{self, AGENT, WORLD},
-    subprocess::{reach, start},
+    subprocess::{start, wait_for},
 };
 
 /// Frames of the run, and of a quick one.
@@ -219,7 +219,8 @@ impl Run {
         let args = [&listen[..], flags].concat();
         let mut launcher = start("launcher", &args, sets, folder.path())?;
         let endpoints = Endpoints::to(vec![endpoint.clone()]);
-        let session = reach(&mut launcher, || session::open(&endpoints))?;
+        wait_for(&mut launcher, &endpoint)?;
+        let session = session::open(&endpoints)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         let reached = Reached {
             name: "replay-server".into(),

@@ -16,7 +16,7 @@ use driml_launch::{
 };
 use driml_machine::{
     error::{Interrupted, usage},
-    resources,
+    process_env, resources,
 };
 use minijinja::Value;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -250,7 +250,7 @@ fn folder(name: &str, flags: &ExperimentFlags) -> PathBuf {
 
 /// Names this program and the processor it runs on, for [`Session::piece_of`]: the size of its file and when that was written.
 pub(crate) fn program() -> anyhow::Result<String> {
-    let file = std::env::current_exe().context("finding this program's own file")?;
+    let file = process_env::program();
     let about = fs::metadata(&file).with_context(|| format!("looking at {}", file.display()))?;
     let written = about.modified().ok();
     let written = written.and_then(|it| it.duration_since(SystemTime::UNIX_EPOCH).ok());

@@ -393,18 +393,4 @@ mod tests {
         let joined = join_losses(lost.lines().map(str::to_owned));
         assert_eq!(joined, ["x", "2 rows of a, 1 rows of b are lost: full"]);
     }
-
-    #[test]
-    fn a_terminal_that_is_gone_can_still_be_drawn_on() {
-        let pty = nix::pty::openpty(None, None).unwrap();
-        let slave = std::fs::File::from(pty.slave);
-        let term = Term::read_write_pair(slave.try_clone().unwrap(), slave);
-        let target = ProgressDrawTarget::term(term, DRAWS_PER_SECOND);
-        let bar = ProgressBar::with_draw_target(Some(10), target);
-        bar.tick();
-        drop(pty.master);
-        bar.set_message("one\ntwo");
-        bar.suspend(|| ());
-        bar.finish_and_clear();
-    }
 }

@@ -83,7 +83,8 @@ fn is_taken<T>(bound: std::io::Result<T>) -> bool {
 fn check_endpoint(endpoint: &str, tls: bool) -> Result<(), Usage> {
     let has_host = |address: &str| {
         let parts = address.rsplit_once(':');
-        parts.is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
+        let is_port = |port: &str| port.parse::<u16>().is_ok_and(|port| port > 0);
+        parts.is_some_and(|(host, port)| !host.is_empty() && is_port(port))
     };
     // Behind # zenoh takes further settings, which could undo ours.
     match endpoint.split_once('/') {
@@ -155,6 +156,7 @@ mod tests {
             ("localhost:7447", false, none),
             ("tcp/localhost", false, none),
             ("tcp/:1", false, none),
+            ("tcp/127.0.0.1:0", false, none),
             ("tcp/127.0.0.1:7447#so_sndbuf=1", false, none),
             ("tcp/127.0.0.1:70000", false, none),
             ("udp/1.2.3.4:5", false, none),

@@ -188,7 +188,7 @@ pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow:
 }
 
 /// Watches without ending anything.
-pub(crate) fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
+fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 

@@ -2,19 +2,23 @@
 //! What the best is worth, `driml evaluate` says on other episodes: the best of many is best by luck, too.
 
 use std::{
+    ffi::OsStr,
+    ops::ControlFlow,
     path::Path,
     time::{Duration, Instant},
 };
 
+use driml_actor::Step;
 use driml_learner::checkpoint;
+use driml_machine::error::Interrupted;
 use driml_settings::config::{EvaluationConfig, RunConfig};
 
 use crate::{
     chosen::{Weights, Which, checkpoint_at, config_of},
     console::Screen,
-    evaluate::{Levels, Player, Who, levels, play_on},
+    evaluate::{Levels, Player, Who, levels},
     managed_process::{ManagedProcess, Surroundings},
-    run_folder::{Candidate, Evaluated, RunFolder, sweep},
+    run_folder::{Candidate, Evaluated, RunFolder},
     stats::mean_and_deviation,
 };
 
@@ -37,14 +41,29 @@ pub struct Judged {
 ///
 /// Both are compared over the same episodes. A best that was played for fewer is played again; a checkpoint that is played for fewer
 /// does not take its place.
-pub fn keep(folder: &RunFolder, which: Which, episodes: u32) -> anyhow::Result<Judged> {
+///
+/// # Errors
+/// A file system error; [`Interrupted`] once it `is_stopped`, and nothing is kept.
+pub fn keep(
+    folder: &RunFolder,
+    which: Which,
+    episodes: u32,
+    is_stopped: &dyn Fn() -> bool,
+) -> anyhow::Result<Judged> {
     let path = checkpoint_at(folder, which)?;
-    let candidate = Candidate::hold(folder, &path)?;
+    let candidate = Candidate::read(&path)?;
     let play = |path: &Path| -> anyhow::Result<Evaluated> {
         let player = Player::read(config_of(folder)?, path, Weights::default())?;
         let world = levels(&player.config.world, Levels::Train)?;
-        let (count, watch) = (episodes as usize, &mut play_on);
+        let count = episodes as usize;
+        let watch = &mut |_: &Step<'_>, _: &[f64]| match is_stopped() {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        };
         let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
+        if returns.len() < count {
+            return Err(Interrupted.into());
+        }
         let earned = mean_and_deviation(&returns);
         Ok(Evaluated::at(folder, player.updates, episodes, earned))
     };
@@ -80,10 +99,10 @@ pub(crate) struct Due {
 impl Due {
     /// Those after the checkpoints that the run's folder lists as played.
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
-        Ok(Self {
-            config: config.local.evaluation,
-            newest: Evaluated::newest(run_dir)?,
-        })
+        let config = config.local.evaluation;
+        let newest = config.map(|_| Evaluated::newest(run_dir));
+        let newest = newest.transpose()?.unwrap_or(0);
+        Ok(Self { config, newest })
     }
 
     /// How many episodes the checkpoint after so many updates is now played for, if it is due.
@@ -169,14 +188,15 @@ impl Evaluator {
         episodes: u32,
         screen: &Screen,
     ) -> anyhow::Result<ManagedProcess> {
+        let [updates, episodes] = [updates, episodes.into()].map(|it: u64| it.to_string());
         let args = [
-            "evaluate".into(),
-            self.run_dir.display().to_string(),
-            "--keep".into(),
-            "--checkpoint".into(),
-            updates.to_string(),
-            "--episodes".into(),
-            episodes.to_string(),
+            OsStr::new("evaluate"),
+            self.run_dir.path().as_os_str(),
+            OsStr::new("--keep"),
+            OsStr::new("--checkpoint"),
+            OsStr::new(&updates),
+            OsStr::new("--episodes"),
+            OsStr::new(&episodes),
         ];
         let surroundings = Surroundings {
             logs: &self.run_dir.logs(),
@@ -206,13 +226,5 @@ impl Evaluator {
         };
         screen.line(&said);
         self.playing = None;
-    }
-}
-
-impl Drop for Evaluator {
-    fn drop(&mut self) {
-        // Which kills it.
-        self.playing = None;
-        sweep(&self.run_dir);
     }
 }

@@ -49,6 +49,11 @@ impl Interrupts {
         u32::from(self.0.ending.is_set()) + u32::from(self.0.now.is_set())
     }
 
+    /// Sleeps until there are two.
+    pub(crate) fn wait_for_second(&self) {
+        self.0.now.wait();
+    }
+
     /// Sleeps for `timeout`, or until there is one; returns how many there were. After the first one it returns at once.
     pub fn wait_timeout(&self, timeout: Duration) -> u32 {
         self.0.ending.wait_timeout(timeout);

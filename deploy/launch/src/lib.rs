@@ -37,7 +37,7 @@ pub mod panics;
 pub mod plan;
 pub mod pretrained;
 mod process_log;
-mod processes;
+pub mod processes;
 mod rates;
 pub mod rendezvous;
 pub mod resume;

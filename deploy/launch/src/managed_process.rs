@@ -2,6 +2,7 @@
 //! It does not know what the processes do or in which order they end.
 
 use std::{
+    ffi::OsStr,
     os::unix::process::{CommandExt, ExitStatusExt},
     path::Path,
     process::{Child, Command, ExitStatus, Stdio},
@@ -9,7 +10,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::units::kib;
+use driml_machine::{process_env::program, units::kib};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -57,16 +58,15 @@ impl ManagedProcess {
     /// this process does.
     pub fn start(
         name: &str,
-        args: &[String],
+        args: &[impl AsRef<OsStr>],
         threads: u32,
         surroundings: Surroundings<'_>,
     ) -> anyhow::Result<Self> {
         let log = ProcessLog::open(name, surroundings.logs)?;
-        let program = std::env::current_exe().context("finding this program's own file")?;
         let held = surroundings.rendezvous.map(Rendezvous::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
-        let mut command = Command::new(program);
+        let mut command = Command::new(program());
         // Everything else that it needs of its environment it has from this one.
         command
             .env(THREADS, threads.to_string())
@@ -114,13 +114,13 @@ impl ManagedProcess {
         self.child.id()
     }
 
-    /// Whether it has died in a way that a restart may mend: it was killed, or it had run for a while. A broken
-    /// invariant of our own aborts it.
-    pub(crate) fn may_be_started_again(&mut self) -> bool {
+    /// Whether it has ended in a way that a restart may mend: it was killed, or it had run for a while. A broken
+    /// invariant of our own aborts it. An orderly end is one only if it `is_needed`.
+    pub(crate) fn may_be_started_again(&mut self, is_needed: bool) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
         self.end().is_some_and(|status| {
             let was_killed = status.signal().is_some_and(killed);
-            !status.success() && (was_killed || self.started.elapsed() > AT_ONCE)
+            (is_needed || !status.success()) && (was_killed || self.started.elapsed() > AT_ONCE)
         })
     }
 
@@ -153,7 +153,7 @@ impl ManagedProcess {
         }
     }
 
-    /// Waits for its end until `deadline`, or until `hurry` says that there is no time for that.
+    /// Waits for its end until `deadline`, or until `abort` says that there is no time for that.
     pub fn wait_until(
         &mut self,
         deadline: Instant,

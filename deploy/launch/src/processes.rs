@@ -1,24 +1,23 @@
-//! The processes of a run, as far as they were started: replay servers, learner and actors; and the first session to them.
+//! The processes of a run, as far as they were started: replay servers, learner and actors.
 //! It does not know when they start or why they end.
 
 use std::{
     os::unix::process::ExitStatusExt,
-    sync::mpsc::sync_channel,
+    process::ExitStatus,
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
-use driml_protocol::{
-    fail_point,
-    session::{self, Endpoints},
-};
+use driml_protocol::reach;
 use nix::sys::signal::Signal;
 
 use crate::{interrupts::Interrupts, managed_process::ManagedProcess};
 
 /// How long the replay server may take to listen.
-const LISTEN_MAX: Duration = Duration::from_secs(30);
+const LISTEN_MAX: Duration = Duration::from_secs(60);
+/// How often it is looked whether it does.
+const LOOK: Duration = Duration::from_millis(20);
 const KILLED_MAX: Duration = Duration::from_secs(30);
 
 #[derive(Default)]
@@ -54,8 +53,10 @@ impl Processes {
             }
         }
         for actor in &mut self.actors {
-            let comes_back = revived.actors && actor.may_be_started_again();
-            if actor.end().is_some_and(|status| !status.success()) && !comes_back {
+            let is_needed = revived.actors_are_needed;
+            let comes_back = revived.actors && actor.may_be_started_again(is_needed);
+            let is_missed = |status: ExitStatus| is_needed || !status.success();
+            if actor.end().is_some_and(is_missed) && !comes_back {
                 bail!("{}", actor.exit_report());
             }
         }
@@ -69,6 +70,8 @@ pub(crate) struct Revived {
     pub(crate) servers: bool,
     /// Actors that had lived for a while.
     pub(crate) actors: bool,
+    /// An actor that has exited was asked to by someone else, as frames are missing.
+    pub(crate) actors_are_needed: bool,
 }
 
 /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
@@ -105,50 +108,48 @@ pub(crate) fn stop(
     late
 }
 
-/// A session to the replay server as soon as it listens; none after an interrupt. `check_alive` says whether it still can.
-pub(crate) fn connect(
+/// Waits until something listens at `endpoint`; false after an interrupt. `check_alive` says whether it still can.
+pub fn wait_until_listening(
     endpoint: &str,
     interrupts: &Interrupts,
     mut check_alive: impl FnMut() -> anyhow::Result<()>,
-) -> anyhow::Result<Option<zenoh::Session>> {
-    let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
+) -> anyhow::Result<bool> {
     let deadline = Instant::now() + LISTEN_MAX;
-    let (tell, told) = sync_channel(0);
-    // Opening may take seconds, in which the replay server may end: so it runs on another thread.
-    let open = move || {
-        loop {
-            fail_point::reach("connect");
-            let opened = session::open(&endpoints);
-            let is_open = opened.is_ok();
-            // The receiver is gone if the run has ended meanwhile.
-            if tell.send(opened).is_err() || is_open {
-                return;
-            }
-        }
-    };
-    let thread = std::thread::Builder::new().name("connect".into());
-    thread.spawn(open).context("starting a thread")?;
-    while interrupts.count() == 0 {
+    while let Err(e) = reach::look(endpoint) {
         check_alive()?;
-        let opened = told.recv_timeout(Duration::from_millis(50));
-        let is_late = Instant::now() > deadline;
-        match opened {
-            Ok(Ok(session)) => return Ok(Some(session)),
-            Ok(Err(e)) if is_late => return Err(e).context("reaching the replay server"),
-            Ok(Err(e)) => tracing::debug!("the replay server does not listen yet: {e}"),
-            Err(_) if is_late => bail!(
-                "the replay server does not listen on {endpoint} after {}",
-                duration(LISTEN_MAX)
-            ),
-            Err(_) => {}
+        if Instant::now() > deadline {
+            return Err(e).context("waiting for the replay server");
+        }
+        if interrupts.wait_timeout(LOOK) > 0 {
+            return Ok(false);
         }
     }
-    Ok(None)
+    Ok(true)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_actor_that_exits_before_the_run_is_over_is_missed() {
+        let logs = tempfile::tempdir().unwrap();
+        let mut actor = ManagedProcess::of_script("exit 0", logs.path());
+        actor.wait_until(Instant::now() + Duration::from_secs(60), || false);
+        let mut processes = Processes {
+            actors: vec![actor],
+            ..Processes::default()
+        };
+        for actors_are_needed in [false, true] {
+            let revived = Revived {
+                actors_are_needed,
+                ..Revived::default()
+            };
+            let said = processes.check_alive(revived).map_err(|e| e.to_string());
+            let is_missed = said.is_err_and(|it| it.starts_with("script exited with code 0"));
+            assert_eq!(is_missed, actors_are_needed);
+        }
+    }
 
     #[test]
     fn a_process_that_dies_of_the_request_to_stop_has_stopped() {

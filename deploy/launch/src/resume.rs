@@ -32,18 +32,29 @@ const SAVING_MAX: Duration = Duration::from_secs(120);
 const ENDING_MAX: Duration = Duration::from_secs(20);
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, and the world keeps no progress over episodes.
+/// Whether the run in `folder`, which is in this world, can be resumed: it has a checkpoint, and the world keeps no progress over episodes
+/// or is saved with it.
 pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
         && saved.last().is_some_and(|(_, newest)| {
-            world.is_resumable() || is_in_lockstep(newest).unwrap_or(false)
+            let lockstep = lockstep_of(newest).unwrap_or_default();
+            lockstep.map_or_else(|| world.is_resumable(), |it| it.is_whole)
         })
 }
 
-/// Whether a checkpoint is of a run in lockstep, and holds all its components.
-fn is_in_lockstep(checkpoint: &Path) -> Result<bool, CheckpointError> {
-    checkpoint::companion(checkpoint).map(|it| it.is_some())
+/// A run in lockstep.
+struct InLockstep {
+    /// A checkpoint holds all its components.
+    is_whole: bool,
+}
+
+/// Whether a checkpoint is of a run in lockstep; none if it is not.
+fn lockstep_of(checkpoint: &Path) -> Result<Option<InLockstep>, CheckpointError> {
+    let companion = checkpoint::companion(checkpoint)?;
+    Ok(companion.map(|it| InLockstep {
+        is_whole: !it.is_empty(),
+    }))
 }
 
 /// Prints how to resume a run that was interrupted or failed, if it can be.
@@ -69,7 +80,7 @@ pub(crate) fn say_next(
         say_how(world, folder);
         return Err(Interrupted.into());
     }
-    console::print(&summary.next_steps(folder))
+    console::print(&summary.next_steps(folder, is_resumable(world, folder)))
 }
 
 /// Waits until the learner of the run in `folder` has saved and its other processes have ended, if the run was ended.
@@ -160,7 +171,15 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
     })?;
     let (updates, progress) = checkpoint::progress(newest)?;
-    let lockstep = is_in_lockstep(newest)?;
+    let found = lockstep_of(newest)?;
+    if found.as_ref().is_some_and(|it| !it.is_whole) {
+        return Err(usage!(
+            "the run in {} cannot be resumed, because the state of its world cannot be saved: start it again",
+            folder.display()
+        )
+        .into());
+    }
+    let lockstep = found.is_some();
     if !lockstep && !config.world.is_resumable() {
         return Err(usage!(
             "the run in {} cannot be resumed, because a checkpoint does not save its position in world.lethal_schedule: start it again",
@@ -168,9 +187,9 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         )
         .into());
     }
-    // Where nothing was learned, nothing is behind it.
+    // Where nothing was learned, only a run in lockstep keeps what it has.
     let (frames, rows) = match updates {
-        0 => (0, 0),
+        0 if !lockstep => (0, 0),
         _ => (progress.frames(), progress.rows()),
     };
     let has_other_pace = before.learner.batch_size != config.learner.batch_size

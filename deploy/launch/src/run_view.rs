@@ -53,6 +53,15 @@ impl Plan {
     }
 }
 
+/// Updates whose batches were served when `rows` were sampled in the whole run: before it was resumed with other settings, and since.
+pub(crate) fn updates_served(config: &RunConfig, rows: u64) -> u64 {
+    let (rows_before, updates) = config
+        .replay
+        .since
+        .map_or((0, 0), |it| (it.rows, it.updates));
+    updates + rows.saturating_sub(rows_before) / u64::from(config.learner.batch_size)
+}
+
 /// Mean and standard deviation over the rows served.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Spread {
@@ -226,9 +235,13 @@ impl RunView {
 
     /// Whether everything is learned and saved.
     pub(crate) fn is_finished(&self) -> bool {
-        let learner = self.learner_status();
-        self.replay.learner_finished
-            || self.replay.finished && learner.is_some_and(|it| it.finished)
+        self.replay.learner_finished || self.learner_status().is_some() && self.is_learned()
+    }
+
+    /// Whether no more rows will be sampled and the learner has saved, by the last answers. A learner that was asked to end before has
+    /// saved, too.
+    pub(crate) fn is_learned(&self) -> bool {
+        self.replay.waiting == Waiting::Finished && self.learner.finished
     }
 
     /// Whether everything is learned and saved, or the replay servers have ended after everything was sampled.
@@ -286,7 +299,37 @@ impl RunView {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::with;
+    use crate::testing::{config, with};
+    use driml_replay_server::Since;
+
+    #[test]
+    fn updates_are_those_of_the_batches_that_each_part_of_a_run_had() {
+        let mut config = config("smoke", "chain", "c51", &["learner.batch_size=32"]);
+        assert_eq!(updates_served(&config, 96_000), 3_000);
+        let (transitions, rows, updates) = (9_000, 64_000, 1_000);
+        let since = Since {
+            transitions,
+            rows,
+            updates,
+        };
+        config.replay.since = Some(since);
+        for (rows, updates) in [(64_000, 1_000), (96_000, 2_000), (96_031, 2_000)] {
+            assert_eq!(updates_served(&config, rows), updates);
+        }
+    }
+
+    #[test]
+    fn a_learner_that_ended_before_all_is_sampled_has_not_learned_it() {
+        let mut view = RunView::new(Plan::default());
+        view.take_learner(Some(with(|it: &mut LearnerStatus| it.finished = true)));
+        for (waiting, is_learned) in [(Waiting::Neither, false), (Waiting::Finished, true)] {
+            view.take_replay(vec![with(|it: &mut ReplayStatus| {
+                (it.finished, it.waiting) = (true, waiting);
+            })]);
+            let found = (view.is_learned(), view.is_finished());
+            assert_eq!(found, (is_learned, is_learned), "{waiting}");
+        }
+    }
 
     #[test]
     fn updates_before_the_learner_s_first_answer_are_not_its_speed() {

@@ -1,7 +1,7 @@
 //! The environment that a process of this program needs before its first allocation and its first tensor.
 //! It is read by the C library and by candle, each once: so a process that lacks it starts itself again with it.
 
-use std::{env, ffi::OsString, io, os::unix::process::CommandExt, process::Command};
+use std::{env, ffi::OsString, io, os::unix::process::CommandExt, path::PathBuf, process::Command};
 
 /// What every process needs. candle's second pool of threads spins while it waits, which costs more than it gives on busy
 /// cores; and glibc returns each large tensor to the system and faults it in again unless told to keep it.
@@ -27,7 +27,7 @@ pub enum Purpose {
 /// has set stays unchanged.
 ///
 /// # Errors
-/// The program cannot be started again, for example because its file was replaced. It may continue, only slower.
+/// The program cannot be started again. It may continue, only slower.
 pub fn settle(purpose: Purpose) -> io::Result<()> {
     let missing = missing(purpose, |name| env::var_os(name).is_some());
     if missing.is_empty() {
@@ -43,8 +43,14 @@ pub fn start_again_with<'a>(
 ) -> io::Result<()> {
     let mut args = env::args_os();
     let name = args.next().unwrap_or_else(|| OsString::from("driml"));
-    let mut again = Command::new(env::current_exe()?);
+    let mut again = Command::new(program());
     Err(again.arg0(name).args(args).envs(variables).exec())
+}
+
+/// This program, for another process of it: its file, or what the system holds of it once a build has put another in its place.
+pub fn program() -> PathBuf {
+    let file = env::current_exe().ok().filter(|it| it.exists());
+    file.unwrap_or_else(|| "/proc/self/exe".into())
 }
 
 /// The variables that a process for `purpose` lacks, with their values.
@@ -56,7 +62,33 @@ fn missing(purpose: Purpose, has: impl Fn(&str) -> bool) -> Vec<(&'static str, &
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
+
+    /// Set where this test is the process whose file is gone.
+    const CHILD: &str = "DRIML_TEST_REPLACED";
+
+    #[test]
+    fn a_program_whose_file_was_replaced_starts_again() {
+        let name = "process_env::tests::a_program_whose_file_was_replaced_starts_again";
+        let status = |program: PathBuf| {
+            let mut command = Command::new(program);
+            let command = command.args(["--exact", name]).env(CHILD, "");
+            command.process_group(0).status().unwrap()
+        };
+        match env::var_os(CHILD) {
+            None => {
+                let folder = tempfile::tempdir().unwrap();
+                let copy = folder.path().join("program");
+                fs::copy(env::current_exe().unwrap(), &copy).unwrap();
+                assert!(status(copy).success());
+            }
+            // It is the process that was started again.
+            Some(_) if fs::remove_file(env::current_exe().unwrap()).is_err() => {}
+            Some(_) => assert!(status(program()).success()),
+        }
+    }
 
     #[test]
     fn what_is_missing_is_added_and_what_is_set_stays() {

@@ -19,6 +19,7 @@ use driml_launch::{
 };
 use driml_machine::{
     error::{EXIT_USAGE, usage},
+    process_env,
     resources::Machine,
 };
 use driml_protocol::lock_file;
@@ -107,8 +108,9 @@ fn install<P>(plans: &[Planned<P>]) -> anyhow::Result<()> {
 
 /// The commit that this program was built from, as its `--version` says in brackets.
 fn commit() -> anyhow::Result<String> {
-    let program = std::env::current_exe().context("finding this program's own file")?;
-    let output = Command::new(program).arg("--version").output();
+    let output = Command::new(process_env::program())
+        .arg("--version")
+        .output();
     let output = output.context("asking this program for its version")?;
     let text = String::from_utf8_lossy(&output.stdout);
     let text = text.trim().strip_suffix(')');
@@ -263,8 +265,7 @@ impl Queue {
             ));
         }
         self.runs.write_call(&plan, &self.commit)?;
-        let program = std::env::current_exe().context("finding this program's own file")?;
-        let mut command = Command::new(program);
+        let mut command = Command::new(process_env::program());
         command
             .args(["train", "--no-play"])
             .args(exit_with_this_process());

@@ -11,7 +11,12 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_machine::{error::Usage, units::duration};
-use driml_protocol::{Keys, RunClient, Silence, Waiting, config::Settings, session, shared_memory};
+use driml_protocol::{
+    Keys, RunClient, Silence,
+    config::Settings,
+    session::{self, Endpoints},
+    shared_memory,
+};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
@@ -21,11 +26,11 @@ use crate::{
     evaluator::Evaluator,
     interrupts::Interrupts,
     last_play, open_files,
-    processes::{Processes, Revived, connect, stop},
+    processes::{Processes, Revived, stop, wait_until_listening},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
-    run_view::{Plan, RunView},
+    run_view::{Plan, RunView, updates_served},
     view::{Display, Poller, Reached, TEMPLATE, notes},
 };
 
@@ -74,9 +79,9 @@ pub fn run(
     let restarts_before = before.map_or([0; 2], |it| {
         [it.replay_servers_restarted, it.actors_restarted]
     });
+    let evaluator = Evaluator::new(config, run_dir)?;
     let mut recorder = RunRecorder::open(run_dir, config, process_names(config), resumed)?;
     let resume_point = resumed.unwrap_or_default();
-    let evaluator = Evaluator::new(config, run_dir)?;
     let rendezvous = Rendezvous::create()?;
     let mut endpoints: Vec<_> = servers
         .iter()
@@ -113,6 +118,7 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
+        actors_are_needed: false,
         poller: None,
     };
 
@@ -178,6 +184,8 @@ struct Launch<'a> {
     evaluator: Evaluator,
     server_restarts: u32,
     actor_restarts: u32,
+    /// An actor that has exited is to come back.
+    actors_are_needed: bool,
     poller: Option<Poller>,
 }
 
@@ -210,9 +218,10 @@ impl Launch<'_> {
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
             let check_alive = || self.processes.check_alive(Revived::default());
-            let Some(session) = connect(endpoint, &self.interrupts, check_alive)? else {
+            if !wait_until_listening(endpoint, &self.interrupts, check_alive)? {
                 return Ok(Outcome::Interrupted);
-            };
+            }
+            let session = session::open(&Endpoints::to(vec![endpoint.clone()]))?;
             reached.push(Reached {
                 name: name.clone(),
                 endpoint: endpoint.clone(),
@@ -240,6 +249,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
+            self.actors_are_needed = self.is_actor_missed();
             self.revive()?;
             self.processes.check_alive(self.revived())?;
             let poller = self.poller.as_mut();
@@ -268,7 +278,7 @@ impl Launch<'_> {
             let view = &poller.view;
             self.display.show(view, &notes(view));
             self.evaluator.look(&self.screen);
-            if view.replay.finished && view.learner.finished {
+            if view.is_learned() {
                 self.display
                     .show_alone("all frames and updates are done: the processes exit");
                 return Ok(Outcome::Finished);
@@ -358,10 +368,8 @@ impl Launch<'_> {
     /// Whether all transitions are in and learned from, and the result saved, by the last answers.
     fn is_complete(&self) -> bool {
         self.poller.as_ref().is_some_and(|Poller { view, .. }| {
-            let rows = view.learner.updates * u64::from(self.config.learner.batch_size);
-            view.replay.waiting == Waiting::Finished
-                && view.learner.finished
-                && rows >= view.replay.rows_sampled
+            let served = updates_served(self.config, view.replay.rows_sampled);
+            view.is_learned() && view.learner.updates >= served
         })
     }
 

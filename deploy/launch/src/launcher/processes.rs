@@ -1,6 +1,8 @@
 //! The launcher's processes: the words that start each, and those that are started again when they have died.
 //! When the first are started, and how all end, is in `mod`.
 
+use std::ffi::{OsStr, OsString};
+
 use anyhow::bail;
 use driml_protocol::session;
 
@@ -18,21 +20,23 @@ const ACTOR_RESTARTS_MAX: u32 = 16;
 const PROCESS_THREADS: u32 = 1;
 
 /// A command of this program and flags with their values.
-fn call<'a>(command: &str, flags: impl IntoIterator<Item = (&'a str, &'a str)>) -> Vec<String> {
-    let flags = flags.into_iter().flat_map(|(flag, value)| [flag, value]);
-    let words = command.split(' ').chain(flags);
-    words.map(str::to_owned).collect()
+fn call<'a>(
+    command: &'a str,
+    flags: impl IntoIterator<Item = (&'a str, &'a OsStr)>,
+) -> Vec<OsString> {
+    let flags = flags.into_iter();
+    let flags = flags.flat_map(|(flag, value)| [OsStr::new(flag), value]);
+    let words = command.split(' ').map(OsStr::new).chain(flags);
+    words.map(OsStr::to_owned).collect()
 }
 
 impl Outside {
     /// Flags of the first replay server, beside where the processes meet.
-    fn flags(&self) -> Vec<String> {
+    fn flags(&self) -> Vec<OsString> {
         let mut flags = Vec::new();
         if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
-            let folder = folder.display().to_string();
-            flags = ["--listen", listen, "--tls-dir", &folder]
-                .map(str::to_owned)
-                .to_vec();
+            flags.extend(["--listen".into(), listen.into()]);
+            flags.extend(["--tls-dir".into(), folder.into()]);
         }
         if self.allow_insecure {
             flags.push("--allow-insecure".into());
@@ -42,7 +46,7 @@ impl Outside {
 }
 
 impl Launch<'_> {
-    fn start(&self, name: &str, args: &[String], threads: u32) -> anyhow::Result<ManagedProcess> {
+    fn start(&self, name: &str, args: &[OsString], threads: u32) -> anyhow::Result<ManagedProcess> {
         let surroundings = Surroundings {
             logs: &self.run_dir.logs(),
             screen: &self.screen,
@@ -52,39 +56,39 @@ impl Launch<'_> {
     }
 
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
-        let folder = self.run_dir.display().to_string();
-        let device = self.config.local.learner_device.to_string();
-        let connect = self.endpoints.iter().map(|it| ("--connect", it.as_str()));
-        let flags = [("--run-dir", folder.as_str()), ("--device", &device)];
+        let folder = self.run_dir.path().as_os_str();
+        let device = OsString::from(self.config.local.learner_device.to_string());
+        let endpoints = self.endpoints.iter().map(OsStr::new);
+        let connect = endpoints.map(|it| ("--connect", it));
+        let flags = [("--run-dir", folder), ("--device", &device)];
         let args = call("learner --keep-alive", flags.into_iter().chain(connect));
         self.start("learner", &args, self.config.local.learner_threads)
     }
 
     pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let number = id.to_string();
-        let endpoint = &self.endpoints[id as usize % self.endpoints.len()];
-        let mut flags = vec![("--connect", endpoint.as_str()), ("--id", &number)];
+        let number = OsString::from(id.to_string());
+        let endpoint = OsStr::new(&self.endpoints[id as usize % self.endpoints.len()]);
+        let mut flags = vec![("--connect", endpoint), ("--id", &number)];
         if self.config.world.name().foreign_code().is_some() {
-            flags.push(("--env", &self.config.run.world));
+            flags.push(("--env", OsStr::new(&self.config.run.world)));
         }
         let args = call("actor", flags);
         self.start(&format!("actor-{id}"), &args, PROCESS_THREADS)
     }
 
     pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
-        let config = self.run_dir.config().display().to_string();
-        let number = shard.to_string();
-        let folder = self.run_dir.replay().display().to_string();
+        let (config, folder) = (self.run_dir.config(), self.run_dir.replay());
+        let number = OsString::from(shard.to_string());
         let mut flags = vec![
-            ("--listen", self.endpoints[shard].as_str()),
+            ("--listen", OsStr::new(&self.endpoints[shard])),
             ("--shard", &number),
-            ("--config", &config),
+            ("--config", config.as_os_str()),
         ];
         if self.config.transport.shared_memory && !self.shared_memory {
-            flags.push(("--set", "transport.shared_memory=false"));
+            flags.push(("--set", OsStr::new("transport.shared_memory=false")));
         }
         if self.config.local.durable {
-            flags.push(("--replay-dir", &folder));
+            flags.push(("--replay-dir", folder.as_os_str()));
         }
         let mut args = call("replay-server --keep-alive", flags);
         if shard == 0 {
@@ -93,10 +97,23 @@ impl Launch<'_> {
         self.start(&self.servers[shard], &args, PROCESS_THREADS)
     }
 
+    /// Whether an actor has exited though frames are missing, by an answer that is newer than its end.
+    pub(super) fn is_actor_missed(&mut self) -> bool {
+        let Some(poller) = &mut self.poller else {
+            return false;
+        };
+        let mut ends = self.processes.actors.iter_mut().map(ManagedProcess::end);
+        if poller.view.replay.finished || !ends.any(|it| it.is_some()) {
+            return false;
+        }
+        poller.ask_replay().is_ok() && !poller.view.replay.finished
+    }
+
     pub(super) fn revived(&self) -> Revived {
         Revived {
             servers: self.config.local.durable && self.server_restarts < RESTARTS_MAX,
             actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
+            actors_are_needed: self.actors_are_needed,
         }
     }
 
@@ -119,7 +136,7 @@ impl Launch<'_> {
         }
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
-            if !actor.may_be_started_again() || !self.revived().actors {
+            if !actor.may_be_started_again(self.actors_are_needed) || !self.revived().actors {
                 continue;
             }
             let report = self.processes.actors[id].exit_report();

@@ -13,13 +13,13 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::Shutdown;
 use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::Which,
     console::{self, Screen, print_wrapped},
     evaluator::{Due, keep},
+    interrupts::Interrupts,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
@@ -41,7 +41,10 @@ pub fn run(
     resumed: Option<ResumePoint>,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
-    let shutdown = Shutdown::on_signals(exit_with_parent).context("listening for signals")?;
+    let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
+    let is_stopped = || interrupts.count() > 0;
+    exit_at_a_second(interrupts.clone())?;
+    let mut due = Due::new(config, run_dir)?;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
@@ -53,13 +56,15 @@ pub fn run(
     } = resumed.unwrap_or_default();
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
     let mut display = Display::new(screen.clone(), Instant::now(), updates);
-    let mut due = Due::new(config, run_dir)?;
-    let mut play = |updates, is_last| -> anyhow::Result<()> {
-        if let Some(episodes) = due.take(updates, is_last) {
-            let judged = keep(run_dir, Which::After(updates), episodes)?;
-            screen.line(&judged.earned.describe());
+    let mut play = |updates, is_last| {
+        let Some(episodes) = due.take(updates, is_last) else {
+            return;
+        };
+        match keep(run_dir, Which::After(updates), episodes, &is_stopped) {
+            Ok(judged) => screen.line(&judged.earned.describe()),
+            Err(_) if is_stopped() => screen.line("an evaluation was left out"),
+            Err(e) => screen.line(&format!("the run continues without an evaluation: {e:#}")),
         }
-        Ok(())
     };
     let mut shown = Instant::now();
     let row_frames = (config.frames() / ROWS_MIN).max(1);
@@ -83,7 +88,7 @@ pub fn run(
                 ));
             } else {
                 saved = Some((updates, lockstep.replay.inserted_total()));
-                play(updates, false)?;
+                play(updates, false);
             }
         }
         let show = shown.elapsed() >= POLL;
@@ -96,7 +101,7 @@ pub fn run(
                 display.show(&view, &[]);
             }
         }
-        if shutdown.is_set() {
+        if is_stopped() {
             outcome = Outcome::Interrupted;
             break;
         }
@@ -110,10 +115,10 @@ pub fn run(
     // After the last save: a longer run would continue from there without it.
     lockstep.end()?;
     screen.clear();
-    if outcome == Outcome::Finished {
-        play(lockstep.learner.updates(), true)?;
-    }
     record(&mut recorder, &mut view, &mut lockstep);
+    if outcome == Outcome::Finished {
+        play(lockstep.learner.updates(), true);
+    }
     let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
     run_dir.check_whole()?;
@@ -121,6 +126,18 @@ pub fn run(
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
     resume::say_next(&summary, &config.world, run_dir)
+}
+
+/// Ends this process at a second interrupt, whatever it does.
+fn exit_at_a_second(interrupts: Interrupts) -> anyhow::Result<()> {
+    let exit = move || {
+        interrupts.wait_for_second();
+        console::line("error: stopped at once by a second interrupt: what was not saved is lost");
+        std::process::exit(1);
+    };
+    let thread = std::thread::Builder::new().name("end".into());
+    thread.spawn(exit).context("starting a thread")?;
+    Ok(())
 }
 
 /// Records how the run stands, and the episodes that ended. Returns warnings.

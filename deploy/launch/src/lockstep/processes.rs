@@ -56,7 +56,8 @@ impl SavedParts {
     fn read(run_dir: &RunFolder) -> anyhow::Result<Self> {
         let all = checkpoint::list(&run_dir.checkpoints())?;
         let (_, path) = all.last().context("there is no checkpoint")?;
-        let bytes = checkpoint::companion(path)?
+        let bytes = checkpoint::companion(path)?.filter(|it| !it.is_empty());
+        let bytes = bytes
             .with_context(|| format!("{} is not a checkpoint of a lockstep run", path.display()))?;
         let content = bytes.strip_prefix(&FORMAT.to_le_bytes()).with_context(|| {
             let path = path.display();
@@ -212,7 +213,8 @@ impl Lockstep {
         let inserted = self.replay.counts().inserted;
         self.learner.progress_mut().note_inserted(0, inserted);
         let Some(mark) = self.replay.mark()? else {
-            return Ok(self.learner.save(folder)?);
+            // Which says that the run is in lockstep, and cannot be resumed.
+            return Ok(self.learner.save_with(folder, Some(&[]))?);
         };
         let saved = self.save_at(mark, folder);
         if saved.is_err() {

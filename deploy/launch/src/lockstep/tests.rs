@@ -1,5 +1,7 @@
 //! What a run in lockstep computes, and that one that was interrupted computes the same.
 
+use driml_settings::resolve::Flags;
+
 use super::*;
 use crate::testing;
 
@@ -121,14 +123,10 @@ fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
     format!("{error:#}")
 }
 
-/// By which rule rows are drawn decides the weights, and a checkpoint of the one rule is none of the other.
 #[test]
-fn rows_that_are_drawn_by_priority_are_others() {
+fn a_checkpoint_of_one_rule_of_sampling_is_none_of_another() {
     let uniform = config("chain", "c51", 800, &[]);
     let prioritised = config("chain", "c51", 800, &[PRIORITISED]);
-    assert_eq!(weights(&prioritised), weights(&prioritised));
-    assert_ne!(weights(&prioritised), weights(&uniform));
-
     let (_folder, run_dir, _) = begun(&uniform, 9);
     let why = refused(&prioritised, &run_dir);
     let another = "replay.sampling is another rule than it was";
@@ -148,20 +146,6 @@ fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
     }
     lockstep.end().unwrap();
     assert_eq!(sha256(&lockstep), whole);
-}
-
-/// A run that ended continues as a longer one would have.
-#[test]
-fn a_finished_run_that_continues_computes_what_a_longer_one_would_have() {
-    let short = config("mspacman", "driml-ada", 512, &[]);
-    let (_folder, run_dir, mut lockstep) = begun(&short, 0);
-    while lockstep.round().unwrap() {}
-    lockstep.save(&run_dir.checkpoints()).unwrap();
-    lockstep.end().unwrap();
-    drop(lockstep);
-    let long = config("mspacman", "driml-ada", 1024, &[]);
-    let resumed = Lockstep::resume(&long, &run_dir).unwrap();
-    assert_eq!(ended(resumed), weights(&long));
 }
 
 #[test]
@@ -184,11 +168,20 @@ fn what_cannot_go_on_says_why() {
     std::fs::remove_file(&segments(&run_dir)[0]).unwrap();
     let why = refused(&config, &run_dir);
     assert!(why.contains("cannot resume to the same weights"), "{why}");
-    // A learner's own checkpoint.
+    // Of a world that cannot be saved.
     let (_folder, run_dir, _) = begun(&config, 9);
+    std::fs::write(run_dir.config(), config.to_toml()).unwrap();
+    assert!(resume::is_resumable(&config.world, &run_dir));
     std::fs::remove_dir_all(run_dir.checkpoints()).unwrap();
     let mut unkept = Lockstep::in_memory(&config).unwrap();
     unkept.save(&run_dir.checkpoints()).unwrap();
+    assert!(!resume::is_resumable(&config.world, &run_dir));
+    let found = resume::find(&run_dir, &Flags::default(), &testing::MACHINE);
+    let why = found.unwrap_err().to_string();
+    assert!(
+        why.contains("the state of its world cannot be saved"),
+        "{why}"
+    );
     let why = refused(&config, &run_dir);
     assert!(why.contains("not a checkpoint of a lockstep run"), "{why}");
 }

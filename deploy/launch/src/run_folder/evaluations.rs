@@ -2,9 +2,10 @@
 //! It plays nothing.
 
 use std::{
+    ffi::OsString,
     fs::{self, File},
-    io::{ErrorKind, Write},
-    path::{Path, PathBuf},
+    io::Write,
+    path::Path,
 };
 
 use anyhow::Context;
@@ -20,8 +21,8 @@ use crate::metrics::rounded;
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
-/// What the name of a checkpoint that is held begins with; the number of the process follows.
-const HELD: &str = ".playing-";
+/// The name of a checkpoint that is about to be the best; one with this name is left from a process that was killed.
+const NEW: &str = ".new";
 
 /// What a checkpoint earned over whole episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
@@ -112,7 +113,7 @@ impl Evaluated {
         let doing = || format!("writing {}", path.display());
         let file = File::options().create(true).append(true).open(&path);
         let mut file = file.with_context(doing)?;
-        let is_new = file.metadata().with_context(doing)?.len() == 0;
+        let before = file.metadata().with_context(doing)?.len();
         let row = csv_row([
             self.seconds.map_or(String::new(), |it| it.to_string()),
             self.frames.map_or(String::new(), |it| it.to_string()),
@@ -121,47 +122,43 @@ impl Evaluated {
             rounded(self.mean_return).to_string(),
             rounded(self.deviation).to_string(),
         ]);
-        let head = is_new.then(|| csv_row(HEADER.split(',')));
+        let head = (before == 0).then(|| csv_row(HEADER.split(',')));
         // A whole row at once: others may read meanwhile.
         let rows = [head.unwrap_or_default(), row].concat();
-        file.write_all(&rows).with_context(doing)
+        let written = file.write_all(&rows);
+        if written.is_err() {
+            // Half a row may be there.
+            let _ = file.set_len(before);
+        }
+        written.with_context(doing)
     }
 }
 
-/// A checkpoint that is being played. Its files are held, so that it can be kept even if the learner clears it away meanwhile.
+/// A checkpoint that is being played, in memory, so that it can be kept even if the learner clears it away meanwhile.
 #[derive(Debug)]
 pub(crate) struct Candidate {
-    best: PathBuf,
-    held: PathBuf,
-    name: PathBuf,
+    name: OsString,
+    files: Vec<(OsString, Vec<u8>)>,
 }
 
 impl Candidate {
-    /// Holds the files of a checkpoint of the run.
-    pub(crate) fn hold(folder: &RunFolder, checkpoint: &Path) -> anyhow::Result<Self> {
-        sweep(folder);
-        let best = folder.best();
-        let name = PathBuf::from(checkpoint.file_name().unwrap_or_default());
-        let held = best.join(format!("{HELD}{}-{}", std::process::id(), name.display()));
-        let this = Self { best, held, name };
-        let (from, to) = (checkpoint.display(), this.held.display());
-        let doing = || format!("holding {from} in {to}");
-        fs::create_dir_all(&this.held).with_context(doing)?;
+    /// Reads the files of a checkpoint of the run.
+    pub(crate) fn read(checkpoint: &Path) -> anyhow::Result<Self> {
+        let doing = || format!("reading {}", checkpoint.display());
+        let mut files = Vec::new();
         for entry in fs::read_dir(checkpoint).with_context(doing)? {
             let entry = entry.with_context(doing)?;
-            let to = this.held.join(entry.file_name());
-            // Files of a checkpoint never change; where there are no links, a copy does.
-            if fs::hard_link(entry.path(), &to).is_err() {
-                fs::copy(entry.path(), &to).with_context(doing)?;
-            }
+            let bytes = fs::read(entry.path()).with_context(doing)?;
+            files.push((entry.file_name(), bytes));
         }
-        Ok(this)
+        let name = checkpoint.file_name().unwrap_or_default().to_owned();
+        Ok(Self { name, files })
     }
 
     /// Adds what it earned to the run's table, and keeps it if it earned more than the best before it, over at least as many episodes.
     /// Says whether it is the best.
     pub(crate) fn judge(
-        self,
+        &self,
         folder: &RunFolder,
         earned: &Evaluated,
         best: Option<&Evaluated>,
@@ -171,53 +168,42 @@ impl Candidate {
                 || earned.episodes >= best.episodes && earned.mean_return > best.mean_return
         });
         if is_best {
-            let path = self.best.join(&self.name);
-            let doing = || format!("keeping {}", path.display());
-            let older = driml_learner::checkpoint::list(&self.best)?;
-            for (_, older) in older {
-                fs::remove_dir_all(&older).with_context(doing)?;
-            }
-            fs::rename(&self.held, &path).with_context(doing)?;
+            self.replace(&folder.best())?;
         }
         earned.add(folder)?;
         Ok(is_best)
     }
-}
 
-impl Drop for Candidate {
-    fn drop(&mut self) {
-        remove(&self.held);
-    }
-}
-
-/// Removes what this process, and processes that are gone, held while they played.
-pub fn sweep(folder: &RunFolder) {
-    let Ok(entries) = fs::read_dir(folder.best()) else {
-        return;
-    };
-    for entry in entries.flatten() {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let holder = name
-            .strip_prefix(HELD)
-            .and_then(|rest| rest.split('-').next()?.parse().ok());
-        let is_left =
-            |pid: u32| pid == std::process::id() || !Path::new(&format!("/proc/{pid}")).exists();
-        if holder.is_some_and(is_left) {
-            remove(&entry.path());
+    /// Makes it the only checkpoint in the folder `best`.
+    fn replace(&self, best: &Path) -> anyhow::Result<()> {
+        let (new, path) = (best.join(NEW), best.join(&self.name));
+        let doing = || format!("keeping {}", path.display());
+        if new.exists() {
+            fs::remove_dir_all(&new).with_context(doing)?;
         }
-    }
-}
-
-fn remove(held: &Path) {
-    if let Err(e) = fs::remove_dir_all(held)
-        && e.kind() != ErrorKind::NotFound
-    {
-        tracing::warn!("removing {}: {e}", held.display());
+        fs::create_dir_all(&new).with_context(doing)?;
+        for (name, bytes) in &self.files {
+            fs::write(new.join(name), bytes).with_context(doing)?;
+        }
+        let there = driml_learner::checkpoint::list(best)?;
+        let there = there.into_iter().map(|(_, path)| path);
+        // Only for one of the same name there is a moment without a best.
+        let (same, others): (Vec<_>, Vec<_>) = there.partition(|it| *it == path);
+        for older in same {
+            fs::remove_dir_all(older).with_context(doing)?;
+        }
+        fs::rename(&new, &path).with_context(doing)?;
+        for older in others {
+            fs::remove_dir_all(older).with_context(doing)?;
+        }
+        Ok(())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use super::*;
 
     fn checkpoint(folder: &RunFolder, updates: u64) -> PathBuf {
@@ -239,7 +225,7 @@ mod tests {
         assert_eq!(Evaluated::all(&folder).unwrap(), []);
         let judge = |updates, mean, episodes| {
             let path = checkpoint(&folder, updates);
-            let candidate = Candidate::hold(&folder, &path).unwrap();
+            let candidate = Candidate::read(&path).unwrap();
             // The learner clears it away while it is played.
             fs::remove_dir_all(path).unwrap();
             let earned = Evaluated::at(&folder, updates, episodes, (mean, 0.5));
@@ -254,14 +240,10 @@ mod tests {
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
-        // What a process that was killed left.
-        let left = |pid: u32| folder.best().join(format!("{HELD}{pid}-checkpoint-7"));
-        let (left, other) = (left(u32::MAX), left(1));
-        for folder in [&left, &other] {
-            fs::create_dir(folder).unwrap();
-        }
-        sweep(&folder);
-        assert!(!left.exists() && other.exists(), "process 1 lives");
+        // What a process that was killed left is no checkpoint and in no one's way.
+        fs::create_dir(folder.best().join(NEW)).unwrap();
+        let again = driml_learner::checkpoint::list(&folder.best()).unwrap();
+        assert_eq!(again, best);
         let all = Evaluated::all(&folder).unwrap();
         let at = all.iter().map(|it| (it.frames, it.updates, it.mean_return));
         let (early, late) = (Some(300), Some(500));
@@ -271,6 +253,26 @@ mod tests {
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
         let said = Evaluated::all(&folder).unwrap_err().to_string();
         assert!(said.contains("is not a table of evaluations"), "{said}");
+    }
+
+    #[test]
+    fn the_best_stays_until_another_has_its_place() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let judge = |updates, mean| {
+            let candidate = Candidate::read(&checkpoint(&folder, updates)).unwrap();
+            let earned = Evaluated::at(&folder, updates, 4, (mean, 0.5));
+            let best = Evaluated::best(&folder).unwrap();
+            candidate.judge(&folder, &earned, best.as_ref())
+        };
+        assert!(judge(20, 3.0).unwrap());
+        let taken = folder.best().join("checkpoint-50");
+        fs::write(&taken, "").unwrap();
+        judge(50, 9.0).unwrap_err();
+        fs::remove_file(taken).unwrap();
+        assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 20);
+        assert!(judge(50, 9.0).unwrap());
+        assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 50);
     }
 
     #[test]

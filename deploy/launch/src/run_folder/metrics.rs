@@ -25,7 +25,7 @@ pub struct ResumePoint {
 }
 
 /// Bytes at the end of the file in which its last row lies.
-const LAST_ROW_BYTES: u64 = 4096;
+const LAST_ROW_BYTES: u64 = 1 << 16;
 
 /// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames, under this header; none where there is no
 /// such file. The others, which contradict what the run will do, are set aside.
@@ -41,8 +41,10 @@ pub(super) fn rows_up_to(
         let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
             return Err(usage!("{}: {row:?} is not a row of metrics", path.display()).into());
         };
-        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows.
-        Ok(updates <= resume_point.updates && frames <= frames_max)
+        // Actors run ahead: without the second condition a run that now ends sooner would end before its rows. A replay that is filled
+        // anew counts from the checkpoint's frames.
+        let is_counted = resume_point.replay_is_kept || frames <= resume_point.frames;
+        Ok(updates <= resume_point.updates && frames <= frames_max && is_counted)
     })?;
     let places: Vec<_> = header.iter().map(|name| found.place(name)).collect();
     let rows = found.rows.iter().map(|row| {
@@ -104,11 +106,18 @@ mod tests {
         assert_eq!(progress(&folder), None);
         write("seconds,frames,updates,a,b,c,episodes\n");
         assert_eq!(progress(&folder), None);
-        write("seconds,frames,updates,a,b,c,episodes\n1,200,3,,,,7\n2,30");
         let found = Progress {
             frames: 200,
             episodes: 7,
         };
-        assert_eq!(progress(&folder), Some(found));
+        // With the memory of as many processes as a run may have, too.
+        for processes in [3, 512] {
+            let [names, memory] =
+                [",rss_mib_actor_255", ",12345.678"].map(|it| it.repeat(processes));
+            write(&format!(
+                "seconds,frames,updates,episodes{names}\n1,200,3,7{memory}\n2,30"
+            ));
+            assert_eq!(progress(&folder), Some(found));
+        }
     }
 }

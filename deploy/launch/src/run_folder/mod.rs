@@ -15,7 +15,7 @@ pub(crate) use self::{
     table::AppendLog,
 };
 pub use self::{
-    evaluations::{Evaluated, sweep},
+    evaluations::Evaluated,
     folder::RunFolder,
     metrics::{Progress, ResumePoint, progress},
     recorder::RunRecorder,

@@ -131,8 +131,7 @@ impl RunRecorder {
     }
 
     pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
-        let kept = (self.resume_point.updates > 0).then_some(self.resume_point.frames);
-        self.events = Some(Events::create(folder, kept)?);
+        self.events = Some(Events::create(folder, self.resume_point.frames)?);
         Ok(())
     }
 

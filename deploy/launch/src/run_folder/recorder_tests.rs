@@ -171,7 +171,11 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
     let header = header_of(&processes);
-    let read = |frames_max| rows_up_to(&path, header.clone(), point(99), frames_max).unwrap();
+    let all = ResumePoint {
+        replay_is_kept: true,
+        ..point(99)
+    };
+    let read = |frames_max| rows_up_to(&path, header.clone(), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
@@ -228,6 +232,33 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
     }
 }
 
+/// The replay fills again, from the checkpoint's frames, or from none where nothing was learned.
+#[test]
+fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
+    let at_start = ResumePoint::default();
+    for (metrics, point, kept) in [
+        ("1.0,700,0,2\n", at_start, 0),
+        ("1.0,1900,31,2\n1.5,2300,31,3\n", point(31), 1),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunFolder::new(folder.path());
+        fs::write(
+            run.metrics(),
+            format!("seconds,frames,updates,episodes\n{metrics}"),
+        )
+        .unwrap();
+        let processes = Vec::new();
+        let recorder = RunRecorder::go_on(&run, &settings(), processes, point, 9_999).unwrap();
+        assert_eq!(
+            Table::read(&run.metrics()).unwrap().rows.len(),
+            kept,
+            "{metrics}"
+        );
+        let episodes = recorder.episodes(&ReplayStatus::default()).count;
+        assert_eq!(episodes, 2 * kept as u64, "{metrics}");
+    }
+}
+
 fn summary(replay: &ReplayStatus) -> Summary {
     let view = view(replay, &LearnerStatus::default());
     Summary::of(
@@ -256,7 +287,21 @@ fn next_steps_stand_in_columns() {
           driml plot runs/x --out plot.png            return, losses, k and speed
           driml train --resume runs/x --frames 2560   trains on
     "#]]
-    .assert_eq(&summary.next_steps(&RunFolder::new("runs/x")));
+    .assert_eq(&summary.next_steps(&RunFolder::new("runs/x"), true));
+    let repeated_alone = summary.next_steps(&RunFolder::new("runs/x"), false);
+    assert!(!repeated_alone.contains("--resume"), "{repeated_alone}");
+}
+
+/// It may come from a file or another process.
+#[test]
+fn a_time_that_cannot_be_is_described_as_none() {
+    for wall_seconds in [-1.0, 1e300, f64::NAN] {
+        let summary = Summary {
+            wall_seconds,
+            ..summary(&ReplayStatus::default())
+        };
+        assert!(summary.counts().contains(" in 0 s ("), "{wall_seconds}");
+    }
 }
 
 #[test]

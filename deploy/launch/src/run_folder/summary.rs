@@ -233,16 +233,19 @@ impl Summary {
     }
 
     /// What the weights of a finished run earn, and what a person may do with them, a command a line.
-    pub(crate) fn next_steps(&self, run_dir: &RunFolder) -> String {
+    pub(crate) fn next_steps(&self, run_dir: &RunFolder, is_resumable: bool) -> String {
         let run = run_dir.display();
         let more = self.frames.saturating_mul(2);
         let film = "films it, and plays a random policy beside it";
-        let commands = commands(&[
+        let mut next = vec![
             (format!("evaluate {run} --record play.gif"), film),
             plot(run_dir),
-            (format!("train --resume {run} --frames {more}"), "trains on"),
-        ]);
-        self.earned() + &commands
+        ];
+        if is_resumable {
+            let longer = format!("train --resume {run} --frames {more}");
+            next.push((longer, "trains on"));
+        }
+        self.earned() + &commands(&next)
     }
 
     /// How it ended and what its weights earn.
@@ -275,7 +278,7 @@ impl Summary {
             "{how}: {} frames and {} updates in {} ({:.0} frames/s, {:.2} updates/s), replay ratio {}, {returns}",
             self.frames,
             self.updates,
-            duration(Duration::from_secs_f64(self.wall_seconds)),
+            duration(Duration::try_from_secs_f64(self.wall_seconds).unwrap_or_default()),
             self.frames_per_second,
             self.updates_per_second,
             ratio.as_deref().unwrap_or("-"),

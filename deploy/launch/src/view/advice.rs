@@ -17,13 +17,13 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 /// Unresponsive actors that a note names.
 const NAMED_MAX: usize = 4;
 
-/// The endpoint and the account of each replay server that answered.
+/// Each replay server that answered, and its account.
 fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesStatus)> {
     let answered = view.servers.iter();
     answered.filter_map(|server| Some((server, server.processes.as_ref()?)))
 }
 
-/// The learner's status, and all actors', each with the server that they are connected to.
+/// The status of the learner and of all actors, each with the endpoint of the server that it is connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
     statuses(view).flat_map(|(server, account)| {
         account

@@ -182,15 +182,14 @@ pub enum Live {
 /// It is not a run's, or one whose processes were started by hand.
 pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
     let config = config_of(folder)?;
-    let endpoints = std::fs::read_to_string(folder.endpoints()).ok();
+    let endpoints = std::fs::read_to_string(folder.endpoints());
+    let endpoints = endpoints.unwrap_or_default();
+    let mut lines = endpoints.lines();
+    if lines.any(|it| reach::look(it).is_ok()) {
+        return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
+    }
     // A launcher that runs there holds the lock.
-    if folder.lock().is_err()
-        && let Some(endpoints) = endpoints
-    {
-        let endpoints: Vec<_> = endpoints.lines().map(str::to_owned).collect();
-        if endpoints.iter().any(|it| reach::look(it).is_ok()) {
-            return Ok(Live::At(endpoints));
-        }
+    if !endpoints.is_empty() && folder.lock().is_err() {
         let frames = progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
             true => "is stopping: all frames are stored and its replay server has exited",
@@ -215,4 +214,33 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         "no process runs in {}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT\n",
         folder.display()
     )))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+    use crate::testing::config;
+
+    /// As on a file system without locks.
+    #[test]
+    fn a_server_that_listens_is_found_without_a_lock() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = RunFolder::new(root.path());
+        let settings = config("smoke", "chain", "c51", &[]).to_toml();
+        std::fs::write(folder.config(), settings).unwrap();
+        let socket = root.path().join("s");
+        let endpoint = format!("unixsock-stream/{}", socket.display());
+        std::fs::write(folder.endpoints(), &endpoint).unwrap();
+        let found = || match endpoints_of(&folder).unwrap() {
+            Live::At(endpoints) => endpoints.join(" "),
+            Live::Over(how) => how,
+        };
+        let listener = UnixListener::bind(&socket).unwrap();
+        assert_eq!(found(), endpoint);
+        drop(listener);
+        let said = found();
+        assert!(said.starts_with("no process runs in "), "{said}");
+    }
 }

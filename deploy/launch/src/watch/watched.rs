@@ -17,7 +17,7 @@ use crate::{
     console::{self, Screen},
     launcher::process_names,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
-    run_view::RunView,
+    run_view::{RunView, updates_served},
     view::{Display, Poller, TEMPLATE, notes},
 };
 
@@ -99,7 +99,7 @@ impl Watched {
 
     fn is_over(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
         let view = &poller.view;
-        if view.replay.finished && view.learner.finished {
+        if view.is_learned() {
             return Ok(true);
         }
         let silent = view.replay_silence.length();
@@ -121,8 +121,7 @@ impl Watched {
 
     /// Counts the updates that the learner did after its last answer.
     fn learn_all_that_was_served(&mut self, poller: &mut Poller) {
-        let batch_size = u64::from(poller.config.learner.batch_size);
-        let updates = poller.view.replay.rows_sampled / batch_size;
+        let updates = updates_served(&poller.config, poller.view.replay.rows_sampled);
         if poller.view.learner.updates >= updates {
             return;
         }

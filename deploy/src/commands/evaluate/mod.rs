@@ -22,7 +22,7 @@ use driml_launch::{
     evaluator::{Judged, keep},
     metrics::rounded,
     pretrained,
-    run_folder::{RunFolder, sweep, write_whole},
+    run_folder::{RunFolder, write_whole},
     stats::mean_and_deviation,
     view::TEMPLATE,
 };
@@ -103,8 +103,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         .into());
     }
     if args.keep {
-        end_when_asked(folder.clone(), args.exit_with_parent)?;
-        let judged = keep(&folder, which, args.episodes)?;
+        end_when_asked(args.exit_with_parent)?;
+        let judged = keep(&folder, which, args.episodes, &|| false)?;
         let earned = judged.earned.describe();
         return print(&format!("{earned}{}\n", verdict(&judged)));
     }
@@ -201,13 +201,12 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
 }
 
 /// Ends this process at a signal or when its reader is gone, and leaves no partial file.
-fn end_when_asked(folder: RunFolder, parent: Option<u32>) -> anyhow::Result<()> {
+fn end_when_asked(parent: Option<u32>) -> anyhow::Result<()> {
     let shutdown = Shutdown::on_signals(parent).context("listening for signals")?;
     std::thread::Builder::new()
         .name("end".into())
         .spawn(move || {
             shutdown.wait();
-            sweep(&folder);
             std::process::exit(i32::from(EXIT_INTERRUPTED));
         })
         .context("starting a thread")?;

