@@ -179,6 +179,14 @@ fn every_decoder_has_a_target_and_seeds() {
     }
 }
 
+/// A state of another format is rejected before the rest of it is read.
+#[test]
+fn the_states_among_the_seeds_can_be_read() {
+    for seed in seeds("state") {
+        driml_learner::checkpoint::check_state(&seed).unwrap();
+    }
+}
+
 /// The logs among the seeds are ones that this version reads: `UPDATE_CORPUS=1` writes them. They are not the same each time.
 #[test]
 fn the_logs_among_the_seeds_can_be_read() {
