@@ -158,7 +158,7 @@ impl Queue {
                 && let Some((tried, plan)) = self.waiting.pop_front()
             {
                 let running = self.start(plan, tried + 1, progress)?;
-                self.running.push(running);
+                self.running.extend(running);
             }
             if self.running.is_empty() {
                 return Ok(());
@@ -237,13 +237,13 @@ impl Queue {
         Ok(progress.advance(plan.units - ended.done)?)
     }
 
-    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone.
+    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone; none if another process finished it.
     fn start(
         &self,
         plan: PlannedRun,
         tried: u32,
         progress: &mut Progress,
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<Option<Running>> {
         let path = self.runs.log(&plan);
         let doing = || format!("making {}", path.display());
         let log = File::options()
@@ -252,6 +252,10 @@ impl Queue {
             .open(&path)
             .with_context(doing)?;
         wait_for_the_last(&log, &plan, progress)?;
+        if self.runs.finished(&plan).is_some() {
+            progress.find(plan.units);
+            return Ok(None);
+        }
         log.set_len(0).with_context(doing)?;
         let folder = self.runs.folder(&plan).path().to_owned();
         let resumed = folder.exists() && self.is_resumable(&plan, tried, progress)?;
@@ -281,14 +285,14 @@ impl Queue {
             .process_group(0);
         let starting = || format!("starting the run {}", plan.name);
         let child = command.spawn().with_context(starting)?;
-        Ok(Running {
+        Ok(Some(Running {
             plan,
             tried,
             resumed,
             child,
             done: 0,
             enough: false,
-        })
+        }))
     }
 
     /// Whether what lies in the plan's folder can be resumed: at the first try alone, as its checkpoint may be what fails.
@@ -371,4 +375,33 @@ fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
         progress.advance(0)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use driml_launch::interrupts::Interrupts;
+
+    use super::*;
+    use crate::sweep::runs::tests::finish;
+
+    /// As when a run saved while this call waited for its log.
+    #[test]
+    fn a_run_that_finished_meanwhile_is_not_made_again() {
+        let root = tempfile::tempdir().unwrap();
+        let runs = Runs::open(root.path()).unwrap();
+        let plan = PlannedRun::new("run".into(), Call::default(), 10);
+        let folder = runs.folder(&plan);
+        finish(&folder);
+        runs.write_call(&plan, "abc").unwrap();
+        let mut queue = Queue {
+            runs,
+            jobs: 1,
+            commit: "def".into(),
+            waiting: [(0, plan.clone())].into(),
+            running: Vec::new(),
+        };
+        let mut progress = Progress::new(100, Interrupts::default());
+        queue.make(&mut progress).unwrap();
+        assert_eq!(queue.runs.finished(&plan).unwrap().commit, "abc");
+    }
 }

@@ -114,7 +114,7 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use driml_launch::{
         run_folder::RunRecorder,
         run_view::{Plan, RunView},
@@ -122,6 +122,20 @@ mod tests {
 
     use super::*;
     use crate::sweep::plan::Call;
+
+    /// Leaves what a finished run of a chain leaves.
+    pub(in crate::sweep) fn finish(folder: &RunFolder) {
+        let call = Call {
+            env: Some("chain".into()),
+            ..Call::default()
+        };
+        let config = call.config().unwrap();
+        let mut view = RunView::new(Plan::of(&config));
+        let mut recorder = RunRecorder::create(folder, &config, Vec::new()).unwrap();
+        recorder.record(&mut view, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
+        summary.write(folder).unwrap();
+    }
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -136,17 +150,8 @@ mod tests {
             };
             PlannedRun::new("run".into(), call, frames)
         };
-        let folder = RunFolder::new(runs.root.join("run"));
-        let call = Call {
-            env: Some("chain".into()),
-            ..Call::default()
-        };
-        let config = call.config().unwrap();
-        let mut view = RunView::new(Plan::of(&config));
-        let mut recorder = RunRecorder::create(&folder, &config, Vec::new()).unwrap();
-        recorder.record(&mut view, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
-        summary.write(&folder).unwrap();
+        let folder = runs.folder(&plan(10));
+        finish(&folder);
         assert!(runs.finished(&plan(10)).is_none(), "it has no call");
         runs.write_call(&plan(10), "abc").unwrap();
         assert_eq!(runs.finished(&plan(10)).unwrap().commit, "abc");
