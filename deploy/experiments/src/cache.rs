@@ -62,34 +62,11 @@ impl Session {
         settings: &impl Serialize,
         units: u64,
     ) -> anyhow::Result<Self> {
-        let folder = folder(name, flags);
-        let pieces = folder.join(PIECES);
-        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
-        let settings =
-            serde_json::to_string_pretty(settings).context("writing down the settings")?;
-        let path = pieces.join(SETTINGS);
-        match fs::read(&path) {
-            Ok(found) if found == settings.as_bytes() => {}
-            Ok(_) => {
-                return Err(usage!(
-                    "{} holds what was made with other settings: choose another --out, or remove that folder",
-                    folder.display()
-                )
-                .into());
-            }
-            Err(_) => write_whole(&path, settings.as_bytes())?,
-        }
-        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
-        Ok(Self {
-            folder,
-            smoke: flags.smoke,
-            progress: Progress::new(units, interrupts),
-            seconds: 0.0,
-            at_once: 1,
-        })
+        Self::open_queue(name, flags, settings, units, false)
     }
 
-    /// [`Session::open`] of a sweep. For a report alone it makes no folder; runs that lie in one with their calls are enough.
+    /// [`Session::open`] of a sweep. For a report alone it makes no folder, and writes down no settings, as they
+    /// made nothing; runs that lie in one with their calls are enough.
     pub(crate) fn open_queue(
         name: &str,
         flags: &ExperimentFlags,
@@ -106,7 +83,31 @@ impl Session {
             )
             .into());
         }
-        Self::open(name, flags, settings, units)
+        let pieces = folder.join(PIECES);
+        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
+        let settings =
+            serde_json::to_string_pretty(settings).context("writing down the settings")?;
+        let path = pieces.join(SETTINGS);
+        match fs::read(&path) {
+            Ok(found) if found == settings.as_bytes() => {}
+            Ok(_) => {
+                return Err(usage!(
+                    "{} holds what was made with other settings: choose another --out, or remove that folder",
+                    folder.display()
+                )
+                .into());
+            }
+            Err(_) if report_only => {}
+            Err(_) => write_whole(&path, settings.as_bytes())?,
+        }
+        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
+        Ok(Self {
+            folder,
+            smoke: flags.smoke,
+            progress: Progress::new(units, interrupts),
+            seconds: 0.0,
+            at_once: 1,
+        })
     }
 
     /// The piece of this name if it is there and can be read, whatever it was made of.
@@ -275,10 +276,13 @@ mod tests {
             out: Some(folder.path().join("walk")),
             seeds: None,
         };
-        let open = |settings: &str| Session::open("walk", &flags, &settings, 4);
-        let report = || Session::open_queue("walk", &flags, &"a", 4, true);
-        assert!(report().unwrap_err().is::<Usage>());
+        let open = |settings: &str| Session::open("walk", &flags, &settings, 40);
+        let report = |settings: &str| Session::open_queue("walk", &flags, &settings, 40, true);
+        assert!(report("a").unwrap_err().is::<Usage>());
         assert!(!folder.path().join("walk").exists());
+        // Of runs that were copied there, with the wrong flags: they are not what is kept.
+        fs::create_dir_all(folder.path().join("walk/runs")).unwrap();
+        assert!(report("wrong").is_ok());
         let mut session = open("a").unwrap();
         assert_eq!(session.piece("one", 2, |_| Ok(7)).unwrap(), 7);
         let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
@@ -303,6 +307,7 @@ mod tests {
         session.keep("calls", ["driml tradeoff"]).unwrap();
         let calls: Option<Vec<String>> = session.kept_piece("calls");
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
-        assert!(report().is_ok());
+        assert!(report("a").is_ok());
+        assert!(report("b").unwrap_err().is::<Usage>());
     }
 }

@@ -52,6 +52,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         }
     }
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
+    queue::install(&plans, args.report)?;
     // Other seeds, and more runs at once, are the same sweep.
     let settings = json!({ "axes": axes, "preset": args.preset, "frames": args.frames });
     let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;

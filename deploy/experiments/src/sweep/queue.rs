@@ -41,17 +41,13 @@ const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. All settings are resolved, and what their worlds
-/// need is installed, before anything starts.
+/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
     jobs: u32,
     report: bool,
 ) -> anyhow::Result<Swept<P>> {
-    if !report {
-        install(&plans)?;
-    }
     let (folder, progress) = session.work();
     let mut queue = Queue {
         runs: Runs::open(folder)?,
@@ -86,9 +82,11 @@ pub(crate) fn make<P>(
     Ok(swept)
 }
 
-/// Resolves the settings of each call once, whatever its seed, and installs what its world needs.
-fn install<P>(plans: &[Planned<P>]) -> anyhow::Result<()> {
+/// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
+/// called before anything is written, so that a corrected call can have the same folder.
+pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
     let mut known: Vec<Call> = Vec::new();
+    let plans = if report { &[] } else { plans };
     for (_, plan) in plans {
         let call = Call {
             seed: 1,

@@ -278,6 +278,7 @@ impl Tradeoff<'_> {
     fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
+        queue::install(&wanted, report_only)?;
         let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
         // A random policy plays once.
         self.session.work().1.again(work + units);
