@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::{
     axes::{Axis, Cell, cells},
-    plan::{Call, Made, PlannedRun},
+    plan::{self, Call, Made, PlannedRun},
     queue,
 };
 use crate::{
@@ -61,16 +61,14 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let table = table(&axes, &cells, &swept.made);
     session.csv(NAME, &table)?;
     print(&format!("{}{LEGEND}", table.text()))?;
-    if swept.made.is_empty() {
-        return Err(usage!("no run is finished yet: there is nothing to draw").into());
-    }
+    swept.check_any(args.report)?;
     let runs = swept.made.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
         runs: runs.collect(),
         out: session.folder().join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;
-    queue::check_made(&swept.missing, args.report)
+    plan::check_made(&swept.missing, args.report)
 }
 
 /// Worlds and agents first, where there are several, then the settings as they were named.

@@ -119,12 +119,23 @@ pub(crate) struct Swept<P> {
 
 impl<P> Swept<P> {
     /// Makes sure that there is something to report.
-    pub(crate) fn check_any(&self) -> Result<(), Usage> {
+    pub(crate) fn check_any(&self, report_only: bool) -> anyhow::Result<()> {
         if self.made.is_empty() {
-            return Err(usage!("no run is finished yet: there is nothing to report"));
+            check_made(&self.missing, report_only)?;
+            return Err(usage!("no run is finished yet: there is nothing to report").into());
         }
         Ok(())
     }
+}
+
+/// Makes sure that no run is missing, unless a report of what there is was asked for.
+pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        missing.is_empty() || report_only,
+        "these runs failed and are in no number of the page; the same command tries them again: {}",
+        missing.join(", ")
+    );
+    Ok(())
 }
 
 #[cfg(test)]
@@ -145,5 +156,16 @@ mod tests {
         let words = "--env procgen:maze --agent c51 --preset tuned --seed 2 --frames 1000 --set learner.batch_size=64";
         assert_eq!(call.args().join(" "), words);
         assert_eq!(Call::default().args(), ["--seed", "0"]);
+    }
+
+    #[test]
+    fn runs_that_failed_are_no_fault_of_the_call() {
+        let nothing = Swept::<u32> {
+            made: Vec::new(),
+            missing: vec!["a".into()],
+        };
+        let said = |report_only| nothing.check_any(report_only).unwrap_err();
+        assert!(!said(false).is::<Usage>() && said(false).to_string().ends_with(": a"));
+        assert!(said(true).is::<Usage>());
     }
 }

@@ -114,16 +114,6 @@ fn commit() -> anyhow::Result<String> {
     Ok(commit.map_or_else(String::new, |it| it.1.to_owned()))
 }
 
-/// Makes sure that no run is missing, unless a report of what there is was asked for.
-pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
-    anyhow::ensure!(
-        missing.is_empty() || report_only,
-        "these runs failed and are in no number of the page; the same command tries them again: {}",
-        missing.join(", ")
-    );
-    Ok(())
-}
-
 struct Queue {
     runs: Runs,
     /// Runs at once.

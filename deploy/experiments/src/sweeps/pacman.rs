@@ -16,7 +16,7 @@ use crate::{
     cache::Session,
     flags::PacmanArgs,
     page::{Table, number},
-    sweep::queue,
+    sweep::{plan, queue},
 };
 
 /// Names of ghosts 0 to 3.
@@ -34,12 +34,12 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     queue::install(&plans, report)?;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any()?;
+    swept.check_any(report)?;
     let results = Results::read(settings, swept)?;
     session.figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
     session.finish(include_str!("pacman.md.j2"), values(&results))?;
-    queue::check_made(&results.missing, report)
+    plan::check_made(&results.missing, report)
 }
 
 /// Writes the tables.

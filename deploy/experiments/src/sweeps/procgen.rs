@@ -13,7 +13,10 @@ use self::{
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
-    sweep::{plan::Swept, queue},
+    sweep::{
+        plan::{self, Swept},
+        queue,
+    },
 };
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
@@ -28,7 +31,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     queue::install(&plans, report)?;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any()?;
+    swept.check_any(report)?;
     let Swept { made, missing } = swept;
     let mut scored = Vec::new();
     for made in made {
@@ -47,7 +50,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let over_games = report::over_games(&mut session, &settings, &games)?;
     let values = report::values(&settings, &games, &over_games, scored.len(), &missing);
     session.finish(include_str!("procgen.md.j2"), values)?;
-    queue::check_made(&missing, report)
+    plan::check_made(&missing, report)
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ use crate::{
     flags::{TradeoffArgs, this_command},
     stats::Spread,
     sweep::{
-        plan::{FinishedRun, Made, Planned, Swept},
+        plan::{FinishedRun, Made, Planned, Swept, check_made},
         queue,
         results::Played,
         runs::Runs,
@@ -98,9 +98,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     }
     let results = it.make(&fit.chosen)?;
     if results.levels.is_empty() {
-        if !results.points.is_empty() {
-            queue::check_made(&results.missing, report_only)?;
-        }
+        check_made(&results.missing, report_only)?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
             false => "no level has a finished run beside its base's",
@@ -110,7 +108,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         );
     }
     report::report(it.session, &results)?;
-    queue::check_made(&results.missing, report_only)
+    check_made(&results.missing, report_only)
 }
 
 /// Makes the runs shorter if not even the first level fits into the budget.
