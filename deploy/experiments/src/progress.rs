@@ -114,7 +114,7 @@ impl Progress {
     }
 
     /// At the speed so far; none before there is one.
-    fn seconds_left(&self, elapsed: f64) -> Option<f64> {
+    pub(crate) fn seconds_left(&self, elapsed: f64) -> Option<f64> {
         let fresh = self.done - self.found;
         let left = self.total.saturating_sub(self.done);
         (fresh > 0).then(|| elapsed / fresh as f64 * left as f64)

@@ -167,23 +167,17 @@ impl Queue {
     fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {
+            let (done, enough) = self.done(&self.running[at].plan);
             let running = &mut self.running[at];
-            let plan = &running.plan;
-            let folder = self.runs.folder(plan);
-            let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
-            let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
-            let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
-            let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
-            let done = (share * plan.units as f64) as u64;
             let fresh = done.saturating_sub(running.done);
             running.done += fresh;
             progress.advance(fresh)?;
-            if plan.episodes.is_some_and(|all| episodes >= all) && !running.enough {
+            if enough && !running.enough {
                 running.enough = true;
                 signal(&running.child, Signal::SIGTERM);
             }
             let ended = running.child.try_wait();
-            match ended.with_context(|| format!("waiting for {}", plan.name))? {
+            match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
                 None => at += 1,
                 Some(status) => {
                     let ended = self.running.remove(at);
@@ -192,6 +186,24 @@ impl Queue {
             }
         }
         Ok(())
+    }
+
+    /// Units that the plan's run has done, and whether it has all its episodes.
+    fn done(&self, plan: &PlannedRun) -> (u64, bool) {
+        let folder = self.runs.folder(plan);
+        let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
+        let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
+        let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
+        let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
+        let enough = plan.episodes.is_some_and(|all| episodes >= all);
+        ((share * plan.units as f64) as u64, enough)
+    }
+
+    /// Units that a run which resumes did in an earlier start: no measure of this one's speed.
+    fn find(&self, plan: &PlannedRun, progress: &mut Progress) -> u64 {
+        let (done, _) = self.done(plan);
+        progress.find(done);
+        done
     }
 
     /// Counts a run that ended; one that failed is tried once more, or left out.
@@ -273,12 +285,16 @@ impl Queue {
             .process_group(0);
         let starting = || format!("starting the run {}", plan.name);
         let child = command.spawn().with_context(starting)?;
+        let done = match resumed {
+            true => self.find(&plan, progress),
+            false => 0,
+        };
         Ok(Some(Running {
             plan,
             tried,
             resumed,
             child,
-            done: 0,
+            done,
             enough: false,
         }))
     }
@@ -367,28 +383,46 @@ fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use driml_launch::interrupts::Interrupts;
 
     use super::*;
     use crate::sweep::runs::tests::finish;
 
-    /// As when a run saved while this call waited for its log.
-    #[test]
-    fn a_run_that_finished_meanwhile_is_not_made_again() {
-        let root = tempfile::tempdir().unwrap();
-        let runs = Runs::open(root.path()).unwrap();
+    /// A queue in `root`, where the run of its only plan is finished.
+    fn queue(root: &Path) -> (Queue, PlannedRun) {
+        let runs = Runs::open(root).unwrap();
         let plan = PlannedRun::new("run".into(), Call::default(), 10);
-        let folder = runs.folder(&plan);
-        finish(&folder);
+        finish(&runs.folder(&plan));
         runs.write_call(&plan, "abc").unwrap();
-        let mut queue = Queue {
+        let queue = Queue {
             runs,
             jobs: 1,
             commit: "def".into(),
             waiting: [(0, plan.clone())].into(),
             running: Vec::new(),
         };
-        let mut progress = Progress::new(100, Interrupts::default());
+        (queue, plan)
+    }
+
+    #[test]
+    fn what_a_resumed_run_did_before_is_no_measure_of_speed() {
+        let root = tempfile::tempdir().unwrap();
+        let (queue, plan) = queue(root.path());
+        let metrics = queue.runs.folder(&plan).metrics();
+        std::fs::write(metrics, "seconds,frames,episodes\n60,9,0\n").unwrap();
+        let mut progress = Progress::new(10, Interrupts::default());
+        assert_eq!(queue.find(&plan, &mut progress), 9);
+        assert_eq!(progress.seconds_left(1.0), None);
+    }
+
+    /// As when a run saved while this call waited for its log.
+    #[test]
+    fn a_run_that_finished_meanwhile_is_not_made_again() {
+        let root = tempfile::tempdir().unwrap();
+        let (mut queue, plan) = queue(root.path());
+        let mut progress = Progress::new(10, Interrupts::default());
         queue.make(&mut progress).unwrap();
         assert_eq!(queue.runs.finished(&plan).unwrap().commit, "abc");
     }
