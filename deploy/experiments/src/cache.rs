@@ -179,13 +179,14 @@ impl Session {
             self.seconds += kept.seconds;
             return Ok(kept.result);
         }
-        self.progress.begin(key);
-        let started = Instant::now();
-        let result = make(&mut self.progress).inspect_err(|e| {
+        let stopped = |e: &anyhow::Error| {
             if e.is::<Interrupted>() {
                 console::line("stopped; the same command resumes after the last whole piece");
             }
-        })?;
+        };
+        self.progress.begin(key);
+        let (started, before) = (Instant::now(), self.progress.done());
+        let result = make(&mut self.progress).inspect_err(stopped)?;
         let kept = Kept {
             of: of.into(),
             seconds: started.elapsed().as_secs_f64(),
@@ -193,22 +194,11 @@ impl Session {
         };
         self.write(key, &kept)?;
         self.seconds += kept.seconds;
+        // What it has not counted itself. Whoever interrupts it now finds it kept.
+        let rest = units.saturating_sub(self.progress.done() - before);
+        let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
+        counted.inspect_err(stopped)?;
         Ok(kept.result)
-    }
-
-    /// [`Session::piece_of`] that counts as work when it is whole.
-    pub(crate) fn whole_piece<T: Serialize + DeserializeOwned>(
-        &mut self,
-        of: &str,
-        key: &str,
-        units: u64,
-        make: impl FnOnce() -> anyhow::Result<T>,
-    ) -> anyhow::Result<T> {
-        self.piece_of(of, key, units, |progress| {
-            let made = make()?;
-            progress.advance(units)?;
-            Ok(made)
-        })
     }
 
     /// Writes a table as `name.csv`.
@@ -309,5 +299,15 @@ mod tests {
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
         assert!(report("a").is_ok());
         assert!(report("b").unwrap_err().is::<Usage>());
+        // Ctrl-C while it is made: first it is kept.
+        let stopped = session.piece_of("", "slow", 1, |progress| {
+            nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
+            while progress.interrupts() == 0 {
+                std::thread::yield_now();
+            }
+            Ok(5)
+        });
+        assert!(stopped.unwrap_err().is::<Interrupted>());
+        assert_eq!(session.kept_piece::<u32>("slow"), Some(5));
     }
 }

@@ -57,6 +57,11 @@ impl Progress {
         debug_assert!(self.done <= self.total, "more work than was announced");
     }
 
+    /// Units that are done.
+    pub(crate) const fn done(&self) -> u64 {
+        self.done
+    }
+
     /// Counts work that was done in vain and has to be done again.
     pub(crate) fn again(&mut self, units: u64) {
         self.total += units;

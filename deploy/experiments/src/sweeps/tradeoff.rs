@@ -157,8 +157,8 @@ impl Tradeoff<'_> {
                     let common = &self.settings.common;
                     let (base, config) = (common.config(&of.base)?, common.config(point)?);
                     self.session.work().1.again(units);
-                    let measure = || speed::measure(&base, &config, smoke);
-                    Some(self.session.whole_piece(&program, &key, units, measure)?)
+                    let measure = |_: &mut _| speed::measure(&base, &config, smoke);
+                    Some(self.session.piece_of(&program, &key, units, measure)?)
                 };
                 self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
             }
@@ -340,8 +340,8 @@ impl Tradeoff<'_> {
             run.summary.weights_sha256
         );
         let key = format!("exactness-{}", point.key);
-        let measure = || exactness::measure(&config, &run.folder);
-        self.session.whole_piece(&of, &key, units, measure)
+        let measure = |_: &mut _| exactness::measure(&config, &run.folder);
+        self.session.piece_of(&of, &key, units, measure)
     }
 
     /// The calls that made the folder's runs, this one last unless it makes none.
