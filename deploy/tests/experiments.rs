@@ -303,6 +303,17 @@ fn tradeoff() {
     assert_eq!(counts, [2 + 3, 4 + 4]);
     call("--dials learner.precision --report");
     assert_eq!(rows(&data(&folder), "levels.csv"), 2);
+
+    // Of a level whose first seed is left out the others are reported.
+    let names = fs::read_dir(folder.join("runs")).unwrap();
+    let names = names.map(|it| it.unwrap().file_name().into_string().unwrap());
+    let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
+    for name in first {
+        fs::remove_file(folder.join("runs").join(name).join("summary.json")).unwrap();
+    }
+    call("--dials learner.precision --report");
+    let counts = ["levels.csv", "runs.csv"].map(|name| rows(&data(&folder), name));
+    assert_eq!(counts, [2, 4 + 4 - 1]);
 }
 
 /// A killed experiment takes its runs with it, and resumes at the next call.

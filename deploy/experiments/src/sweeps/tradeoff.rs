@@ -15,6 +15,7 @@ mod speed;
 use std::{collections::BTreeMap, time::Instant};
 
 use driml_launch::{
+    chosen::config_of,
     console::{self, print},
     evaluate::Levels,
 };
@@ -332,7 +333,8 @@ impl Tradeoff<'_> {
     }
 
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Exactness> {
-        let (units, config) = (self.piece_units(), self.settings.common.config(point)?);
+        // The run's own: its seed need not be the first.
+        let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.work().1.again(units);
         let (rows, states) = exactness::sizes(&config);
         let of = format!(
