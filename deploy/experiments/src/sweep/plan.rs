@@ -95,7 +95,8 @@ impl PlannedRun {
 pub(crate) struct FinishedRun {
     pub(crate) folder: RunFolder,
     pub(crate) summary: Summary,
-    /// The commit that the program which made it was built from; empty where it was not noted.
+    /// The commit that the program which made it was built from; those of several, where others resumed it, parted by `+`; empty
+    /// where it was not noted.
     pub(crate) commit: String,
 }
 

@@ -266,7 +266,7 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(&plan, &self.commit)?;
+        self.runs.write_call(&plan, &self.commit, resumed)?;
         let program = std::env::current_exe().context("finding this program's own file")?;
         let mut command = Command::new(program);
         command
@@ -395,7 +395,7 @@ mod tests {
         let runs = Runs::open(root).unwrap();
         let plan = PlannedRun::new("run".into(), Call::default(), 10);
         finish(&runs.folder(&plan));
-        runs.write_call(&plan, "abc").unwrap();
+        runs.write_call(&plan, "abc", false).unwrap();
         let queue = Queue {
             runs,
             jobs: 1,

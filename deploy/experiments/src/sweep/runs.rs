@@ -43,13 +43,16 @@ impl Runs {
             Outcome::Interrupted => enough,
             Outcome::Failed => false,
         };
-        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
-        let commit = commit.trim().to_owned();
         is_good.then_some(FinishedRun {
             folder,
             summary,
-            commit,
+            commit: self.commit(plan),
         })
+    }
+
+    fn commit(&self, plan: &PlannedRun) -> String {
+        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
+        commit.trim().to_owned()
     }
 
     /// Whether what lies in the plan's folder was begun by this very plan.
@@ -59,11 +62,22 @@ impl Runs {
         call.is_some_and(|args| args == plan.call.args())
     }
 
-    /// Notes that the plan's run is made by this plan, and by a program of this commit.
-    pub(super) fn write_call(&self, plan: &PlannedRun, commit: &str) -> anyhow::Result<()> {
+    /// Notes that the plan's run is made by this plan, and by a program of this commit; one that resumes keeps those before it.
+    pub(super) fn write_call(
+        &self,
+        plan: &PlannedRun,
+        commit: &str,
+        resumed: bool,
+    ) -> anyhow::Result<()> {
+        let before = if resumed { self.commit(plan) } else { String::new() };
+        let commits = match before.split('+').any(|it| it == commit) {
+            true => before,
+            false if before.is_empty() => commit.to_owned(),
+            false => format!("{before}+{commit}"),
+        };
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
         write_whole(&self.beside(plan, "call.json"), &call)?;
-        write_whole(&self.beside(plan, "commit"), commit.as_bytes())
+        write_whole(&self.beside(plan, "commit"), commits.as_bytes())
     }
 
     /// The end of what the run's process printed.
@@ -153,8 +167,16 @@ pub(super) mod tests {
         let folder = runs.folder(&plan(10));
         finish(&folder);
         assert!(runs.finished(&plan(10)).is_none(), "it has no call");
-        runs.write_call(&plan(10), "abc").unwrap();
-        assert_eq!(runs.finished(&plan(10)).unwrap().commit, "abc");
+        for (commit, resumed, expected) in [
+            ("old", false, "old"),
+            ("abc", false, "abc"),
+            ("abc", true, "abc"),
+            ("def", true, "abc+def"),
+            ("abc", true, "abc+def"),
+        ] {
+            runs.write_call(&plan(10), commit, resumed).unwrap();
+            assert_eq!(runs.finished(&plan(10)).unwrap().commit, expected);
+        }
         assert!(runs.finished(&plan(20)).is_none());
         fs::remove_file(runs.beside(&plan(10), "commit")).unwrap();
         assert_eq!(runs.finished(&plan(10)).unwrap().commit, "");
