@@ -19,7 +19,10 @@ use driml_machine::{
     resources,
 };
 use minijinja::Value;
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde::{
+    Deserialize, Serialize,
+    de::{DeserializeOwned, IgnoredAny},
+};
 
 use crate::{
     flags::ExperimentFlags,
@@ -113,6 +116,11 @@ impl Session {
     /// The piece of this name if it is there and can be read, whatever it was made of.
     pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         self.read(key).map(|kept| kept.result)
+    }
+
+    /// Of what the piece of this name was made, if it is there.
+    pub(crate) fn made_of(&self, key: &str) -> Option<String> {
+        self.read::<IgnoredAny>(key).map(|kept| kept.of)
     }
 
     /// Keeps a piece that took no time.
@@ -292,6 +300,7 @@ mod tests {
             (1, 1, 3, 3)
         );
         // Read whatever it was made of.
+        assert_eq!(session.made_of("played").unwrap(), "y");
         assert_eq!(session.kept_piece::<u32>("played"), Some(3));
         assert_eq!(session.kept_piece::<u32>("never"), None);
         session.keep("calls", ["driml tradeoff"]).unwrap();

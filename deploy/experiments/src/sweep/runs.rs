@@ -69,7 +69,11 @@ impl Runs {
         commit: &str,
         resumed: bool,
     ) -> anyhow::Result<()> {
-        let before = if resumed { self.commit(plan) } else { String::new() };
+        let before = if resumed {
+            self.commit(plan)
+        } else {
+            String::new()
+        };
         let commits = match before.split('+').any(|it| it == commit) {
             true => before,
             false if before.is_empty() => commit.to_owned(),

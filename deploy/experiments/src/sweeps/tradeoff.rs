@@ -336,12 +336,11 @@ impl Tradeoff<'_> {
         // The run's own: its seed need not be the first.
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.work().1.again(units);
-        let (rows, states) = exactness::sizes(&config);
-        let of = format!(
-            "{}, {rows} rows, {states} states",
-            run.summary.weights_sha256
-        );
         let key = format!("exactness-{}", point.key);
+        let kept = self.session.made_of(&key);
+        let kept = kept.filter(|_| self.args.queue.report);
+        let weights = &run.summary.weights_sha256;
+        let of = exactness::made_of(weights, &config, &cache::program()?, kept);
         let measure = |_: &mut _| exactness::measure(&config, &run.folder);
         self.session.piece_of(&of, &key, units, measure)
     }
