@@ -99,7 +99,11 @@ fn check(name: &str, files: &str) {
     let mut pieces: Vec<_> = fs::read_dir(folder.join("pieces"))
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        .filter(|path| !path.ends_with("settings.json"))
+        .filter(|path| {
+            !["settings.json", "cores.json"]
+                .iter()
+                .any(|it| path.ends_with(it))
+        })
         .collect();
     pieces.sort();
     fs::remove_file(&pieces[0]).unwrap();

@@ -16,7 +16,7 @@ use driml_launch::{
 };
 use driml_machine::{
     error::{Interrupted, usage},
-    resources,
+    resources::{self, Machine},
 };
 use minijinja::Value;
 use serde::{
@@ -33,6 +33,8 @@ use crate::{
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
 const PIECES: &str = "pieces";
 const SETTINGS: &str = "settings.json";
+/// The piece with how many cores this machine has, if that is where work is done.
+const CORES: &str = "cores";
 /// Where the runs of a sweep lie. Git does not keep them.
 pub(crate) const RUNS: &str = "runs";
 
@@ -104,13 +106,17 @@ impl Session {
             Err(_) => write_whole(&path, settings.as_bytes())?,
         }
         let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
-        Ok(Self {
+        let session = Self {
             folder,
             smoke: flags.smoke,
             progress: Progress::new(units, interrupts),
             seconds: 0.0,
             at_once: 1,
-        })
+        };
+        if !report_only {
+            session.keep(CORES, Machine::this().cores)?;
+        }
+        Ok(session)
     }
 
     /// The piece of this name if it is there and can be read, whatever it was made of.
@@ -228,7 +234,15 @@ impl Session {
     /// Writes the page of this template with these values, says where it is, and ends.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let text = page(template, values, self.smoke, self.seconds, self.at_once);
+        let cores = self.kept_piece(CORES);
+        let text = page(
+            template,
+            values,
+            self.smoke,
+            self.seconds,
+            self.at_once,
+            cores,
+        );
         let path = self.folder.join("README.md");
         write_whole(&path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))
@@ -280,7 +294,8 @@ mod tests {
         assert!(!folder.path().join("walk").exists());
         // Of runs that were copied there, with the wrong flags: they are not what is kept.
         fs::create_dir_all(folder.path().join("walk/runs")).unwrap();
-        assert!(report("wrong").is_ok());
+        let copied = report("wrong").unwrap();
+        assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
         let mut session = open("a").unwrap();
         assert_eq!(session.piece("one", 2, |_| Ok(7)).unwrap(), 7);
         let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
@@ -306,7 +321,8 @@ mod tests {
         session.keep("calls", ["driml tradeoff"]).unwrap();
         let calls: Option<Vec<String>> = session.kept_piece("calls");
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
-        assert!(report("a").is_ok());
+        let cores = report("a").unwrap().kept_piece(CORES);
+        assert_eq!(cores, Some(Machine::this().cores));
         assert!(report("b").unwrap_err().is::<Usage>());
         // Ctrl-C while it is made: first it is kept.
         let stopped = session.piece_of("", "slow", 1, |progress| {

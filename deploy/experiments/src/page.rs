@@ -73,7 +73,8 @@ pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
 }
 
 /// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
-/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time.
+/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores`
+/// where that is known.
 /// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
 pub(crate) fn page(
     template: &str,
@@ -81,15 +82,19 @@ pub(crate) fn page(
     smoke: bool,
     seconds: f64,
     at_once: u32,
+    cores: Option<u32>,
 ) -> String {
     let at_once = match at_once {
         1 => String::new(),
         jobs => format!(" of runs, {jobs} at once,"),
     };
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let time = rough_duration(seconds);
+    let time = format!("{}{at_once}", rough_duration(seconds));
+    let time = match cores {
+        Some(cores) => format!("{time} on a machine with {cores} cores."),
+        None => format!("{}.", time.trim_end_matches(',')),
+    };
     let values = context! {
-        time => format!("{time}{at_once} on a machine with {cores} cores."),
+        time,
         smoke => if smoke { SMOKE } else { "" },
         ..context! { ..values, ..context! { command => this_command() } }
     };
@@ -214,20 +219,22 @@ mod tests {
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
         let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
-        let page = |smoke, at_once| page(template, values.clone(), smoke, 130.0, at_once);
-        let text = page(true, 1);
+        let page =
+            |smoke, at_once, cores| page(template, values.clone(), smoke, 130.0, at_once, cores);
+        let text = page(true, 1, Some(64));
         for part in [
             "# T\n",
             "smoke length",
             "**Command.** `driml experiment t`",
-            "**Time.** 2 min on",
+            "**Time.** 2 min on a machine with 64 cores.\n",
             "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
             "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
         assert_eq!(summary(&text), "* 0.5\n* 1\n* 2\n");
-        let other = page(false, 2);
+        assert!(page(true, 2, None).contains("**Time.** 2 min of runs, 2 at once.\n"));
+        let other = page(false, 2, Some(64));
         assert!(other.contains("**Time.** 2 min of runs, 2 at once, on"));
         assert!(!other.contains("smoke length"));
     }

@@ -164,7 +164,7 @@ mod tests {
         let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
         let page = |rows: &[Row]| {
             let values = values(rows, &settings);
-            crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1)
+            crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1, None)
         };
         let mut row = Row {
             routine: "halving".into(),
