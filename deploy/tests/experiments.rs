@@ -413,6 +413,10 @@ fn a_grid_makes_every_combination_once() {
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
     let mut seeds = table.lines().skip(1).map(|row| row.split(',').nth(3));
     assert!(seeds.all(|seeds| seeds == Some("2")), "{table}");
+    // A report of the folder has all that is there.
+    run(root.path(), "grid --report");
+    let reported = fs::read_to_string(folder.join("grid.csv")).unwrap();
+    assert_eq!(reported, table);
     // Another grid does not mix with it.
     refused(&format!("{fixed} --frames 352"), &["other settings"]);
 }

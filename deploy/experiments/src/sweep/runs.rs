@@ -13,6 +13,8 @@ use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far,
 use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
 
+/// Seeds up to which finished runs are looked for.
+pub(crate) const SEEDS_FOUND_MAX: u32 = 64;
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: u64 = 1200;
 

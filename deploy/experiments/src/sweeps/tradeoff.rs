@@ -38,14 +38,12 @@ use crate::{
         plan::{FinishedRun, Made, Planned, Swept, check_made},
         queue,
         results::Played,
-        runs::Runs,
+        runs::{Runs, SEEDS_FOUND_MAX},
     },
 };
 
 /// The piece that lists the calls.
 const CALLS: &str = "calls";
-/// Seeds up to which finished runs are looked for.
-const SEEDS_FOUND_MAX: u32 = 64;
 /// A piece of measuring as a share of a run's work; only the estimate of the time left depends on it.
 const PIECE_SHARE: u64 = 20;
 /// What a run takes beside its updates and actions, as a factor: replay, messages, waiting for one another.
