@@ -26,7 +26,7 @@ use serde::{
 
 use crate::{
     flags::ExperimentFlags,
-    page::{Table, page, summary},
+    page::{page, summary},
     progress::Progress,
 };
 
@@ -215,13 +215,19 @@ impl Session {
         Ok(kept.result)
     }
 
-    /// Writes a table as `name.csv`.
-    pub(crate) fn csv(&self, name: &str, table: &Table) -> anyhow::Result<()> {
+    /// Writes rows as `name.csv`, below the names of their columns, parted by commas.
+    pub(crate) fn csv<R: Serialize>(
+        &self,
+        name: &str,
+        columns: &str,
+        rows: impl IntoIterator<Item = R>,
+    ) -> anyhow::Result<()> {
         let path = self.folder.join(format!("{name}.csv"));
         let doing = || format!("writing {}", path.display());
         let mut file = csv::Writer::from_path(&path).with_context(doing)?;
-        for line in std::iter::once(&table.header).chain(&table.rows) {
-            file.write_record(line).with_context(doing)?;
+        file.write_record(columns.split(',')).with_context(doing)?;
+        for row in rows {
+            file.serialize(row).with_context(doing)?;
         }
         file.flush().with_context(doing)
     }

@@ -6,70 +6,15 @@ use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context
 
 use crate::{
     flags::this_command,
-    stats::{Interval, Spread, difference, interval},
+    stats::{Spread, difference, interval},
 };
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// Rows of data below the names of their columns.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Table {
-    pub(crate) header: Vec<String>,
-    pub(crate) rows: Vec<Vec<String>>,
-}
-
-impl Table {
-    /// A table of these rows.
-    pub(crate) fn new(
-        header: impl IntoIterator<Item: AsRef<str>>,
-        rows: impl IntoIterator<Item = Vec<String>>,
-    ) -> Self {
-        Self {
-            header: header
-                .into_iter()
-                .map(|it| it.as_ref().to_owned())
-                .collect(),
-            rows: rows.into_iter().collect(),
-        }
-    }
-
-    /// Lines of data, whose values have no comma, below the names of a file's columns, parted by commas.
-    pub(crate) fn of_lines(columns: &str, lines: impl IntoIterator<Item = String>) -> Self {
-        let row = |line: String| line.split(',').map(str::to_owned).collect();
-        Self::new(columns.split(','), lines.into_iter().map(row))
-    }
-
-    /// Columns that stand below each other, for a terminal.
-    pub(crate) fn text(&self) -> String {
-        let lines = || std::iter::once(&self.header).chain(&self.rows);
-        let width = |column: usize| lines().map(|line| line[column].chars().count()).max();
-        let widths: Vec<_> = (0..self.header.len()).map(width).collect();
-        let mut text = String::new();
-        for line in lines() {
-            let cells = line.iter().zip(&widths);
-            let padded = cells.map(|(cell, width)| format!("{cell:0$}", width.unwrap_or(0)));
-            text += padded.collect::<Vec<_>>().join("  ").trim_end();
-            text.push('\n');
-        }
-        text
-    }
-}
-
 /// The cell of a number; empty in data where there is none.
 pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
-}
-
-/// Numbers as a line of data has them.
-pub(crate) fn numbers<const N: usize>(values: [f64; N], decimals: usize) -> String {
-    values.map(|it| format!("{it:.decimals$}")).join(",")
-}
-
-/// Mean, low and high end as a file of data has them; empty where there is none.
-pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
-    let (low, high) = of.and_then(|it| it.ends).unzip();
-    [of.map(|it| it.mean), low, high].map(|it| number(it, 4))
 }
 
 /// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
@@ -213,8 +158,6 @@ mod tests {
 
     #[test]
     fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
-        let table = Table::new(["a", "b"], [vec!["1".into(), "2".into()]]);
-        assert_eq!(table.text(), "a  b\n1  2\n");
         let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";

@@ -2,7 +2,7 @@
 //! Runs are made by `queue`; which there are follows from `axes`.
 
 use driml_envs::WorldName;
-use driml_launch::console::print;
+use driml_launch::console::{aligned, print};
 use driml_machine::error::usage;
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +15,7 @@ use super::{
 use crate::{
     cache::{Session, settings_of},
     flags::SweepArgs,
-    page::{Table, number},
+    page::number,
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
 };
@@ -24,6 +24,9 @@ use crate::{
 const NAME: &str = "grid";
 /// Most letters of a cell in the name of a run's folder.
 const NAME_LETTERS: usize = 80;
+/// Columns of the table behind the axes.
+const MEASURED: &str =
+    "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
 /// Below the table on a terminal.
 const LEGEND: &str = "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% \
                       interval (Student's t)\n";
@@ -67,9 +70,12 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
     session.work().1.clear();
-    let table = table(axes, &cells, &swept.made);
-    session.csv(NAME, &table)?;
-    print(&format!("{}{LEGEND}", table.text()))?;
+    let rows = rows(&cells, &swept.made);
+    let names = axes.iter().map(|axis| axis.name.as_str());
+    let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
+    session.csv(NAME, &header.join(","), &rows)?;
+    let lines = [vec![header], rows].concat();
+    print(&format!("{}{LEGEND}", aligned(&lines, &[])))?;
     swept.check_any(args.report)?;
     let runs = swept.made.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
@@ -174,10 +180,7 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
 }
 
 /// What came out, a row a cell; the point of a run is its cell's number.
-fn table(axes: &[Axis], cells: &[Cell], made: &[Made<usize>]) -> Table {
-    let measured = "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
-    let header = axes.iter().map(|axis| axis.name.as_str());
-    let header = header.chain(measured.split(','));
+fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
@@ -200,7 +203,7 @@ fn table(axes: &[Axis], cells: &[Cell], made: &[Made<usize>]) -> Table {
         ]);
         row
     };
-    Table::new(header, cells.iter().enumerate().map(row))
+    cells.iter().enumerate().map(row).collect()
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ mod figure;
 mod results;
 mod settings;
 
+use driml_launch::metrics::rounded;
 use driml_protocol::RETURNS_OF;
 use minijinja::{Value, context};
 
@@ -15,7 +16,6 @@ use self::{
 use crate::{
     cache::Session,
     flags::PacmanArgs,
-    page::{Table, number},
     sweep::{plan, queue},
 };
 
@@ -44,28 +44,22 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
 
 /// Writes the tables.
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
-    let losses = results.losses.iter().map(|it| {
-        let of = format!("{},{},{}", it.epsilon, it.seed, it.column);
-        (of, it)
-    });
+    let losses = results.losses.iter();
+    let losses = losses.map(|it| ((it.epsilon, it.seed, it.column), it));
     let points = losses.clone().flat_map(|(of, it)| {
         let points = it.points.iter();
-        points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+        points.map(move |(x, y)| (of, *x as u64, rounded(*y)))
     });
-    let columns = "epsilon,seed,loss,frames,nats";
-    session.csv("loss", &Table::of_lines(columns, points))?;
-    let ends =
-        losses.map(|(of, it)| format!("{of},{},{}", number(it.last, 4), number(it.whole, 4)));
+    session.csv("loss", "epsilon,seed,loss,frames,nats", points)?;
+    let ends = losses.map(|(of, it)| (of, [it.last, it.whole].map(|it| it.map(rounded))));
     let columns = "epsilon,seed,loss,last_fifth_nats,whole_nats";
-    session.csv("final_loss", &Table::of_lines(columns, ends))?;
+    session.csv("final_loss", columns, ends)?;
     for (name, traces) in PART_NAMES.iter().zip(&results.traces) {
         let rows = traces.iter().flat_map(|it| {
-            let of = format!("{},{}", it.agent, it.seed);
             let points = it.points.iter();
-            points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+            points.map(move |(x, y)| (&it.agent, it.seed, *x as u64, rounded(*y)))
         });
-        let columns = "agent,seed,episodes,mean_return";
-        session.csv(name, &Table::of_lines(columns, rows))?;
+        session.csv(name, "agent,seed,episodes,mean_return", rows)?;
     }
     Ok(())
 }

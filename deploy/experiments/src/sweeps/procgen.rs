@@ -7,7 +7,7 @@ mod settings;
 use driml_launch::evaluate::Levels;
 
 use self::{
-    report::{Scored, data, games},
+    report::{Scored, games},
     settings::{NAME, Settings},
 };
 use crate::{
@@ -44,7 +44,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             made,
         });
     }
-    session.csv("table", &data(&scored)?)?;
+    report::write_data(&session, &scored)?;
     let games = games(&settings, &scored);
     session.figure("curves", &report::figure(&settings, &games)?)?;
     let over_games = report::over_games(&mut session, &settings, &games)?;
