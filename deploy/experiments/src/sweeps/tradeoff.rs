@@ -24,11 +24,9 @@ use driml_settings::{config::RunConfig, presets};
 
 use self::{
     dials::Point,
-    exactness::Exactness,
     plan::{Cost, Fit},
-    results::{PointResult, Results, SeedResult, fields},
+    results::{Measured, PointResult, Results, SeedResult},
     settings::Settings,
-    speed::Speed,
 };
 use crate::{
     cache::{self, Session},
@@ -57,7 +55,7 @@ struct Tradeoff<'a> {
     settings: Settings,
     session: Session,
     /// The bench of points by their keys.
-    speeds: BTreeMap<String, Speed>,
+    speeds: BTreeMap<String, Measured>,
 }
 
 /// Measures what each dial that buys speed costs: plans, benches, trains, and writes the page.
@@ -127,9 +125,9 @@ fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow:
 }
 
 /// Seconds of a run, about.
-fn estimate(config: &RunConfig, speed: &Speed) -> f64 {
-    let updates = config.updates() as f64 * speed.update_seconds;
-    let actions = config.frames() as f64 * speed.act_seconds;
+fn estimate(config: &RunConfig, speed: &Measured) -> f64 {
+    let updates = config.updates() as f64 * speed["update_seconds"];
+    let actions = config.frames() as f64 * speed["act_seconds"];
     START_SECONDS + OVERHEAD * (updates + actions)
 }
 
@@ -299,8 +297,8 @@ impl Tradeoff<'_> {
             }
             // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
             if !points.contains_key(&point.key) {
-                let mut measured = fields(self.speeds.get(&point.key));
-                measured.extend(fields(Some(self.exactness(&point, &run)?)));
+                let mut measured = self.exactness(&point, &run)?;
+                measured.extend(self.speeds.get(&point.key).cloned().unwrap_or_default());
                 let seeds = Vec::new();
                 points.insert(point.key.clone(), PointResult { measured, seeds });
             }
@@ -330,7 +328,7 @@ impl Tradeoff<'_> {
         })
     }
 
-    fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Exactness> {
+    fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
         // The run's own: its seed need not be the first.
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.work().1.again(units);

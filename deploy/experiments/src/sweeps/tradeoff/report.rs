@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use driml_launch::metrics::rounded;
 use minijinja::{Value, context};
 use serde::Serialize;
-use serde_json::Value as Json;
 
 use super::{
     exactness, figures,
@@ -78,7 +77,7 @@ fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
         columns += &format!(",{name}_minus_base,{name}_minus_base_low,{name}_minus_base_high");
     }
     let rows = results.by_dial().flatten().map(|row| {
-        let measured = |name| row.result.measured.get(name).and_then(Json::as_f64);
+        let measured = |name| row.result.measured.get(name).copied();
         let of_runs = MEASURES.map(|measure| {
             let difference = row.difference(measure).filter(|_| !row.is_base);
             let both = [row.result.mean(measure), difference.map(|it| it.interval)];
