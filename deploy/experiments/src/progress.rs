@@ -35,7 +35,6 @@ impl Progress {
         }
     }
 
-    /// Says what is being done.
     pub(crate) fn begin(&mut self, what: &str) {
         self.what = what.to_owned();
     }
@@ -64,7 +63,6 @@ impl Progress {
         }
     }
 
-    /// Counts work done.
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.count(units);
         self.show();
@@ -85,7 +83,6 @@ impl Progress {
         self.interrupts.count()
     }
 
-    /// Takes the bar away.
     pub(crate) fn clear(&self) {
         self.screen.clear();
     }

@@ -26,7 +26,6 @@ pub(super) struct Group<'a> {
     pub(super) runs: Vec<&'a Run>,
 }
 
-/// A line and its band.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Curve {
     pub(crate) points: Vec<(f64, f64)>,

@@ -8,7 +8,6 @@ use driml_machine::error::Usage;
 use super::*;
 use crate::sweep::plan::Call;
 
-/// Folders of runs.
 struct Runs(tempfile::TempDir);
 
 impl Runs {

@@ -44,7 +44,6 @@ impl Call {
             .collect()
     }
 
-    /// The settings of the run.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
         let flags = RunFlags {
             env: self.env.clone(),
@@ -67,7 +66,6 @@ impl Call {
 pub(crate) struct PlannedRun {
     /// Its folder's name.
     pub(crate) name: String,
-    /// What makes it.
     pub(crate) call: Call,
     /// Its length in frames.
     pub(crate) frames: u64,
@@ -78,7 +76,6 @@ pub(crate) struct PlannedRun {
 }
 
 impl PlannedRun {
-    /// A run of so many frames.
     pub(crate) const fn new(name: String, call: Call, frames: u64) -> Self {
         Self {
             name,
@@ -90,7 +87,6 @@ impl PlannedRun {
     }
 }
 
-/// A finished run.
 #[derive(Clone, Debug)]
 pub(crate) struct FinishedRun {
     pub(crate) folder: RunFolder,
@@ -110,7 +106,6 @@ pub(crate) struct Made<P> {
     pub(crate) run: FinishedRun,
 }
 
-/// What a sweep gave.
 pub(crate) struct Swept<P> {
     /// The finished runs, in the order of their plans.
     pub(crate) made: Vec<Made<P>>,

@@ -14,7 +14,6 @@ use crate::{cache::Session, progress::Progress};
 /// Seed of the played episodes: the same levels for every run.
 const SEED: u64 = 1;
 
-/// What is played of a run.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Played {
     pub(crate) levels: Levels,
@@ -71,7 +70,6 @@ impl Played {
     }
 }
 
-/// Which weights of a run play.
 fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();

@@ -91,7 +91,6 @@ impl Runs {
         tail(&self.log(plan), LAST_WORDS_BYTES).unwrap_or_default()
     }
 
-    /// The folder of the plan's run.
     pub(super) fn folder(&self, plan: &PlannedRun) -> RunFolder {
         RunFolder::new(self.root.join(&plan.name))
     }
@@ -122,7 +121,6 @@ pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     Ok(Some(aside))
 }
 
-/// The end of a file.
 fn tail(path: &Path, bytes: u64) -> Option<String> {
     let mut file = File::open(path).ok()?;
     let length = file.metadata().ok()?.len();

@@ -24,7 +24,6 @@ const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 /// How the page names (b) and (c).
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
-/// Runs the experiment.
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = settings::with_flags(args)?;
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
@@ -42,7 +41,6 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     plan::check_made(&results.missing, report)
 }
 
-/// Writes the tables.
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let losses = results.losses.iter();
     let losses = losses.map(|it| ((it.epsilon, it.seed, it.column), it));
@@ -123,7 +121,6 @@ fn differences(part: usize, results: &Results) -> Vec<Value> {
     gains.chain(above_first).flatten().collect()
 }
 
-/// What the page says.
 fn values(results: &Results) -> Value {
     let settings = &results.settings;
     let (ghosts, noise) = (&settings.continual, &settings.noise);

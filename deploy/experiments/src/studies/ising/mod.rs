@@ -48,7 +48,6 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
     })
 }
 
-/// Runs the experiment.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,

@@ -23,7 +23,6 @@ use crate::{
 
 const NAME: &str = "random-walk";
 
-/// Runs the experiment.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,

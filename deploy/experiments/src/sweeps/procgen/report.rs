@@ -23,7 +23,6 @@ use crate::{
 
 /// Standard errors from which on a mean return counts as different from the random policy's.
 const ERRORS: f64 = 2.0;
-/// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;
 /// Seeds of each game and agent from which on scores over all games are made.
 const SEEDS_MIN: usize = 3;
@@ -38,7 +37,6 @@ pub(super) struct Scored {
 }
 
 impl Scored {
-    /// Whether a run's greedy episodes are better than the random policy's.
     fn is_above_random(&self) -> bool {
         let spreads = [&self.greedy, &self.random].map(|it| Spread::of(it.iter().copied()));
         let [Some(greedy), Some(random)] = spreads else {
@@ -71,7 +69,6 @@ struct OfAgent<'a> {
     is_above_random: bool,
 }
 
-/// The games of all runs.
 pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Game<'a>> {
     let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
     for it in scored {

@@ -39,7 +39,6 @@ const EQUAL_TIME: &str = "agent,base,equal_seconds,\
 /// The dial that turns DIM on.
 const DIM: &str = "DIM";
 
-/// Writes them all.
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let equal = equal_time(results)?;
     write_runs(&session, results)?;
@@ -165,7 +164,6 @@ fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     before.map(|(_, value)| *value)
 }
 
-/// What the page says.
 fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let common = &results.common;
     let (rows, states) = exactness::sizes(&common.config(&results.levels[0].base)?);

@@ -17,7 +17,6 @@ use crate::{
 /// Numbers of the bench, or errors against the reference, by their names in the data.
 pub(super) type Measured = BTreeMap<String, f64>;
 
-/// What a point gave.
 #[derive(Default)]
 pub(super) struct PointResult {
     /// The bench, and the errors at the weights of its first seed.
@@ -32,7 +31,6 @@ pub(super) struct SeedResult {
     pub(super) greedy: Vec<f64>,
 }
 
-/// All there is to report.
 pub(super) struct Results {
     pub(super) common: Common,
     /// Levels that have runs, as their bases do.

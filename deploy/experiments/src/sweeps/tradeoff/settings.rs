@@ -77,12 +77,10 @@ impl Settings {
 }
 
 impl Common {
-    /// The resolved settings of a run at `point`.
     pub(super) fn config(&self, point: &Point) -> Result<RunConfig, Usage> {
         self.run(point, 1).call.config()
     }
 
-    /// The run of a seed at `point`.
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
         PlannedRun::new(
             format!("{}-seed{seed}", point.key),
