@@ -14,7 +14,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_110),
     ("replay-server", 11_460),
     ("learner", 26_870),
-    ("deploy", 34_975),
+    ("deploy", 35_100),
     ("tests", 11_550),
 ];
 /// Most lines of one file.
