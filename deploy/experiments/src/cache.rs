@@ -208,7 +208,7 @@ impl Session {
         };
         self.write(key, &kept)?;
         self.seconds += kept.seconds;
-        // What it has not counted itself. Whoever interrupts it now finds it kept.
+        // What it has not counted itself; only now, so that an interrupt finds the piece kept.
         let rest = units.saturating_sub(self.progress.done() - before);
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
         counted.inspect_err(stopped)?;
