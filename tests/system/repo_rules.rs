@@ -14,7 +14,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 13_110),
     ("replay-server", 11_460),
     ("learner", 26_340),
-    ("deploy", 35_150),
+    ("deploy", 35_350),
     ("tests", 11_580),
 ];
 /// Most lines of one file.

@@ -22,7 +22,6 @@
 
 #![cfg_attr(test, allow(clippy::unwrap_used))]
 
-mod effort;
 mod env;
 pub mod flags;
 mod in_process;
@@ -39,10 +38,13 @@ mod subprocess;
 mod system;
 
 use driml_learner::DeviceName;
-use driml_machine::{device, resources::MachineNote};
+use driml_machine::{
+    device,
+    effort::{self, Effort},
+    resources::MachineNote,
+};
 
 use crate::{
-    effort::Effort,
     flags::{BenchArgs, BenchCommand},
     report::{Report, publish},
 };
@@ -66,7 +68,7 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         subprocess::ensure_threads(flags.threads)?;
     }
     let machine = MachineNote::this(device::gpu(on));
-    let (effort, mut table) = (Effort::new(flags), None);
+    let (effort, mut table) = (Effort::new(flags.quick), None);
     let (bench, figures) = match command {
         BenchCommand::Learner(args) if args.kernels => {
             ("learner", kernels::measure(flags, &effort)?)

@@ -16,20 +16,26 @@ use driml_launch::{
 };
 use driml_machine::{
     error::{Interrupted, usage},
-    process_env, resources,
+    process_env,
+    resources::{self, Machine},
 };
 use minijinja::Value;
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde::{
+    Deserialize, Serialize,
+    de::{DeserializeOwned, IgnoredAny},
+};
 
 use crate::{
     flags::ExperimentFlags,
-    page::{Table, page, summary},
+    page::{page, summary},
     progress::Progress,
 };
 
 /// Finished pieces, one file each, and the settings they were made with. Git does not keep it.
 const PIECES: &str = "pieces";
 const SETTINGS: &str = "settings.json";
+/// The piece with how many cores this machine has, if that is where work is done.
+const CORES: &str = "cores";
 /// Where the runs of a sweep lie. Git does not keep them.
 pub(crate) const RUNS: &str = "runs";
 
@@ -62,34 +68,11 @@ impl Session {
         settings: &impl Serialize,
         units: u64,
     ) -> anyhow::Result<Self> {
-        let folder = folder(name, flags);
-        let pieces = folder.join(PIECES);
-        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
-        let settings =
-            serde_json::to_string_pretty(settings).context("writing down the settings")?;
-        let path = pieces.join(SETTINGS);
-        match fs::read(&path) {
-            Ok(found) if found == settings.as_bytes() => {}
-            Ok(_) => {
-                return Err(usage!(
-                    "{} holds what was made with other settings: choose another --out, or remove that folder",
-                    folder.display()
-                )
-                .into());
-            }
-            Err(_) => write_whole(&path, settings.as_bytes())?,
-        }
-        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
-        Ok(Self {
-            folder,
-            smoke: flags.smoke,
-            progress: Progress::new(units, interrupts),
-            seconds: 0.0,
-            at_once: 1,
-        })
+        Self::open_queue(name, flags, settings, units, false)
     }
 
-    /// [`Session::open`] of a sweep. For a report alone it makes no folder; runs that lie in one with their calls are enough.
+    /// [`Session::open`] of a sweep. For a report alone it makes no folder, and writes down no settings, as they
+    /// made nothing; runs that lie in one with their calls are enough.
     pub(crate) fn open_queue(
         name: &str,
         flags: &ExperimentFlags,
@@ -106,12 +89,45 @@ impl Session {
             )
             .into());
         }
-        Self::open(name, flags, settings, units)
+        let pieces = folder.join(PIECES);
+        fs::create_dir_all(&pieces).with_context(|| format!("making {}", pieces.display()))?;
+        let settings =
+            serde_json::to_string_pretty(settings).context("writing down the settings")?;
+        let path = pieces.join(SETTINGS);
+        match fs::read(&path) {
+            Ok(found) if found == settings.as_bytes() => {}
+            Ok(_) => {
+                return Err(usage!(
+                    "{} holds what was made with other settings: choose another --out, or remove that folder",
+                    folder.display()
+                )
+                .into());
+            }
+            Err(_) if report_only => {}
+            Err(_) => write_whole(&path, settings.as_bytes())?,
+        }
+        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
+        let session = Self {
+            folder,
+            smoke: flags.smoke,
+            progress: Progress::new(units, interrupts),
+            seconds: 0.0,
+            at_once: 1,
+        };
+        if !report_only {
+            session.keep(CORES, Machine::this().cores)?;
+        }
+        Ok(session)
     }
 
     /// The piece of this name if it is there and can be read, whatever it was made of.
     pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         self.read(key).map(|kept| kept.result)
+    }
+
+    /// Of what the piece of this name was made, if it is there.
+    pub(crate) fn made_of(&self, key: &str) -> Option<String> {
+        self.read::<IgnoredAny>(key).map(|kept| kept.of)
     }
 
     /// Keeps a piece that took no time.
@@ -178,13 +194,14 @@ impl Session {
             self.seconds += kept.seconds;
             return Ok(kept.result);
         }
-        self.progress.begin(key);
-        let started = Instant::now();
-        let result = make(&mut self.progress).inspect_err(|e| {
+        let stopped = |e: &anyhow::Error| {
             if e.is::<Interrupted>() {
                 console::line("stopped; the same command resumes after the last whole piece");
             }
-        })?;
+        };
+        self.progress.begin(key);
+        let (started, before) = (Instant::now(), self.progress.done());
+        let result = make(&mut self.progress).inspect_err(stopped)?;
         let kept = Kept {
             of: of.into(),
             seconds: started.elapsed().as_secs_f64(),
@@ -192,31 +209,26 @@ impl Session {
         };
         self.write(key, &kept)?;
         self.seconds += kept.seconds;
+        // What it has not counted itself; only now, so that an interrupt finds the piece kept.
+        let rest = units.saturating_sub(self.progress.done() - before);
+        let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
+        counted.inspect_err(stopped)?;
         Ok(kept.result)
     }
 
-    /// [`Session::piece_of`] that counts as work when it is whole.
-    pub(crate) fn whole_piece<T: Serialize + DeserializeOwned>(
-        &mut self,
-        of: &str,
-        key: &str,
-        units: u64,
-        make: impl FnOnce() -> anyhow::Result<T>,
-    ) -> anyhow::Result<T> {
-        self.piece_of(of, key, units, |progress| {
-            let made = make()?;
-            progress.advance(units)?;
-            Ok(made)
-        })
-    }
-
-    /// Writes a table as `name.csv`.
-    pub(crate) fn csv(&self, name: &str, table: &Table) -> anyhow::Result<()> {
+    /// Writes rows as `name.csv`, below the names of their columns, parted by commas.
+    pub(crate) fn csv<R: Serialize>(
+        &self,
+        name: &str,
+        columns: &str,
+        rows: impl IntoIterator<Item = R>,
+    ) -> anyhow::Result<()> {
         let path = self.folder.join(format!("{name}.csv"));
         let doing = || format!("writing {}", path.display());
         let mut file = csv::Writer::from_path(&path).with_context(doing)?;
-        for line in std::iter::once(&table.header).chain(&table.rows) {
-            file.write_record(line).with_context(doing)?;
+        file.write_record(columns.split(',')).with_context(doing)?;
+        for row in rows {
+            file.serialize(row).with_context(doing)?;
         }
         file.flush().with_context(doing)
     }
@@ -229,7 +241,15 @@ impl Session {
     /// Writes the page of this template with these values, says where it is, and ends.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let text = page(template, values, self.smoke, self.seconds, self.at_once);
+        let cores = self.kept_piece(CORES);
+        let text = page(
+            template,
+            values,
+            self.smoke,
+            self.seconds,
+            self.at_once,
+            cores,
+        );
         let path = self.folder.join("README.md");
         write_whole(&path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))
@@ -275,10 +295,14 @@ mod tests {
             out: Some(folder.path().join("walk")),
             seeds: None,
         };
-        let open = |settings: &str| Session::open("walk", &flags, &settings, 4);
-        let report = || Session::open_queue("walk", &flags, &"a", 4, true);
-        assert!(report().unwrap_err().is::<Usage>());
+        let open = |settings: &str| Session::open("walk", &flags, &settings, 40);
+        let report = |settings: &str| Session::open_queue("walk", &flags, &settings, 40, true);
+        assert!(report("a").unwrap_err().is::<Usage>());
         assert!(!folder.path().join("walk").exists());
+        // Of runs that were copied there, with the wrong flags: they are not what is kept.
+        fs::create_dir_all(folder.path().join("walk/runs")).unwrap();
+        let copied = report("wrong").unwrap();
+        assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
         let mut session = open("a").unwrap();
         assert_eq!(session.piece("one", 2, |_| Ok(7)).unwrap(), 7);
         let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
@@ -298,11 +322,24 @@ mod tests {
             (1, 1, 3, 3)
         );
         // Read whatever it was made of.
+        assert_eq!(session.made_of("played").unwrap(), "y");
         assert_eq!(session.kept_piece::<u32>("played"), Some(3));
         assert_eq!(session.kept_piece::<u32>("never"), None);
         session.keep("calls", ["driml tradeoff"]).unwrap();
         let calls: Option<Vec<String>> = session.kept_piece("calls");
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
-        assert!(report().is_ok());
+        let cores = report("a").unwrap().kept_piece(CORES);
+        assert_eq!(cores, Some(Machine::this().cores));
+        assert!(report("b").unwrap_err().is::<Usage>());
+        // Ctrl-C while it is made: first it is kept.
+        let stopped = session.piece_of("", "slow", 1, |progress| {
+            nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
+            while progress.interrupts() == 0 {
+                std::thread::yield_now();
+            }
+            Ok(5)
+        });
+        assert!(stopped.unwrap_err().is::<Interrupted>());
+        assert_eq!(session.kept_piece::<u32>("slow"), Some(5));
     }
 }

@@ -199,10 +199,33 @@ pub(crate) fn this_command() -> String {
         if word == "--out" {
             args.next();
         } else if word != "--report" && !word.starts_with("--out=") {
-            let plain = |c: char| c.is_ascii_alphanumeric() || "-_.,=:/".contains(c);
-            let is_plain = word.chars().all(plain);
-            words.push(if is_plain { word } else { format!("'{word}'") });
+            words.push(quoted(word));
         }
     }
     words.join(" ")
+}
+
+/// The word as a shell takes it.
+fn quoted(word: String) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.,=:/".contains(c);
+    match word.chars().all(plain) {
+        true => word,
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_can_be_pasted() {
+        for (word, expected) in [
+            ("--set=a.b=1", "--set=a.b=1"),
+            ("a=[1, 2]", "'a=[1, 2]'"),
+            ("a='b c'", r"'a='\''b c'\'''"),
+        ] {
+            assert_eq!(quoted(word.into()), expected);
+        }
+    }
 }

@@ -6,74 +6,20 @@ use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context
 
 use crate::{
     flags::this_command,
-    stats::{Interval, Spread, difference, interval},
+    stats::{Spread, difference, interval},
 };
 
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
-
-/// Rows of data below the names of their columns.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Table {
-    pub(crate) header: Vec<String>,
-    pub(crate) rows: Vec<Vec<String>>,
-}
-
-impl Table {
-    /// A table of these rows.
-    pub(crate) fn new(
-        header: impl IntoIterator<Item: AsRef<str>>,
-        rows: impl IntoIterator<Item = Vec<String>>,
-    ) -> Self {
-        Self {
-            header: header
-                .into_iter()
-                .map(|it| it.as_ref().to_owned())
-                .collect(),
-            rows: rows.into_iter().collect(),
-        }
-    }
-
-    /// Lines of data, whose values have no comma, below the names of a file's columns, parted by commas.
-    pub(crate) fn of_lines(columns: &str, lines: impl IntoIterator<Item = String>) -> Self {
-        let row = |line: String| line.split(',').map(str::to_owned).collect();
-        Self::new(columns.split(','), lines.into_iter().map(row))
-    }
-
-    /// Columns that stand below each other, for a terminal.
-    pub(crate) fn text(&self) -> String {
-        let lines = || std::iter::once(&self.header).chain(&self.rows);
-        let width = |column: usize| lines().map(|line| line[column].chars().count()).max();
-        let widths: Vec<_> = (0..self.header.len()).map(width).collect();
-        let mut text = String::new();
-        for line in lines() {
-            let cells = line.iter().zip(&widths);
-            let padded = cells.map(|(cell, width)| format!("{cell:0$}", width.unwrap_or(0)));
-            text += padded.collect::<Vec<_>>().join("  ").trim_end();
-            text.push('\n');
-        }
-        text
-    }
-}
 
 /// The cell of a number; empty in data where there is none.
 pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
 }
 
-/// Numbers as a line of data has them.
-pub(crate) fn numbers<const N: usize>(values: [f64; N], decimals: usize) -> String {
-    values.map(|it| format!("{it:.decimals$}")).join(",")
-}
-
-/// Mean, low and high end as a file of data has them; empty where there is none.
-pub(crate) fn interval_cells(of: Option<Interval>) -> [String; 3] {
-    let (low, high) = of.and_then(|it| it.ends).unzip();
-    [of.map(|it| it.mean), low, high].map(|it| number(it, 4))
-}
-
 /// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
-/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time.
+/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores`
+/// where that is known.
 /// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
 pub(crate) fn page(
     template: &str,
@@ -81,15 +27,19 @@ pub(crate) fn page(
     smoke: bool,
     seconds: f64,
     at_once: u32,
+    cores: Option<u32>,
 ) -> String {
     let at_once = match at_once {
         1 => String::new(),
         jobs => format!(" of runs, {jobs} at once,"),
     };
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let time = rough_duration(seconds);
+    let time = format!("{}{at_once}", rough_duration(seconds));
+    let time = match cores {
+        Some(cores) => format!("{time} on a machine with {cores} cores."),
+        None => format!("{}.", time.trim_end_matches(',')),
+    };
     let values = context! {
-        time => format!("{time}{at_once} on a machine with {cores} cores."),
+        time,
         smoke => if smoke { SMOKE } else { "" },
         ..context! { ..values, ..context! { command => this_command() } }
     };
@@ -208,26 +158,26 @@ mod tests {
 
     #[test]
     fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
-        let table = Table::new(["a", "b"], [vec!["1".into(), "2".into()]]);
-        assert_eq!(table.text(), "a  b\n1  2\n");
         let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
         let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
-        let page = |smoke, at_once| page(template, values.clone(), smoke, 130.0, at_once);
-        let text = page(true, 1);
+        let page =
+            |smoke, at_once, cores| page(template, values.clone(), smoke, 130.0, at_once, cores);
+        let text = page(true, 1, Some(64));
         for part in [
             "# T\n",
             "smoke length",
             "**Command.** `driml experiment t`",
-            "**Time.** 2 min on",
+            "**Time.** 2 min on a machine with 64 cores.\n",
             "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
             "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");
         }
         assert_eq!(summary(&text), "* 0.5\n* 1\n* 2\n");
-        let other = page(false, 2);
+        assert!(page(true, 2, None).contains("**Time.** 2 min of runs, 2 at once.\n"));
+        let other = page(false, 2, Some(64));
         assert!(other.contains("**Time.** 2 min of runs, 2 at once, on"));
         assert!(!other.contains("smoke length"));
     }

@@ -1,15 +1,11 @@
 //! How far an experiment is and how long the rest will take: a bar on a terminal, a line now and then elsewhere.
 //! It also notices Ctrl-C, after every unit of work.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use driml_launch::{console::Screen, interrupts::Interrupts};
 use driml_machine::{error::Interrupted, units::rough_duration};
 
-/// How often a line is written where there is no terminal.
-const PLAIN_PERIOD: Duration = Duration::from_secs(10);
-/// How often the bar is redrawn.
-const BAR_PERIOD: Duration = Duration::from_millis(200);
 const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
 
 /// Counts units of work, such as updates.
@@ -20,7 +16,6 @@ pub(crate) struct Progress {
     /// Done before this start: known, so no measure of speed.
     found: u64,
     started: Instant,
-    shown: Instant,
     what: String,
     screen: Screen,
     interrupts: Interrupts,
@@ -34,14 +29,12 @@ impl Progress {
             done: 0,
             found: 0,
             started: Instant::now(),
-            shown: Instant::now(),
             what: String::new(),
             screen: Screen::new(total, TEMPLATE),
             interrupts,
         }
     }
 
-    /// Says what is being done.
     pub(crate) fn begin(&mut self, what: &str) {
         self.what = what.to_owned();
     }
@@ -57,6 +50,11 @@ impl Progress {
         debug_assert!(self.done <= self.total, "more work than was announced");
     }
 
+    /// Units that are done.
+    pub(crate) const fn done(&self) -> u64 {
+        self.done
+    }
+
     /// Counts work that was done in vain and has to be done again.
     pub(crate) fn again(&mut self, units: u64) {
         self.total += units;
@@ -65,14 +63,9 @@ impl Progress {
         }
     }
 
-    /// Counts work done.
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.count(units);
-        let period = self.screen.bar().map_or(PLAIN_PERIOD, |_| BAR_PERIOD);
-        if self.shown.elapsed() >= period {
-            self.shown = Instant::now();
-            self.show();
-        }
+        self.show();
         if self.interrupts.count() > 0 {
             self.clear();
             return Err(Interrupted);
@@ -90,31 +83,25 @@ impl Progress {
         self.interrupts.count()
     }
 
-    /// Takes the bar away.
     pub(crate) fn clear(&self) {
         self.screen.clear();
     }
 
-    fn show(&self) {
+    fn show(&mut self) {
         let left = match self.seconds_left(self.started.elapsed().as_secs_f64()) {
             Some(seconds) => format!("about {} left", rough_duration(seconds)),
             None => "the time left is not known yet".to_owned(),
         };
-        let line = format!("{}, {left}", self.what);
-        match self.screen.bar() {
-            Some(bar) => {
-                bar.set_position(self.done.min(self.total));
-                bar.set_message(line);
-            }
-            None => {
-                let percent = 100 * self.done / self.total.max(1);
-                self.screen.line(&format!("{percent:>3}%  {line}"));
-            }
-        }
+        let (what, percent) = (&self.what, 100 * self.done / self.total.max(1));
+        let done = self.done.min(self.total);
+        self.screen.show(done, |beside_bar| match beside_bar {
+            true => format!("{what}, {left}"),
+            false => format!("{percent:>3}%  {what}, {left}"),
+        });
     }
 
     /// At the speed so far; none before there is one.
-    fn seconds_left(&self, elapsed: f64) -> Option<f64> {
+    pub(crate) fn seconds_left(&self, elapsed: f64) -> Option<f64> {
         let fresh = self.done - self.found;
         let left = self.total.saturating_sub(self.done);
         (fresh > 0).then(|| elapsed / fresh as f64 * left as f64)

@@ -48,7 +48,6 @@ pub(super) enum Anchor {
     End,
 }
 
-/// How a text looks.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct TextStyle {
     pub(super) size: f64,
@@ -82,7 +81,6 @@ impl TextStyle {
     }
 }
 
-/// How a line is drawn: colour, width, dashes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stroke {
     pub(super) colour: Colour,
@@ -142,7 +140,6 @@ impl Canvas {
         self.elements.push('\n');
     }
 
-    /// Draws a line through points.
     pub(super) fn line(&mut self, points: &[Point], stroke: Stroke) {
         // A line without length has no direction to be drawn in.
         if points.iter().any(|point| *point != points[0]) {

@@ -370,7 +370,6 @@ fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
     }
 }
 
-/// A mark that stands for one point.
 fn point_mark(canvas: &mut Canvas, at: Point, mark: Mark, colour: Colour) {
     match mark {
         Mark::Rings => canvas.ring(at, RING_RADIUS, colour),

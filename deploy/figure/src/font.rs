@@ -5,7 +5,6 @@ use std::{fmt::Write as _, sync::LazyLock};
 
 use ttf_parser::{Face, OutlineBuilder};
 
-/// Light or heavy letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Weight {
     Regular,
@@ -28,7 +27,6 @@ impl Weight {
     }
 }
 
-/// Width of a line of text.
 pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
     let face = weight.face();
     let units: f64 = text.chars().map(|c| advance(face, c)).sum();

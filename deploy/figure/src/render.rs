@@ -27,7 +27,6 @@ pub(super) fn pdf(svg: &str) -> Result<Vec<u8>, FigureError> {
     packed.map_err(|e| FigureError::Encode(e.to_string()))
 }
 
-/// The picture's shapes.
 pub(super) fn tree(svg: &str) -> Result<Tree, FigureError> {
     let tree = Tree::from_str(svg, &Options::default());
     tree.map_err(|e| FigureError::Encode(e.to_string()))

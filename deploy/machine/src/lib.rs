@@ -15,6 +15,7 @@
 
 pub mod device;
 pub mod doctor;
+pub mod effort;
 pub mod error;
 pub mod limits;
 pub mod process_env;

@@ -26,7 +26,6 @@ pub(super) struct Group<'a> {
     pub(super) runs: Vec<&'a Run>,
 }
 
-/// A line and its band.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Curve {
     pub(crate) points: Vec<(f64, f64)>,
@@ -97,7 +96,9 @@ impl Group<'_> {
     }
 
     fn over_seeds(&self, column: &str, args: &PlotArgs) -> anyhow::Result<Curve> {
-        let each = self.runs.iter().map(|run| {
+        // Evaluations are of some runs only.
+        let having = self.runs.iter().filter(|run| run.has_values(column));
+        let each = having.map(|run| {
             let values = run.values_over(args.x, column)?;
             Ok(match args.smooth {
                 Some(window) => smoothed(&values, window as f64),

@@ -134,6 +134,10 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     };
     let mut panels = Vec::new();
     for column in &columns {
+        // A name that no run knows is an error.
+        if !runs.iter().any(|run| run.has_values(column)) {
+            runs[0].values_over(args.x, column)?;
+        }
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);
         let is_return = column == RETURN || column == EVALUATED;

@@ -57,7 +57,6 @@ impl Over {
 }
 
 impl Run {
-    /// Reads a run's folder.
     pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         let path = folder.metrics();
         let text = std::fs::read(&path)

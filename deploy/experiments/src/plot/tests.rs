@@ -8,7 +8,6 @@ use driml_machine::error::Usage;
 use super::*;
 use crate::sweep::plan::Call;
 
-/// Folders of runs.
 struct Runs(tempfile::TempDir);
 
 impl Runs {
@@ -200,6 +199,22 @@ fn a_run_without_an_episode_is_named() {
         empty.display()
     );
     assert!(absent(RETURN, &runs).eq([expected]));
+}
+
+#[test]
+fn a_run_that_was_never_evaluated_stands_beside_one_that_was() {
+    let root = Runs::new();
+    let a = root.run("a", "c51", 1, METRICS);
+    let evaluations = "seconds,frames,updates,evaluated_return\n3,20,2,7.5\n";
+    std::fs::write(a.join("evaluations.csv"), evaluations).unwrap();
+    // Another seed of it, and another agent.
+    for (name, agent, seed) in [("b", "c51", 2), ("c", "curl", 1)] {
+        let b = root.run(name, agent, seed, METRICS);
+        for columns in [&[][..], &["evaluated_return"]] {
+            let svg = drawn(&root.args(&[&b, &a], columns));
+            assert!(svg.contains("Return of checkpoints"), "{name} {columns:?}");
+        }
+    }
 }
 
 #[test]

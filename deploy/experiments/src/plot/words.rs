@@ -29,7 +29,6 @@ pub(super) fn words(column: &str) -> (String, String) {
     }
 }
 
-/// What is compared.
 pub(super) fn title(groups: &[Group<'_>]) -> String {
     match groups {
         [only] => only.name.clone(),

@@ -24,10 +24,10 @@ use self::{
 use crate::{
     cache::{self, Session},
     flags::{self, ExperimentFlags},
-    page::Table,
 };
 
 const NAME: &str = "stability";
+const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,input";
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
@@ -61,7 +61,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         of_property.extend(property.untried(&of_property));
         rows.extend(of_property);
     }
-    session.csv("promises", &table_of(&rows))?;
+    session.csv("promises", COLUMNS, table_of(&rows))?;
     session.figure(
         "worst",
         &figure::figure(&rows, &HumanCount(cases(&rows)).to_string()),
@@ -73,11 +73,8 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn table_of(rows: &[Row]) -> Table {
-    let header = [
-        "routine", "range", "extreme", "cases", "worst", "promised", "kept", "promise", "input",
-    ];
-    let cells = rows.iter().map(|row| {
+fn table_of(rows: &[Row]) -> impl Iterator<Item = Vec<String>> {
+    rows.iter().map(|row| {
         vec![
             row.routine.clone(),
             row.range.clone(),
@@ -89,8 +86,7 @@ fn table_of(rows: &[Row]) -> Table {
             row.promise.clone(),
             row.input.clone(),
         ]
-    });
-    Table::new(&header, cells)
+    })
 }
 
 /// Two digits; what is not a number is the largest float.
@@ -164,7 +160,7 @@ mod tests {
         let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
         let page = |rows: &[Row]| {
             let values = values(rows, &settings);
-            crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1)
+            crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1, None)
         };
         let mut row = Row {
             routine: "halving".into(),

@@ -4,15 +4,15 @@
 
 use crate::stats::{Interval, interval};
 
-/// Scores by game and seed: `scores[game][seed]`, each game with at least one seed.
+/// Scores by game and seed: `scores[game][seed]`. Nothing follows from no game, or from one without a score.
 pub(crate) type Scores = Vec<Vec<f64>>;
 
-/// Mean of the middle half of all scores, and its interval; none of no score.
+/// Mean of the middle half of all scores, and its interval.
 pub(crate) fn iqm(scores: &Scores) -> Option<Interval> {
     estimate(&[scores], |it| interquartile_mean(it[0].iter().flatten()))
 }
 
-/// Probability that a run of `x` does better than one of `y` in a game drawn at random, and its interval; none of no game.
+/// Probability that a run of `x` does better than one of `y` in a game drawn at random, and its interval.
 ///
 /// `1/M sum_m 1/(N_x N_y) sum_ij [x_mi > y_mj] + [x_mi = y_mj] / 2` over the M games; both have the same games.
 pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
@@ -50,7 +50,8 @@ fn better(x: &[f64], y: &[f64]) -> f64 {
 /// single seed; of the games' further seeds only `v` knows. Source: Tukey 1958. For a mean it is Student's interval itself.
 fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interval> {
     let all: Vec<Scores> = groups.iter().map(|&scores| scores.clone()).collect();
-    let seeds = all.iter().flatten().map(Vec::len).min()?;
+    let seeds = all.iter().flatten().map(Vec::len).min();
+    let seeds = seeds.filter(|seeds| *seeds > 0)?;
     let mean = of(&all);
     let pseudo_value = |seed: usize| {
         let mut others = all.clone();
@@ -60,7 +61,7 @@ fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interva
         seeds as f64 * mean - (seeds - 1) as f64 * of(&others)
     };
     let ends = match seeds {
-        0 | 1 => None,
+        1 => None,
         _ => {
             let found = interval(&(0..seeds).map(pseudo_value).collect::<Vec<_>>())?;
             let around = |end: f64| mean + end - found.mean;
@@ -99,6 +100,8 @@ mod tests {
         let one_each = iqm(&vec![vec![0.1], vec![0.3]]).unwrap();
         assert_eq!((one_each.mean, one_each.ends), (0.2, None));
         assert_eq!(improvement(&vec![], &vec![]), None);
+        // No run of a game has ended an episode.
+        assert_eq!(improvement(&vec![vec![], vec![1.0]], &y), None);
     }
 
     #[test]

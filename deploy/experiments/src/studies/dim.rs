@@ -23,7 +23,6 @@ pub(super) struct DimLearner {
 }
 
 impl DimLearner {
-    /// A network at its initial weights.
     pub(super) fn new(
         model: &ModelConfig,
         dim: Dim,
@@ -54,7 +53,6 @@ impl DimLearner {
         Ok(self.dim.pair_losses(network, now, next, &action, &valid)?)
     }
 
-    /// A step of the optimiser down this loss.
     pub(super) fn step(&mut self, loss: &Tensor) -> anyhow::Result<()> {
         let gradients = Gradients::of(&self.parameters, loss)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);

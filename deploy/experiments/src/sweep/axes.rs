@@ -2,13 +2,13 @@
 //! What a setting means is for `driml local`, which takes each of them as it stands here.
 
 use driml_machine::error::{Usage, usage};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Most runs of a grid; more are a slip of the keyboard.
 const RUNS_MAX: usize = 10_000;
 
 /// What is varied, or fixed if it has one value alone.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Axis {
     /// As a column is headed: `env`, `agent`, or a setting's dotted path.
     pub(crate) name: String,

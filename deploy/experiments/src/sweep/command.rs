@@ -2,19 +2,20 @@
 //! Runs are made by `queue`; which there are follows from `axes`.
 
 use driml_envs::WorldName;
-use driml_launch::console::print;
+use driml_launch::console::{aligned, print};
 use driml_machine::error::usage;
-use serde_json::json;
+use serde::{Deserialize, Serialize};
 
 use super::{
     axes::{Axis, Cell, cells},
-    plan::{Call, Made, PlannedRun},
+    plan::{self, Call, Made, PlannedRun},
     queue,
+    runs::SEEDS_FOUND_MAX,
 };
 use crate::{
-    cache::Session,
+    cache::{Session, settings_of},
     flags::SweepArgs,
-    page::{Table, number},
+    page::number,
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
 };
@@ -23,53 +24,86 @@ use crate::{
 const NAME: &str = "grid";
 /// Most letters of a cell in the name of a run's folder.
 const NAME_LETTERS: usize = 80;
+/// Columns of the table behind the axes.
+const MEASURED: &str =
+    "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
 /// Below the table on a terminal.
 const LEGEND: &str = "mean_return: of each run's last 100 training episodes, then over seeds; sd over seeds, ci_low and ci_high the mean's 95% \
                       interval (Student's t)\n";
+
+/// What all runs of a folder have in common: other seeds, and more runs at once, are the same sweep.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Settings {
+    axes: Vec<Axis>,
+    frames: Option<u64>,
+    preset: Option<String>,
+}
 
 /// Makes a run for each combination of settings and each seed that is not there yet, then the table and the plot.
 ///
 /// # Errors
 /// As [`crate::run`].
 pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
-    let axes = axes_of(args)?;
-    let cells = cells(&axes, args.seeds)?;
+    let kept = settings_of(NAME, &args.folder()).filter(|_| args.report);
+    let (settings, seeds) = settings(args, kept)?;
+    let axes = &settings.axes;
+    let cells = cells(axes, args.seeds)?;
     let mut points = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
-        let config = call(args, cell, 1).config();
+        let config = settings.call(cell, 1).config();
         let config = config.map_err(|e| match &described(cell)[..] {
             "" => e,
             cell => usage!("{cell}: {e}"),
         })?;
-        points.push((at, folder_name(&axes, cell, at), config.frames()));
+        points.push((at, folder_name(axes, cell, at), config.frames()));
     }
     let mut plans = Vec::new();
-    for seed in 1..=args.seeds {
+    for seed in 1..=seeds {
         for (at, name, frames) in &points {
             let name = format!("{name}-seed{seed}");
-            let call = call(args, &cells[*at], seed);
+            let call = settings.call(&cells[*at], seed);
             plans.push((*at, PlannedRun::new(name, call, *frames)));
         }
     }
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
-    // Other seeds, and more runs at once, are the same sweep.
-    let settings = json!({ "axes": axes, "preset": args.preset, "frames": args.frames });
+    queue::install(&plans, args.report)?;
     let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
     session.work().1.clear();
-    let table = table(&axes, &cells, &swept.made);
-    session.csv(NAME, &table)?;
-    print(&format!("{}{LEGEND}", table.text()))?;
-    if swept.made.is_empty() {
-        return Err(usage!("no run is finished yet: there is nothing to draw").into());
-    }
+    let rows = rows(&cells, &swept.made);
+    let names = axes.iter().map(|axis| axis.name.as_str());
+    let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
+    session.csv(NAME, &header.join(","), &rows)?;
+    let lines = [vec![header], rows].concat();
+    print(&format!("{}{LEGEND}", aligned(&lines, &[])))?;
+    swept.check_any(args.report)?;
     let runs = swept.made.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
         runs: runs.collect(),
         out: session.folder().join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;
-    queue::check_made(&swept.missing, args.report)
+    plan::check_made(&swept.missing, args.report)
+}
+
+/// What a call asks for, and its seeds. A report that names no axis is of the `kept` settings, and of all seeds that there are.
+fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Settings, u32)> {
+    let asked = Settings {
+        axes: axes_of(args)?,
+        frames: args.frames,
+        preset: args.preset.clone(),
+    };
+    Ok(match kept.filter(|_| asked.axes.is_empty()) {
+        Some(kept) => (
+            Settings {
+                axes: kept.axes,
+                frames: asked.frames.or(kept.frames),
+                preset: asked.preset.or(kept.preset),
+            },
+            args.seeds.max(SEEDS_FOUND_MAX),
+        ),
+        None => (asked, args.seeds),
+    })
 }
 
 /// Worlds and agents first, where there are several, then the settings as they were named.
@@ -94,23 +128,24 @@ fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
     Ok(axes)
 }
 
-/// The call of a cell's run.
-fn call(args: &SweepArgs, cell: &Cell, seed: u32) -> Call {
-    let mut call = Call {
-        preset: args.preset.clone(),
-        seed,
-        frames: args.frames,
-        ..Call::default()
-    };
-    for (name, value) in cell {
-        match name.as_str() {
-            // A game may be named alone.
-            "env" => call.env = Some(full_name(value)),
-            "agent" => call.agent = Some(value.clone()),
-            _ => call.sets.push(format!("{name}={value}")),
+impl Settings {
+    fn call(&self, cell: &Cell, seed: u32) -> Call {
+        let mut call = Call {
+            preset: self.preset.clone(),
+            seed,
+            frames: self.frames,
+            ..Call::default()
+        };
+        for (name, value) in cell {
+            match name.as_str() {
+                // A game may be named alone.
+                "env" => call.env = Some(full_name(value)),
+                "agent" => call.agent = Some(value.clone()),
+                _ => call.sets.push(format!("{name}={value}")),
+            }
         }
+        call
     }
-    call
 }
 
 fn full_name(world: &str) -> String {
@@ -145,10 +180,7 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
 }
 
 /// What came out, a row a cell; the point of a run is its cell's number.
-fn table(axes: &[Axis], cells: &[Cell], made: &[Made<usize>]) -> Table {
-    let measured = "seeds,mean_return,sd,ci_low,ci_high,lowest,highest,updates_per_second,minutes";
-    let header = axes.iter().map(|axis| axis.name.as_str());
-    let header = header.chain(measured.split(','));
+fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
@@ -171,12 +203,32 @@ fn table(axes: &[Axis], cells: &[Cell], made: &[Made<usize>]) -> Table {
         ]);
         row
     };
-    Table::new(header, cells.iter().enumerate().map(row))
+    cells.iter().enumerate().map(row).collect()
 }
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+
+    #[derive(Parser)]
+    struct CommandLine {
+        #[command(flatten)]
+        args: SweepArgs,
+    }
+
+    #[test]
+    fn a_report_need_not_repeat_what_the_folder_was_made_with() {
+        let of = |line: &str, kept| {
+            let words = ["sweep"].into_iter().chain(line.split_whitespace());
+            settings(&CommandLine::parse_from(words).args, kept).unwrap()
+        };
+        let kept = || Some(of("--agent c51,curl --frames 320", None).0);
+        assert_eq!(of("--report", kept()), (kept().unwrap(), SEEDS_FOUND_MAX));
+        let asked = of("--report --agent c51 --seeds 2", kept());
+        assert_eq!(asked, of("--agent c51 --seeds 2", None));
+    }
 
     #[test]
     fn folders_are_named_for_what_changes() {

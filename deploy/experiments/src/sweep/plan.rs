@@ -44,7 +44,6 @@ impl Call {
             .collect()
     }
 
-    /// The settings of the run.
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {
         let flags = RunFlags {
             env: self.env.clone(),
@@ -67,7 +66,6 @@ impl Call {
 pub(crate) struct PlannedRun {
     /// Its folder's name.
     pub(crate) name: String,
-    /// What makes it.
     pub(crate) call: Call,
     /// Its length in frames.
     pub(crate) frames: u64,
@@ -78,7 +76,6 @@ pub(crate) struct PlannedRun {
 }
 
 impl PlannedRun {
-    /// A run of so many frames.
     pub(crate) const fn new(name: String, call: Call, frames: u64) -> Self {
         Self {
             name,
@@ -90,12 +87,12 @@ impl PlannedRun {
     }
 }
 
-/// A finished run.
 #[derive(Clone, Debug)]
 pub(crate) struct FinishedRun {
     pub(crate) folder: RunFolder,
     pub(crate) summary: Summary,
-    /// The commit that the program which made it was built from; empty where it was not noted.
+    /// The commit that the program which made it was built from; those of several, where others resumed it, parted by `+`; empty
+    /// where it was not noted.
     pub(crate) commit: String,
 }
 
@@ -109,7 +106,6 @@ pub(crate) struct Made<P> {
     pub(crate) run: FinishedRun,
 }
 
-/// What a sweep gave.
 pub(crate) struct Swept<P> {
     /// The finished runs, in the order of their plans.
     pub(crate) made: Vec<Made<P>>,
@@ -119,12 +115,23 @@ pub(crate) struct Swept<P> {
 
 impl<P> Swept<P> {
     /// Makes sure that there is something to report.
-    pub(crate) fn check_any(&self) -> Result<(), Usage> {
+    pub(crate) fn check_any(&self, report_only: bool) -> anyhow::Result<()> {
         if self.made.is_empty() {
-            return Err(usage!("no run is finished yet: there is nothing to report"));
+            check_made(&self.missing, report_only)?;
+            return Err(usage!("no run is finished yet: there is nothing to report").into());
         }
         Ok(())
     }
+}
+
+/// Makes sure that no run is missing, unless a report of what there is was asked for.
+pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        missing.is_empty() || report_only,
+        "these runs failed and are in no number of the page; the same command tries them again: {}",
+        missing.join(", ")
+    );
+    Ok(())
 }
 
 #[cfg(test)]
@@ -145,5 +152,16 @@ mod tests {
         let words = "--env procgen:maze --agent c51 --preset tuned --seed 2 --frames 1000 --set learner.batch_size=64";
         assert_eq!(call.args().join(" "), words);
         assert_eq!(Call::default().args(), ["--seed", "0"]);
+    }
+
+    #[test]
+    fn runs_that_failed_are_no_fault_of_the_call() {
+        let nothing = Swept::<u32> {
+            made: Vec::new(),
+            missing: vec!["a".into()],
+        };
+        let said = |report_only| nothing.check_any(report_only).unwrap_err();
+        assert!(!said(false).is::<Usage>() && said(false).to_string().ends_with(": a"));
+        assert!(said(true).is::<Usage>());
     }
 }

@@ -42,17 +42,13 @@ const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none. All settings are resolved, and what their worlds
-/// need is installed, before anything starts.
+/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
     jobs: u32,
     report: bool,
 ) -> anyhow::Result<Swept<P>> {
-    if !report {
-        install(&plans)?;
-    }
     let (folder, progress) = session.work();
     let mut queue = Queue {
         runs: Runs::open(folder)?,
@@ -87,9 +83,11 @@ pub(crate) fn make<P>(
     Ok(swept)
 }
 
-/// Resolves the settings of each call once, whatever its seed, and installs what its world needs.
-fn install<P>(plans: &[Planned<P>]) -> anyhow::Result<()> {
+/// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
+/// called before anything is written, so that a corrected call can have the same folder.
+pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
     let mut known: Vec<Call> = Vec::new();
+    let plans = if report { &[] } else { plans };
     for (_, plan) in plans {
         let call = Call {
             seed: 1,
@@ -116,16 +114,6 @@ fn commit() -> anyhow::Result<String> {
     let text = text.trim().strip_suffix(')');
     let commit = text.and_then(|it| it.rsplit_once('('));
     Ok(commit.map_or_else(String::new, |it| it.1.to_owned()))
-}
-
-/// Makes sure that no run is missing, unless a report of what there is was asked for.
-pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
-    anyhow::ensure!(
-        missing.is_empty() || report_only,
-        "these runs failed and are in no number of the page; the same command tries them again: {}",
-        missing.join(", ")
-    );
-    Ok(())
 }
 
 struct Queue {
@@ -160,7 +148,7 @@ impl Queue {
                 && let Some((tried, plan)) = self.waiting.pop_front()
             {
                 let running = self.start(plan, tried + 1, progress)?;
-                self.running.push(running);
+                self.running.extend(running);
             }
             if self.running.is_empty() {
                 return Ok(());
@@ -181,23 +169,17 @@ impl Queue {
     fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {
+            let (done, enough) = self.done(&self.running[at].plan);
             let running = &mut self.running[at];
-            let plan = &running.plan;
-            let folder = self.runs.folder(plan);
-            let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
-            let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
-            let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
-            let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
-            let done = (share * plan.units as f64) as u64;
             let fresh = done.saturating_sub(running.done);
             running.done += fresh;
             progress.advance(fresh)?;
-            if plan.episodes.is_some_and(|all| episodes >= all) && !running.enough {
+            if enough && !running.enough {
                 running.enough = true;
                 signal(&running.child, Signal::SIGTERM);
             }
             let ended = running.child.try_wait();
-            match ended.with_context(|| format!("waiting for {}", plan.name))? {
+            match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
                 None => at += 1,
                 Some(status) => {
                     let ended = self.running.remove(at);
@@ -206,6 +188,24 @@ impl Queue {
             }
         }
         Ok(())
+    }
+
+    /// Units that the plan's run has done, and whether it has all its episodes.
+    fn done(&self, plan: &PlannedRun) -> (u64, bool) {
+        let folder = self.runs.folder(plan);
+        let RunProgress { frames, episodes } = how_far(&folder).unwrap_or_default();
+        let share = |part: u64, all: u64| part as f64 / all.max(1) as f64;
+        let of_episodes = plan.episodes.map_or(0.0, |all| share(episodes, all));
+        let share = of_episodes.max(share(frames, plan.frames)).min(1.0);
+        let enough = plan.episodes.is_some_and(|all| episodes >= all);
+        ((share * plan.units as f64) as u64, enough)
+    }
+
+    /// Units that a run which resumes did in an earlier start: no measure of this one's speed.
+    fn find(&self, plan: &PlannedRun, progress: &mut Progress) -> u64 {
+        let (done, _) = self.done(plan);
+        progress.find(done);
+        done
     }
 
     /// Counts a run that ended; one that failed is tried once more, or left out.
@@ -239,13 +239,13 @@ impl Queue {
         Ok(progress.advance(plan.units - ended.done)?)
     }
 
-    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone.
+    /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone; none if another process finished it.
     fn start(
         &self,
         plan: PlannedRun,
         tried: u32,
         progress: &mut Progress,
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<Option<Running>> {
         let path = self.runs.log(&plan);
         let doing = || format!("making {}", path.display());
         let log = File::options()
@@ -254,6 +254,10 @@ impl Queue {
             .open(&path)
             .with_context(doing)?;
         wait_for_the_last(&log, &plan, progress)?;
+        if self.runs.finished(&plan).is_some() {
+            progress.find(plan.units);
+            return Ok(None);
+        }
         log.set_len(0).with_context(doing)?;
         let folder = self.runs.folder(&plan).path().to_owned();
         let resumed = folder.exists() && self.is_resumable(&plan, tried, progress)?;
@@ -264,7 +268,7 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(&plan, &self.commit)?;
+        self.runs.write_call(&plan, &self.commit, resumed)?;
         let mut command = Command::new(process_env::program());
         command
             .args(["train", "--no-play"])
@@ -282,14 +286,18 @@ impl Queue {
             .process_group(0);
         let starting = || format!("starting the run {}", plan.name);
         let child = command.spawn().with_context(starting)?;
-        Ok(Running {
+        let done = match resumed {
+            true => self.find(&plan, progress),
+            false => 0,
+        };
+        Ok(Some(Running {
             plan,
             tried,
             resumed,
             child,
-            done: 0,
+            done,
             enough: false,
-        })
+        }))
     }
 
     /// Whether what lies in the plan's folder can be resumed: at the first try alone, as its checkpoint may be what fails.
@@ -372,4 +380,51 @@ fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
         progress.advance(0)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use driml_launch::interrupts::Interrupts;
+
+    use super::*;
+    use crate::sweep::runs::tests::finish;
+
+    /// A queue in `root`, where the run of its only plan is finished.
+    fn queue(root: &Path) -> (Queue, PlannedRun) {
+        let runs = Runs::open(root).unwrap();
+        let plan = PlannedRun::new("run".into(), Call::default(), 10);
+        finish(&runs.folder(&plan));
+        runs.write_call(&plan, "abc", false).unwrap();
+        let queue = Queue {
+            runs,
+            jobs: 1,
+            commit: "def".into(),
+            waiting: [(0, plan.clone())].into(),
+            running: Vec::new(),
+        };
+        (queue, plan)
+    }
+
+    #[test]
+    fn what_a_resumed_run_did_before_is_no_measure_of_speed() {
+        let root = tempfile::tempdir().unwrap();
+        let (queue, plan) = queue(root.path());
+        let metrics = queue.runs.folder(&plan).metrics();
+        std::fs::write(metrics, "seconds,frames,episodes\n60,9,0\n").unwrap();
+        let mut progress = Progress::new(10, Interrupts::default());
+        assert_eq!(queue.find(&plan, &mut progress), 9);
+        assert_eq!(progress.seconds_left(1.0), None);
+    }
+
+    /// As when a run saved while this call waited for its log.
+    #[test]
+    fn a_run_that_finished_meanwhile_is_not_made_again() {
+        let root = tempfile::tempdir().unwrap();
+        let (mut queue, plan) = queue(root.path());
+        let mut progress = Progress::new(10, Interrupts::default());
+        queue.make(&mut progress).unwrap();
+        assert_eq!(queue.runs.finished(&plan).unwrap().commit, "abc");
+    }
 }

@@ -9,12 +9,11 @@ use driml_launch::{
 use driml_learner::checkpoint::{self, AVERAGE};
 
 use super::plan::FinishedRun;
-use crate::cache::Session;
+use crate::{cache::Session, progress::Progress};
 
 /// Seed of the played episodes: the same levels for every run.
 const SEED: u64 = 1;
 
-/// What is played of a run.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Played {
     pub(crate) levels: Levels,
@@ -34,7 +33,9 @@ impl Played {
         run: &FinishedRun,
     ) -> anyhow::Result<Option<Vec<f64>>> {
         let of = format!("{} {}", run.summary.weights_sha256, self.episodes);
-        session.whole_piece(&of, key, self.units, || self.returns(&run.folder))
+        session.piece_of(&of, key, self.units, |progress| {
+            self.returns(&run.folder, progress)
+        })
     }
 
     /// Returns of a random policy in a run's world, on the levels trained on.
@@ -44,16 +45,21 @@ impl Played {
         key: &str,
         run: &FinishedRun,
     ) -> anyhow::Result<Vec<f64>> {
-        session.whole_piece(&self.episodes.to_string(), key, self.units, || {
+        session.piece_of(&self.episodes.to_string(), key, self.units, |_| {
             random_returns(&config_of(&run.folder)?, self.episodes as usize, SEED)
         })
     }
 
-    fn returns(self, folder: &RunFolder) -> anyhow::Result<Option<Vec<f64>>> {
+    fn returns(
+        self,
+        folder: &RunFolder,
+        progress: &mut Progress,
+    ) -> anyhow::Result<Option<Vec<f64>>> {
         let mut all = Vec::new();
         let players = players(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(players.len().max(1) as u32);
         for which in players {
+            progress.advance(0)?;
             let player = Player::load_at(folder, which, Weights::default())?;
             match player.returns(Who::Agent, self.levels, each, SEED)? {
                 Some(returns) => all.extend(returns),
@@ -64,7 +70,6 @@ impl Played {
     }
 }
 
-/// Which weights of a run play.
 fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>> {
     let all = checkpoint::list(&folder.checkpoints())?;
     let newest = all.last();

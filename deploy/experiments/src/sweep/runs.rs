@@ -13,6 +13,8 @@ use driml_launch::run_folder::{Outcome, RunFolder, Summary, progress as how_far,
 use super::plan::{FinishedRun, PlannedRun};
 use crate::cache::RUNS;
 
+/// Seeds up to which finished runs are looked for.
+pub(crate) const SEEDS_FOUND_MAX: u32 = 64;
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: u64 = 1200;
 
@@ -43,13 +45,16 @@ impl Runs {
             Outcome::Interrupted => enough,
             Outcome::Failed => false,
         };
-        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
-        let commit = commit.trim().to_owned();
         is_good.then_some(FinishedRun {
             folder,
             summary,
-            commit,
+            commit: self.commit(plan),
         })
+    }
+
+    fn commit(&self, plan: &PlannedRun) -> String {
+        let commit = fs::read_to_string(self.beside(plan, "commit")).unwrap_or_default();
+        commit.trim().to_owned()
     }
 
     /// Whether what lies in the plan's folder was begun by this very plan.
@@ -59,11 +64,26 @@ impl Runs {
         call.is_some_and(|args| args == plan.call.args())
     }
 
-    /// Notes that the plan's run is made by this plan, and by a program of this commit.
-    pub(super) fn write_call(&self, plan: &PlannedRun, commit: &str) -> anyhow::Result<()> {
+    /// Notes that the plan's run is made by this plan, and by a program of this commit; one that resumes keeps those before it.
+    pub(super) fn write_call(
+        &self,
+        plan: &PlannedRun,
+        commit: &str,
+        resumed: bool,
+    ) -> anyhow::Result<()> {
+        let before = if resumed {
+            self.commit(plan)
+        } else {
+            String::new()
+        };
+        let commits = match before.split('+').any(|it| it == commit) {
+            true => before,
+            false if before.is_empty() => commit.to_owned(),
+            false => format!("{before}+{commit}"),
+        };
         let call = serde_json::to_vec(&plan.call.args()).context("writing down a call")?;
         write_whole(&self.beside(plan, "call.json"), &call)?;
-        write_whole(&self.beside(plan, "commit"), commit.as_bytes())
+        write_whole(&self.beside(plan, "commit"), commits.as_bytes())
     }
 
     /// The end of what the run's process printed.
@@ -71,7 +91,6 @@ impl Runs {
         tail(&self.log(plan), LAST_WORDS_BYTES).unwrap_or_default()
     }
 
-    /// The folder of the plan's run.
     pub(super) fn folder(&self, plan: &PlannedRun) -> RunFolder {
         RunFolder::new(self.root.join(&plan.name))
     }
@@ -102,7 +121,6 @@ pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     Ok(Some(aside))
 }
 
-/// The end of a file.
 fn tail(path: &Path, bytes: u64) -> Option<String> {
     let mut file = File::open(path).ok()?;
     let length = file.metadata().ok()?.len();
@@ -114,7 +132,7 @@ fn tail(path: &Path, bytes: u64) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use driml_launch::{
         run_folder::RunRecorder,
         run_view::{Plan, RunView},
@@ -122,6 +140,20 @@ mod tests {
 
     use super::*;
     use crate::sweep::plan::Call;
+
+    /// Leaves what a finished run of a chain leaves.
+    pub(in crate::sweep) fn finish(folder: &RunFolder) {
+        let call = Call {
+            env: Some("chain".into()),
+            ..Call::default()
+        };
+        let config = call.config().unwrap();
+        let mut view = RunView::new(Plan::of(&config));
+        let mut recorder = RunRecorder::create(folder, &config, Vec::new()).unwrap();
+        recorder.record(&mut view, &[]);
+        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
+        summary.write(folder).unwrap();
+    }
 
     #[test]
     fn a_run_counts_for_the_plan_that_made_it_alone() {
@@ -136,20 +168,19 @@ mod tests {
             };
             PlannedRun::new("run".into(), call, frames)
         };
-        let folder = RunFolder::new(runs.root.join("run"));
-        let call = Call {
-            env: Some("chain".into()),
-            ..Call::default()
-        };
-        let config = call.config().unwrap();
-        let mut view = RunView::new(Plan::of(&config));
-        let mut recorder = RunRecorder::create(&folder, &config, Vec::new()).unwrap();
-        recorder.record(&mut view, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
-        summary.write(&folder).unwrap();
+        let folder = runs.folder(&plan(10));
+        finish(&folder);
         assert!(runs.finished(&plan(10)).is_none(), "it has no call");
-        runs.write_call(&plan(10), "abc").unwrap();
-        assert_eq!(runs.finished(&plan(10)).unwrap().commit, "abc");
+        for (commit, resumed, expected) in [
+            ("old", false, "old"),
+            ("abc", false, "abc"),
+            ("abc", true, "abc"),
+            ("def", true, "abc+def"),
+            ("abc", true, "abc+def"),
+        ] {
+            runs.write_call(&plan(10), commit, resumed).unwrap();
+            assert_eq!(runs.finished(&plan(10)).unwrap().commit, expected);
+        }
         assert!(runs.finished(&plan(20)).is_none());
         fs::remove_file(runs.beside(&plan(10), "commit")).unwrap();
         assert_eq!(runs.finished(&plan(10)).unwrap().commit, "");

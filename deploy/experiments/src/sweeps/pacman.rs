@@ -5,6 +5,7 @@ mod figure;
 mod results;
 mod settings;
 
+use driml_launch::metrics::rounded;
 use driml_protocol::RETURNS_OF;
 use minijinja::{Value, context};
 
@@ -15,8 +16,7 @@ use self::{
 use crate::{
     cache::Session,
     flags::PacmanArgs,
-    page::{Table, number},
-    sweep::queue,
+    sweep::{plan, queue},
 };
 
 /// Names of ghosts 0 to 3.
@@ -24,47 +24,40 @@ const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 /// How the page names (b) and (c).
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
-/// Runs the experiment.
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = settings::with_flags(args)?;
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     let report = args.queue.report;
+    queue::install(&plans, report)?;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any()?;
+    swept.check_any(report)?;
     let results = Results::read(settings, swept)?;
     session.figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
     session.finish(include_str!("pacman.md.j2"), values(&results))?;
-    queue::check_made(&results.missing, report)
+    plan::check_made(&results.missing, report)
 }
 
-/// Writes the tables.
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
-    let losses = results.losses.iter().map(|it| {
-        let of = format!("{},{},{}", it.epsilon, it.seed, it.column);
-        (of, it)
-    });
+    let losses = results.losses.iter();
+    let losses = losses.map(|it| ((it.epsilon, it.seed, it.column), it));
     let points = losses.clone().flat_map(|(of, it)| {
         let points = it.points.iter();
-        points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+        points.map(move |(x, y)| (of, *x as u64, rounded(*y)))
     });
-    let columns = "epsilon,seed,loss,frames,nats";
-    session.csv("loss", &Table::of_lines(columns, points))?;
-    let ends =
-        losses.map(|(of, it)| format!("{of},{},{}", number(it.last, 4), number(it.whole, 4)));
+    session.csv("loss", "epsilon,seed,loss,frames,nats", points)?;
+    let ends = losses.map(|(of, it)| (of, [it.last, it.whole].map(|it| it.map(rounded))));
     let columns = "epsilon,seed,loss,last_fifth_nats,whole_nats";
-    session.csv("final_loss", &Table::of_lines(columns, ends))?;
+    session.csv("final_loss", columns, ends)?;
     for (name, traces) in PART_NAMES.iter().zip(&results.traces) {
         let rows = traces.iter().flat_map(|it| {
-            let of = format!("{},{}", it.agent, it.seed);
             let points = it.points.iter();
-            points.map(move |(x, y)| format!("{of},{x:.0},{y:.4}"))
+            points.map(move |(x, y)| (&it.agent, it.seed, *x as u64, rounded(*y)))
         });
-        let columns = "agent,seed,episodes,mean_return";
-        session.csv(name, &Table::of_lines(columns, rows))?;
+        session.csv(name, "agent,seed,episodes,mean_return", rows)?;
     }
     Ok(())
 }
@@ -128,7 +121,6 @@ fn differences(part: usize, results: &Results) -> Vec<Value> {
     gains.chain(above_first).flatten().collect()
 }
 
-/// What the page says.
 fn values(results: &Results) -> Value {
     let settings = &results.settings;
     let (ghosts, noise) = (&settings.continual, &settings.noise);

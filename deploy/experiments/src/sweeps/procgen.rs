@@ -7,13 +7,16 @@ mod settings;
 use driml_launch::evaluate::Levels;
 
 use self::{
-    report::{Scored, data, games},
+    report::{Scored, games},
     settings::{NAME, Settings},
 };
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
-    sweep::{plan::Swept, queue},
+    sweep::{
+        plan::{self, Swept},
+        queue,
+    },
 };
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
@@ -25,9 +28,10 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     // Each run's agent plays, and a random policy beside it.
     let units = plans.len() as u64 * (settings.frames + 2 * play.units);
     let report = args.queue.report;
+    queue::install(&plans, report)?;
     let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any()?;
+    swept.check_any(report)?;
     let Swept { made, missing } = swept;
     let mut scored = Vec::new();
     for made in made {
@@ -40,11 +44,35 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             made,
         });
     }
-    session.csv("table", &data(&scored)?)?;
+    report::write_data(&session, &scored)?;
     let games = games(&settings, &scored);
     session.figure("curves", &report::figure(&settings, &games)?)?;
     let over_games = report::over_games(&mut session, &settings, &games)?;
     let values = report::values(&settings, &games, &over_games, scored.len(), &missing);
     session.finish(include_str!("procgen.md.j2"), values)?;
-    queue::check_made(&missing, report)
+    plan::check_made(&missing, report)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use driml_machine::error::Usage;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct CommandLine {
+        #[command(flatten)]
+        args: ProcgenArgs,
+    }
+
+    #[test]
+    fn a_setting_that_is_rejected_leaves_the_folder_to_the_corrected_call() {
+        let root = tempfile::tempdir().unwrap();
+        let out = format!("--out={}", root.path().join("x").display());
+        let words = ["procgen", "--smoke", "--set=learner.batchsize=64", &out];
+        let rejected = run(&CommandLine::parse_from(words).args).unwrap_err();
+        assert!(rejected.is::<Usage>(), "{rejected}");
+        assert!(!root.path().join("x").exists());
+    }
 }

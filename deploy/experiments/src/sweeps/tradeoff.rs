@@ -15,6 +15,7 @@ mod speed;
 use std::{collections::BTreeMap, time::Instant};
 
 use driml_launch::{
+    chosen::config_of,
     console::{self, print},
     evaluate::Levels,
 };
@@ -23,28 +24,24 @@ use driml_settings::{config::RunConfig, presets};
 
 use self::{
     dials::Point,
-    exactness::Exactness,
     plan::{Cost, Fit},
-    results::{PointResult, Results, SeedResult, fields},
+    results::{Measured, PointResult, Results, SeedResult},
     settings::Settings,
-    speed::Speed,
 };
 use crate::{
     cache::{self, Session},
     flags::{TradeoffArgs, this_command},
     stats::Spread,
     sweep::{
-        plan::{FinishedRun, Made, Planned, Swept},
+        plan::{FinishedRun, Made, Planned, Swept, check_made},
         queue,
         results::Played,
-        runs::Runs,
+        runs::{Runs, SEEDS_FOUND_MAX},
     },
 };
 
 /// The piece that lists the calls.
 const CALLS: &str = "calls";
-/// Seeds up to which finished runs are looked for.
-const SEEDS_FOUND_MAX: u32 = 64;
 /// A piece of measuring as a share of a run's work; only the estimate of the time left depends on it.
 const PIECE_SHARE: u64 = 20;
 /// What a run takes beside its updates and actions, as a factor: replay, messages, waiting for one another.
@@ -58,7 +55,7 @@ struct Tradeoff<'a> {
     settings: Settings,
     session: Session,
     /// The bench of points by their keys.
-    speeds: BTreeMap<String, Speed>,
+    speeds: BTreeMap<String, Measured>,
 }
 
 /// Measures what each dial that buys speed costs: plans, benches, trains, and writes the page.
@@ -98,9 +95,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     }
     let results = it.make(&fit.chosen)?;
     if results.levels.is_empty() {
-        if !results.points.is_empty() {
-            queue::check_made(&results.missing, report_only)?;
-        }
+        check_made(&results.missing, report_only)?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
             false => "no level has a finished run beside its base's",
@@ -110,7 +105,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
         );
     }
     report::report(it.session, &results)?;
-    queue::check_made(&results.missing, report_only)
+    check_made(&results.missing, report_only)
 }
 
 /// Makes the runs shorter if not even the first level fits into the budget.
@@ -130,9 +125,9 @@ fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow:
 }
 
 /// Seconds of a run, about.
-fn estimate(config: &RunConfig, speed: &Speed) -> f64 {
-    let updates = config.updates() as f64 * speed.update_seconds;
-    let actions = config.frames() as f64 * speed.act_seconds;
+fn estimate(config: &RunConfig, speed: &Measured) -> f64 {
+    let updates = config.updates() as f64 * speed["update_seconds"];
+    let actions = config.frames() as f64 * speed["act_seconds"];
     START_SECONDS + OVERHEAD * (updates + actions)
 }
 
@@ -159,8 +154,8 @@ impl Tradeoff<'_> {
                     let common = &self.settings.common;
                     let (base, config) = (common.config(&of.base)?, common.config(point)?);
                     self.session.work().1.again(units);
-                    let measure = || speed::measure(&base, &config, smoke);
-                    Some(self.session.whole_piece(&program, &key, units, measure)?)
+                    let measure = |_: &mut _| speed::measure(&base, &config, smoke);
+                    Some(self.session.piece_of(&program, &key, units, measure)?)
                 };
                 self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
             }
@@ -278,6 +273,7 @@ impl Tradeoff<'_> {
     fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
+        queue::install(&wanted, report_only)?;
         let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
         // A random policy plays once.
         self.session.work().1.again(work + units);
@@ -301,8 +297,8 @@ impl Tradeoff<'_> {
             }
             // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
             if !points.contains_key(&point.key) {
-                let mut measured = fields(self.speeds.get(&point.key));
-                measured.extend(fields(Some(self.exactness(&point, &run)?)));
+                let mut measured = self.exactness(&point, &run)?;
+                measured.extend(self.speeds.get(&point.key).cloned().unwrap_or_default());
                 let seeds = Vec::new();
                 points.insert(point.key.clone(), PointResult { measured, seeds });
             }
@@ -332,17 +328,17 @@ impl Tradeoff<'_> {
         })
     }
 
-    fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Exactness> {
-        let (units, config) = (self.piece_units(), self.settings.common.config(point)?);
+    fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
+        // The run's own: its seed need not be the first.
+        let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.work().1.again(units);
-        let (rows, states) = exactness::sizes(&config);
-        let of = format!(
-            "{}, {rows} rows, {states} states",
-            run.summary.weights_sha256
-        );
         let key = format!("exactness-{}", point.key);
-        let measure = || exactness::measure(&config, &run.folder);
-        self.session.whole_piece(&of, &key, units, measure)
+        let kept = self.session.made_of(&key);
+        let kept = kept.filter(|_| self.args.queue.report);
+        let weights = &run.summary.weights_sha256;
+        let of = exactness::made_of(weights, &config, &cache::program()?, kept);
+        let measure = |_: &mut _| exactness::measure(&config, &run.folder);
+        self.session.piece_of(&of, &key, units, measure)
     }
 
     /// The calls that made the folder's runs, this one last unless it makes none.

@@ -5,6 +5,7 @@ mod training;
 
 use driml_envs::{WorldConfig, WorldName};
 use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
+use driml_launch::metrics::rounded;
 use driml_machine::{error::usage, resources::Machine};
 use driml_settings::{
     presets,
@@ -16,7 +17,6 @@ use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags},
-    page::{Table, numbers},
     plot::Curve,
     stats::Spread,
 };
@@ -48,7 +48,6 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
     })
 }
 
-/// Runs the experiment.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,
@@ -78,21 +77,21 @@ fn write_data(session: &Session, trained: &[Trained]) -> anyhow::Result<()> {
     let checks = seeds().flat_map(|(seed, one)| {
         one.checks.iter().map(move |(update, it)| {
             let of_check = [it.auc, it.auc_raw, it.auc_clear, it.auc_pairs, it.loss];
-            format!("{seed},{update},{}", numbers(of_check, 4))
+            (seed, *update, of_check.map(rounded))
         })
     });
     let columns = "seed,updates,auc,auc_raw_score,auc_clear,auc_pairs,loss_nats";
-    session.csv("auc", &Table::of_lines(columns, checks))?;
+    session.csv("auc", columns, checks)?;
     let losses = seeds().flat_map(|(seed, one)| {
-        smoothed(&one.loss).map(move |(update, loss)| format!("{seed},{update},{loss:.4}"))
+        smoothed(&one.loss).map(move |(update, loss)| (seed, update as u64, rounded(loss)))
     });
-    session.csv("loss", &Table::of_lines("seed,updates,loss_nats", losses))?;
+    session.csv("loss", "seed,updates,loss_nats", losses)?;
     let maps = (1u32..).zip(&trained[0].maps).flat_map(|(episode, map)| {
         let scores = map.iter().enumerate();
-        scores.map(move |(at, score)| format!("{episode},{at},{score:.4}"))
+        scores.map(move |(at, score)| (episode, at, rounded(*score)))
     });
     let columns = "episode,location,score_nats";
-    session.csv("maps", &Table::of_lines(columns, maps))
+    session.csv("maps", columns, maps)
 }
 
 /// Means of `LOSS_WINDOW` updates each, at their end.

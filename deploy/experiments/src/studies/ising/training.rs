@@ -21,7 +21,6 @@ pub(super) struct Settings {
     /// Seeds 1 to this. No piece depends on it, so that more can be added later.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
-    /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
     pub(super) batch_size: usize,
@@ -49,7 +48,6 @@ pub(super) struct Task {
 /// Seed of the worlds that are measured on: the same for every training, and of none that is trained on.
 const MEASURED_SEED: u64 = 1 << 40;
 
-/// What one training left.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Trained {
     /// InfoNCE's loss at each update, in nats.

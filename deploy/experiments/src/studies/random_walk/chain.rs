@@ -125,7 +125,6 @@ impl Chain {
         apart * apart + 4.0 * up * down * sine * sine
     }
 
-    /// A step from `state`.
     pub(super) fn step(&self, state: usize, rng: &mut impl Rng) -> usize {
         if rng.random::<f64>() < self.alpha {
             (state + 1).min(self.states - 1)

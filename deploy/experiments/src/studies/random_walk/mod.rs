@@ -6,6 +6,7 @@ mod figures;
 mod results;
 mod training;
 
+use driml_launch::metrics::rounded;
 use minijinja::{Value, context};
 
 use self::{
@@ -16,14 +17,12 @@ use self::{
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags},
-    page::{Table, number, numbers},
     plot::Curve,
     stats::Spread,
 };
 
 const NAME: &str = "random-walk";
 
-/// Runs the experiment.
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(
         NAME,
@@ -78,41 +77,39 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
             chain.spectral_gap(),
             chain::spectral_gap_numerically(&t, k),
         ];
-        format!("{alpha},{}", numbers(of_chain, 6))
+        (alpha, of_chain.map(rounded))
     });
     let columns = "alpha,mi_nats,mi_numerical_nats,mi_learnt_nats,mi_ring_nats,mi_as_printed_nats,gap,gap_numerical";
-    session.csv("alpha", &Table::of_lines(columns, laws))?;
+    session.csv("alpha", columns, laws)?;
 
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let entries = truth.iter().zip(&learnt).enumerate();
     let entries = entries.map(|(at, (truth, learnt))| {
-        let (state, next) = (at / k + 1, at % k + 1);
-        let entry = numbers([*truth, learnt.mean, learnt.sd], 6);
-        format!("{state},{next},{entry}")
+        let entry = [*truth, learnt.mean, learnt.sd].map(rounded);
+        (at / k + 1, at % k + 1, entry)
     });
     let columns = "state,next,true_ratio,learnt_mean,learnt_sd";
-    session.csv("ratio", &Table::of_lines(columns, entries))?;
+    session.csv("ratio", columns, entries)?;
 
     let times = results.trained.iter().map(|one| {
-        let time = |measure: Measure| number(measure(one).map(|it| it as f64), 0);
-        let (name, alpha, seed) = (one.sampling.name(), one.chain.alpha, one.seed);
-        let (gap, tv, share) = (one.chain.spectral_gap(), time(TV), time(SHARE));
-        let last = numbers([one.final_tv(), one.final_excess()], 6);
-        format!("{name},{alpha},{seed},{gap:.6},{tv},{share},{last}")
+        let gap = rounded(one.chain.spectral_gap());
+        let of = (one.sampling.name(), one.chain.alpha, one.seed, gap);
+        let last = [one.final_tv(), one.final_excess()].map(rounded);
+        (of, TV(one), SHARE(one), last)
     });
     let columns =
         "sampling,alpha,seed,gap,updates_to_tv,updates_to_share,final_tv,final_excess_nats";
-    session.csv("convergence", &Table::of_lines(columns, times))?;
+    session.csv("convergence", columns, times)?;
 
     let curves = results.shown().into_iter().flat_map(|alpha| {
         let Curve { points, band } = results.tv_curve(alpha);
         let rows = points.into_iter().zip(band);
         rows.map(move |((updates, mean), (_, min, max))| {
-            format!("{alpha},{updates},{}", numbers([mean, min, max], 5))
+            (alpha, updates as u64, [mean, min, max].map(rounded))
         })
     });
     let columns = "alpha,updates,tv_mean,tv_min,tv_max";
-    session.csv("curves", &Table::of_lines(columns, curves))
+    session.csv("curves", columns, curves)
 }
 
 fn values(results: &Results) -> Value {

@@ -9,7 +9,6 @@ use crate::{
     stats::{Spread, rank_correlation},
 };
 
-/// One training of the grid.
 pub(super) struct Trained {
     pub(super) chain: Chain,
     pub(super) sampling: Sampling,
@@ -36,7 +35,6 @@ pub(super) type Measure = fn(&Trained) -> Option<u64>;
 pub(super) const TV: Measure = |it| it.updates_to_tv;
 pub(super) const SHARE: Measure = |it| it.updates_to_share;
 
-/// All trainings, and what was asked for.
 pub(super) struct Results {
     pub(super) settings: Settings,
     pub(super) trained: Vec<Trained>,

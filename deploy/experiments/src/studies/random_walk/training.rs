@@ -20,7 +20,6 @@ const WARMUP_TRANSITIONS: usize = 16;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
-    /// States of the chain.
     pub(super) states: usize,
     /// Probabilities of a step up.
     pub(super) alphas: Vec<f64>,
@@ -29,7 +28,6 @@ pub(super) struct Settings {
     /// Seeds 1 to this. No piece depends on it, so that more can be added later.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
-    /// Updates of a training.
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
     pub(super) batch_size: usize,
@@ -47,7 +45,6 @@ pub(super) struct Settings {
     /// Share of the mutual information that is still missed when a training counts as converged.
     #[serde(skip_serializing)]
     pub(super) share_reached: f64,
-    /// The optimiser's numbers.
     pub(super) adam: AdamSettings,
 }
 

@@ -20,12 +20,8 @@ pub(super) fn figure(results: &Results) -> Figure {
         let mut series = Vec::new();
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
-            let each = results.losses(column, epsilon).map(|it| {
-                let mut points = smoothed(&it.points, window);
-                // While the learner catches up at the end, several rows have the same frames.
-                points.dedup_by_key(|point| point.0);
-                points
-            });
+            let each = results.losses(column, epsilon);
+            let each = each.map(|it| smoothed(&it.points, window));
             let curve = over_seeds(&each.collect::<Vec<_>>());
             series.push(curve.series(&format!("epsilon {epsilon}"), index));
         }

@@ -17,14 +17,12 @@ const FINAL: f64 = 0.2;
 /// (x, y) in the order of x.
 pub(super) type Points = Vec<(f64, f64)>;
 
-/// All there is to report.
 pub(super) struct Results {
     pub(super) settings: Settings,
     /// Of (a).
     pub(super) losses: Vec<Loss>,
     /// Of (b) and of (c).
     pub(super) traces: [Vec<Trace>; PARTS],
-    /// Runs that are missing.
     pub(super) missing: Vec<String>,
 }
 
@@ -39,7 +37,6 @@ pub(super) struct Loss {
     /// Means of the last fifth and of the whole run; none if it has no value there.
     pub(super) last: Option<f64>,
     pub(super) whole: Option<f64>,
-    /// Of the run.
     pub(super) episodes: f64,
 }
 
@@ -94,13 +91,11 @@ impl Results {
         })
     }
 
-    /// The losses of one column and one epsilon.
     pub(super) fn losses(&self, column: &str, epsilon: f64) -> impl Iterator<Item = &Loss> {
         let all = self.losses.iter();
         all.filter(move |it| it.column == column && it.epsilon == epsilon)
     }
 
-    /// The traces of an agent, by seed.
     pub(super) fn traces(&self, part: usize, agent: &str) -> impl Iterator<Item = &Trace> {
         let all = self.traces[part].iter();
         all.filter(move |it| it.agent == agent)

@@ -44,7 +44,6 @@ pub(super) struct Settings {
 pub(super) struct Predictability {
     pub(super) agent: String,
     pub(super) epsilons: Vec<f64>,
-    /// Frames of a run.
     pub(super) frames: u64,
 }
 
@@ -52,7 +51,6 @@ pub(super) struct Predictability {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Continual {
-    /// Tasks of a run.
     pub(super) tasks: u64,
     /// The lethal ghost of each task; after the last the first again.
     pub(super) order: Vec<u8>,
@@ -65,7 +63,6 @@ pub(super) struct Continual {
 }
 
 impl Continual {
-    /// Episodes of a whole run.
     pub(super) const fn episodes(&self) -> u64 {
         self.tasks * self.episodes_per_task
     }
@@ -91,7 +88,6 @@ impl Settings {
         [&self.continual, &self.noise][part]
     }
 
-    /// The runs of a seed.
     pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
         let mut plans = Vec::new();
         let Predictability {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
-use driml_launch::{evaluate::Levels, run_folder::RunFolder};
+use driml_launch::{evaluate::Levels, metrics::rounded, run_folder::RunFolder};
 use driml_protocol::RETURNS_OF;
 use minijinja::{Value, context};
 use serde::Serialize;
@@ -12,7 +12,6 @@ use serde::Serialize;
 use super::settings::{CHECKPOINTS, Point, Settings};
 use crate::{
     cache::Session,
-    page::{Table, number},
     plot::{Run, over_seeds},
     stats::{
         Spread,
@@ -24,7 +23,6 @@ use crate::{
 
 /// Standard errors from which on a mean return counts as different from the random policy's.
 const ERRORS: f64 = 2.0;
-/// Frames of the paper's runs.
 const PAPER_FRAMES: f64 = 50e6;
 /// Seeds of each game and agent from which on scores over all games are made.
 const SEEDS_MIN: usize = 3;
@@ -39,7 +37,6 @@ pub(super) struct Scored {
 }
 
 impl Scored {
-    /// Whether a run's greedy episodes are better than the random policy's.
     fn is_above_random(&self) -> bool {
         let spreads = [&self.greedy, &self.random].map(|it| Spread::of(it.iter().copied()));
         let [Some(greedy), Some(random)] = spreads else {
@@ -72,7 +69,6 @@ struct OfAgent<'a> {
     is_above_random: bool,
 }
 
-/// The games of all runs.
 pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Game<'a>> {
     let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
     for it in scored {
@@ -102,26 +98,26 @@ pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Gam
 }
 
 /// A line a run.
-pub(super) fn data(scored: &[Scored]) -> anyhow::Result<Table> {
+pub(super) fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
+    let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     let mut rows = Vec::new();
     for it in scored {
         let Made { point, plan, run } = &it.made;
-        rows.push(vec![
-            point.game.clone(),
-            point.agent.clone(),
-            torso(&run.folder)?,
-            plan.call.seed.to_string(),
-            run.summary.frames.to_string(),
-            number(run.summary.mean_return, 4),
-            number(mean(&it.greedy), 4),
-            number(mean(&it.random), 4),
-            number(paper(&point.game, &point.agent), 4),
-            format!("{:.0}", run.summary.wall_seconds),
-            run.commit.clone(),
-        ]);
+        let summary = &run.summary;
+        let returns = [
+            summary.mean_return,
+            mean(&it.greedy),
+            mean(&it.random),
+            paper(&point.game, &point.agent),
+        ];
+        rows.push((
+            (&point.game, &point.agent, torso(&run.folder)?),
+            (plan.call.seed, summary.frames),
+            returns.map(|it| it.map(rounded)),
+            (summary.wall_seconds.round() as u64, &run.commit),
+        ));
     }
-    let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
-    Ok(Table::new(columns.split(','), rows))
+    session.csv("table", columns, rows)
 }
 
 /// The torso of a run's network, from its settings; those without a choice have the one of Nature's DQN.

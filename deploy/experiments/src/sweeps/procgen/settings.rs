@@ -84,7 +84,6 @@ impl Settings {
         Ok(settings)
     }
 
-    /// The runs of a seed.
     pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
         let mut plans = Vec::new();
         let games = self.games.iter();

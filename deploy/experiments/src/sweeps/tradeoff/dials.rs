@@ -30,7 +30,6 @@ fn c51() -> String {
     "c51".into()
 }
 
-/// A level of a dial.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Level {
@@ -52,7 +51,6 @@ pub(super) struct Point {
     pub(super) sets: Vec<String>,
 }
 
-/// A level of a dial and its base.
 #[derive(Clone, Debug)]
 pub(super) struct LevelOf {
     pub(super) dial: Dial,
@@ -106,7 +104,6 @@ fn slug(name: &str) -> String {
     parts.collect::<Vec<_>>().join("-")
 }
 
-/// The file of settings.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
@@ -136,7 +133,6 @@ fn file() -> File {
         .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"))
 }
 
-/// The full or the smoke length.
 pub(super) fn length(smoke: bool) -> Length {
     let file = file();
     if smoke { file.smoke } else { file.full }

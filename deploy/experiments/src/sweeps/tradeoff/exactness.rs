@@ -10,42 +10,36 @@ use driml_learner::{
 };
 use driml_model::PolicyNetwork;
 use driml_settings::config::RunConfig;
-use serde::{Deserialize, Serialize};
 
-use super::fixed_batch;
+use super::{fixed_batch, results::Measured};
 
 /// Rows of the batch whose loss and gradient are compared, at most.
 const ROWS_MAX: usize = 64;
 /// States whose values and greedy actions are compared, for each of these rows.
 const STATES_A_ROW: usize = 16;
 
-/// Errors of a level against the reference, at the weights of one of its runs; named as in the data.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) struct Exactness {
-    /// Relative error of the total loss.
-    loss_error: f64,
-    /// Relative error of the gradient, and 1 - cosine of its angle to the reference.
-    gradient_error: f64,
-    gradient_angle: f64,
-    /// Of the learner's values, in units of return.
-    q_rms_error: f64,
-    q_max_error: f64,
-    /// Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
-    same_action_learner: f64,
-    same_action_actor: f64,
-    /// Of the actor's values.
-    actor_q_rms_error: f64,
+/// Of what the errors of a run of `config` with these weights are made, for [`Session::piece_of`](crate::cache::Session::piece_of): the
+/// `program` does the arithmetic. A report takes the `kept` errors of any.
+pub(super) fn made_of(
+    weights: &str,
+    config: &RunConfig,
+    program: &str,
+    kept: Option<String>,
+) -> String {
+    let (rows, states) = sizes(config);
+    let of = format!("{weights}, {rows} rows, {states} states");
+    let kept = kept.filter(|kept| kept.starts_with(&of));
+    kept.unwrap_or_else(|| format!("{of}, {program}"))
 }
 
-/// Of what the errors of a run of `config` are made, beside its weights: rows whose loss and gradient are compared, and states whose values
-/// and greedy actions are.
+/// Rows whose loss and gradient are compared, and states whose values and greedy actions are.
 pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
     let rows = ROWS_MAX.min(config.learner.batch_size as usize);
     (rows, rows * STATES_A_ROW)
 }
 
 /// Measures the newest checkpoint of a run of a level with `config`.
-pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Exactness> {
+pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Measured> {
     let (model, update) = (&config.model, &config.learner.update);
     let compute = Compute::cpu(config.learner.precision);
     let restored = checkpoint::load_latest(
@@ -76,14 +70,39 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
     let expected = reference.q_values_t(&held.batch())?;
     let [learning, acting] = [agent.q_values_t(&held.batch())?, acted]
         .map(|values| QError::of(&values, &expected, model.num_actions));
-    Ok(Exactness {
-        loss_error: found.loss,
-        gradient_error: found.gradient,
-        gradient_angle: found.angle,
-        q_rms_error: learning.rms,
-        q_max_error: learning.max,
-        same_action_learner: learning.same_action,
-        same_action_actor: acting.same_action,
-        actor_q_rms_error: acting.rms,
-    })
+    let errors = [
+        // Relative: of the total loss, of the gradient, and 1 - cosine of its angle to the reference.
+        ("loss_error", found.loss),
+        ("gradient_error", found.gradient),
+        ("gradient_angle", found.angle),
+        // Of the learner's values, in units of return.
+        ("q_rms_error", learning.rms),
+        ("q_max_error", learning.max),
+        // Share of states with the reference's greedy action: by the learner, and by an actor with the weights as they are published.
+        ("same_action_learner", learning.same_action),
+        ("same_action_actor", acting.same_action),
+        // Of the actor's values.
+        ("actor_q_rms_error", acting.rms),
+    ];
+    Ok(errors.map(|(name, it)| (name.to_owned(), it)).into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sweep::plan::Call;
+
+    #[test]
+    fn errors_are_of_the_program_that_computes_them() {
+        let call = Call {
+            env: Some("chain".into()),
+            ..Call::default()
+        };
+        let config = call.config().unwrap();
+        let of = |weights, program, kept| made_of(weights, &config, program, kept);
+        let old = of("w", "old", None);
+        assert_ne!(of("w", "new", None), old);
+        assert_eq!(of("w", "new", Some(old.clone())), old, "for a report");
+        assert_eq!(of("v", "new", Some(old)), of("v", "new", None));
+    }
 }

@@ -5,12 +5,10 @@ use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 use super::results::{FRAMES_PER_SECOND, Measure, PointResult, Results};
 use crate::{plot::over_seeds, stats::Spread};
 
-/// Panels side by side.
 const COLUMNS: usize = 3;
 /// Width and height of a panel.
 const PANEL: (f64, f64) = (330.0, 250.0);
 
-/// A point in return and speed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Placed {
     speed: f64,

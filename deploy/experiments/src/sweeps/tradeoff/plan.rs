@@ -10,7 +10,6 @@ pub(super) struct Cost {
     pub(super) seconds: f64,
 }
 
-/// What fits into a budget.
 #[derive(Debug, PartialEq)]
 pub(super) struct Fit {
     /// Whether each level does.

@@ -2,9 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use driml_launch::metrics::rounded;
 use minijinja::{Value, context};
 use serde::Serialize;
-use serde_json::Value as Json;
 
 use super::{
     exactness, figures,
@@ -12,26 +12,25 @@ use super::{
 };
 use crate::{
     cache::Session,
-    page::{Table, interval_cells, number},
-    stats::{apart_by_chance, difference, interval},
+    stats::{Interval, apart_by_chance, difference, interval},
 };
 
-/// What the bench and the errors against the reference give, as the data has it, and its decimals; none for `1.234e-5`.
-const MEASURED: [(&str, Option<usize>); 14] = [
-    ("update_seconds", Some(6)),
-    ("rows_gain", Some(4)),
-    ("act_seconds", Some(9)),
-    ("act_gain", Some(4)),
-    ("weights_bytes", Some(0)),
-    ("frame_bytes", Some(0)),
-    ("loss_error", None),
-    ("gradient_error", None),
-    ("gradient_angle", None),
-    ("q_rms_error", None),
-    ("q_max_error", None),
-    ("same_action_learner", None),
-    ("same_action_actor", None),
-    ("actor_q_rms_error", None),
+/// What the bench and the errors against the reference give, as the data has it.
+const MEASURED: [&str; 14] = [
+    "update_seconds",
+    "rows_gain",
+    "act_seconds",
+    "act_gain",
+    "weights_bytes",
+    "frame_bytes",
+    "loss_error",
+    "gradient_error",
+    "gradient_angle",
+    "q_rms_error",
+    "q_max_error",
+    "same_action_learner",
+    "same_action_actor",
+    "actor_q_rms_error",
 ];
 /// C51 beside an agent with DIM in training return, as the data has it.
 const EQUAL_TIME: &str = "agent,base,equal_seconds,\
@@ -40,15 +39,11 @@ const EQUAL_TIME: &str = "agent,base,equal_seconds,\
 /// The dial that turns DIM on.
 const DIM: &str = "DIM";
 
-/// Writes them all.
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let equal = equal_time(results)?;
-    session.csv("runs", &runs(results))?;
-    session.csv("levels", &levels(results))?;
-    session.csv(
-        "equal_time",
-        &Table::new(EQUAL_TIME.split(','), equal.iter().map(EqualTime::cells)),
-    )?;
+    write_runs(&session, results)?;
+    write_levels(&session, results)?;
+    session.csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
     for (stem, returns, name) in [
         ("pareto", GREEDY, "greedy"),
         ("pareto_training", TRAINING, "training"),
@@ -59,57 +54,48 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     session.finish(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
 }
 
-fn runs(results: &Results) -> Table {
+fn write_runs(session: &Session, results: &Results) -> anyhow::Result<()> {
     let names = MEASURES.map(|it| it.name).join(",");
     let columns = format!("point,agent,seed,updates,updates_per_second,weights_sha256,{names}");
     let all = results.points.iter();
     let all = all.flat_map(|(key, point)| point.seeds.iter().map(move |it| (key, it)));
     let rows = all.map(|(key, it)| {
         let summary = &it.ran.summary;
-        let mut row = vec![
-            key.clone(),
-            summary.agent.clone(),
-            it.seed.to_string(),
-            summary.updates.to_string(),
-            format!("{:.2}", summary.updates_per_second),
-            summary.weights_sha256.clone(),
-        ];
-        row.extend(MEASURES.map(|measure| number((measure.of)(it), 4)));
-        row
+        let speed = (summary.updates, rounded(summary.updates_per_second));
+        let measured = MEASURES.map(|measure| (measure.of)(it).map(rounded));
+        let of = (key, &summary.agent, it.seed);
+        (of, speed, &summary.weights_sha256, measured)
     });
-    Table::new(columns.split(','), rows)
+    session.csv("runs", &columns, rows)
 }
 
-fn levels(results: &Results) -> Table {
-    let mut columns = "dial,level,base,seeds".to_owned();
-    for (name, _) in MEASURED {
-        columns += &format!(",{name}");
-    }
+fn write_levels(session: &Session, results: &Results) -> anyhow::Result<()> {
+    let mut columns = format!("dial,level,base,seeds,{}", MEASURED.join(","));
     for name in MEASURES.map(|it| it.name) {
         columns += &format!(",{name},{name}_low,{name}_high");
         columns += &format!(",{name}_minus_base,{name}_minus_base_low,{name}_minus_base_high");
     }
-    let rows = results.by_dial().flatten();
-    Table::new(columns.split(','), rows.map(|it| cells(&it)))
+    let rows = results.by_dial().flatten().map(|row| {
+        let measured = |name| row.result.measured.get(name).copied();
+        let of_runs = MEASURES.map(|measure| {
+            let difference = row.difference(measure).filter(|_| !row.is_base);
+            let both = [row.result.mean(measure), difference.map(|it| it.interval)];
+            both.map(interval_cells)
+        });
+        (
+            (&row.dial.name, row.name, &row.dial.base),
+            row.result.seeds.len(),
+            MEASURED.map(|name| measured(name).map(rounded)),
+            of_runs,
+        )
+    });
+    session.csv("levels", &columns, rows)
 }
 
-fn cells(row: &Row<'_>) -> Vec<String> {
-    let seeds = row.result.seeds.len().to_string();
-    let (dial, name, base) = (&row.dial.name, row.name.to_owned(), &row.dial.base);
-    let mut cells = vec![dial.clone(), name, base.clone(), seeds];
-    cells.extend(MEASURED.map(|(name, decimals)| {
-        let value = row.result.measured.get(name).and_then(Json::as_f64);
-        match decimals {
-            Some(decimals) => number(value, decimals),
-            None => value.map_or(String::new(), |it| format!("{it:.3e}")),
-        }
-    }));
-    for measure in MEASURES {
-        let difference = row.difference(measure).filter(|_| !row.is_base);
-        cells.extend(interval_cells(row.result.mean(measure)));
-        cells.extend(interval_cells(difference.map(|it| it.interval)));
-    }
-    cells
+/// Mean, low and high end; empty where there is none.
+fn interval_cells(of: Option<Interval>) -> [Option<f64>; 3] {
+    let (low, high) = of.and_then(|it| it.ends).unzip();
+    [of.map(|it| it.mean), low, high].map(|it| it.map(rounded))
 }
 
 /// C51 beside an agent with DIM in training return, by the base's runs and the level's.
@@ -128,18 +114,13 @@ struct EqualTime {
 
 impl EqualTime {
     /// As [`EQUAL_TIME`] has it.
-    fn cells(&self) -> Vec<String> {
-        let mut row = vec![self.agent.clone(), self.base.clone()];
-        row.push(format!("{:.3}", self.seconds));
-        for (base, level) in [
+    fn cells(&self) -> impl Serialize {
+        let minus_base = [
             (&self.base_end, &self.level_end),
             (&self.base_then, &self.level_then),
-        ] {
-            row.extend(interval_cells(
-                difference(base, level).map(|it| it.interval),
-            ));
-        }
-        row
+        ]
+        .map(|(base, level)| interval_cells(difference(base, level).map(|it| it.interval)));
+        (&self.agent, &self.base, rounded(self.seconds), minus_base)
     }
 }
 
@@ -183,7 +164,6 @@ fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
     before.map(|(_, value)| *value)
 }
 
-/// What the page says.
 fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let common = &results.common;
     let (rows, states) = exactness::sizes(&common.config(&results.levels[0].base)?);
@@ -227,7 +207,7 @@ fn page_row(row: &Row<'_>) -> BTreeMap<&'static str, Value> {
     values.insert("level", row.name.into());
     values.insert("agent", row.agent.into());
     values.insert("frames_gain", Value::from_serialize(row.frames_gain()));
-    for (name, _) in MEASURED {
+    for name in MEASURED {
         values.insert(name, Value::from_serialize(row.result.measured.get(name)));
     }
     for measure in MEASURES {

@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::Serialize;
-use serde_json::{Map, Value};
+use serde_json::Value;
 
 use super::{
     dials::{Dial, LevelOf},
@@ -15,20 +14,14 @@ use crate::{
     sweep::{plan::FinishedRun, results::mean},
 };
 
-/// What a point gave.
+/// Numbers of the bench, or errors against the reference, by their names in the data.
+pub(super) type Measured = BTreeMap<String, f64>;
+
 #[derive(Default)]
 pub(super) struct PointResult {
-    /// The bench, and the errors at the weights of its first seed, by their names in the data.
-    pub(super) measured: Map<String, Value>,
+    /// The bench, and the errors at the weights of its first seed.
+    pub(super) measured: Measured,
     pub(super) seeds: Vec<SeedResult>,
-}
-
-/// The fields of a measurement by their names; none if there is none.
-pub(super) fn fields(measured: Option<impl Serialize>) -> Map<String, Value> {
-    match serde_json::to_value(measured) {
-        Ok(Value::Object(map)) => map,
-        _ => Map::new(),
-    }
 }
 
 /// A finished run and the returns of its agent, played greedily.
@@ -38,7 +31,6 @@ pub(super) struct SeedResult {
     pub(super) greedy: Vec<f64>,
 }
 
-/// All there is to report.
 pub(super) struct Results {
     pub(super) common: Common,
     /// Levels that have runs, as their bases do.

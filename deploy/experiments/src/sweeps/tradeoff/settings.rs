@@ -61,7 +61,7 @@ pub(super) fn of(
         },
         levels: dials::levels(world, &args.dials)?,
         seeds: args.flags.seeds.unwrap_or(length.seeds),
-        frames_open: frames.is_none(),
+        frames_open: frames.is_none() && !args.queue.report,
     })
 }
 
@@ -77,12 +77,10 @@ impl Settings {
 }
 
 impl Common {
-    /// The resolved settings of a run at `point`.
     pub(super) fn config(&self, point: &Point) -> Result<RunConfig, Usage> {
         self.run(point, 1).call.config()
     }
 
-    /// The run of a seed at `point`.
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
         PlannedRun::new(
             format!("{}-seed{seed}", point.key),
@@ -214,6 +212,8 @@ coinrun|observation|input.height=64 input.width=64";
             (again.common.frames, again.common.jobs, again.frames_open),
             (777, 2, false)
         );
+        // A report measures nothing, so it chooses no length.
+        assert!(!of("--env mspacman --report", None).unwrap().frames_open);
     }
 
     #[test]

@@ -3,14 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use crate::flags::BenchFlags;
-
 /// What is measured; a call is what is timed.
-pub(super) type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
+pub type Work<'a> = Box<dyn FnMut() -> anyhow::Result<()> + 'a>;
 
 /// How long each thing is measured.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Effort {
+pub struct Effort {
     /// Calls before the first that counts.
     warmup_calls: u32,
     /// Calls that count, at least.
@@ -20,9 +18,9 @@ pub(super) struct Effort {
 }
 
 impl Effort {
-    /// What the flags ask for.
-    pub(super) fn new(flags: &BenchFlags) -> Self {
-        let (warmup_calls, calls_min, time_min) = match flags.quick {
+    /// Four seconds, or a fifth of one.
+    pub const fn new(quick: bool) -> Self {
+        let (warmup_calls, calls_min, time_min) = match quick {
             true => (1, 2, Duration::from_millis(200)),
             false => (2, 3, Duration::from_secs(4)),
         };
@@ -34,7 +32,7 @@ impl Effort {
     }
 
     /// Calls of `work` a second, by the median of their durations: for calls that all do the same.
-    pub(super) fn rate_by_median<'a>(
+    pub fn rate_by_median<'a>(
         &self,
         work: impl FnMut() -> anyhow::Result<()> + 'a,
     ) -> anyhow::Result<f64> {
@@ -42,7 +40,7 @@ impl Effort {
     }
 
     /// Calls of `work` a second over all of them: for calls of which a few do much more than the others.
-    pub(super) fn rate_overall<'a>(
+    pub fn rate_overall<'a>(
         &self,
         work: impl FnMut() -> anyhow::Result<()> + 'a,
     ) -> anyhow::Result<f64> {
@@ -51,7 +49,7 @@ impl Effort {
     }
 
     /// Calls a second of each of `works`, by the median. They take turns, so that a load of the machine affects them alike.
-    pub(super) fn rates_in_turn(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<f64>> {
+    pub fn rates_in_turn(&self, works: &mut [Work<'_>]) -> anyhow::Result<Vec<f64>> {
         let durations = self.durations(works)?;
         Ok(durations.iter().map(|it| 1.0 / median(it)).collect())
     }
@@ -74,13 +72,13 @@ impl Effort {
     }
 
     /// Whether something that began at `started` has been measured for long enough.
-    pub(super) fn is_spent(&self, started: Instant) -> bool {
+    pub fn is_spent(&self, started: Instant) -> bool {
         started.elapsed() >= self.time_min
     }
 }
 
 /// The middle value, or the mean of the two in the middle; NaN of none.
-pub(super) fn median(values: &[f64]) -> f64 {
+pub fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     match (sorted.len() / 2, sorted.len() % 2) {
