@@ -9,7 +9,6 @@ mod counters;
 mod info_nce;
 mod optimiser;
 mod products;
-mod refused;
 mod replay;
 mod sampling;
 mod stored;
@@ -20,7 +19,7 @@ mod worlds;
 use super::property::Property;
 
 /// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
-pub(super) const TABLE: [&[Property]; 15] = [
+pub(super) const TABLE: [&[Property]; 14] = [
     c51::PROPERTIES,
     values::PROPERTIES,
     info_nce::PROPERTIES,
@@ -35,5 +34,4 @@ pub(super) const TABLE: [&[Property]; 15] = [
     replay::PROPERTIES,
     counters::PROPERTIES,
     worlds::PROPERTIES,
-    refused::PROPERTIES,
 ];

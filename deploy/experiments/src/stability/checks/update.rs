@@ -2,11 +2,16 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Compute, Lambda, LearnerSettings, OwnedBatch,
+    Agent, Compute, Lambda, LearnerSettings, NetworkParameters, OwnedBatch,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
+use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
+use driml_settings::{
+    presets::PRESETS,
+    resolve::{Flags, Source, resolve},
+};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -65,7 +70,8 @@ impl Setting {
     }
 
     fn learner(&self) -> anyhow::Result<LearnerSettings> {
-        let run = small::run("chain".parse()?, "driml-fix", Vec::new())?;
+        let source = Source::Layers(&PRESETS[0], "chain".parse()?, "driml-fix");
+        let run = resolve(&source, &Flags::default(), &Machine::this())?;
         Ok(LearnerSettings {
             lambda: Lambda {
                 l3t3: 0.5,
@@ -115,7 +121,15 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     let model = setting.model(&settings);
     let online = setting.weights(&model, rng)?;
     let target = setting.weights(&model, rng)?.without_dim()?;
-    let agent = |compute| small::agent(&model, &settings, compute, &online, &target);
+    let agent = |compute: &Compute| -> anyhow::Result<Agent> {
+        let parameters = NetworkParameters {
+            online: online.copy()?,
+            target: target.copy()?,
+            key: None,
+        };
+        let (model, settings) = (model.clone(), settings.clone());
+        Ok(Agent::from_parameters(model, settings, compute, parameters)?)
+    };
     let (mut agent, reference) = (agent(&Compute::CPU)?, agent(&REFERENCE)?);
     let rows = rng.random_range(2..24);
     let distinct = setting.distinct.min(3 * rows);
