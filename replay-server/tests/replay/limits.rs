@@ -9,8 +9,8 @@ use proptest::prelude::*;
 
 use crate::{
     calls::{
-        affinity, counts, header, insert, is_refused, is_stored, join, last_word, life, small,
-        small_spec, stored, wait,
+        affinity, counts, header, insert, is_refused, is_stored, join, last_word, life,
+        small, small_spec, stored, wait,
     },
     history::{spec, unlimited},
 };
@@ -284,6 +284,24 @@ proptest! {
         }
         prop_assert!(allowed - (sampled as f64) < f64::from(rows) + 1e-6, "less than a batch is left");
         prop_assert_eq!(limiter.counts().rows_sampled, sampled);
+    }
+
+    #[test]
+    fn the_longest_runs_are_allowed_what_integers_allow(
+        inserted in (1u64 << 49..1 << 50, 0u32..30).prop_map(|(count, shift)| count >> shift),
+        credit in -20_000i64..20_000,
+        others in prop::option::of((any::<u64>(), any::<u64>())),
+    ) {
+        let rows_sampled = (8 * inserted).saturating_add_signed(-credit);
+        let (inserted_there, sampled_there) = others.unwrap_or_default();
+        let there = counts(inserted_there % inserted, sampled_there % rows_sampled);
+        let here = counts(inserted - there.inserted, rows_sampled - there.rows_sampled);
+        let limiter = RateLimiter::new(8.0, 0, 1000, None).counting_on(here, there);
+        let near = credit.unsigned_abs() as u32;
+        for rows in [1, 32, 256, near, near + 1] {
+            prop_assert_eq!(limiter.may_sample(rows), i64::from(rows) <= credit);
+        }
+        prop_assert_eq!(limiter.may_insert(), credit <= 8000);
     }
 }
 

@@ -5,7 +5,7 @@ mod adam;
 mod affinity;
 mod augment;
 mod c51;
-mod counters;
+mod epsilon;
 mod info_nce;
 mod optimiser;
 mod products;
@@ -32,6 +32,6 @@ pub(super) const TABLE: [&[Property]; 14] = [
     affinity::PROPERTIES,
     sampling::PROPERTIES,
     replay::PROPERTIES,
-    counters::PROPERTIES,
+    epsilon::PROPERTIES,
     worlds::PROPERTIES,
 ];
