@@ -14,12 +14,11 @@ mod sampling;
 mod stored;
 mod update;
 mod values;
-mod worlds;
 
 use super::property::Property;
 
 /// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
-pub(super) const TABLE: [&[Property]; 14] = [
+pub(super) const TABLE: [&[Property]; 13] = [
     c51::PROPERTIES,
     values::PROPERTIES,
     info_nce::PROPERTIES,
@@ -33,5 +32,4 @@ pub(super) const TABLE: [&[Property]; 14] = [
     sampling::PROPERTIES,
     replay::PROPERTIES,
     epsilon::PROPERTIES,
-    worlds::PROPERTIES,
 ];
