@@ -84,7 +84,9 @@ pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
         frame_bytes: 4,
     });
     for (row, (reward, end)) in steps.iter().enumerate() {
-        chunk.frame_mut(row).copy_from_slice(&(row as u32).to_le_bytes());
+        chunk
+            .frame_mut(row)
+            .copy_from_slice(&(row as u32).to_le_bytes());
         chunk.set(row, 1, *reward, *end);
     }
     chunk

@@ -128,7 +128,9 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
             key: None,
         };
         let (model, settings) = (model.clone(), settings.clone());
-        Ok(Agent::from_parameters(model, settings, compute, parameters)?)
+        Ok(Agent::from_parameters(
+            model, settings, compute, parameters,
+        )?)
     };
     let (mut agent, reference) = (agent(&Compute::CPU)?, agent(&REFERENCE)?);
     let rows = rng.random_range(2..24);
