@@ -36,12 +36,13 @@ pub(super) type Check = fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
     /// A promise at one kind of extreme, before the first case.
-    fn row(&self, promise: usize, extreme: &str) -> Row {
+    fn row(&self, promise: usize, extreme: &str, is_drawn: bool) -> Row {
         let (words, bound) = self.promises[promise];
         Row {
             routine: self.routine.to_owned(),
             range: self.range.to_owned(),
             extreme: extreme.to_owned(),
+            is_drawn,
             promise: words.to_owned(),
             bound,
             cases: 0,
@@ -55,7 +56,7 @@ impl Property {
         let promises = self.promises.iter().enumerate();
         let untried = promises.filter(|(_, it)| rows.iter().all(|row| row.promise != it.0));
         untried
-            .map(|(promise, _)| self.row(promise, "none was tried"))
+            .map(|(promise, _)| self.row(promise, "none was tried", false))
             .collect()
     }
 }
@@ -66,6 +67,8 @@ pub(super) struct Row {
     pub(super) routine: String,
     pub(super) range: String,
     pub(super) extreme: String,
+    /// Whether its inputs are of the generator, and not listed.
+    pub(super) is_drawn: bool,
     pub(super) promise: String,
     pub(super) bound: f64,
     pub(super) cases: u64,
@@ -212,7 +215,10 @@ impl<'a> Cases<'a> {
             let mut rows = self.rows.iter();
             let found = rows.position(|it| it.is_beside(words, &self.extreme));
             let at = found.unwrap_or_else(|| {
-                self.rows.push(self.property.row(promise, &self.extreme));
+                let row = self
+                    .property
+                    .row(promise, &self.extreme, self.taken.is_none());
+                self.rows.push(row);
                 self.rows.len() - 1
             });
             let row = &mut self.rows[at];
@@ -282,6 +288,11 @@ mod tests {
         let mut rows = cases.run().unwrap();
         rows.extend(HALVING.untried(&rows));
         let seen = |row: &Row| (row.cases, row.worst, row.input.clone(), row.is_kept());
+        assert_eq!(
+            rows.iter().filter(|it| it.is_drawn).count(),
+            1,
+            "the third row"
+        );
         let expected = [
             (6, 320.0, "320".to_owned(), true),
             (6, 0.0, String::new(), true),
