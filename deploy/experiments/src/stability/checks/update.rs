@@ -169,12 +169,23 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     for deduplicate in [false, true] {
         agent = agent.with_deduplication(deduplicate);
         let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
-        let share = found.reference_loss.abs() / (1.0 + found.reference_loss.abs());
-        losses.push(found.loss * share);
+        losses.push(loss_error(&found));
         gradients.push((found.same_next_action == 1.0).then_some(found.gradient));
     }
     let gradients: Option<Vec<f64>> = gradients.into_iter().collect();
     Ok((worst(losses), gradients.map(worst)))
+}
+
+/// The error of a loss, which may be 0, as a share of 1 + loss.
+const fn loss_error(found: &ErrorOfUpdate) -> f64 {
+    (found.own_loss - found.reference_loss).abs() / (1.0 + found.reference_loss.abs())
+}
+
+/// The larger of the two in the middle, if there is any; NaN where one is NaN, which would stand last.
+fn median(mut errors: Vec<f64>) -> Option<f64> {
+    errors.sort_by(f64::total_cmp);
+    let nan = errors.iter().find(|it| it.is_nan());
+    nan.or_else(|| errors.get(errors.len() / 2)).copied()
 }
 
 fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -187,8 +198,33 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         gradients.extend(gradient);
     }
     // Not of each case: where states are equal, or losses saturate, a gradient's terms cancel, and its norm is that of rounding.
-    gradients.sort_by(f64::total_cmp);
     // Of a few cases none may have a gradient that can be compared.
-    let median = gradients.get(gradients.len() / 2).copied();
-    cases.see(format_args!("weights x {scale:e}"), [None, median])
+    let input = format_args!("weights x {scale:e}");
+    cases.see(input, [None, median(gradients)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gradient_that_is_not_a_number_shows_in_the_median() {
+        assert_eq!(median(vec![0.3, 0.1, 0.2]), Some(0.2));
+        assert_eq!(median(vec![]), None);
+        let found = median(vec![0.3, f64::NAN, 0.2, 0.1]);
+        assert!(found.is_some_and(f64::is_nan), "{found:?}");
+    }
+
+    #[test]
+    fn a_loss_of_0_has_an_error_too() {
+        let found = ErrorOfUpdate {
+            own_loss: 1e-9,
+            reference_loss: 0.0,
+            loss: f64::INFINITY,
+            gradient: 0.0,
+            angle: 0.0,
+            same_next_action: 1.0,
+        };
+        assert_eq!(loss_error(&found), 1e-9);
+    }
 }
