@@ -4,6 +4,7 @@
 
 use std::fmt::Arguments;
 
+use driml_machine::error::Interrupted;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
@@ -154,19 +155,27 @@ impl<'a> Cases<'a> {
                 Listed => {
                     self.taken = Some(Vec::new());
                     while self.taken.is_some() {
-                        check(&mut self)?;
+                        self.attempt(check)?;
                         self.combine_anew();
                     }
                 }
                 Drawn(share) => {
                     for _ in 0..self.draws(share) {
-                        check(&mut self)?;
+                        self.attempt(check)?;
                     }
                 }
             }
         }
         self.progress.advance(1)?;
         Ok(self.rows)
+    }
+
+    /// Runs a case; one that fails breaks the first promise, and the error stands for its input.
+    fn attempt(&mut self, check: Check) -> anyhow::Result<()> {
+        match check(self) {
+            Err(e) if !e.is::<Interrupted>() => self.see(format_args!("{e:#}"), [f64::NAN]),
+            done => done,
+        }
     }
 
     /// Goes to the next combination of listed inputs, the last list's item first; none is taken after the last.
@@ -276,6 +285,7 @@ mod tests {
             ("large", Listed, |cases| {
                 cases.see(format_args!("4"), [Some(f64::NAN), None])
             }),
+            ("failing", Listed, |_| anyhow::bail!("no memory")),
         ],
     };
 
@@ -298,12 +308,13 @@ mod tests {
             (6, 0.0, String::new(), true),
             (40, 9.0, "9".to_owned(), true),
             (1, f64::MAX, "4".to_owned(), false),
+            (1, f64::MAX, "no memory".to_owned(), false),
             (0, 0.0, String::new(), false),
         ];
         assert_eq!(rows.iter().map(seen).collect::<Vec<_>>(), expected);
         let mut both = rows.clone();
         both[0].worst = 160.0;
         merge(&mut both, rows);
-        assert_eq!((both.len(), both[0].cases, both[0].worst), (5, 12, 320.0));
+        assert_eq!((both.len(), both[0].cases, both[0].worst), (6, 12, 320.0));
     }
 }
