@@ -301,6 +301,8 @@ mod tests {
             at(7, 1),
             at((1 << 32) + 7, 0),
             at(1 << 32, 1),
+            at(1 << 52, 0),
+            at(u64::MAX, 0),
         ];
         let spec = settings(1.0).spec;
         let mut seen = Vec::new();

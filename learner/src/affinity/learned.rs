@@ -291,6 +291,26 @@ mod tests {
         }
     }
 
+    /// By 2^24 updates 0.999^t is 0 beside 1, and bias corrections are 1 from there on.
+    #[test]
+    fn updates_beyond_32_bits_are_counted() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let learned = LearnedAffinity::new(Alphabet::raw(3).unwrap(), SETTINGS, &mut rng).unwrap();
+        let after = |updates| {
+            let (mut learned, mut rng) = (learned.clone(), rng.clone());
+            learned.updates = updates;
+            for _ in 0..20 {
+                learned
+                    .observe(&[(0, 1), (1, 2), (2, 0)], &mut rng)
+                    .unwrap();
+            }
+            learned.matrix
+        };
+        for updates in [1 << 31, 1 << 32, 1 << 40, 1 << 53] {
+            assert_eq!(after(updates), after(1 << 24), "{updates}");
+        }
+    }
+
     #[test]
     fn it_starts_uniform_and_comes_back_from_text_as_it_was() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);

@@ -14,20 +14,27 @@ pub const SLOPE_ERROR: f64 = 1e-15;
 /// Largest error of a row's divergence, as a share of `10 + sum_i target_i (max logit - logit_i)`.
 pub const KL_ERROR: f64 = 1e-14;
 
-/// Mean over rows of `KL(target || softmax(logits))`, and its gradient.
+/// Mean over rows of `KL(target || softmax(logits))`, each times its weight, and its gradient.
 ///
-/// `logits` [B, N], those of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`.
-/// Loss: `1/B * sum_b sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
-/// `gradient` [B, N] is overwritten with the derivative by the logits: `(softmax - target) / B`. The arithmetic is f64 and shifts by
+/// `logits` [B, N], those of the action that each row took; `target` [B, N], rows sum to 1; N is `atoms`; `weights` [B], finite and
+/// not negative, or none for 1.
+/// Loss: `1/B * sum_b weight sum_i target * (ln target - ln softmax)`, with `0 ln 0 = 0`, in nats.
+/// `gradient` [B, N] is overwritten with the derivative by the logits: `weight (softmax - target) / B`. The arithmetic is f64 and shifts by
 /// the largest logit, so any finite logits are fine: the loss is right to [`KL_ERROR`], its slopes to [`ENTRY_ERROR`] and
 /// [`SLOPE_ERROR`]. A loss beyond the finite f32 needs logits that differ by more than 1e38. A logit that is
 /// not finite, or a target that is NaN, gives a loss that is not finite, which the update refuses; a logit of -inf under a target
 /// of 0 adds nothing to the loss, as `0 ln 0` does, and has a slope of 0.
-/// Source: Bellemare et al. 2017, equation 7.
+/// Sources: Bellemare et al. 2017, equation 7; Schaul et al. 2016, Prioritized Experience Replay, algorithm 1, line 12.
 ///
 /// # Panics
 /// If the lengths disagree, or there is no row: the caller has checked its batch by then.
-pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) -> f64 {
+pub fn kl(
+    logits: &[f32],
+    target: &[f32],
+    weights: Option<&[f32]>,
+    atoms: usize,
+    gradient: &mut [f32],
+) -> f64 {
     let rows = logits.len() / atoms;
     assert!(
         rows > 0 && logits.len() == rows * atoms,
@@ -39,21 +46,27 @@ pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) ->
         gradient.len(),
         "the gradient has the shape of the logits"
     );
+    assert!(
+        weights.is_none_or(|it| it.len() == rows),
+        "a weight for each row"
+    );
     let mut total = 0.0;
-    for ((logits, target), gradient) in logits
+    for (row, ((logits, target), gradient)) in logits
         .chunks_exact(atoms)
         .zip(target.chunks_exact(atoms))
         .zip(gradient.chunks_exact_mut(atoms))
+        .enumerate()
     {
+        let weight = weights.map_or(1.0, |it| f64::from(it[row]));
         let log_p = LogSoftmax::of(logits);
         let mass: f64 = target.iter().map(|&t| f64::from(t)).sum();
         for ((&logit, &t), gradient) in logits.iter().zip(target).zip(gradient) {
             let (log_p, t) = (log_p.at(logit), f64::from(t));
             // Not t > 0, which would leave a NaN out of the loss.
             if t != 0.0 {
-                total += t * (t.ln() - log_p);
+                total += weight * t * (t.ln() - log_p);
             }
-            *gradient = ((mass * log_p.exp() - t) / rows as f64) as f32;
+            *gradient = ((mass * log_p.exp() - t) * weight / rows as f64) as f32;
         }
     }
     total / rows as f64
@@ -65,47 +78,8 @@ pub fn kl(logits: &[f32], target: &[f32], atoms: usize, gradient: &mut [f32]) ->
 /// As [`kl`].
 pub fn row_kls(logits: &[f32], target: &[f32], atoms: usize) -> Vec<f64> {
     let rows = logits.chunks_exact(atoms).zip(target.chunks_exact(atoms));
-    let row = |(logits, target)| kl(logits, target, atoms, &mut vec![0.0; atoms]).max(0.0);
+    let row = |(logits, target)| kl(logits, target, None, atoms, &mut vec![0.0; atoms]).max(0.0);
     rows.map(row).collect()
-}
-
-/// [`kl`] with each row's divergence, and its slopes, times its weight: `1/B * sum_b weight_b KL_b`.
-///
-/// `weights` [B], finite and not negative; all else as there.
-/// Source: Schaul et al. 2016, Prioritized Experience Replay, algorithm 1, line 12.
-///
-/// # Panics
-/// As [`kl`], and if there is not a weight a row.
-pub fn weighted_kl(
-    logits: &[f32],
-    target: &[f32],
-    weights: &[f32],
-    atoms: usize,
-    gradient: &mut [f32],
-) -> f64 {
-    let rows = weights.len();
-    assert_eq!(logits.len(), rows * atoms, "a weight a row");
-    assert_eq!(logits.len(), target.len(), "logits and target [B, N]");
-    assert_eq!(
-        logits.len(),
-        gradient.len(),
-        "the gradient has the shape of the logits"
-    );
-    let mut total = 0.0;
-    for (((logits, target), gradient), &weight) in logits
-        .chunks_exact(atoms)
-        .zip(target.chunks_exact(atoms))
-        .zip(gradient.chunks_exact_mut(atoms))
-        .zip(weights)
-    {
-        // Of a single row the mean is the row's.
-        total += f64::from(weight) * kl(logits, target, atoms, gradient);
-        let share = f64::from(weight) / rows as f64;
-        gradient
-            .iter_mut()
-            .for_each(|slope| *slope = (f64::from(*slope) * share) as f32);
-    }
-    total / rows as f64
 }
 
 /// `ln softmax` of a row that is not empty, in f64.
@@ -143,7 +117,7 @@ pub fn softmax(row: &[f32], out: &mut [f32]) {
     }
 }
 
-/// [`kl`], or with `weights` [`weighted_kl`], as a candle operation: `logits` [B, N] to a scalar.
+/// [`kl`] as a candle operation: `logits` [B, N] to a scalar.
 ///
 /// # Errors
 /// Logits that are not [B, N] f32 of as many values as `target`, or not of as many rows as there are weights.
@@ -168,14 +142,9 @@ pub fn kl_loss(
     if kernels == Kernels::Candle {
         return candle::kl_loss(logits, target, weights);
     }
-    match weights {
-        None => scalar_op("c51-kl", logits, move |logits, gradient| {
-            kl(logits, &target, atoms, gradient)
-        }),
-        Some(weights) => scalar_op("c51-weighted-kl", logits, move |logits, gradient| {
-            weighted_kl(logits, &target, &weights, atoms, gradient)
-        }),
-    }
+    scalar_op("c51-kl", logits, move |logits, gradient| {
+        kl(logits, &target, weights.as_deref(), atoms, gradient)
+    })
 }
 
 #[cfg(test)]
@@ -219,7 +188,7 @@ mod tests {
     #[test]
     fn a_target_that_is_no_number_is_not_left_out_of_the_loss() {
         let mut gradient = [0f32; 3];
-        let loss = kl(&[0.0; 3], &[f32::NAN, 0.0, 0.0], ATOMS, &mut gradient);
+        let loss = kl(&[0.0; 3], &[f32::NAN, 0.0, 0.0], None, ATOMS, &mut gradient);
         assert!(loss.is_nan(), "{loss}");
     }
 
@@ -227,10 +196,10 @@ mod tests {
     fn an_atom_without_probability_costs_nothing_where_the_target_has_none() {
         let mut gradient = [f32::NAN; 3];
         let logits = [0.0, f32::NEG_INFINITY, 0.0];
-        let loss = kl(&logits, &[0.5, 0.0, 0.5], ATOMS, &mut gradient);
+        let loss = kl(&logits, &[0.5, 0.0, 0.5], None, ATOMS, &mut gradient);
         assert!(loss.abs() < 1e-15, "{loss}");
         assert_eq!(gradient[1], 0.0);
-        let loss = kl(&logits, &[0.5, 0.5, 0.0], ATOMS, &mut gradient);
+        let loss = kl(&logits, &[0.5, 0.5, 0.0], None, ATOMS, &mut gradient);
         assert_eq!(loss, f64::INFINITY);
     }
 
@@ -240,16 +209,16 @@ mod tests {
         let rows = row_kls(&LOGITS, &TARGET, ATOMS);
         let weighted = (0.25 * rows[0] + rows[1]) / 2.0;
         let (mut gradient, mut plain) = ([0f32; 6], [0f32; 6]);
-        let loss = weighted_kl(&LOGITS, &TARGET, &weights, ATOMS, &mut gradient);
+        let loss = kl(&LOGITS, &TARGET, Some(&weights), ATOMS, &mut gradient);
         assert!((loss - weighted).abs() < 1e-14);
-        let unweighted = kl(&LOGITS, &TARGET, ATOMS, &mut plain);
+        let unweighted = kl(&LOGITS, &TARGET, None, ATOMS, &mut plain);
         assert!((unweighted - (rows[0] + rows[1]) / 2.0).abs() < 1e-14);
         for (i, (slope, plain)) in gradient.iter().zip(plain).enumerate() {
             let expected = f64::from(plain) * f64::from(weights[i / ATOMS]);
             assert!((f64::from(*slope) - expected).abs() < 1e-8, "logit {i}");
         }
         let mut scratch = [0f32; 6];
-        let by_hand = |logits: &[f32]| weighted_kl(logits, &TARGET, &weights, ATOMS, &mut scratch);
+        let by_hand = |logits: &[f32]| kl(logits, &TARGET, Some(&weights), ATOMS, &mut scratch);
         assert_slope(by_hand, &gradient);
         for kernels in [Kernels::FUSED, Kernels::Candle] {
             let (loss, got) = operation(&LOGITS, Some(weights.to_vec()), kernels)?;
@@ -266,18 +235,34 @@ mod tests {
         Ok(())
     }
 
+    /// As a float its own slope, 5.5e-42, has three digits.
+    #[test]
+    fn a_weight_does_not_magnify_what_rounding_lost() {
+        let mut gradient = [0f32; 2];
+        kl(&[0.0, -95.0], &[1.0, 0.0], Some(&[1e10]), 2, &mut gradient);
+        let share = (-95f64).exp();
+        let error = f64::from(gradient[1]) / (1e10 * share / (1.0 + share)) - 1.0;
+        assert!(error.abs() < ENTRY_ERROR, "{error:e}");
+    }
+
     #[test]
     fn a_perfect_prediction_costs_nothing() {
         let logits: Vec<f32> = [0.2f32, 0.5, 0.3].iter().map(|p| p.ln()).collect();
         let mut gradient = [0f32; 3];
-        let loss = kl(&logits, &[0.2, 0.5, 0.3], ATOMS, &mut gradient);
+        let loss = kl(&logits, &[0.2, 0.5, 0.3], None, ATOMS, &mut gradient);
         assert!(loss.abs() < 1e-7 && gradient.iter().all(|g| g.abs() < 1e-7));
     }
 
     #[test]
     fn extreme_logits_stay_finite() {
         let mut gradient = [0f32; 3];
-        let loss = kl(&[1e4, -1e4, 0.0], &[0.0, 1.0, 0.0], ATOMS, &mut gradient);
+        let loss = kl(
+            &[1e4, -1e4, 0.0],
+            &[0.0, 1.0, 0.0],
+            None,
+            ATOMS,
+            &mut gradient,
+        );
         assert!((loss - 2e4).abs() < 1e-6);
         assert_eq!(gradient, [1.0, -1.0, 0.0]);
     }
@@ -291,7 +276,7 @@ mod tests {
             let (mut probs, mut gradient) = ([0f32; ATOMS], [0f32; ATOMS]);
             let mut logits = [offset; ATOMS];
             softmax(&logits, &mut probs);
-            let loss = kl(&logits, &target, ATOMS, &mut gradient);
+            let loss = kl(&logits, &target, None, ATOMS, &mut gradient);
             assert!(
                 probs.iter().all(|p| (p * 51.0 - 1.0).abs() < 1e-6),
                 "{offset}: {probs:?}"
@@ -317,8 +302,11 @@ mod tests {
     #[test]
     fn the_operation_gives_the_function_and_the_gradient_is_its_slope() -> Result<()> {
         let (mut gradient, mut scratch) = ([0f32; 6], [0f32; 6]);
-        let expected = kl(&LOGITS, &TARGET, ATOMS, &mut gradient);
-        assert_slope(|logits| kl(logits, &TARGET, ATOMS, &mut scratch), &gradient);
+        let expected = kl(&LOGITS, &TARGET, None, ATOMS, &mut gradient);
+        assert_slope(
+            |logits| kl(logits, &TARGET, None, ATOMS, &mut scratch),
+            &gradient,
+        );
         let (loss, got) = operation(&LOGITS, None, Kernels::FUSED)?;
         assert_eq!(loss, expected as f32);
         assert_eq!(got, gradient.map(|g| g * 3.0));
@@ -331,7 +319,7 @@ mod tests {
             let logits = LOGITS.map(|logit| logit * scale);
             let (loss, got) = operation(&logits, None, Kernels::Candle)?;
             let mut gradient = [0f32; 6];
-            let expected = kl(&logits, &TARGET, ATOMS, &mut gradient);
+            let expected = kl(&logits, &TARGET, None, ATOMS, &mut gradient);
             let error = f64::from(loss) - expected;
             assert!(error.abs() <= 1e-6 * expected, "{scale}: {error}");
             for (got, expected) in got.iter().zip(gradient) {

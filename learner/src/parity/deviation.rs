@@ -16,11 +16,13 @@ pub const REFERENCE: Compute = Compute {
 /// How far an agent's numbers are from a reference's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ErrorOfUpdate {
+    /// The agent's total loss.
+    pub own_loss: f64,
     /// The reference's total loss.
     pub reference_loss: f64,
     /// |total - reference| / |reference|.
     pub loss: f64,
-    /// 2-norm of the gradients' difference over that of the reference, all parameters together.
+    /// 2-norm of the gradients' difference over that of the reference, all parameters together; 0 where both are 0.
     pub gradient: f64,
     /// 1 - cosine of the angle between the gradients.
     pub angle: f64,
@@ -57,11 +59,15 @@ impl ErrorOfUpdate {
             .map(|(own, expected)| own == expected)
             .collect();
         let same_next = next.iter().filter(|same| **same).count() as f64;
-        let [total, reference_loss] = [own.total, expected.total].map(f64::from);
+        let [own_loss, reference_loss] = [own.total, expected.total].map(f64::from);
         Ok(Self {
+            own_loss,
             reference_loss,
-            loss: (total - reference_loss).abs() / reference_loss.abs(),
-            gradient: f64::sqrt(apart / square),
+            loss: (own_loss - reference_loss).abs() / reference_loss.abs(),
+            gradient: match apart {
+                0.0 => 0.0,
+                _ => f64::sqrt(apart / square),
+            },
             angle: 1.0 - dot / f64::sqrt(own_square * square),
             same_next_action: if next.is_empty() {
                 1.0

@@ -41,6 +41,18 @@ fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
 }
 
 #[test]
+fn a_target_network_that_overflows_is_an_error_that_changes_nothing() {
+    let (mut agent, rows) = (agent(NO_DIM, 16), Rows::random(4, 18));
+    let weight = agent.target().get("torso.conv1.weight").unwrap();
+    let large = Tensor::full(1e38f32, weight.dims(), &Device::Cpu).unwrap();
+    weight.set(&large).unwrap();
+    let before = values(agent.online());
+    let error = agent.update(&rows.batch()).unwrap_err().to_string();
+    assert!(error.contains("target network"), "{error}");
+    assert_eq!(values(agent.online()), before);
+}
+
+#[test]
 fn a_bad_batch_is_an_error_that_changes_nothing() {
     let mut agent = agent(ALL_DIM, 19);
     let before = values(agent.online());
@@ -59,6 +71,7 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     refused(|rows| rows.n_step_return[1] = f32::NAN, "row 1");
     refused(|rows| rows.n_step_return[1] = f32::INFINITY, "row 1");
     refused(|rows| rows.bootstrap_discount[1] = 1.5, "row 1");
+    refused(|rows| rows.bootstrap_discount[1] = f32::NAN, "row 1");
     refused(|rows| rows.frames[0].truncate(7), "states_t");
     refused(|rows| rows.frames[1].truncate(7), "states_k");
     refused(|rows| rows.positive_valid.clear(), "positive_valid");

@@ -170,6 +170,7 @@ proptest! {
             let fresh = |incarnation| {
                 let mut actor = Actor::new(number, incarnation);
                 actor.next.frame_bytes = spec.frame_bytes() as u32;
+                actor.next.weights_version = 1 << 40;
                 (actor, 0)
             };
             let (actor, part) = known.entry(number).or_insert_with(|| fresh(1));

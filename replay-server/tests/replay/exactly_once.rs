@@ -135,6 +135,7 @@ type Story = [(Said, (u64, u64, u64), &'static str)];
 fn what_was_lost_or_stored_twice_is_counted_once() {
     let absurd = u64::MAX;
     let most = 1 << 48;
+    let many = 1 << 40;
     let lost: &Story = &[
         (Sends(0, 1, 0, 4), (4, 0, 0), "before the first chunk"),
         (Sends(0, 1, 1, 10), (4, 0, 0), "nothing"),
@@ -144,6 +145,8 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
         (Leaves(1, 1, 3), (12, 0, 1), "one that has not joined"),
         (Joins(1, 1), (12, 0, 1), "nothing was said"),
         (Leaves(1, 1, 3), (15, 0, 1), "of which nothing came"),
+        (Sends(2, 1, many, many), (15, 0, 1), "a chunk far ahead"),
+        (Sends(2, 1, 0, many), (15 + many, 0, 1), "more than 2^32"),
     ];
     let duplicated: &Story = &[
         (Sends(0, 1, 0, 0), (0, 0, 0), "the first chunk"),

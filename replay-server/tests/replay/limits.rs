@@ -1,18 +1,21 @@
 //! What a replay rejects or delays, settings that cannot work, and the end of a run: neither side waits forever.
-//! It does not look at rows, and no message is lost or repeated.
+//! Rows are looked at where a replay holds the least, and no message is lost or repeated.
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Waiting};
 use driml_replay_server::{
     ACTORS_MAX, Compression, Config, NotReady, RateLimiter, Replay, STREAMS_MAX,
 };
 use proptest::prelude::*;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use crate::{
+    batches::check_rows,
     calls::{
-        affinity, counts, header, insert, is_refused, is_stored, join, last_word, life, small,
-        small_spec, stored, wait,
+        Actor, affinity, counts, header, insert, is_refused, is_stored, join, last_word, life,
+        small, small_spec, stored, wait,
     },
-    history::{spec, unlimited},
+    history::{History, spec, unlimited},
 };
 
 const HUNGRY: Waiting = Waiting::LearnerWaitsForActors;
@@ -285,6 +288,24 @@ proptest! {
         prop_assert!(allowed - (sampled as f64) < f64::from(rows) + 1e-6, "less than a batch is left");
         prop_assert_eq!(limiter.counts().rows_sampled, sampled);
     }
+
+    #[test]
+    fn the_longest_runs_are_allowed_what_integers_allow(
+        inserted in (1u64 << 49..1 << 50, 0u32..30).prop_map(|(count, shift)| count >> shift),
+        credit in -20_000i64..20_000,
+        others in prop::option::of((any::<u64>(), any::<u64>())),
+    ) {
+        let rows_sampled = (8 * inserted).saturating_add_signed(-credit);
+        let (inserted_there, sampled_there) = others.unwrap_or_default();
+        let there = counts(inserted_there % inserted, sampled_there % rows_sampled);
+        let here = counts(inserted - there.inserted, rows_sampled - there.rows_sampled);
+        let limiter = RateLimiter::new(8.0, 0, 1000, None).counting_on(here, there);
+        let near = credit.unsigned_abs() as u32;
+        for rows in [1, 32, 256, near, near + 1] {
+            prop_assert_eq!(limiter.may_sample(rows), i64::from(rows) <= credit);
+        }
+        prop_assert_eq!(limiter.may_insert(), credit <= 8000);
+    }
 }
 
 fn good() -> Config {
@@ -342,6 +363,40 @@ fn each_fault_names_its_key_and_a_way_out() {
     let broken = RunSpec { gamma: 2.0, ..spec };
     let refused = good().validate(&broken, 256).unwrap_err().to_string();
     assert!(refused.starts_with("run.gamma = 2 "), "{refused}");
+}
+
+#[test]
+fn the_least_capacity_works_and_a_smaller_one_is_refused() {
+    let rng = &mut ChaCha8Rng::seed_from_u64(5);
+    for (n_step, stack) in [(1, 1), (1, 4), (2, 2), (7, 1), (8, 4), (1000, 4)] {
+        let (spec, least) = (
+            spec(3, stack, n_step, Horizon::None {}),
+            u64::from(n_step + stack),
+        );
+        let said = refusal(&unlimited(least - 1), &spec, 4);
+        let named = format!("replay.capacity_transitions = {} ", least - 1);
+        assert!(said.starts_with(&named), "{said}");
+        for capacity in least..least + 8 {
+            let what = format!("n_step {n_step}, stack {stack}, capacity {capacity}");
+            let mut replay = Replay::new(&spec, &unlimited(capacity), 4).unwrap();
+            let mut history = History::new(&spec, capacity);
+            history.ends = false;
+            let mut actor = Actor::new(0, 1);
+            join(&mut replay, 0, 1);
+            while history.inserted < 3 * capacity {
+                let steps = rng.random_range(1..=capacity.min(300));
+                let chunk = history.next_chunk(actor.send(1, steps as u32), 0, rng);
+                assert_eq!(replay.insert(&chunk), stored(history.inserted), "{what}");
+                match replay.sample(4) {
+                    Ok(batch) => drop(check_rows(&batch, &history)),
+                    Err(why) => {
+                        assert!(matches!(why, NotReady::Wait(_)), "{what}: {why:?}");
+                        assert!(history.valid_anchors().is_empty(), "{what}");
+                    }
+                }
+            }
+        }
+    }
 }
 
 #[test]

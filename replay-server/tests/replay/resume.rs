@@ -5,7 +5,7 @@ use driml_protocol::LearnerJoin;
 use driml_replay_server::{Config, NotReady, Replay, Since};
 
 use crate::{
-    calls::{counts, header, insert, is_stored, learner, small_spec},
+    calls::{counts, header, insert, is_stored, learner, small_spec, stored},
     history::unlimited,
 };
 
@@ -79,6 +79,25 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         assert_eq!(status.rows_sampled, served, "{what}");
         assert_eq!(status.transitions_held, stored, "{what}");
         assert_eq!(replay.resumed_after(), join.updates, "{what}");
+    }
+}
+
+#[test]
+fn a_run_of_more_than_2_to_the_32_updates_counts_on() {
+    let config = Config {
+        replay_ratio: 8.0,
+        ..unlimited(1000)
+    };
+    for updates in [1 << 32, 10_000_000_000, 1 << 48] {
+        let before = 4 * updates;
+        let mut replay = Replay::new(&small_spec(), &config, 32).unwrap();
+        let join = learner(1, updates, 32 * updates, before);
+        replay.join_learner(join).unwrap();
+        let reply = insert(&mut replay, header(0, 1, 0, 0));
+        assert_eq!(reply, stored(before + 6), "{updates} updates");
+        replay.sample(32).expect("8 rows each of 6 transitions");
+        let drawn = replay.sample(32);
+        assert!(matches!(drawn, Err(NotReady::Wait(_))), "{drawn:?}");
     }
 }
 

@@ -11,23 +11,24 @@ const MOST: f64 = 10.0;
 /// So few that their names have room below a chart.
 const ROUTINES_A_CHART: usize = 8;
 
+/// Worst errors of rows with these inputs, `aside` of the place of their routine.
+fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f64, f64)> {
+    let some = rows.iter().filter(|it| it.is_drawn == is_drawn);
+    let points = some.filter_map(|row| {
+        let at = names.iter().position(|name| *name == row.routine)? as f64;
+        let share = match row.worst {
+            _ if row.cases == 0 => MOST,
+            0.0 => 0.0,
+            worst => worst / row.bound,
+        };
+        Some((at + aside, share.clamp(NONE, MOST)))
+    });
+    points.collect()
+}
+
 /// One chart over some of the routines.
 fn chart(rows: &[Row], names: &[String]) -> Chart {
-    let of = |drawn: bool, aside: f64| -> Vec<(f64, f64)> {
-        let some = rows
-            .iter()
-            .filter(|it| it.extreme.contains("drawn") == drawn);
-        let points = some.filter_map(|row| {
-            let at = names.iter().position(|name| *name == row.routine)? as f64;
-            let share = if row.worst == 0.0 {
-                0.0
-            } else {
-                row.worst / row.bound
-            };
-            Some((at + aside, share.clamp(NONE, MOST)))
-        });
-        points.collect()
-    };
+    let of = |is_drawn, aside| points(rows, names, is_drawn, aside);
     let ends = vec![(-0.5, 1.0), (names.len() as f64 - 0.5, 1.0)];
     let promise = Series::line("the promise", 0, ends).coloured(GREY);
     Chart::new(
@@ -57,5 +58,39 @@ pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
         columns: 1,
         panel_size: (1_000.0, 270.0),
         panels: charts.collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn inputs_have_their_side_and_a_promise_that_was_not_tried_is_not_kept() {
+        let row = Row {
+            routine: "halving".into(),
+            range: "any".into(),
+            extreme: "0, 1, and drawn".into(),
+            is_drawn: false,
+            promise: "error of |x|".into(),
+            bound: 0.5,
+            cases: 1,
+            worst: 0.25,
+            input: "3".into(),
+        };
+        let drawn = Row {
+            extreme: "one is infinite".into(),
+            is_drawn: true,
+            worst: 0.0,
+            ..row.clone()
+        };
+        let untried = Row {
+            cases: 0,
+            worst: 0.0,
+            ..row.clone()
+        };
+        let (rows, names) = ([row, drawn, untried], ["halving".to_owned()]);
+        assert_eq!(points(&rows, &names, false, 0.0), [(0.0, 0.5), (0.0, MOST)]);
+        assert_eq!(points(&rows, &names, true, 0.0), [(0.0, NONE)]);
     }
 }

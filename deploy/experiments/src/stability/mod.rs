@@ -166,6 +166,7 @@ mod tests {
             routine: "halving".into(),
             range: "any".into(),
             extreme: "big".into(),
+            is_drawn: false,
             promise: "error of |x|".into(),
             bound: 0.5,
             cases: 1,

@@ -4,6 +4,7 @@
 
 use std::fmt::Arguments;
 
+use driml_machine::error::Interrupted;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
@@ -36,12 +37,13 @@ pub(super) type Check = fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
     /// A promise at one kind of extreme, before the first case.
-    fn row(&self, promise: usize, extreme: &str) -> Row {
+    fn row(&self, promise: usize, extreme: &str, is_drawn: bool) -> Row {
         let (words, bound) = self.promises[promise];
         Row {
             routine: self.routine.to_owned(),
             range: self.range.to_owned(),
             extreme: extreme.to_owned(),
+            is_drawn,
             promise: words.to_owned(),
             bound,
             cases: 0,
@@ -55,7 +57,7 @@ impl Property {
         let promises = self.promises.iter().enumerate();
         let untried = promises.filter(|(_, it)| rows.iter().all(|row| row.promise != it.0));
         untried
-            .map(|(promise, _)| self.row(promise, "none was tried"))
+            .map(|(promise, _)| self.row(promise, "none was tried", false))
             .collect()
     }
 }
@@ -66,6 +68,8 @@ pub(super) struct Row {
     pub(super) routine: String,
     pub(super) range: String,
     pub(super) extreme: String,
+    /// Whether its inputs are of the generator, and not listed.
+    pub(super) is_drawn: bool,
     pub(super) promise: String,
     pub(super) bound: f64,
     pub(super) cases: u64,
@@ -151,19 +155,27 @@ impl<'a> Cases<'a> {
                 Listed => {
                     self.taken = Some(Vec::new());
                     while self.taken.is_some() {
-                        check(&mut self)?;
+                        self.attempt(check)?;
                         self.combine_anew();
                     }
                 }
                 Drawn(share) => {
                     for _ in 0..self.draws(share) {
-                        check(&mut self)?;
+                        self.attempt(check)?;
                     }
                 }
             }
         }
         self.progress.advance(1)?;
         Ok(self.rows)
+    }
+
+    /// Runs a case; one that fails breaks the first promise, and the error stands for its input.
+    fn attempt(&mut self, check: Check) -> anyhow::Result<()> {
+        match check(self) {
+            Err(e) if !e.is::<Interrupted>() => self.see(format_args!("{e:#}"), [f64::NAN]),
+            done => done,
+        }
     }
 
     /// Goes to the next combination of listed inputs, the last list's item first; none is taken after the last.
@@ -212,7 +224,10 @@ impl<'a> Cases<'a> {
             let mut rows = self.rows.iter();
             let found = rows.position(|it| it.is_beside(words, &self.extreme));
             let at = found.unwrap_or_else(|| {
-                self.rows.push(self.property.row(promise, &self.extreme));
+                let row = self
+                    .property
+                    .row(promise, &self.extreme, self.taken.is_none());
+                self.rows.push(row);
                 self.rows.len() - 1
             });
             let row = &mut self.rows[at];
@@ -270,6 +285,7 @@ mod tests {
             ("large", Listed, |cases| {
                 cases.see(format_args!("4"), [Some(f64::NAN), None])
             }),
+            ("failing", Listed, |_| anyhow::bail!("no memory")),
         ],
     };
 
@@ -282,17 +298,23 @@ mod tests {
         let mut rows = cases.run().unwrap();
         rows.extend(HALVING.untried(&rows));
         let seen = |row: &Row| (row.cases, row.worst, row.input.clone(), row.is_kept());
+        assert_eq!(
+            rows.iter().filter(|it| it.is_drawn).count(),
+            1,
+            "the third row"
+        );
         let expected = [
             (6, 320.0, "320".to_owned(), true),
             (6, 0.0, String::new(), true),
             (40, 9.0, "9".to_owned(), true),
             (1, f64::MAX, "4".to_owned(), false),
+            (1, f64::MAX, "no memory".to_owned(), false),
             (0, 0.0, String::new(), false),
         ];
         assert_eq!(rows.iter().map(seen).collect::<Vec<_>>(), expected);
         let mut both = rows.clone();
         both[0].worst = 160.0;
         merge(&mut both, rows);
-        assert_eq!((both.len(), both[0].cases, both[0].worst), (5, 12, 320.0));
+        assert_eq!((both.len(), both[0].cases, both[0].worst), (6, 12, 320.0));
     }
 }

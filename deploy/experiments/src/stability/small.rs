@@ -1,18 +1,9 @@
-//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once; and the
-//! settings of small runs.
+//! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once.
 
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_envs::WorldName;
-use driml_learner::{Agent, Compute, LearnerSettings, NetworkParameters};
-use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
-use driml_settings::{
-    config::RunConfig,
-    presets,
-    resolve::{Flags, Source, resolve},
-};
 
 /// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
 pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
@@ -80,39 +71,4 @@ pub(super) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Ve
         }
     }
     Ok(values)
-}
-
-/// A run of the first preset, with these settings as `--set` takes them.
-pub(super) fn run(
-    world: WorldName,
-    agent: &'static str,
-    sets: Vec<String>,
-) -> anyhow::Result<RunConfig> {
-    let source = Source::Layers(&presets::PRESETS[0], world, agent);
-    let flags = Flags {
-        sets,
-        ..Flags::default()
-    };
-    Ok(resolve(&source, &flags, &Machine::this())?)
-}
-
-/// An agent with these weights.
-pub(super) fn agent(
-    model: &ModelConfig,
-    settings: &LearnerSettings,
-    compute: &Compute,
-    online: &Parameters,
-    target: &Parameters,
-) -> anyhow::Result<Agent> {
-    let parameters = NetworkParameters {
-        online: online.copy()?,
-        target: target.copy()?,
-        key: None,
-    };
-    Ok(Agent::from_parameters(
-        model.clone(),
-        settings.clone(),
-        compute,
-        parameters,
-    )?)
 }

@@ -12,26 +12,31 @@ const SETTINGS: AdamSettings = AdamSettings {
 
 #[test]
 fn moments_of_a_gradient_that_is_gone_end_at_zero() {
-    let (mut p, mut m, mut v) = (vec![1.0f32; 9], vec![0.0; 9], vec![0.0; 9]);
-    // The last element's gradient stays.
-    let mut g = vec![1e-3f32; 9];
-    let mut updates = 0;
-    let mut run = |g: &[f32], count: u64| {
-        for _ in 0..count {
-            updates += 1;
-            let rule = Rule::new(SETTINGS, updates, 1.0);
-            assert!(rule.apply(&mut p, g, &mut m, &mut v));
-        }
-        (m.clone(), v.clone())
-    };
-    run(&g, 10);
-    g[..8].fill(0.0);
-    let (m, v) = run(&g, 2_000);
-    assert_eq!(m[..8], [0.0; 8], "0.9^2000 of what it was");
-    assert!((m[8] / 1e-3 - 1.0).abs() < 1e-5 && v[0] > f32::MIN_POSITIVE);
-    let (_, v) = run(&g, 75_000);
-    assert_eq!(v[..8], [0.0; 8], "0.999^77000 of what it was");
-    assert!((v[8] / 1e-6 - 1.0).abs() < 1e-3);
+    for size in [1e-30f32, 1e-3, 1.0, 1e15] {
+        let (mut p, mut m, mut v) = (vec![1.0f32; 9], vec![0.0; 9], vec![0.0; 9]);
+        // The last element's gradient stays.
+        let mut g = vec![size; 9];
+        let mut updates = 0;
+        let mut run = |g: &[f32], count: u64| {
+            for _ in 0..count {
+                updates += 1;
+                let rule = Rule::new(SETTINGS, updates, 1.0);
+                assert!(rule.apply(&mut p, g, &mut m, &mut v));
+            }
+            (m.clone(), v.clone())
+        };
+        // A square that a float holds.
+        let is_held = size > 1e-15;
+        run(&g, 10);
+        g[..8].fill(0.0);
+        let (m, v) = run(&g, 2_000);
+        assert_eq!(m[..8], [0.0; 8], "0.9^2000 of what it was");
+        assert!((m[8] / size - 1.0).abs() < 1e-5);
+        assert!(!is_held || v[0] > f32::MIN_POSITIVE);
+        let (_, v) = run(&g, 250_000);
+        assert_eq!(v[..8], [0.0; 8], "0.999^252000 of what it was");
+        assert!(!is_held || (v[8] / size.powi(2) - 1.0).abs() < 1e-3);
+    }
 }
 
 /// Whether a step is fine at this parameter and gradient, in the last of that many `elements`.

@@ -113,12 +113,16 @@ fn assert_samples_law(
 
 #[test]
 fn sweeps_sample_the_boltzmann_law_3x3_periodic() {
-    assert_samples_law(3, 3, 4.0, Boundary::Periodic, true);
+    for temperature in [2.0, 4.0, 5.0] {
+        assert_samples_law(3, 3, temperature, Boundary::Periodic, true);
+    }
 }
 
 #[test]
 fn sweeps_sample_the_boltzmann_law_3x4_free() {
-    assert_samples_law(3, 4, 2.5, Boundary::Free, true);
+    for temperature in [2.0, 2.5, 5.0] {
+        assert_samples_law(3, 4, temperature, Boundary::Free, true);
+    }
 }
 
 #[test]
@@ -137,6 +141,23 @@ fn energy_and_magnetisation_follow_every_step() {
             lattice.check_valid();
             lattice.attempt_flips(3, &mut rng);
             lattice.check_valid();
+        }
+    }
+}
+
+#[test]
+fn near_temperature_0_no_sweep_raises_the_energy() {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    for (temperature, side) in [(1e-300, 3), (1e-9, 7), (0.02, 64)] {
+        for boundary in [Boundary::Free, Boundary::Periodic] {
+            let mut lattice =
+                IsingLattice::random(side, side, temperature, boundary, &mut rng).unwrap();
+            for _ in 0..100 {
+                let before = lattice.energy();
+                lattice.sweep(&mut rng);
+                lattice.check_valid();
+                assert!(lattice.energy() <= before, "T = {temperature:e}");
+            }
         }
     }
 }

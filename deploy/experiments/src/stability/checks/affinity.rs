@@ -47,7 +47,7 @@ pub(super) const PROPERTIES: &[Property] = &[
 ];
 
 /// As the preset has them.
-pub(super) const LEARNED: LearnedSettings = LearnedSettings {
+const LEARNED: LearnedSettings = LearnedSettings {
     hidden: 32,
     lr: 2e-3,
     beta1: 0.9,

@@ -186,6 +186,8 @@ struct Batch {
     atoms: usize,
     logits: Vec<f32>,
     target: Vec<f32>,
+    /// One a row, or 1 for all.
+    weights: Option<Vec<f32>>,
 }
 
 impl Batch {
@@ -195,16 +197,25 @@ impl Batch {
             atoms,
             logits: finites(rows * atoms, rng),
             target: (0..rows).flat_map(|_| law(atoms, rng)).collect(),
+            weights: rng
+                .random()
+                .then(|| (0..rows).map(|_| probability(rng)).collect()),
         }
+    }
+
+    fn kl(&self, slopes: &mut [f32]) -> f64 {
+        let weights = self.weights.as_deref();
+        c51::kl(&self.logits, &self.target, weights, self.atoms, slopes)
     }
 
     /// Sees the errors of the loss and of its slopes.
     fn see(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let rows = self.logits.len() / self.atoms;
         let mut gradient = vec![f32::NAN; self.logits.len()];
-        let loss = c51::kl(&self.logits, &self.target, self.atoms, &mut gradient);
+        let loss = self.kl(&mut gradient);
         let (mut terms, mut scale, mut slopes) = (Vec::new(), 0.0, Vec::new());
         for row in 0..rows {
+            let weight = self.weights.as_ref().map_or(1.0, |it| f64::from(it[row]));
             let row = row * self.atoms..(row + 1) * self.atoms;
             let (x, t) = (
                 widened(&self.logits[row.clone()]),
@@ -214,17 +225,18 @@ impl Batch {
             let mass = exact_sum(t.iter().copied());
             let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
             // t ln t, t (max - x) and t ln sum apart, as their sizes are.
-            terms.extend(there().map(|(_, t)| t * t.ln()));
-            terms.extend(there().map(|(x, t)| t * (max - x)));
-            terms.push(mass * sum.ln());
-            scale += 10.0 + exact_sum(there().map(|(x, t)| t * (max - x)));
+            terms.extend(there().map(|(_, t)| weight * t * t.ln()));
+            terms.extend(there().map(|(x, t)| weight * t * (max - x)));
+            terms.push(weight * mass * sum.ln());
+            scale += weight * (10.0 + exact_sum(there().map(|(x, t)| t * (max - x))));
             slopes.extend(gradient[row].iter().zip(probs).zip(&t).map(|((g, p), t)| {
-                let expected = (mass * p - t) / rows as f64;
+                let expected = (mass * p - t) * weight / rows as f64;
                 let allowed = ENTRY_ERROR * expected.abs().max(LEAST) + SLOPE_ERROR;
                 (f64::from(*g) - expected).abs() / allowed
             }));
         }
-        let of_loss = (loss * rows as f64 - exact_sum(terms)) / scale;
+        // A scale of 0 is that of weights of 0.
+        let of_loss = (loss * rows as f64 - exact_sum(terms)) / scale.max(LEAST);
         let input = format_args!("{rows} rows, logits {}", Shown(&self.logits));
         cases.see(input, [of_loss, worst(slopes)])
     }
@@ -242,6 +254,7 @@ fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
                 "any" => law(atoms, &mut cases.rng),
                 _ => one_hot(atoms, atoms / 2),
             },
+            weights: None,
         },
     };
     batch.see(cases)
@@ -274,7 +287,7 @@ fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         _ => (batch.logits[at], f32::NAN),
     };
     let slopes = &mut vec![0.0; batch.logits.len()];
-    let loss = c51::kl(&batch.logits, &batch.target, batch.atoms, slopes);
+    let loss = batch.kl(slopes);
     let (logit, target) = (batch.logits[at], batch.target[at]);
     let input = format_args!("logit {logit} under {target} at {at} of {}", batch.atoms);
     cases.keeps(2, input, !loss.is_finite())

@@ -5,22 +5,20 @@ mod adam;
 mod affinity;
 mod augment;
 mod c51;
-mod counters;
+mod epsilon;
 mod info_nce;
 mod optimiser;
 mod products;
-mod refused;
 mod replay;
 mod sampling;
 mod stored;
 mod update;
 mod values;
-mod worlds;
 
 use super::property::Property;
 
 /// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
-pub(super) const TABLE: [&[Property]; 15] = [
+pub(super) const TABLE: [&[Property]; 13] = [
     c51::PROPERTIES,
     values::PROPERTIES,
     info_nce::PROPERTIES,
@@ -33,7 +31,5 @@ pub(super) const TABLE: [&[Property]; 15] = [
     affinity::PROPERTIES,
     sampling::PROPERTIES,
     replay::PROPERTIES,
-    counters::PROPERTIES,
-    worlds::PROPERTIES,
-    refused::PROPERTIES,
+    epsilon::PROPERTIES,
 ];

@@ -66,7 +66,7 @@ pub(super) const PROPERTIES: &[Property] = &[
 ];
 
 /// Gradients with these values, one parameter after the other: those of the sum of each parameter times its value.
-pub(super) fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> {
+fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> {
     let parameters = small::parameters(config, &vec![0.0; values.len()])?;
     let slopes = small::tensors(config, values)?;
     let mut sum = Tensor::new(0f32, &Device::Cpu)?;

@@ -1,9 +1,9 @@
-//! Whole replays: n-step returns and discounts, as their batches have them, and replays that hold no more than a row or a few need.
+//! N-step returns and discounts, as a replay's batches have them.
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, NotReady, RETURN_ERROR, Replay, return_sum_error};
+use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, return_sum_error};
 use rand::Rng;
 
 use crate::stability::{
@@ -12,28 +12,16 @@ use crate::stability::{
 };
 
 const REWARDS: &str = "rewards 0, 1e-45, +-1e30 that cancel, 3.4e38 / n; n 1, 7, 1,000; gamma 0, 1e-320, 0.5, 0.99, 1 - 1e-12, 1";
-const SIZES: &str = "capacities 1 to 8 and 1,000 to 1,008, n_step 1 to 8 and 1,000, 1, 2 and 4 frames a state; filled three times and more by chunks of any length";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "n-step return",
-        range: "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1",
-        promises: &[
-            // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
-            ("return or discount, as a share of its bound", 1.0),
-        ],
-        extremes: &[(REWARDS, Listed, returns), ("drawn", Drawn(0.1), returns)],
-    },
-    Property {
-        routine: "replay",
-        range: "capacities from n_step + frame_stack on; n_step 1 to 1,000",
-        promises: &[
-            ("capacities too small not refused by name, or others", 0.0),
-            ("batches too early, or with other frames or returns", 0.0),
-        ],
-        extremes: &[(SIZES, Listed, capacity)],
-    },
-];
+pub(super) const PROPERTIES: &[Property] = &[Property {
+    routine: "n-step return",
+    range: "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1",
+    promises: &[
+        // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
+        ("return or discount, as a share of its bound", 1.0),
+    ],
+    extremes: &[(REWARDS, Listed, returns), ("drawn", Drawn(0.1), returns)],
+}];
 
 /// Of a world whose frames are the number of their step.
 pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
@@ -82,35 +70,31 @@ pub(super) fn replay(spec: &RunSpec, rows: u32, config: &Config) -> anyhow::Resu
     Ok(replay)
 }
 
-/// Steps of one stream as a chunk, the first of which has this number.
-pub(super) fn chunk_from(first: u64, steps: &[(f32, End)]) -> Chunk {
+/// The first steps of a stream as a chunk.
+pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 0,
         incarnation: 1,
         sequence: 0,
-        first_transition: first,
+        first_transition: 0,
         weights_version: 0,
         leaving: false,
         streams: 1,
         steps: steps.len() as u32,
         frame_bytes: 4,
     });
-    for ((row, (reward, end)), number) in steps.iter().enumerate().zip(first as u32..) {
-        chunk.frame_mut(row).copy_from_slice(&number.to_le_bytes());
+    for (row, (reward, end)) in steps.iter().enumerate() {
+        chunk
+            .frame_mut(row)
+            .copy_from_slice(&(row as u32).to_le_bytes());
         chunk.set(row, 1, *reward, *end);
     }
     chunk
 }
 
-/// The first steps of a stream as a chunk.
-pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
-    chunk_from(0, steps)
-}
-
-/// The number that is frame `at` of a state [1, 4, stack].
-pub(super) fn number(state: &[u8], stack: usize, at: usize) -> u64 {
-    let byte = |i: usize| state[i * stack + at];
-    u32::from_le_bytes([byte(0), byte(1), byte(2), byte(3)]).into()
+/// The number of the step that a state [1, 4, 1] is of.
+pub(super) fn number(state: &[u8]) -> usize {
+    u32::from_le_bytes([state[0], state[1], state[2], state[3]]) as usize
 }
 
 /// One replay's steps.
@@ -194,7 +178,7 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = batch.n_step_returns().into_iter();
     let found = found.zip(batch.bootstrap_discounts());
     for (state, (found, discount)) in batch.states_t().chunks_exact(4).zip(found) {
-        let t = number(state, 1, 0) as usize;
+        let t = number(state);
         let (expected, sizes, expected_discount) = stream.expected(t);
         let allowed = RETURN_ERROR * expected.abs().max(LEAST) + return_sum_error(n) * sizes;
         let of_return = (f64::from(found) - expected).abs() / allowed;
@@ -202,93 +186,6 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let of_discount = (f64::from(discount) - expected_discount).abs() / allowed;
         let input = format_args!("n = {n}, gamma = {gamma:e}, the row at {t}: {found:e}");
         cases.see(input, [of_return.max(of_discount)])?;
-    }
-    Ok(())
-}
-
-/// Rows of a batch of a replay that holds little.
-const ROWS: u32 = 4;
-
-/// A replay's sizes.
-#[derive(Clone, Copy, Debug)]
-struct Sizes {
-    capacity: u64,
-    n_step: u32,
-    frame_stack: u32,
-}
-
-impl Sizes {
-    /// Whether a batch is of states that are held, frame by frame, with returns of n rewards of 1; or there is none, where too few
-    /// are held.
-    fn is_right(self, replay: &mut Replay, inserted: u64) -> bool {
-        let held = inserted.min(self.capacity);
-        let oldest = inserted - held;
-        // Where the stream's first step is held, its frame serves for those before it.
-        let lost = if oldest == 0 {
-            0
-        } else {
-            u64::from(self.frame_stack) - 1
-        };
-        let batch = match replay.sample(ROWS) {
-            Ok(batch) => batch,
-            Err(why) => {
-                let is_too_few = held < lost + u64::from(self.n_step) + 1;
-                return is_too_few && matches!(why, NotReady::Wait(_));
-            }
-        };
-        let anchors = oldest + lost..inserted.saturating_sub(self.n_step.into());
-        let stack = self.frame_stack as usize;
-        batch.states_t().chunks_exact(4 * stack).all(|state| {
-            let newest = number(state, stack, stack - 1);
-            let expected = |at| newest.saturating_sub((stack - 1 - at) as u64);
-            anchors.contains(&newest)
-                && (0..stack).all(|at| number(state, stack, at) == expected(at))
-        }) && batch
-            .n_step_returns()
-            .iter()
-            .all(|&sum| sum == self.n_step as f32)
-            && batch.bootstrap_discounts().iter().all(|&rest| rest == 1.0)
-    }
-}
-
-fn capacity(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let sizes = Sizes {
-        capacity: cases.each(&[1, 2, 3, 4, 5, 6, 7, 8, 1000, 1001, 1002, 1004, 1008]),
-        n_step: cases.each(&[1, 2, 3, 4, 5, 6, 7, 8, 1000]),
-        frame_stack: cases.each(&[1, 2, 4]),
-    };
-    let Sizes {
-        capacity,
-        n_step,
-        frame_stack,
-    } = sizes;
-    let spec = RunSpec {
-        frame_stack,
-        ..spec(n_step, 1.0, TimeoutRule::Terminal)
-    };
-    let found = replay(&spec, ROWS, &config(capacity));
-    let is_small = capacity < u64::from(n_step) + u64::from(frame_stack);
-    let name = format!("replay.capacity_transitions = {capacity} ");
-    let said = found.as_ref().err().map(ToString::to_string);
-    let right = said
-        .as_ref()
-        .map_or(!is_small, |said| is_small && said.contains(&name));
-    cases.keeps(0, format_args!("{sizes:?}: {said:?}"), right)?;
-    let Ok(mut replay) = found else {
-        return Ok(());
-    };
-    let mut inserted = 0;
-    for sequence in 0.. {
-        let steps = cases.rng.random_range(1..=capacity.min(300));
-        let mut chunk = chunk_from(inserted, &vec![(1.0, End::Running); steps as usize]);
-        chunk.header.sequence = sequence;
-        replay.insert(&chunk);
-        inserted += steps;
-        let right = sizes.is_right(&mut replay, inserted);
-        cases.keeps(1, format_args!("{sizes:?}, {inserted} stored"), right)?;
-        if inserted >= 3 * capacity {
-            break;
-        }
     }
     Ok(())
 }

@@ -21,7 +21,7 @@ use crate::stability::{
 };
 
 /// Deviations of a chi-square that one right law in two million passes.
-pub(super) const DEVIATIONS: f64 = 5.0;
+const DEVIATIONS: f64 = 5.0;
 
 const EVERY: &str =
     "A 0, 1e-45, 1e-9, 0.5, 1 - 6e-8, 1 and drawn; all 2^24 values that a draw can have";
@@ -149,7 +149,7 @@ fn law_of_k(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 /// How far counts are beyond a law, in standard deviations of a normal of the same tail; cells that expect less than 5 are one.
 ///
 /// Pearson's chi-square by the cube root of Wilson and Hilferty 1931. Infinite where something was seen that cannot be.
-pub(super) fn deviations(counts: &[u64], law: &[f64]) -> f64 {
+fn deviations(counts: &[u64], law: &[f64]) -> f64 {
     let total = counts.iter().sum::<u64>() as f64;
     let (mut cells, mut few) = (Vec::new(), (0.0, 0.0));
     for (&count, &p) in counts.iter().zip(law) {
@@ -236,7 +236,7 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let batch = batch_of(&mut replay)?;
         let chances = batch.probabilities().context("rows drawn by priority")?;
         for (frame, chance) in batch.states_t().chunks_exact(4).zip(chances) {
-            let transition = number(frame, 1, 0) as usize;
+            let transition = number(frame);
             counts[transition] += 1;
             // A chance below the least normal number counts as that.
             let expected = law[transition];

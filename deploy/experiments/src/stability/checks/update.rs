@@ -2,11 +2,16 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Compute, Lambda, LearnerSettings, OwnedBatch,
+    Agent, Compute, Lambda, LearnerSettings, NetworkParameters, OwnedBatch,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
+use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
+use driml_settings::{
+    presets::PRESETS,
+    resolve::{Flags, Source, resolve},
+};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -65,7 +70,8 @@ impl Setting {
     }
 
     fn learner(&self) -> anyhow::Result<LearnerSettings> {
-        let run = small::run("chain".parse()?, "driml-fix", Vec::new())?;
+        let source = Source::Layers(&PRESETS[0], "chain".parse()?, "driml-fix");
+        let run = resolve(&source, &Flags::default(), &Machine::this())?;
         Ok(LearnerSettings {
             lambda: Lambda {
                 l3t3: 0.5,
@@ -115,7 +121,17 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     let model = setting.model(&settings);
     let online = setting.weights(&model, rng)?;
     let target = setting.weights(&model, rng)?.without_dim()?;
-    let agent = |compute| small::agent(&model, &settings, compute, &online, &target);
+    let agent = |compute: &Compute| -> anyhow::Result<Agent> {
+        let parameters = NetworkParameters {
+            online: online.copy()?,
+            target: target.copy()?,
+            key: None,
+        };
+        let (model, settings) = (model.clone(), settings.clone());
+        Ok(Agent::from_parameters(
+            model, settings, compute, parameters,
+        )?)
+    };
     let (mut agent, reference) = (agent(&Compute::CPU)?, agent(&REFERENCE)?);
     let rows = rng.random_range(2..24);
     let distinct = setting.distinct.min(3 * rows);
@@ -153,12 +169,23 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     for deduplicate in [false, true] {
         agent = agent.with_deduplication(deduplicate);
         let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
-        let share = found.reference_loss.abs() / (1.0 + found.reference_loss.abs());
-        losses.push(found.loss * share);
+        losses.push(loss_error(&found));
         gradients.push((found.same_next_action == 1.0).then_some(found.gradient));
     }
     let gradients: Option<Vec<f64>> = gradients.into_iter().collect();
     Ok((worst(losses), gradients.map(worst)))
+}
+
+/// The error of a loss, which may be 0, as a share of 1 + loss.
+const fn loss_error(found: &ErrorOfUpdate) -> f64 {
+    (found.own_loss - found.reference_loss).abs() / (1.0 + found.reference_loss.abs())
+}
+
+/// The larger of the two in the middle, if there is any; NaN where one is NaN, which would stand last.
+fn median(mut errors: Vec<f64>) -> Option<f64> {
+    errors.sort_by(f64::total_cmp);
+    let nan = errors.iter().find(|it| it.is_nan());
+    nan.or_else(|| errors.get(errors.len() / 2)).copied()
 }
 
 fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -171,8 +198,33 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         gradients.extend(gradient);
     }
     // Not of each case: where states are equal, or losses saturate, a gradient's terms cancel, and its norm is that of rounding.
-    gradients.sort_by(f64::total_cmp);
     // Of a few cases none may have a gradient that can be compared.
-    let median = gradients.get(gradients.len() / 2).copied();
-    cases.see(format_args!("weights x {scale:e}"), [None, median])
+    let input = format_args!("weights x {scale:e}");
+    cases.see(input, [None, median(gradients)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gradient_that_is_not_a_number_shows_in_the_median() {
+        assert_eq!(median(vec![0.3, 0.1, 0.2]), Some(0.2));
+        assert_eq!(median(vec![]), None);
+        let found = median(vec![0.3, f64::NAN, 0.2, 0.1]);
+        assert!(found.is_some_and(f64::is_nan), "{found:?}");
+    }
+
+    #[test]
+    fn a_loss_of_0_has_an_error_too() {
+        let found = ErrorOfUpdate {
+            own_loss: 1e-9,
+            reference_loss: 0.0,
+            loss: f64::INFINITY,
+            gradient: 0.0,
+            angle: 0.0,
+            same_next_action: 1.0,
+        };
+        assert_eq!(loss_error(&found), 1e-9);
+    }
 }

@@ -5,20 +5,13 @@
 
 use rand::Rng;
 
-/// Largest error of the stationary law, a probability, for any alpha and up to 1e6 states.
-pub(crate) const LAW_ERROR: f64 = 2e-15;
-/// Largest error of the mutual information, in nats, for any alpha and up to 1e6 states.
-pub(crate) const MUTUAL_INFORMATION_ERROR: f64 = 1e-12;
-/// Largest error of the spectral gap, as a share of it, for any alpha and up to 1e8 states.
-pub(crate) const GAP_ERROR: f64 = 5e-15;
-
 /// A biased random walk on a line of states, whose transition ratio is known in closed form.
 #[derive(Clone, Debug)]
-pub(crate) struct Chain {
+pub(super) struct Chain {
     /// States K, at least 2.
-    pub(crate) states: usize,
+    pub(super) states: usize,
     /// Probability of a step up, in [0, 1].
-    pub(crate) alpha: f64,
+    pub(super) alpha: f64,
 }
 
 impl Chain {
@@ -37,37 +30,22 @@ impl Chain {
         matrix
     }
 
-    /// theta = |ln(alpha / (1 - alpha))|, by which the stationary law falls from state to state away from the end to which the walk
-    /// tends: 0 at even odds, infinite for a walk that only goes one way.
-    fn rate(&self) -> f64 {
-        let [up, down] = [self.alpha, 1.0 - self.alpha];
-        let (less, more) = (up.min(down), up.max(down));
-        if less < more / 2.0 {
-            -(less / more).ln()
-        } else {
-            // The difference is exact near even odds, where a quotient would not be.
-            -(-(more - less) / more).ln_1p()
-        }
-    }
-
-    /// ln of the sum over states of exp(-theta i): ln((1 - exp(-theta K)) / (1 - exp(-theta))); ln K at even odds.
-    fn log_sum(&self) -> f64 {
-        let (rate, k) = (self.rate(), self.states as f64);
-        if rate == 0.0 {
-            return k.ln();
-        }
-        ((-k * rate).exp_m1() / (-rate).exp_m1()).ln()
-    }
-
     /// ln of the stationary law at each state.
     ///
     /// rho(i) = r^i (1 - r) / (1 - r^K), r = alpha / (1 - alpha); 1 / K at r = 1. It is taken from the likelier end, where all powers
     /// are of a number of at most 1. Source: the paper's appendix; it holds for this chain exactly, as its steps balance in detail.
     fn log_stationary(&self) -> Vec<f64> {
-        let (rate, log_sum) = (self.rate(), self.log_sum());
-        // 0 times infinity is NaN.
-        let falls = |away: usize| if away == 0 { 0.0 } else { away as f64 * rate };
-        let law = (0..self.states).map(|away| -falls(away) - log_sum);
+        // Infinite for a walk that only goes one way.
+        let rate = (self.alpha / (1.0 - self.alpha)).ln().abs();
+        let fall = |away: usize| match away {
+            0 => 0.0,
+            away => -(away as f64) * rate,
+        };
+        let log_sum = (0..self.states)
+            .map(|away| fall(away).exp())
+            .sum::<f64>()
+            .ln();
+        let law = (0..self.states).map(|away| fall(away) - log_sum);
         if self.alpha > 0.5 {
             law.rev().collect()
         } else {
@@ -75,19 +53,14 @@ impl Chain {
         }
     }
 
-    /// The stationary law rho, right to [`LAW_ERROR`]: see [`Chain::log_stationary`].
-    pub(crate) fn stationary(&self) -> Vec<f64> {
+    /// The stationary law rho: see [`Chain::log_stationary`].
+    pub(super) fn stationary(&self) -> Vec<f64> {
         self.log_stationary().into_iter().map(f64::exp).collect()
     }
 
     /// I(S_t; S_{t+1}) at stationarity, in nats: H(rho) - h(alpha), as every row of T is (alpha, 1 - alpha).
-    ///
-    /// H(rho) = ln Z + theta E[away], with Z the sum of exp(-theta away) and theta E[away] = f(theta) - f(K theta),
-    /// f(x) = x / (exp(x) - 1): right to [`MUTUAL_INFORMATION_ERROR`].
-    pub(crate) fn mutual_information(&self) -> f64 {
-        let (rate, k) = (self.rate(), self.states as f64);
-        let entropy_of_law = self.log_sum() + (bose(rate) - bose(k * rate));
-        entropy_of_law - entropy(&[self.alpha, 1.0 - self.alpha])
+    pub(super) fn mutual_information(&self) -> f64 {
+        entropy(&self.stationary()) - entropy(&[self.alpha, 1.0 - self.alpha])
     }
 
     /// The same on a ring, which has no ends: ln K - h(alpha), in nats.
@@ -115,10 +88,10 @@ impl Chain {
 
     /// 1 - lambda_2 = 1 - 2 sqrt(alpha (1 - alpha)) cos(pi / K).
     ///
-    /// Taken as (sqrt(1 - alpha) - sqrt(alpha))^2 + 4 sqrt(alpha (1 - alpha)) sin^2(pi / 2K), which cancels nothing: right to [`GAP_ERROR`].
+    /// Taken as (sqrt(1 - alpha) - sqrt(alpha))^2 + 4 sqrt(alpha (1 - alpha)) sin^2(pi / 2K), which cancels nothing.
     /// Source: Feller, An Introduction to Probability Theory, vol. 1, XVI.3. The smallest eigenvalue is -lambda_2, so
     /// this is the absolute gap as well.
-    pub(crate) fn spectral_gap(&self) -> f64 {
+    pub(super) fn spectral_gap(&self) -> f64 {
         let (up, down) = (self.alpha.sqrt(), (1.0 - self.alpha).sqrt());
         let apart = (1.0 - 2.0 * self.alpha) / (up + down);
         let sine = (std::f64::consts::PI / (2 * self.states) as f64).sin();
@@ -131,17 +104,6 @@ impl Chain {
         } else {
             state.saturating_sub(1)
         }
-    }
-}
-
-/// x / (exp(x) - 1), from 1 at 0 down to 0.
-fn bose(x: f64) -> f64 {
-    if x == 0.0 {
-        1.0
-    } else if x > 700.0 {
-        0.0
-    } else {
-        x / x.exp_m1()
     }
 }
 
@@ -228,7 +190,6 @@ mod tests {
         assert!(error < 1e-9, "{what}: {a} and {b}");
     }
 
-    /// For long walks and extreme odds the properties of `stability` check the closed forms.
     #[test]
     fn closed_forms_are_what_linear_algebra_finds() {
         for states in [2, 3, 10, 17] {

@@ -1,7 +1,7 @@
 //! Fig. 1: InfoNCE on a biased random walk learns T / rho; does it converge as the spectral gap says?
 //! Closed forms are in `chain`, learning in `training`, pictures in `figures`; here the grid and the page.
 
-pub(crate) mod chain;
+mod chain;
 mod figures;
 mod results;
 mod training;

@@ -1,0 +1,61 @@
+//! The schedule of epsilon.
+
+use driml_actor::Schedule;
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::stability::property::{Cases, Drawn, Listed, Property};
+
+const FRAMES: &str = "decay over 0, 1, 1e5, 1e10, 2^32, 2^53, 2^64 - 1 frames, from before the first to after the last";
+
+pub(super) const PROPERTIES: &[Property] = &[Property {
+    routine: "epsilon",
+    range: "any counts of frames; start and end 0 to 1",
+    promises: &[("epsilon; never back or beyond its ends", Schedule::ERROR)],
+    extremes: &[(FRAMES, Listed, epsilon), ("drawn", Drawn(1.0), epsilon)],
+}];
+
+/// Of any size.
+fn count(rng: &mut ChaCha8Rng) -> u64 {
+    rng.random::<u64>() >> rng.random_range(0..64)
+}
+
+fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let ends = [
+        (1.0, 0.0),
+        (0.1, 0.01),
+        (1.0, 0.999_999_9),
+        (0.05, 0.05),
+        (0.0, 1.0),
+    ];
+    let (start, end) = cases.of(&ends, |rng| (rng.random(), rng.random()));
+    let decays = [0, 1, 100_000, 10_000_000_000, 1 << 32, 1 << 53, u64::MAX];
+    let decay_frames = cases.of(&decays, count);
+    let hundredths = (0..=100u32).map(|i| (u128::from(decay_frames) * u128::from(i) / 100) as u64);
+    let beside = hundredths.flat_map(|at| [at.saturating_sub(1), at, at.saturating_add(1)]);
+    let listed: Vec<u64> = beside.chain([u64::MAX]).collect();
+    let mut frames = cases.of(&[listed], |rng| (0..4).map(|_| count(rng)).collect());
+    frames.sort_unstable();
+    let schedule = Schedule::Falling {
+        start,
+        end,
+        decay_frames,
+    };
+    let mut before: f64 = start;
+    for frames in frames {
+        let found = schedule.epsilon(frames);
+        // The share of two counts, right to the last place: 64 bits of the quotient, as an integer.
+        let share = match frames >= decay_frames {
+            true => 1.0,
+            false => ((u128::from(frames) << 64) / u128::from(decay_frames)) as f64 / 2f64.powi(64),
+        };
+        let error = match (before.min(end)..=before.max(end)).contains(&found) {
+            true => found - (start + (end - start) * share),
+            false => f64::NAN,
+        };
+        let input = format_args!("{start} to {end} over {decay_frames}, after {frames}: {found}");
+        cases.see(input, [error])?;
+        before = found;
+    }
+    Ok(())
+}
