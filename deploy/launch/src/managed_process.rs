@@ -115,12 +115,12 @@ impl ManagedProcess {
     }
 
     /// Whether it has ended in a way that a restart may mend: it was killed, or it had run for a while. A broken
-    /// invariant of our own aborts it. An orderly end is one only if it `is_needed`.
+    /// invariant of our own aborts it. After an orderly end it may if it `is_needed`.
     pub(crate) fn may_be_started_again(&mut self, is_needed: bool) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
-        self.end().is_some_and(|status| {
-            let was_killed = status.signal().is_some_and(killed);
-            (is_needed || !status.success()) && (was_killed || self.started.elapsed() > AT_ONCE)
+        self.end().is_some_and(|status| match status.success() {
+            true => is_needed,
+            false => status.signal().is_some_and(killed) || self.started.elapsed() > AT_ONCE,
         })
     }
 
