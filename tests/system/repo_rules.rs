@@ -11,10 +11,10 @@ use std::{
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_760),
-    ("actor", 13_110),
-    ("replay-server", 11_460),
-    ("learner", 26_870),
-    ("deploy", 34_975),
+    ("actor", 13_150),
+    ("replay-server", 11_720),
+    ("learner", 26_590),
+    ("deploy", 34_410),
     ("tests", 11_550),
 ];
 /// Most lines of one file.
