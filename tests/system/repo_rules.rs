@@ -11,10 +11,10 @@ use std::{
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_760),
-    ("actor", 13_110),
-    ("replay-server", 11_460),
+    ("actor", 13_150),
+    ("replay-server", 11_720),
     ("learner", 26_340),
-    ("deploy", 35_350),
+    ("deploy", 34_700),
     ("tests", 11_580),
 ];
 /// Most lines of one file.

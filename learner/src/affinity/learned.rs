@@ -304,7 +304,7 @@ mod tests {
                     .observe(&[(0, 1), (1, 2), (2, 0)], &mut rng)
                     .unwrap();
             }
-            learned.matrix
+            learned.matrix()
         };
         for updates in [1 << 31, 1 << 32, 1 << 40, 1 << 53] {
             assert_eq!(after(updates), after(1 << 24), "{updates}");

@@ -186,24 +186,6 @@ mod tests {
     }
 
     #[test]
-    fn a_target_that_is_no_number_is_not_left_out_of_the_loss() {
-        let mut gradient = [0f32; 3];
-        let loss = kl(&[0.0; 3], &[f32::NAN, 0.0, 0.0], None, ATOMS, &mut gradient);
-        assert!(loss.is_nan(), "{loss}");
-    }
-
-    #[test]
-    fn an_atom_without_probability_costs_nothing_where_the_target_has_none() {
-        let mut gradient = [f32::NAN; 3];
-        let logits = [0.0, f32::NEG_INFINITY, 0.0];
-        let loss = kl(&logits, &[0.5, 0.0, 0.5], None, ATOMS, &mut gradient);
-        assert!(loss.abs() < 1e-15, "{loss}");
-        assert_eq!(gradient[1], 0.0);
-        let loss = kl(&logits, &[0.5, 0.5, 0.0], None, ATOMS, &mut gradient);
-        assert_eq!(loss, f64::INFINITY);
-    }
-
-    #[test]
     fn a_row_s_weight_is_that_of_its_loss_and_of_its_slopes() -> Result<()> {
         let weights = [0.25f32, 1.0];
         let rows = row_kls(&LOGITS, &TARGET, ATOMS);
@@ -246,14 +228,6 @@ mod tests {
     }
 
     #[test]
-    fn a_perfect_prediction_costs_nothing() {
-        let logits: Vec<f32> = [0.2f32, 0.5, 0.3].iter().map(|p| p.ln()).collect();
-        let mut gradient = [0f32; 3];
-        let loss = kl(&logits, &[0.2, 0.5, 0.3], None, ATOMS, &mut gradient);
-        assert!(loss.abs() < 1e-7 && gradient.iter().all(|g| g.abs() < 1e-7));
-    }
-
-    #[test]
     fn extreme_logits_stay_finite() {
         let mut gradient = [0f32; 3];
         let loss = kl(
@@ -265,38 +239,6 @@ mod tests {
         );
         assert!((loss - 2e4).abs() < 1e-6);
         assert_eq!(gradient, [1.0, -1.0, 0.0]);
-    }
-
-    /// Such logits differ by nothing or by whole steps of a float, and their softmax is as plain as that of small ones.
-    #[test]
-    fn a_common_offset_of_any_size_changes_nothing() {
-        const ATOMS: usize = 51;
-        let target = [1.0 / ATOMS as f32; ATOMS];
-        for offset in [0.0f32, 1e6, 1e12, -1e14, 1e30, -1e38, 1e38, f32::MAX] {
-            let (mut probs, mut gradient) = ([0f32; ATOMS], [0f32; ATOMS]);
-            let mut logits = [offset; ATOMS];
-            softmax(&logits, &mut probs);
-            let loss = kl(&logits, &target, None, ATOMS, &mut gradient);
-            assert!(
-                probs.iter().all(|p| (p * 51.0 - 1.0).abs() < 1e-6),
-                "{offset}: {probs:?}"
-            );
-            assert!(loss.abs() < 1e-6, "{offset}: {loss}");
-            assert!(
-                gradient.iter().all(|g| g.abs() < 1e-7),
-                "{offset}: {gradient:?}"
-            );
-
-            // Two equal logits far above the rest share all the mass.
-            logits.fill(offset - offset.abs() / 2.0 - 1e3);
-            (logits[3], logits[7]) = (offset, offset);
-            softmax(&logits, &mut probs);
-            let sum: f32 = probs.iter().sum();
-            assert!(
-                (probs[3], probs[7], sum) == (0.5, 0.5, 1.0),
-                "{offset}: {probs:?}"
-            );
-        }
     }
 
     #[test]

@@ -1,12 +1,16 @@
 //! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views.
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
-use driml_learner::{Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, UpdateError};
+use driml_learner::{
+    Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, OwnedBatch, UpdateError,
+};
 use driml_model::{Compute, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::synthetic::{ALL_DIM, CPC, CURL, DIM, NO_DIM, Rows, Values, model, settings, values};
+use crate::synthetic::{
+    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, model, random_batch, settings, values,
+};
 
 pub(crate) const GLOBAL: Lambda = Lambda {
     l4t4: 1.0,
@@ -51,7 +55,7 @@ fn agent(kind: AuxiliaryKind, lambda: Lambda) -> Agent {
 }
 
 /// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.
-fn cpc<'a>(rows: &'a Rows, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
+fn cpc<'a>(rows: &'a OwnedBatch, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
     Batch {
         positives: POSITIVES,
         states_k,
@@ -60,21 +64,21 @@ fn cpc<'a>(rows: &'a Rows, states_k: &'a [u8], valid: &'a [u8]) -> Batch<'a> {
     }
 }
 
-fn later(rows: &Rows) -> Vec<u8> {
-    rows.frames.concat()
+fn later(rows: &OwnedBatch) -> Vec<u8> {
+    [&rows.states_t[..], &rows.states_k, &rows.states_n].concat()
 }
 
-fn curl(rows: &Rows) -> Batch<'_> {
+fn curl(rows: &OwnedBatch) -> Batch<'_> {
     Batch {
-        anchors: Some(&rows.frames[1]),
-        states_k: &rows.frames[2],
+        anchors: Some(&rows.states_k),
+        states_k: &rows.states_n,
         ..rows.batch()
     }
 }
 
 #[test]
 fn cpc_with_one_offset_is_dim() {
-    let rows = Rows::random(7, 2);
+    let rows = random_batch(7, 2);
     let one = agent(CPC, ALL_DIM).evaluate(&rows.batch());
     let dim = agent(DIM, ALL_DIM).evaluate(&rows.batch());
     let (one, dim) = (one.unwrap(), dim.unwrap());
@@ -100,7 +104,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         (DIM, ALL_DIM),
         (CPC, ALL_DIM),
     ] {
-        let mut rows = Rows::random(6, 4);
+        let mut rows = random_batch(6, 4);
         rows.bootstrap_discount = vec![0.9, 0.0, 0.9, 0.9, 0.0, 0.9];
         rows.positive_valid = vec![0, 1, 0, 1, 1, 1];
         let several = later(&rows);
@@ -148,7 +152,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
 
 #[test]
 fn without_any_positive_cpc_learns_the_return() {
-    let rows = Rows::random(5, 5);
+    let rows = random_batch(5, 5);
     let states_k = later(&rows);
     for there in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
@@ -162,7 +166,7 @@ fn without_any_positive_cpc_learns_the_return() {
 
 #[test]
 fn cpc_and_curl_bring_their_losses_down() {
-    let rows = Rows::random(16, 6);
+    let rows = random_batch(16, 6);
     let (states_k, valid) = (later(&rows), [1; 16 * POSITIVES]);
     for (kind, batch) in [(CPC, cpc(&rows, &states_k, &valid)), (CURL, curl(&rows))] {
         let mut agent = agent(kind, GLOBAL);
@@ -177,22 +181,22 @@ fn cpc_and_curl_bring_their_losses_down() {
 
 #[test]
 fn curl_compares_its_views_and_not_the_state() {
-    let rows = Rows::random(8, 7);
+    let rows = random_batch(8, 7);
     let agent = agent(CURL, GLOBAL);
     let loss = |batch: &Batch<'_>| only(&agent.evaluate(batch).unwrap().losses);
     let before = loss(&curl(&rows));
     let mut other = rows.clone();
-    other.frames[0].fill(3);
+    other.states_t.fill(3);
     assert_eq!(loss(&curl(&other)), before, "s_t itself");
     // No row is masked: the end of an episode matters to neither view.
     other.positive_valid.fill(0);
     assert_eq!(loss(&curl(&other)), before, "positive_valid");
-    other.frames[1].fill(3);
+    other.states_k.fill(3);
     assert_ne!(loss(&curl(&other)), before, "the query's view");
     let mut other = rows.clone();
-    other.frames[2] = other.frames[1].clone();
+    other.states_n = other.states_k.clone();
     let batch = Batch {
-        states_n: &rows.frames[2],
+        states_n: &rows.states_n,
         ..curl(&other)
     };
     assert_ne!(loss(&batch), before, "the key's view");
@@ -206,7 +210,7 @@ fn part_of(values: &Values, part: impl Fn(&str) -> bool) -> Values {
 
 #[test]
 fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
-    let rows = Rows::random(6, 8);
+    let rows = random_batch(6, 8);
     let mut agent = agent(CURL, GLOBAL);
     let key = |agent: &Agent| values(agent.key().unwrap());
     let encoder = |name: &str| name.starts_with("torso.") || name.starts_with("dim.psi4.");
@@ -235,7 +239,7 @@ fn curl_s_key_encoder_is_a_moving_average_that_moves_at_every_update() {
 /// So that a comparison of agents compares the auxiliary loss alone.
 #[test]
 fn c51_s_target_network_is_the_same_for_every_agent() {
-    let rows = Rows::random(6, 8);
+    let rows = random_batch(6, 8);
     for (kind, lambda) in [
         (AuxiliaryKind::NONE, NO_DIM),
         (DIM, GLOBAL),
@@ -277,7 +281,7 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
 
 #[test]
 fn batches_that_an_agent_cannot_use_are_refused() {
-    let rows = Rows::random(5, 9);
+    let rows = random_batch(5, 9);
     let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
     let said = |kind, batch: &Batch<'_>| {
         let error = agent(kind, GLOBAL).evaluate(batch).unwrap_err();
@@ -356,7 +360,7 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
 
 #[test]
 fn a_psi_that_is_not_given_the_action_does_not_see_it() {
-    let mut rows = Rows::random(6, 10);
+    let mut rows = random_batch(6, 10);
     let agent = agent(DIM, ALL_DIM);
     assert!(!agent.model().dim.action);
     let before = agent.evaluate(&rows.batch()).unwrap().losses;

@@ -220,27 +220,6 @@ fn jitter_is_uniform_within_its_strength() {
     }
 }
 
-/// What jitter does to bytes: brightness keeps the mean on average, and spreads it as its law says.
-#[test]
-fn brightness_moves_means_as_its_law_says() {
-    let settings = AugmentSettings {
-        brightness: 0.4,
-        ..NOTHING
-    };
-    let (count, bytes) = (4_000, 2 * 2 * 3);
-    let seen = applied(settings, (2, 2, 3), &vec![100; count * bytes]);
-    let means: Vec<f64> = seen
-        .chunks_exact(bytes)
-        .map(|state| state.iter().map(|&b| f64::from(b)).sum::<f64>() / bytes as f64)
-        .collect();
-    let mean = means.iter().sum::<f64>() / count as f64;
-    let variance = means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / count as f64;
-    // Uniform on 60..140: standard deviation 80 / sqrt(12) = 23.09.
-    assert!((mean - 100.0).abs() < 4.0 * 23.1 / (count as f64).sqrt());
-    assert!((variance.sqrt() - 23.09).abs() < 1.0, "{}", variance.sqrt());
-    assert!(means.iter().all(|mean| (60.0..=140.0).contains(mean)));
-}
-
 #[test]
 fn the_generator_alone_decides_and_rows_differ() {
     let size = (16, 16, 3);

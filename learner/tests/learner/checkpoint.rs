@@ -16,7 +16,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
-use crate::synthetic::{ACTIONS, ALL_DIM, CANDLE, Rows, agent, agent_on, model, settings};
+use crate::synthetic::{ACTIONS, ALL_DIM, CANDLE, agent, agent_on, model, random_batch, settings};
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -62,7 +62,7 @@ pub(crate) fn start() -> LearnerState {
 
 pub(crate) fn learn(run: &mut LearnerState, updates: u64) {
     for _ in 0..updates {
-        let rows = Rows::random(6, run.agent.updates());
+        let rows = random_batch(6, run.agent.updates());
         run.agent.update(&rows.batch()).unwrap();
         let affinity = run.affinity.as_mut().unwrap();
         let pairs = rows.batch().action_pairs();
@@ -200,7 +200,7 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
         let mut resumed = restored.expect("a checkpoint").agent;
         let is_same = run.agent.weights().unwrap() == resumed.weights().unwrap();
         assert!(is_same, "the weights are the same bits");
-        let rows = Rows::random(6, 9);
+        let rows = random_batch(6, 9);
         let (a, b) = (
             run.agent.update(&rows.batch()).unwrap(),
             resumed.update(&rows.batch()).unwrap(),

@@ -6,7 +6,7 @@ use driml_model::{ModelConfig, TorsoName};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::synthetic::{ALL_DIM, Rows, model, settings};
+use crate::synthetic::{ALL_DIM, batch_of, model, settings};
 
 /// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had a stream, most updates
 /// after the first computed with states that were not there yet. Batches have to be large for that to show.
@@ -15,7 +15,7 @@ use crate::synthetic::{ALL_DIM, Rows, model, settings};
 fn updates_on_a_gpu_follow_those_on_the_cpu() {
     let gpu = DeviceName::Cuda(0).open(Precision::F32).unwrap();
     let (height, width, input_channels) = (64, 64, 3);
-    let rows = Rows::of_frames(256, height * width * input_channels, 3);
+    let rows = batch_of(256, height * width * input_channels, 3);
     let totals = |compute: &Compute| {
         let model = ModelConfig {
             height,

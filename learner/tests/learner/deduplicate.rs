@@ -1,12 +1,12 @@
 //! Equal states of a batch that are computed once: what an update gives with it and without.
 
-use driml_learner::{Agent, AuxiliaryKind, Compute, Evaluation, Lambda, Precision};
+use driml_learner::{Agent, AuxiliaryKind, Compute, Evaluation, Lambda, OwnedBatch, Precision};
 use driml_model::Kernels;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::agents::{GLOBAL, curl_table};
-use crate::synthetic::{ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, Rows, model, settings};
+use crate::synthetic::{ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, model, random_batch, settings};
 
 const ROWS: usize = 40;
 
@@ -38,22 +38,23 @@ enum Repeat {
 }
 
 /// Random rows; where states repeat, every third is an earlier one of s_t, as where a scene stands still.
-fn rows(repeat: Repeat) -> Rows {
-    let mut rows = Rows::random(ROWS, 3);
-    let len = rows.frames[0].len() / ROWS;
+fn rows(repeat: Repeat) -> OwnedBatch {
+    let mut rows = random_batch(ROWS, 3);
+    let len = rows.states_t.len() / ROWS;
     for row in (2..ROWS).step_by(3) {
-        let other = rows.frames[0][(row / 2) * len..][..len].to_vec();
-        for plane in match repeat {
-            Repeat::Nowhere => 0..0,
-            Repeat::Later => 2..3,
-            Repeat::Everywhere => 0..3,
-        } {
-            rows.frames[plane][row * len..][..len].copy_from_slice(&other);
+        let other = rows.states_t[(row / 2) * len..][..len].to_vec();
+        let mut planes = [&mut rows.states_t, &mut rows.states_k, &mut rows.states_n];
+        for plane in &mut planes[match repeat {
+            Repeat::Nowhere => 3..,
+            Repeat::Later => 2..,
+            Repeat::Everywhere => 0..,
+        }] {
+            plane[row * len..][..len].copy_from_slice(&other);
         }
     }
     if repeat == Repeat::Later {
         let (from, to) = (len, 4 * len);
-        rows.frames[2].copy_within(from..from + len, to);
+        rows.states_n.copy_within(from..from + len, to);
     }
     rows
 }
@@ -103,8 +104,8 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                 let weights: Vec<f32> = (1..=batch.rows).map(|row| 1.0 / row as f32).collect();
                 batch.importance_weight = is_weighted.then_some(&weights);
                 if auxiliary_loss == CURL {
-                    batch.anchors = Some(&rows.frames[1]);
-                    batch.states_k = &rows.frames[2];
+                    batch.anchors = Some(&rows.states_k);
+                    batch.states_k = &rows.states_n;
                 }
                 let case = format!("{precision} {auxiliary_loss:?}");
                 let [each, once] = [false, true].map(|deduplicate| {

@@ -4,13 +4,13 @@
 use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
-use driml_learner::{Agent, UpdateError};
+use driml_learner::{Agent, OwnedBatch, UpdateError};
 use driml_model::Compute;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, Rows, agent, agent_on, changed, model, settings, values,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, changed, model, random_batch, settings, values,
 };
 
 /// Double DQN, where the online network overflows on s_{t+n} and not on s_t, and the target network on neither.
@@ -26,8 +26,8 @@ fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
             values.iter_mut().for_each(|v| *v = v.abs() * 1e15);
         }
     });
-    let mut rows = Rows::random(4, 18);
-    rows.frames[0].fill(0);
+    let mut rows = random_batch(4, 18);
+    rows.states_t.fill(0);
     let before = values(agent.online());
     let error = agent.update(&rows.batch()).unwrap_err();
     assert!(
@@ -42,7 +42,7 @@ fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
 
 #[test]
 fn a_target_network_that_overflows_is_an_error_that_changes_nothing() {
-    let (mut agent, rows) = (agent(NO_DIM, 16), Rows::random(4, 18));
+    let (mut agent, rows) = (agent(NO_DIM, 16), random_batch(4, 18));
     let weight = agent.target().get("torso.conv1.weight").unwrap();
     let large = Tensor::full(1e38f32, weight.dims(), &Device::Cpu).unwrap();
     weight.set(&large).unwrap();
@@ -56,8 +56,8 @@ fn a_target_network_that_overflows_is_an_error_that_changes_nothing() {
 fn a_bad_batch_is_an_error_that_changes_nothing() {
     let mut agent = agent(ALL_DIM, 19);
     let before = values(agent.online());
-    let good = Rows::random(5, 20);
-    let mut refused = |change: fn(&mut Rows), said: &str| {
+    let good = random_batch(5, 20);
+    let mut refused = |change: fn(&mut OwnedBatch), said: &str| {
         let mut rows = good.clone();
         change(&mut rows);
         let error = agent.update(&rows.batch()).expect_err(said);
@@ -72,10 +72,12 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
     refused(|rows| rows.n_step_return[1] = f32::INFINITY, "row 1");
     refused(|rows| rows.bootstrap_discount[1] = 1.5, "row 1");
     refused(|rows| rows.bootstrap_discount[1] = f32::NAN, "row 1");
-    refused(|rows| rows.frames[0].truncate(7), "states_t");
-    refused(|rows| rows.frames[1].truncate(7), "states_k");
-    refused(|rows| rows.positive_valid.clear(), "positive_valid");
+    refused(|rows| rows.states_t.truncate(7), "states_t");
+    refused(|rows| rows.states_k.truncate(7), "states_k");
     let mut batch = good.batch();
+    batch.positive_valid = &[];
+    let error = agent.update(&batch).unwrap_err().to_string();
+    assert!(error.contains("positive_valid"), "{error}");
     (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
     assert!(agent.update(&batch).is_err());
     batch.rows = 0;
@@ -86,7 +88,7 @@ fn a_bad_batch_is_an_error_that_changes_nothing() {
 
 #[test]
 fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
-    let rows = Rows::random(5, 21);
+    let rows = random_batch(5, 21);
     let bits = |agent: &Agent| -> HashMap<String, Vec<u32>> {
         let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect();
         let all = values(agent.online()).into_iter();
@@ -128,7 +130,7 @@ fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
     for compute in [&Compute::CPU, &CANDLE] {
         let mut agent = fast(compute, 1e38);
         let before = values(agent.online());
-        let error = agent.update(&Rows::random(6, 30).batch()).unwrap_err();
+        let error = agent.update(&random_batch(6, 30).batch()).unwrap_err();
         let said = "a step of Adam with lr = 1e38 is not finite";
         assert!(error.to_string().contains(said), "{error}");
         assert_eq!(values(agent.online()), before);
@@ -140,7 +142,7 @@ fn a_step_size_beyond_the_finite_numbers_is_an_error_that_changes_nothing() {
 /// A learner whose parameter `name` a step has just taken beyond the finite numbers, and what that step said.
 pub(crate) fn diverged(compute: &Compute, name: &str) -> (Agent, Result<f64, UpdateError>) {
     let mut agent = fast(compute, 3e37);
-    let evaluation = agent.evaluate(&Rows::random(6, 31).batch()).unwrap();
+    let evaluation = agent.evaluate(&random_batch(6, 31).batch()).unwrap();
     let gradient = evaluation.gradients.get(name).unwrap();
     // As large as numbers get; the next step works again.
     let direction = gradient.sign().unwrap().affine(-f64::from(f32::MAX), 0.0);

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AdamSettings, Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, NetworkParameters,
+    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnerSettings, NetworkParameters, OwnedBatch,
     auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters, TorsoName};
@@ -113,65 +113,39 @@ pub(crate) const CANDLE: Compute = Compute {
     ..Compute::CPU
 };
 
-#[derive(Clone)]
-pub(crate) struct Rows {
-    pub(crate) frames: [Vec<u8>; 3],
-    pub(crate) action: Vec<u8>,
-    pub(crate) next_action: Vec<u8>,
-    pub(crate) n_step_return: Vec<f32>,
-    pub(crate) bootstrap_discount: Vec<f32>,
-    pub(crate) positive_valid: Vec<u8>,
+pub(crate) fn random_batch(rows: usize, seed: u64) -> OwnedBatch {
+    batch_of(rows, 20 * 24 * 2, seed)
 }
 
-impl Rows {
-    pub(crate) fn random(rows: usize, seed: u64) -> Self {
-        Self::of_frames(rows, 20 * 24 * 2, seed)
-    }
-
-    /// With states of `frame_len` bytes.
-    pub(crate) fn of_frames(rows: usize, frame_len: usize, seed: u64) -> Self {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut frames = || {
-            (0..rows * frame_len)
-                .map(|_| rng.random())
-                .collect::<Vec<u8>>()
-        };
-        let frames = [frames(), frames(), frames()];
-        let mut draw = |below: u8| {
-            (0..rows)
-                .map(|_| rng.random_range(0..below))
-                .collect::<Vec<u8>>()
-        };
-        let action = draw(ACTIONS as u8);
-        let mut next_action = draw(ACTIONS as u8);
-        next_action[0] = NO_ACTION;
-        Self {
-            frames,
-            action,
-            next_action,
-            n_step_return: (0..rows).map(|_| rng.random_range(-3.0..3.0)).collect(),
-            bootstrap_discount: (0..rows)
-                .map(|row| if row == 0 { 0.0 } else { 0.93 })
-                .collect(),
-            positive_valid: (0..rows).map(|row| u8::from(row != 0)).collect(),
-        }
-    }
-
-    pub(crate) fn batch(&self) -> Batch<'_> {
-        Batch {
-            rows: self.action.len(),
-            states_t: &self.frames[0],
-            anchors: None,
-            positives: 1,
-            states_k: &self.frames[1],
-            states_n: &self.frames[2],
-            action: &self.action,
-            next_action: &self.next_action,
-            n_step_return: &self.n_step_return,
-            bootstrap_discount: &self.bootstrap_discount,
-            positive_valid: &self.positive_valid,
-            importance_weight: None,
-        }
+/// With states of `frame_len` bytes.
+pub(crate) fn batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut states = || {
+        (0..rows * frame_len)
+            .map(|_| rng.random())
+            .collect::<Vec<u8>>()
+    };
+    let [states_t, states_k, states_n] = [states(), states(), states()];
+    let mut draw = |below: u8| {
+        (0..rows)
+            .map(|_| rng.random_range(0..below))
+            .collect::<Vec<u8>>()
+    };
+    let action = draw(ACTIONS as u8);
+    let mut next_action = draw(ACTIONS as u8);
+    next_action[0] = NO_ACTION;
+    OwnedBatch {
+        states_t,
+        states_k,
+        states_n,
+        action,
+        next_action,
+        n_step_return: (0..rows).map(|_| rng.random_range(-3.0..3.0)).collect(),
+        bootstrap_discount: (0..rows)
+            .map(|row| if row == 0 { 0.0 } else { 0.93 })
+            .collect(),
+        positive_valid: (0..rows).map(|row| u8::from(row != 0)).collect(),
+        ..OwnedBatch::default()
     }
 }
 

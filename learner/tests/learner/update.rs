@@ -9,13 +9,13 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, Rows, agent, agent_on, agent_with, changed, model,
-    settings, values,
+    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, model,
+    random_batch, settings, values,
 };
 
 #[test]
 fn repeated_updates_on_one_batch_bring_the_losses_down() {
-    let (mut agent, rows) = (agent(ALL_DIM, 3), Rows::random(16, 4));
+    let (mut agent, rows) = (agent(ALL_DIM, 3), random_batch(16, 4));
     let first = agent.update(&rows.batch()).unwrap();
     let last = (0..60)
         .map(|_| agent.update(&rows.batch()).unwrap())
@@ -32,7 +32,7 @@ fn repeated_updates_on_one_batch_bring_the_losses_down() {
 
 #[test]
 fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
-    let (mut agent, rows) = (agent(NO_DIM, 5), Rows::random(6, 6));
+    let (mut agent, rows) = (agent(NO_DIM, 5), random_batch(6, 6));
     assert!(
         agent
             .online()
@@ -49,7 +49,7 @@ fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
 #[test]
 fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
     for valid in 0..2 {
-        let mut rows = Rows::random(7, 7);
+        let mut rows = random_batch(7, 7);
         rows.positive_valid = (0..7).map(|row| u8::from(row < valid)).collect();
         let with_dim = agent(ALL_DIM, 8);
         let evaluation = with_dim.evaluate(&rows.batch()).unwrap();
@@ -76,15 +76,15 @@ fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
 #[test]
 fn rows_without_a_bootstrap_ignore_what_comes_after() {
     for ended in [&[0, 1, 2, 3, 4, 5][..], &[1, 4]] {
-        let mut rows = Rows::random(6, 9);
+        let mut rows = random_batch(6, 9);
         rows.bootstrap_discount.fill(0.93);
-        let (agent, len) = (agent(NO_DIM, 10), rows.frames[2].len() / 6);
+        let (agent, len) = (agent(NO_DIM, 10), rows.states_n.len() / 6);
         for &row in ended {
             rows.bootstrap_discount[row] = 0.0;
         }
         let first = agent.evaluate(&rows.batch()).unwrap();
         for &row in ended {
-            rows.frames[2][row * len..][..len].fill(0);
+            rows.states_n[row * len..][..len].fill(0);
         }
         let second = agent.evaluate(&rows.batch()).unwrap();
         assert_eq!(first.target_projection, second.target_projection);
@@ -104,7 +104,7 @@ fn rows_without_a_bootstrap_ignore_what_comes_after() {
 
 #[test]
 fn double_dqn_chooses_by_the_online_network() {
-    let mut rows = Rows::random(12, 15);
+    let mut rows = random_batch(12, 15);
     rows.bootstrap_discount.fill(0.93);
     let mut settings = settings(NO_DIM);
     let mut chosen = Vec::new();
@@ -141,7 +141,7 @@ fn candle_s_own_operations_learn_the_same() {
         let (mut ours, mut theirs) = (agent(lambda, 1), agent_on(&CANDLE, lambda, 1));
         // Past the third update the target network has moved.
         for update in 0..5 {
-            let rows = Rows::random(8, update);
+            let rows = random_batch(8, update);
             let (a, b) = (
                 ours.update(&rows.batch()).unwrap(),
                 theirs.update(&rows.batch()).unwrap(),
@@ -174,7 +174,7 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
     }
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     let agent = Agent::new(model, settings(NO_DIM), &CANDLE, rng).unwrap();
-    let evaluation = agent.evaluate(&Rows::random(4, 1).batch()).unwrap();
+    let evaluation = agent.evaluate(&random_batch(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
         assert!(
             !evaluation.gradients.get(name).unwrap().track_op(),
@@ -190,7 +190,7 @@ fn learners_of_one_process_do_not_touch_each_other() {
     let learned = |lambda| {
         let mut agent = agent(lambda, 1);
         for seed in 0..UPDATES {
-            agent.update(&Rows::random(64, seed).batch()).unwrap();
+            agent.update(&random_batch(64, seed).batch()).unwrap();
         }
         values(agent.online())
     };
@@ -212,7 +212,7 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
         double_dqn: true,
         ..settings(NO_DIM)
     };
-    let rows = Rows::random(6, 2);
+    let rows = random_batch(6, 2);
     let agent =
         |seed: u8| agent_with(NOISY_DUELING, settings.clone(), 1).with_noise_seed([seed; 32]);
     let (mut one, mut same, other) = (agent(1), agent(1), agent(2));

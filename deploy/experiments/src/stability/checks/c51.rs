@@ -198,7 +198,7 @@ impl Batch {
             logits: finites(rows * atoms, rng),
             target: (0..rows).flat_map(|_| law(atoms, rng)).collect(),
             weights: rng
-                .random()
+                .random::<bool>()
                 .then(|| (0..rows).map(|_| probability(rng)).collect()),
         }
     }
