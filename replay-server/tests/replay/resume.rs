@@ -4,10 +4,7 @@
 use driml_protocol::LearnerJoin;
 use driml_replay_server::{Config, NotReady, Replay, Since};
 
-use crate::{
-    calls::{counts, header, insert, is_stored, learner, small_spec},
-    history::unlimited,
-};
+use crate::calls::{counts, header, insert, is_stored, learner, small_spec};
 
 fn config() -> Config {
     Config {
@@ -15,7 +12,7 @@ fn config() -> Config {
         warmup_transitions: 60,
         slack_transitions: 12,
         transitions_max: Some(180),
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     }
 }
 
