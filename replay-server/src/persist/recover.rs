@@ -241,6 +241,7 @@ impl Reader<'_> {
             number,
             first_row,
             bytes: if is_last { at } else { bytes.len() } as u64,
+            snapshot_bytes: 0,
         });
         match ended {
             Ok(true) if is_last => self.warn(format!(
