@@ -10,12 +10,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_760),
+    ("protocol", 8_490),
     ("actor", 13_110),
-    ("replay-server", 11_460),
+    ("replay-server", 11_630),
     ("learner", 26_870),
     ("deploy", 34_975),
-    ("tests", 11_550),
+    ("tests", 11_510),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, Learned,
+    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, Horizon, InsertReply, Learned,
     LearnerJoin, Leave, RunSpec, Sampling, ShardCounts, TimeoutRule,
 };
 
@@ -194,4 +194,17 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
     }
     // The 2,000 transitions held take 34 kB in chunks, and a state 16 kB.
     assert!(most < 200_000, "{most}");
+}
+
+#[test]
+fn where_a_launcher_records_it_alone_says_which_episodes_need_not_be_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut replay, _) = open(folder.path()).unwrap();
+    replay.join_actor(join(0, 1)).unwrap();
+    store(&mut replay, 0);
+    for (since, is_launcher, kept) in [(1, false, 0), (0, true, 1), (1, false, 1), (1, true, 0)] {
+        replay.episodes(EpisodesRequest { since, is_launcher });
+        let kept_now = replay.snapshot().state.statistics.episodes_since(0);
+        assert_eq!(kept_now.episodes.len(), kept, "{since} {is_launcher}");
+    }
 }

@@ -6,7 +6,7 @@ use driml_learner::{
     optimiser::adam::{Adam, AdamSettings},
 };
 use driml_model::{Parameters, PolicyNetwork, Precision, StoredAs};
-use driml_protocol::{AffinityUpdate, Chunk, End, InsertReply, TimeoutRule};
+use driml_protocol::{AffinityUpdate, Chunk, End, InsertReply, TimeoutRule, codec};
 use driml_replay_server::horizon::Affinity;
 
 use super::{
@@ -150,8 +150,8 @@ fn replays() -> anyhow::Result<[Refusal; 3]> {
         _ => String::new(),
     };
     let infinite = chunk(&[(f32::INFINITY, End::Running); 10]);
-    let (header, payload) = infinite.seal(7)?;
-    let received = Chunk::decode(&[header.as_slice(), payload].concat(), 7, 2);
+    let bytes = codec::encode(7, &infinite.header, infinite.payload())?;
+    let received = Chunk::decode(&bytes, 7);
     let mut affinity = Affinity::uniform(1);
     let update = AffinityUpdate {
         learner: 1,
