@@ -125,9 +125,6 @@ impl RunClient {
     }
 
     /// Fetches a message that takes no request, such as a status.
-    ///
-    /// # Errors
-    /// As [`RunClient::ask`].
     pub fn fetch<M: Keyed>(&self, timeout: Duration) -> Result<M, SessionError> {
         self.query::<M, M>(self.keys.of::<M>(), ZBytes::new(), timeout)?
             .wait()
@@ -142,9 +139,6 @@ impl RunClient {
     }
 
     /// A request with a payload, which is not copied.
-    ///
-    /// # Errors
-    /// As [`RunClient::seal`].
     pub fn seal_with<R: Request>(
         &self,
         request: &R,
@@ -264,26 +258,17 @@ pub struct PendingReply<M> {
 
 impl<M: Message> PendingReply<M> {
     /// Waits for the reply, which has no payload.
-    ///
-    /// # Errors
-    /// As [`RunClient::ask`].
     pub fn wait(mut self) -> Result<M, SessionError> {
         self.bytes.wait_for(|bytes| decode(bytes, self.spec_hash))
     }
 
     /// Waits for the reply, at most for `wait_max`; `None` if it has not come by then.
-    ///
-    /// # Errors
-    /// As [`RunClient::ask`].
     pub fn wait_within(&mut self, wait_max: Duration) -> Result<Option<M>, SessionError> {
         let read = |bytes: &ZBytes| decode(bytes, self.spec_hash);
         self.bytes.wait_for_within(wait_max, read)
     }
 
     /// Waits for the reply and copies its payload into own memory of `pool`.
-    ///
-    /// # Errors
-    /// As [`RunClient::ask`].
     pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
         self.bytes.wait_for(|bytes| {
             codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))

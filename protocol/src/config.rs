@@ -18,9 +18,6 @@ impl ConfigError {
 }
 
 /// Checks what must be so for the value of a key; if it is not, that is a [`ConfigError::of`] it.
-///
-/// # Errors
-/// It is not so.
 pub fn check<W: Display>(
     is_so: bool,
     key: &str,

@@ -44,7 +44,7 @@ pub use messages::{
     affinity::AffinityUpdate,
     batch::{Batch, NO_ACTION},
     batch_frames::StackedFrames,
-    batch_header::{BatchHeader, BatchReply, POOL_BATCHES},
+    batch_header::{BatchHeader, BatchReply, NotReady, POOL_BATCHES},
     batch_request::{BatchRequest, Learned, RequestId},
     batch_rows::{BatchStatesMut, RowScalars},
     chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},

@@ -30,7 +30,7 @@ use crate::{
         codec::{self, PAYLOAD_BYTES_MAX},
         error::CodecError,
         keys::Keys,
-        message::{Keyed, Message, Request},
+        message::{Message, Request},
     },
 };
 
@@ -61,9 +61,6 @@ impl<R: Request> Incoming<R> {
     }
 
     /// Reads a request and copies its payload into own memory of `pool`.
-    ///
-    /// # Errors
-    /// As [`Incoming::read`].
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
@@ -129,14 +126,20 @@ impl<M: Message> Responder<M> {
     }
 }
 
-/// Threads and the queue to them, for the queries at the key of `M`. The threads end when this and everything that it declared
-/// are dropped.
+/// What a thread of these is given.
+enum Work {
+    Query(Query),
+    /// A query of so many bytes was too long, and who is told.
+    TooLong(usize, Arc<dyn Fn(usize) + Send + Sync>),
+}
+
+/// Threads and the queue to them, for the requests `R`. The threads end when this and everything that it declared are dropped.
 #[derive(Debug)]
-pub struct QueryWorkers<M> {
-    queries: Sender<Query>,
+pub struct QueryWorkers<R> {
+    work: Sender<Work>,
     waiting_bytes: Arc<AtomicUsize>,
     threads: Vec<JoinHandle<()>>,
-    message: PhantomData<fn() -> M>,
+    request: PhantomData<fn() -> R>,
 }
 
 impl<R: Request + 'static> QueryWorkers<R> {
@@ -144,72 +147,46 @@ impl<R: Request + 'static> QueryWorkers<R> {
     ///
     /// # Errors
     /// The operating system gave no thread.
-    pub fn answer(
+    pub fn start(
         name: &str,
         threads: usize,
         spec_hash: u64,
         answer: impl Fn(Incoming<R>) + Clone + Send + 'static,
     ) -> std::io::Result<Self> {
-        Self::start(name, threads, move |query| {
-            answer(Incoming {
-                query,
-                spec_hash,
-                request: PhantomData,
-            });
-        })
-    }
-}
-
-impl<M: Keyed + 'static> QueryWorkers<M> {
-    /// Starts `threads` threads that reply to each fetch with an `M`.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
-    pub fn offer(
-        name: &str,
-        threads: usize,
-        spec_hash: u64,
-        give: impl Fn(Responder<M>) + Clone + Send + 'static,
-    ) -> std::io::Result<Self> {
-        Self::start(name, threads, move |query| {
-            give(Responder {
-                query,
-                spec_hash,
-                reply: PhantomData,
-            });
-        })
-    }
-
-    fn start(
-        name: &str,
-        threads: usize,
-        handle: impl Fn(Query) + Clone + Send + 'static,
-    ) -> std::io::Result<Self> {
-        let (queries, waiting) = crossbeam_channel::bounded::<Query>(WAITING_MAX);
+        let (work, waiting) = crossbeam_channel::bounded::<Work>(WAITING_MAX);
         let waiting_bytes = Arc::<AtomicUsize>::default();
-        let work = |i: usize| {
-            let (waiting, handle, bytes) = (waiting.clone(), handle.clone(), waiting_bytes.clone());
+        let thread = |i: usize| {
+            let (waiting, answer, bytes) = (waiting.clone(), answer.clone(), waiting_bytes.clone());
             let point = name.to_owned();
             let next = move || {
                 fail_point::reach(&point);
-                let query = waiting.recv().ok()?;
-                bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
-                Some(query)
+                waiting.recv().ok()
+            };
+            let handle = move |work| match work {
+                Work::Query(query) => {
+                    bytes.fetch_sub(payload_bytes(&query), Ordering::Relaxed);
+                    answer(Incoming {
+                        query,
+                        spec_hash,
+                        request: PhantomData,
+                    });
+                }
+                Work::TooLong(bytes, refused) => refused(bytes),
             };
             std::thread::Builder::new()
                 .name(format!("{name}-{i}"))
                 .spawn(move || std::iter::from_fn(next).for_each(handle))
         };
-        let threads = (0..threads).map(work).collect::<Result<_, _>>()?;
+        let threads = (0..threads).map(thread).collect::<Result<_, _>>()?;
         Ok(Self {
-            queries,
+            work,
             waiting_bytes,
             threads,
-            message: PhantomData,
+            request: PhantomData,
         })
     }
 
-    /// Takes the queries at the key of `M` in the client's run, until the result is dropped. No other process need be asked: the
+    /// Takes the requests in the client's run, until the result is dropped. No other process need be asked: the
     /// reply is complete.
     ///
     /// # Errors
@@ -219,32 +196,32 @@ impl<M: Keyed + 'static> QueryWorkers<M> {
     }
 
     /// As [`QueryWorkers::declare`], for queries of at most `bytes_max` bytes: longer ones are dropped before anything is copied,
-    /// and `refused` is told their bytes, on the thread that reads the socket.
-    ///
-    /// # Errors
-    /// As [`QueryWorkers::declare`].
+    /// and `refused` is told their bytes.
     pub fn declare_limited(
         &self,
         client: &RunClient,
         bytes_max: usize,
         refused: impl Fn(usize) + Send + Sync + 'static,
     ) -> zenoh::Result<Queryable<()>> {
-        let (queries, waiting_bytes) = (self.queries.clone(), self.waiting_bytes.clone());
+        let (work, waiting_bytes) = (self.work.clone(), self.waiting_bytes.clone());
+        let refused: Arc<dyn Fn(usize) + Send + Sync> = Arc::new(refused);
         let take = move |query: Query| {
             let bytes = payload_bytes(&query);
             if bytes > bytes_max {
-                return refused(bytes);
+                // Where it finds no room, it is one of very many.
+                let _ = work.try_send(Work::TooLong(bytes, refused.clone()));
+                return;
             }
             let before = waiting_bytes.fetch_add(bytes, Ordering::Relaxed);
             // A dropped query ends: its sender is told at once.
-            if before > WAITING_BYTES_MAX || queries.try_send(query).is_err() {
+            if before > WAITING_BYTES_MAX || work.try_send(Work::Query(query)).is_err() {
                 waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
                 tracing::debug!("more queries than can wait; the sender retries");
             }
         };
         client
             .session()
-            .declare_queryable(client.keys().of::<M>())
+            .declare_queryable(client.keys().of::<R>())
             .complete(true)
             .callback(take)
             .wait()

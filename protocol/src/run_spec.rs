@@ -148,6 +148,20 @@ impl RunSpec {
             let why = "it must be at least 1 and of a sensible size";
             check((1..=max).contains(&value), key, value, || why)?;
         }
+        let state = [
+            self.frame_height,
+            self.frame_width,
+            self.frame_channels,
+            self.frame_stack,
+        ];
+        let bytes: u64 = state.into_iter().map(u64::from).product();
+        let why = "with these sizes a state has 4 GiB or more";
+        check(
+            u32::try_from(bytes).is_ok(),
+            "run.frame_height",
+            self.frame_height,
+            || why,
+        )?;
         let fits = (1..=255).contains(&self.num_actions);
         let why = "a world has 1 to 255 actions";
         check(fits, "run.num_actions", self.num_actions, || why)?;

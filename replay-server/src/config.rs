@@ -87,6 +87,24 @@ pub(crate) fn reach(spec: &RunSpec) -> u32 {
 }
 
 impl Config {
+    /// One shard in memory, drawn from uniformly, in which neither side ever waits: for tests, benches and checks.
+    pub fn unlimited(capacity_transitions: u64) -> Self {
+        Self {
+            capacity_transitions,
+            shards: 1,
+            sampling: Sampling::default(),
+            compression: Compression::default(),
+            compressed_bytes_max: None,
+            replay_ratio: 1e6,
+            warmup_transitions: 0,
+            slack_transitions: 1 << 40,
+            transitions_max: None,
+            disk_bytes_max: None,
+            fsync_ms: None,
+            since: None,
+        }
+    }
+
     /// Checks that nothing is set that needs a replay on disk, for one that is in memory alone; `to_keep_it` are the flags that would
     /// change that.
     ///
@@ -206,7 +224,9 @@ pub(crate) const fn compressed_bytes_least(transitions: u64, frame_bytes: usize)
 
 /// Least disk budget of a replay: room for the transitions before the first batch, and for the segments that come and go.
 fn disk_bytes_least(spec: &RunSpec, config: &Config) -> u64 {
-    let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64;
+    // A segment is four times as long as the state that it begins with, which has 8 bytes of each row that has a priority.
+    let of_states = 4 * 8 * u64::from(config.sampling.is_prioritised());
+    let row_bytes = (spec.frame_bytes() + TRANSITION_BYTES) as u64 + of_states;
     let warmup = config.warmup_transitions.saturating_mul(row_bytes);
     let segments = u64::from(config.shards) * 4 * SEGMENT_BYTES_MIN;
     warmup.saturating_mul(2).saturating_add(segments)

@@ -69,10 +69,11 @@ mod service;
 mod storage;
 
 pub use config::{Compression, Config, Since};
+pub use driml_protocol::NotReady;
 pub use ledger::actors::{ACTORS_MAX, STREAMS_MAX};
 pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery};
 pub use rate_limiter::RateLimiter;
-pub use replay::{NotReady, Replay};
+pub use replay::Replay;
 pub use sampling::{
     assemble::{RETURN_ERROR, return_sum_error},
     horizon,

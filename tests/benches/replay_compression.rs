@@ -21,8 +21,7 @@ use driml_envs::{
     DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
 };
 use driml_protocol::{
-    ActorJoin, Buffer, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling,
-    TimeoutRule,
+    ActorJoin, Buffer, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
 };
 use driml_replay_server::{Compression, Config, Replay};
 use rand::{Rng, SeedableRng};
@@ -52,18 +51,8 @@ fn replay(compression: Compression, frame_stack: u32) -> Replay {
         timeout: TimeoutRule::Terminal,
     };
     let config = Config {
-        capacity_transitions: TRANSITIONS,
-        shards: 1,
         compression,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform {},
-        disk_bytes_max: None,
-        fsync_ms: None,
-        since: None,
-        replay_ratio: 1e9,
-        warmup_transitions: 0,
-        slack_transitions: 1 << 50,
-        transitions_max: None,
+        ..Config::unlimited(TRANSITIONS)
     };
     let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
     replay

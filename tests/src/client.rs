@@ -198,8 +198,7 @@ impl Client {
 
     /// A chunk's bytes as a process of the run would send them.
     pub fn seal(&self, chunk: &Chunk) -> Vec<u8> {
-        let (head, payload) = chunk.seal(self.spec.hash()).unwrap();
-        [&head, payload].concat()
+        codec::encode(self.spec.hash(), &chunk.header, chunk.payload()).unwrap()
     }
 
     /// Sends bytes to the place where the chunks of `actor` go.

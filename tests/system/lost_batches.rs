@@ -72,9 +72,9 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
         Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
         Ok(draft) => {
             let (header, payload) = draft.unpack().into_payload();
-            codec::encode(hash, &BatchReply::of(header), &payload).unwrap()
+            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
         }
-        Err(not_ready) => codec::encode(hash, &BatchReply::from(not_ready), &[]).unwrap(),
+        Err(not_ready) => codec::encode(hash, &BatchReply::NotReady(not_ready), &[]).unwrap(),
     };
     session::answer(query, message.into());
 }

@@ -102,7 +102,7 @@ impl Server {
             (tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
         };
         let insert = |server: &Self, payload: &[u8]| {
-            let chunk = Chunk::decode(payload, spec().hash(), 3).unwrap();
+            let chunk = Chunk::decode(payload, spec().hash()).unwrap();
             server.lossy(|replay| replay.insert(&chunk))
         };
         let poll = |server: &Self, payload: &[u8]| {

@@ -5,8 +5,8 @@ use std::{collections::BTreeSet, time::Duration};
 
 use driml_actor::DeliveryLimits;
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, ChunkHeader, Keys, Learned, RequestId, RunClient,
-    RunSpec, Shutdown, config::Settings,
+    Batch, BatchReply, BatchRequest, BufferPool, ChunkHeader, Keys, Learned, NotReady, RequestId,
+    RunClient, RunSpec, Shutdown, config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, TestSystem, check_nothing_lost, connect};
@@ -73,20 +73,14 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
     loop {
         id = id.again();
         match ask(id, batches) {
-            Ok((
-                reply @ (BatchReply::Batch(_)
-                | BatchReply::Prioritised(..)
-                | BatchReply::Stacked(..)),
-                payload,
-            )) => {
-                let header = reply.header().unwrap();
+            Ok((BatchReply::Batch(header), payload)) => {
                 Batch::from_payload(header, payload).unwrap();
                 batches += 1;
                 id = id.next();
             }
-            Ok((BatchReply::Wait(_), _)) => id = id.next(),
-            Ok((BatchReply::Finished, _)) => return batches,
-            Ok((BatchReply::Refused { why }, _)) => panic!("{why}"),
+            Ok((BatchReply::NotReady(NotReady::Wait(_)), _)) => id = id.next(),
+            Ok((BatchReply::NotReady(NotReady::Finished), _)) => return batches,
+            Ok((BatchReply::NotReady(refused), _)) => panic!("{refused:?}"),
             // The server is away; it is asked again, as the same request.
             Err(_) => std::thread::sleep(Duration::from_millis(20)),
         }

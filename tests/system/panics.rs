@@ -7,7 +7,7 @@ use driml_tests::{Ended, TestSystem};
 use crate::{LONG, PRIORITISED, system};
 
 /// The threads of an ordinary run: the process's name in the launcher, and the point that the thread passes.
-const THREADS: [(&str, &str); 22] = [
+const THREADS: [(&str, &str); 23] = [
     ("replay-server", "insert"),
     ("replay-server", "poll"),
     ("replay-server", "admit"),
@@ -24,6 +24,7 @@ const THREADS: [(&str, &str); 22] = [
     ("replay-server", "report"),
     ("replay-server", "episodes"),
     ("replay-server", "missing"),
+    ("replay-server", "members"),
     ("learner", "batches"),
     ("learner", "weights-sender"),
     ("learner", "affinity-sender"),

@@ -10,9 +10,9 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_760),
+    ("protocol", 8_490),
     ("actor", 13_150),
-    ("replay-server", 11_720),
+    ("replay-server", 11_700),
     ("learner", 26_340),
     ("deploy", 34_700),
     ("tests", 11_580),

@@ -3,9 +3,9 @@
 use std::collections::BTreeSet;
 
 use driml_protocol::{
-    ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, Replay};
+use driml_replay_server::{Config, Replay};
 
 /// Frames of 4 x 4 bytes that are not stacked.
 pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
@@ -28,18 +28,9 @@ pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
 /// One shard of `transitions`, each sampled once; as many may come before any is sampled.
 pub(crate) fn config(transitions: u64) -> Config {
     Config {
-        capacity_transitions: transitions,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform {},
-        disk_bytes_max: None,
-        fsync_ms: None,
         replay_ratio: 1.0,
-        warmup_transitions: 0,
         slack_transitions: transitions,
-        transitions_max: None,
-        since: None,
+        ..Config::unlimited(transitions)
     }
 }
 

@@ -11,8 +11,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, PendingReply, ReplayStatus,
-    RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point,
+    Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, NotReady, PendingReply,
+    ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point,
     session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
@@ -399,14 +399,13 @@ impl Fetcher {
             }
         })?;
         Ok(match reply {
-            BatchReply::Batch(_) | BatchReply::Prioritised(..) | BatchReply::Stacked(..) => {
+            BatchReply::Batch(header) => {
                 if shared_memory {
                     self.trust.worked();
                 }
-                let header = reply.header().expect("a batch has a header");
                 Answer::Batch(Batch::from_payload(header, payload)?)
             }
-            BatchReply::Wait(waiting) => {
+            BatchReply::NotReady(NotReady::Wait(waiting)) => {
                 *self
                     .shared
                     .waiting
@@ -414,8 +413,8 @@ impl Fetcher {
                     .unwrap_or_else(PoisonError::into_inner) = waiting;
                 Answer::Wait
             }
-            BatchReply::Finished => Answer::Finished,
-            BatchReply::Refused { why } => Answer::Refused(why),
+            BatchReply::NotReady(NotReady::Finished) => Answer::Finished,
+            BatchReply::NotReady(NotReady::Refused { why }) => Answer::Refused(why),
         })
     }
 }

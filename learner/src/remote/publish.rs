@@ -12,9 +12,9 @@ use std::{
 };
 
 use driml_protocol::{
-    Ack, AffinityUpdate, CodecError, LearnerStatus, LogLimiter, PriorityUpdate, QueryWorkers,
-    Request, Responder, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload, fail_point,
-    session::SessionError,
+    Ack, AffinityUpdate, CodecError, Incoming, LearnerStatus, LogLimiter, PriorityUpdate,
+    QueryWorkers, Request, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload,
+    fail_point, session::SessionError,
 };
 use zenoh::query::Queryable;
 
@@ -101,12 +101,12 @@ impl Publisher {
         let status: Arc<Mutex<LearnerStatus>> = Arc::default();
         let fetched: Arc<AtomicBool> = Arc::default();
         let (held, told) = (status.clone(), fetched.clone());
-        let give = move |responder: Responder<LearnerStatus>| {
+        let give = move |incoming: Incoming<LearnerStatus>| {
             let status = lock(&held).clone();
-            responder.reply(&status);
+            incoming.into_responder().reply(&status);
             told.store(status.finished, Ordering::Relaxed);
         };
-        let status_asked = QueryWorkers::offer("learner-status", 1, spec_hash, give)?;
+        let status_asked = QueryWorkers::start("learner-status", 1, spec_hash, give)?;
         let mut queryables = Vec::new();
         for client in clients {
             let declared = status_asked.declare(client);

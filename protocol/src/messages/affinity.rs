@@ -20,9 +20,6 @@ pub struct AffinityUpdate {
 
 impl AffinityUpdate {
     /// Checks the size and that every entry is a probability.
-    ///
-    /// # Errors
-    /// What is wrong with it.
     pub fn validate(&self, num_actions: u32) -> Result<(), CodecError> {
         let n = num_actions as usize;
         if self.num_actions != num_actions || self.matrix.len() != n * n {

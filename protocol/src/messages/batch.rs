@@ -52,9 +52,8 @@ impl Batch {
             ..header
         };
         let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
-        let layout = header.layout();
         for (row, scalars) in rows.iter().enumerate() {
-            scalars.write(&layout, &mut batch.payload, row);
+            scalars.write(&header, &mut batch.payload, row);
         }
         batch
     }
@@ -77,11 +76,10 @@ impl Batch {
     pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
-        let whole = header.layout();
         for column in Column::ALL {
-            let mut to = &mut merged.payload[whole.range(column)];
+            let mut to = &mut merged.payload[header.range(column)];
             // Of each positive, the rows of the part come together.
-            for positive in 0..whole.values_a_row(column) {
+            for positive in 0..header.values_a_row(column) {
                 let mut frames_before = 0;
                 for part in parts {
                     let from = part.of_positive(column, positive);
@@ -111,7 +109,7 @@ impl Batch {
                 let there = |valid: &[u8]| valid.iter().filter(|valid| **valid != 0).count();
                 let before: usize = valid.clone().take(positive).map(there).sum();
                 let own = valid.clone().nth(positive).map_or(0, there);
-                let bytes = self.header.layout().value_bytes();
+                let bytes = self.header.value_bytes();
                 &values[before * bytes..(before + own) * bytes]
             }
             Column::PositiveValid | Column::K => &values[positive * self.rows()..][..self.rows()],
@@ -178,7 +176,7 @@ impl Batch {
     }
 
     fn column(&self, column: Column) -> &[u8] {
-        &self.payload[self.header.layout().range(column)]
+        &self.payload[self.header.range(column)]
     }
 
     fn column_f32(&self, column: Column) -> Vec<f32> {
@@ -262,10 +260,10 @@ impl Batch {
     pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
-        let layout = self.header.layout();
+        let header = self.header;
         for (row, (transition, probability)) in draws.enumerate() {
             let mut put = |column, bytes: &[u8]| {
-                let column = &mut self.payload[layout.range(column)];
+                let column = &mut self.payload[header.range(column)];
                 column[row * bytes.len()..][..bytes.len()].copy_from_slice(bytes);
             };
             put(Column::Transition, &transition.to_le_bytes());
@@ -322,10 +320,10 @@ impl Batch {
 
     /// The places of all states that the rows have.
     pub fn states_mut(&mut self) -> BatchStatesMut<'_> {
-        BatchStatesMut::new(self.header.layout(), &mut self.payload)
+        BatchStatesMut::new(self.header, &mut self.payload)
     }
 
-    /// Header and payload, to travel as [`BatchReply::of`](super::batch_header::BatchReply::of) the header.
+    /// Header and payload, to travel as a [`BatchReply`](super::batch_header::BatchReply).
     pub fn into_payload(self) -> (BatchHeader, Buffer) {
         (self.header, self.payload)
     }

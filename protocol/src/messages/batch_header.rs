@@ -4,11 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    batch_frames::StackedFrames,
-    batch_layout::{BatchLayout, Column},
-    priorities::Origin,
-    shard_counts::ShardCounts,
-    status::Waiting,
+    batch_frames::StackedFrames, priorities::Origin, shard_counts::ShardCounts, status::Waiting,
 };
 use crate::{
     run_spec::RunSpec,
@@ -40,13 +36,9 @@ pub struct BatchHeader {
     pub mean_age: f64,
     /// Version of the newest weights that chose an action of this batch, and of the oldest.
     pub weights_versions: (u64, u64),
-    /// Who drew the rows, where they are drawn by priority; it travels as [`BatchReply::Prioritised`], and other batches have no
-    /// byte of it.
-    #[serde(skip)]
+    /// Who drew the rows, where they are drawn by priority.
     pub origin: Option<Origin>,
-    /// The frames that states are stacks of, each of which travels once; it travels as [`BatchReply::Stacked`], and batches whose
-    /// states are one frame each have no byte of it.
-    #[serde(skip)]
+    /// The frames that states are stacks of, each of which travels once; none where a state is one frame.
     pub stacked: Option<StackedFrames>,
 }
 
@@ -88,27 +80,13 @@ impl BatchHeader {
     /// # Panics
     /// If they are more than the address space, which no batch of a run is.
     pub fn payload_bytes(&self) -> usize {
-        self.layout()
-            .bytes()
+        self.bytes()
             .expect("a batch is far below the address space")
-    }
-
-    pub(super) const fn layout(&self) -> BatchLayout {
-        BatchLayout {
-            rows: self.rows as usize,
-            positives: self.positives as usize,
-            state_bytes: self.state_bytes as usize,
-            states_k: self.states_k as usize,
-            states_n: self.states_n as usize,
-            is_prioritised: self.origin.is_some(),
-            stacked: self.stacked,
-        }
     }
 
     /// Checks that `payload` is as long as such a batch's, has as many states as its rows say, and that these are made of its frames.
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
-        let layout = self.layout();
-        if layout.bytes() != Some(payload.len()) || self.rows == 0 {
+        if self.bytes() != Some(payload.len()) || self.rows == 0 {
             let of_frames = self.stacked.map_or_else(String::new, |stacked| {
                 let StackedFrames {
                     frames,
@@ -131,9 +109,9 @@ impl BatchHeader {
         }
         if let Some(stacked) = self.stacked {
             // What few frames may be made into, if many states have them.
-            let whole = BatchLayout {
+            let whole = Self {
                 stacked: None,
-                ..layout
+                ..*self
             };
             if whole.bytes().is_none_or(|bytes| bytes > PAYLOAD_BYTES_MAX) {
                 return Err(CodecError::Header(format!(
@@ -141,25 +119,23 @@ impl BatchHeader {
                     self.rows
                 )));
             }
-            let stacks = layout.range(Column::StatesT).start..layout.range(Column::StatesN).end;
-            if let Some(number) = stacked.first_unknown(&payload[stacks]) {
+            if let Some(number) = stacked.first_unknown(self.of_states(payload)) {
                 return Err(CodecError::Header(format!(
                     "a state of frame {number}, of {} that travel",
                     stacked.frames
                 )));
             }
         }
-        let rows = (layout.positives_there(payload), layout.bootstraps(payload));
+        let rows = (self.positives_there(payload), self.bootstraps(payload));
         let count = |there: &[bool]| there.iter().filter(|there| **there).count();
         let counted = (count(&rows.0), count(&rows.1));
-        if counted != (layout.states_k, layout.states_n) {
+        if counted != (self.states_k as usize, self.states_n as usize) {
             return Err(CodecError::Header(format!(
                 "rows with {} positives and {} bootstraps come with {} and {} states",
                 counted.0, counted.1, self.states_k, self.states_n
             )));
         }
-        let (chances, _) = payload[layout.range(Column::Probability)].as_chunks();
-        let mut chances = chances.iter().map(|&chance| f32::from_le_bytes(chance));
+        let mut chances = self.probabilities(payload);
         if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
             return Err(CodecError::Header(format!(
                 "a row that was drawn with the probability {chance}"
@@ -169,60 +145,35 @@ impl BatchHeader {
     }
 }
 
+/// Why there is no batch.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum NotReady {
+    /// Not yet: who waits for what.
+    Wait(Waiting),
+    /// Never again: all transitions are in and sampled.
+    Finished,
+    /// Never: the reason, for a person.
+    Refused {
+        /// Why, and what to do about it.
+        why: String,
+    },
+}
+
 /// The answer to a request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum BatchReply {
     /// The payload that follows is a batch.
     Batch(BatchHeader),
-    /// Nothing yet: ask again.
-    Wait(Waiting),
-    /// All transitions are in and all their rows were sampled: stop.
-    Finished,
-    /// Never: the reason, for a person.
-    Refused {
-        /// The replay server's reason, a sentence.
-        why: String,
-    },
-    /// The payload that follows is a batch whose rows were drawn by priority, and who drew them.
-    Prioritised(BatchHeader, Origin),
-    /// The payload that follows is a batch whose states are stacks of these frames; and who drew its rows, if by priority.
-    Stacked(BatchHeader, StackedFrames, Option<Origin>),
-}
-
-impl BatchReply {
-    /// The reply with a batch of this header.
-    pub const fn of(header: BatchHeader) -> Self {
-        match (header.stacked, header.origin) {
-            (None, None) => Self::Batch(header),
-            (None, Some(origin)) => Self::Prioritised(header, origin),
-            (Some(stacked), origin) => Self::Stacked(header, stacked, origin),
-        }
-    }
-
-    /// The header of the batch, if it is one.
-    pub const fn header(&self) -> Option<BatchHeader> {
-        match *self {
-            Self::Batch(header) => Some(header),
-            Self::Prioritised(header, origin) => Some(BatchHeader {
-                origin: Some(origin),
-                ..header
-            }),
-            Self::Stacked(header, stacked, origin) => Some(BatchHeader {
-                stacked: Some(stacked),
-                origin,
-                ..header
-            }),
-            Self::Wait(_) | Self::Finished | Self::Refused { .. } => None,
-        }
-    }
+    /// There is none.
+    NotReady(NotReady),
 }
 
 impl BatchReply {
     /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
-        match self.header() {
-            Some(header) => header.check_payload(payload),
-            None => no_payload(payload),
+        match self {
+            Self::Batch(header) => header.check_payload(payload),
+            Self::NotReady(_) => no_payload(payload),
         }
     }
 }

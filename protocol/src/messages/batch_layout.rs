@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use super::batch_frames::StackedFrames;
+use super::{batch_frames::StackedFrames, batch_header::BatchHeader};
 
 /// The columns of a batch, in the order in which they lie one after the other. Each has a value for every row; those of the
 /// positives have one for every row of the first positive, then of the second, and so on. States that a row does not have are left out.
@@ -78,75 +78,24 @@ impl Column {
     }
 }
 
-/// Bytes of all scalars of a row itself, or of one of its positives; of those that every row has, or of those of priorities.
-const fn scalar_bytes(per_positive: bool, of_priorities: bool) -> usize {
-    let (mut bytes, mut at) = (0, 0);
-    while at < Column::ALL.len() {
-        let column = Column::ALL[at];
-        assert!(
-            column as usize == at,
-            "the order of ALL is that of the columns"
-        );
-        if column.is_per_positive() == per_positive && column.is_of_priorities() == of_priorities {
-            bytes += column.scalar_bytes();
-        }
-        at += 1;
-    }
-    bytes
-}
-
-const ROW_SCALAR_BYTES: usize = scalar_bytes(false, false);
-const POSITIVE_SCALAR_BYTES: usize = scalar_bytes(true, false);
-const PRIORITY_SCALAR_BYTES: usize = scalar_bytes(false, true);
-const _: () =
-    assert!(ROW_SCALAR_BYTES == 10 && POSITIVE_SCALAR_BYTES == 2 && PRIORITY_SCALAR_BYTES == 12);
-
-/// The shape of a batch, from which the place of every value follows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct BatchLayout {
-    pub(super) rows: usize,
-    /// Positives a row, P.
-    pub(super) positives: usize,
-    /// Bytes of one state.
-    pub(super) state_bytes: usize,
-    /// States s_{t+k} that are there, at most P for each row.
-    pub(super) states_k: usize,
-    /// States s_{t+n} that are there, at most one for each row.
-    pub(super) states_n: usize,
-    /// Whether rows say which transition they are and how likely they were.
-    pub(super) is_prioritised: bool,
-    /// The frames that states are stacks of; none where a state is one frame.
-    pub(super) stacked: Option<StackedFrames>,
-}
-
-impl BatchLayout {
+impl BatchHeader {
     /// Bytes of all columns; none if they are more than the address space, if there are more states than rows can have, or if
     /// states are no stacks of the frames.
     pub(super) fn bytes(&self) -> Option<usize> {
-        let positives = self.rows.checked_mul(self.positives)?;
-        if self.states_k > positives || self.states_n > self.rows {
-            return None;
-        }
-        let states = self.rows.checked_add(self.states_k)?;
-        let states = states.checked_add(self.states_n)?;
-        let frames = match self.stacked {
-            None => 0,
-            Some(stacked) if stacked.fit(states, self.state_bytes) => {
-                let frame_bytes = stacked.frame_bytes(self.state_bytes);
-                frame_bytes.checked_mul(stacked.frames as usize)?
-            }
-            Some(_) => return None,
-        };
-        let states = states.checked_mul(self.value_bytes())?;
-        let states = states.checked_add(frames)?;
-        let of_priorities = if self.is_prioritised {
-            PRIORITY_SCALAR_BYTES
-        } else {
-            0
-        };
-        let of_rows = self.rows.checked_mul(ROW_SCALAR_BYTES + of_priorities)?;
-        let of_positives = positives.checked_mul(POSITIVE_SCALAR_BYTES)?;
-        states.checked_add(of_rows)?.checked_add(of_positives)
+        let positives = u64::from(self.rows) * u64::from(self.positives);
+        let states = self.states().try_into().ok()?;
+        let fits = u64::from(self.states_k) <= positives
+            && self.states_n <= self.rows
+            && self
+                .stacked
+                .is_none_or(|it| it.fit(states, self.state_bytes as usize));
+        let bytes = || Column::ALL.iter().map(|&column| self.column_bytes(column));
+        fits.then(|| bytes().sum::<u128>())
+            .and_then(|it| it.try_into().ok())
+    }
+
+    fn states(&self) -> u64 {
+        u64::from(self.rows) + u64::from(self.states_k) + u64::from(self.states_n)
     }
 
     /// Whether each row [B] bootstraps, in a payload whose scalars are written.
@@ -162,66 +111,90 @@ impl BatchLayout {
         valid.map(|&valid| valid != 0).collect()
     }
 
+    /// The chance of each row [B], where rows are drawn by priority.
+    pub(super) fn probabilities(&self, payload: &[u8]) -> impl Iterator<Item = f32> {
+        let (chances, _) = payload[self.range(Column::Probability)].as_chunks();
+        chances.iter().map(|&chance| f32::from_le_bytes(chance))
+    }
+
+    /// The columns of states.
+    pub(super) fn of_states<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
+        &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
+    }
+
     /// Bytes of a value in a column of states: all of a state, or what says of which frames it is made.
-    pub(super) const fn value_bytes(&self) -> usize {
-        match self.stacked {
-            None => self.state_bytes,
-            Some(stacked) => stacked.stack_bytes(),
-        }
+    pub(super) fn value_bytes(&self) -> usize {
+        let stacked = self.stacked.as_ref();
+        stacked.map_or(self.state_bytes as usize, StackedFrames::stack_bytes)
     }
 
     /// Frames that travel, and bytes of each: states where they are one frame.
-    pub(super) const fn frames(&self) -> (usize, usize) {
+    pub(super) fn frames(&self) -> (usize, usize) {
+        let state_bytes = self.state_bytes as usize;
         match self.stacked {
-            None => (self.rows + self.states_k + self.states_n, self.state_bytes),
-            Some(stacked) => (
-                stacked.frames as usize,
-                stacked.frame_bytes(self.state_bytes),
-            ),
+            None => (self.states() as usize, state_bytes),
+            Some(stacked) => (stacked.frames as usize, stacked.frame_bytes(state_bytes)),
         }
     }
 
     /// Values that a row has in a column.
     pub(super) const fn values_a_row(&self, column: Column) -> usize {
         if column.is_per_positive() {
-            self.positives
+            self.positives as usize
         } else {
             1
         }
     }
 
-    pub(super) const fn column_bytes(&self, column: Column) -> usize {
+    /// Where states fit; of numbers of 32 bits, no three make an overflow.
+    fn column_bytes(&self, column: Column) -> u128 {
+        let product = |count: u32, a: usize, b: usize| u128::from(count) * a as u128 * b as u128;
         match column {
-            Column::Frames => match self.stacked {
-                None => 0,
-                Some(_) => {
-                    let (count, bytes) = self.frames();
-                    count * bytes
-                }
-            },
-            Column::StatesT => self.rows * self.value_bytes(),
-            Column::StatesK => self.states_k * self.value_bytes(),
-            Column::StatesN => self.states_n * self.value_bytes(),
-            _ if column.is_of_priorities() && !self.is_prioritised => 0,
-            _ => self.rows * self.values_a_row(column) * column.scalar_bytes(),
+            Column::Frames => self
+                .stacked
+                .map_or(0, |stacked| product(stacked.frames, 1, self.frames().1)),
+            Column::StatesT => product(self.rows, 1, self.value_bytes()),
+            Column::StatesK => product(self.states_k, 1, self.value_bytes()),
+            Column::StatesN => product(self.states_n, 1, self.value_bytes()),
+            _ if column.is_of_priorities() && self.origin.is_none() => 0,
+            _ => product(self.rows, self.values_a_row(column), column.scalar_bytes()),
         }
     }
 
+    /// Where a column lies, in a payload of so many bytes.
     pub(super) fn range(&self, column: Column) -> Range<usize> {
-        let before = Column::ALL[..column as usize].iter();
-        let start = before.map(|&column| self.column_bytes(column)).sum();
-        start..start + self.column_bytes(column)
+        let bytes = |column: &Column| self.column_bytes(*column) as usize;
+        let start = Column::ALL[..column as usize].iter().map(bytes).sum();
+        start..start + bytes(&column)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::messages::{priorities::Origin, shard_counts::ShardCounts};
 
     const FRAMES: StackedFrames = StackedFrames {
         frames: 5,
         frame_stack: 4,
         frame_channels: 1,
+    };
+
+    const EMPTY: BatchHeader = BatchHeader {
+        rows: 0,
+        positives: 0,
+        state_bytes: 0,
+        states_k: 0,
+        states_n: 0,
+        counts: ShardCounts {
+            inserted: 0,
+            rows_sampled: 0,
+        },
+        held: 0,
+        mean_age: 0.0,
+        weights_versions: (0, 0),
+        origin: None,
+        stacked: None,
     };
 
     #[test]
@@ -232,39 +205,39 @@ mod tests {
             (256, 5, 12_288, 1200, 17),
             (256, 5, 12_288, 1280, 256),
         ] {
-            let layout = BatchLayout {
+            let header = BatchHeader {
                 rows,
                 positives,
                 state_bytes,
                 states_k,
                 states_n,
-                is_prioritised: rows % 2 == 0,
+                origin: rows.is_multiple_of(2).then(Origin::default),
                 stacked: state_bytes.is_multiple_of(4).then_some(FRAMES),
+                ..EMPTY
             };
             let mut end = 0;
             for column in Column::ALL {
-                let range = layout.range(column);
+                let range = header.range(column);
                 assert_eq!(range.start, end, "{column:?}");
                 end = range.end;
             }
-            assert_eq!(layout.bytes(), Some(end));
+            assert_eq!(header.bytes(), Some(end));
         }
-        let small = BatchLayout {
+        let small = BatchHeader {
             rows: 2,
             positives: 2,
             state_bytes: 1,
             states_k: 4,
             states_n: 2,
-            is_prioritised: false,
-            stacked: None,
+            ..EMPTY
         };
         assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
-        let prioritised = BatchLayout {
-            is_prioritised: true,
+        let prioritised = BatchHeader {
+            origin: Some(Origin::default()),
             ..small
         };
         assert_eq!(prioritised.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2 + 12)));
-        let stacks = BatchLayout {
+        let stacks = BatchHeader {
             state_bytes: 8,
             stacked: Some(FRAMES),
             ..small
@@ -272,31 +245,5 @@ mod tests {
         // Five frames of two bytes, and four numbers of four for each of eight states.
         let of_states = 5 * 2 + 8 * 16;
         assert_eq!(stacks.bytes(), Some(of_states + 2 * (10 + 2 * 2)));
-        let frames: [fn(&mut StackedFrames); 7] = [
-            |it| it.frames = 8 * 4 + 1,
-            |it| it.frame_stack = 0,
-            |it| it.frame_stack = 1,
-            |it| it.frame_stack = 3,
-            |it| it.frame_stack = u32::MAX,
-            |it| it.frame_channels = 0,
-            |it| it.frame_channels = 3,
-        ];
-        for change in frames {
-            let mut wrong = stacks;
-            wrong.stacked.as_mut().map(change);
-            assert_eq!(wrong.bytes(), None, "{wrong:?}");
-        }
-        type Change = fn(&mut BatchLayout);
-        let layouts: [(BatchLayout, Change); 5] = [
-            (stacks, |it| it.state_bytes = usize::MAX / 4 * 4),
-            (small, |it| it.rows = usize::MAX),
-            (small, |it| it.states_k = 5),
-            (small, |it| it.states_n = 3),
-            (small, |it| it.state_bytes = usize::MAX / 4),
-        ];
-        for (mut wrong, change) in layouts {
-            change(&mut wrong);
-            assert_eq!(wrong.bytes(), None, "{wrong:?}");
-        }
     }
 }

@@ -1,10 +1,7 @@
 //! How a batch is written: first all of its rows but their states, then each state, or its frames, in the place that follows from them.
 //! `Batch` documents what the values mean.
 
-use super::{
-    batch_frames::StackedFrames,
-    batch_layout::{BatchLayout, Column},
-};
+use super::{batch_frames::StackedFrames, batch_header::BatchHeader, batch_layout::Column};
 
 /// All of a row but its states.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,10 +26,10 @@ impl RowScalars {
         self.bootstrap_discount != 0.0
     }
 
-    pub(super) fn write(&self, layout: &BatchLayout, payload: &mut [u8], row: usize) {
-        assert!(self.positives as usize <= layout.positives, "at most P");
+    pub(super) fn write(&self, header: &BatchHeader, payload: &mut [u8], row: usize) {
+        assert!(self.positives <= header.positives, "at most P");
         let mut put = |column, at: usize, bytes: &[u8]| {
-            let column = &mut payload[layout.range(column)];
+            let column = &mut payload[header.range(column)];
             column[at * bytes.len()..][..bytes.len()].copy_from_slice(bytes);
         };
         put(Column::NStepReturn, row, &self.n_step_return.to_le_bytes());
@@ -40,10 +37,10 @@ impl RowScalars {
         put(Column::BootstrapDiscount, row, &discount);
         put(Column::Action, row, &[self.action]);
         put(Column::NextAction, row, &[self.next_action]);
-        for p in 0..layout.positives {
-            let there = p < self.positives as usize;
-            let k = u8::try_from(self.k_first + p as u32).unwrap_or(u8::MAX);
-            let at = p * layout.rows + row;
+        for p in 0..header.positives {
+            let there = p < self.positives;
+            let k = u8::try_from(self.k_first + p).unwrap_or(u8::MAX);
+            let at = p as usize * header.rows as usize + row;
             put(Column::PositiveValid, at, &[there.into()]);
             put(Column::K, at, &[if there { k } else { 0 }]);
         }
@@ -70,21 +67,23 @@ pub struct BatchStatesMut<'a> {
 
 impl<'a> BatchStatesMut<'a> {
     /// Those of a payload whose scalars are written.
-    pub(super) fn new(layout: BatchLayout, payload: &'a mut [u8]) -> Self {
-        let first_n = layout.rows + layout.states_k;
-        let numbers_k = numbers(&layout.positives_there(payload), layout.rows);
-        let numbers_n = numbers(&layout.bootstraps(payload), first_n);
-        let (count, frame_bytes) = layout.frames();
+    pub(super) fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
+        let rows = header.rows as usize;
+        let first_n = rows + header.states_k as usize;
+        let numbers_k = numbers(&header.positives_there(payload), rows);
+        let numbers_n = numbers(&header.bootstraps(payload), first_n);
+        let (count, frame_bytes) = header.frames();
         let (frames, rest) = payload.split_at_mut(count * frame_bytes);
-        let (stack_bytes, stacks) = match layout.stacked {
+        let (stack_bytes, stacks) = match header.stacked {
             None => (0, &mut [][..]),
             Some(_) => {
-                let bytes = layout.value_bytes();
-                (bytes, &mut rest[..(first_n + layout.states_n) * bytes])
+                let bytes = header.value_bytes();
+                let states = first_n + header.states_n as usize;
+                (bytes, &mut rest[..states * bytes])
             }
         };
         Self {
-            rows: layout.rows,
+            rows,
             frame_bytes,
             frames,
             stacks,

@@ -5,11 +5,7 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use crate::wire::{
-    buffers::{Buffer, BufferPool},
-    codec,
-    error::CodecError,
-};
+use crate::wire::{buffers::Buffer, codec, error::CodecError};
 
 /// Bytes of one transition in a chunk beside its frame: an action, an end and a reward.
 pub const TRANSITION_BYTES: usize = size_of::<u8>() + size_of::<End>() + size_of::<f32>();
@@ -111,34 +107,6 @@ impl ChunkHeader {
     }
 }
 
-/// Where the columns of a chunk lie in its payload, one after the other.
-#[derive(Clone, Copy)]
-struct ChunkLayout {
-    rows: usize,
-    frame_bytes: usize,
-}
-
-impl ChunkLayout {
-    const fn frames(self) -> Range<usize> {
-        0..self.rows * self.frame_bytes
-    }
-
-    const fn actions(self) -> Range<usize> {
-        let start = self.frames().end;
-        start..start + self.rows
-    }
-
-    const fn ends(self) -> Range<usize> {
-        let start = self.actions().end;
-        start..start + self.rows * size_of::<End>()
-    }
-
-    const fn rewards(self) -> Range<usize> {
-        let start = self.ends().end;
-        start..start + self.rows * size_of::<f32>()
-    }
-}
-
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).
 ///
 /// Buffer, one after the other: frames [rows, frame bytes], actions [rows], ends [rows], rewards [rows] f32 little-endian.
@@ -174,26 +142,34 @@ impl Chunk {
         Self { header, payload }
     }
 
-    fn layout(&self) -> ChunkLayout {
-        ChunkLayout {
-            rows: self.header.transitions(),
-            frame_bytes: self.header.frame_bytes as usize,
-        }
+    /// Where its frames, actions, ends and rewards lie in the payload, one after the other.
+    fn columns(&self) -> [Range<usize>; 4] {
+        let rows = self.header.transitions();
+        let frame_bytes = self.header.frame_bytes as usize;
+        let mut end = 0;
+        [frame_bytes, 1, size_of::<End>(), size_of::<f32>()].map(|bytes| {
+            let start = end;
+            end += rows * bytes;
+            start..end
+        })
     }
 
     /// Frames [rows, frame bytes].
     pub fn frames(&self) -> &[u8] {
-        &self.payload[self.layout().frames()]
+        let [frames, ..] = self.columns();
+        &self.payload[frames]
     }
 
     /// Actions [rows].
     pub fn actions(&self) -> &[u8] {
-        &self.payload[self.layout().actions()]
+        let [_, actions, ..] = self.columns();
+        &self.payload[actions]
     }
 
     /// Ends [rows], as bytes of [`End`].
     pub fn ends(&self) -> &[u8] {
-        &self.payload[self.layout().ends()]
+        let [_, _, ends, _] = self.columns();
+        &self.payload[ends]
     }
 
     /// The end of one row; every byte was checked when the chunk was made or decoded.
@@ -203,7 +179,8 @@ impl Chunk {
 
     /// The reward of one row.
     pub fn reward(&self, row: usize) -> f32 {
-        let (rewards, _) = self.payload[self.layout().rewards()].as_chunks();
+        let [.., rewards] = self.columns();
+        let (rewards, _) = self.payload[rewards].as_chunks();
         f32::from_le_bytes(rewards[row])
     }
 
@@ -215,23 +192,13 @@ impl Chunk {
 
     /// Writes everything of one row but its frame.
     pub fn set(&mut self, row: usize, action: u8, reward: f32, end: End) {
-        let layout = self.layout();
-        assert!(row < layout.rows, "row {row} of a chunk of {}", layout.rows);
-        self.payload[layout.actions()][row] = action;
-        self.payload[layout.ends()][row] = end as u8;
-        let (rewards, _) = self.payload[layout.rewards()].as_chunks_mut();
+        let rows = self.header.transitions();
+        assert!(row < rows, "row {row} of a chunk of {rows}");
+        let [_, actions, ends, rewards] = self.columns();
+        self.payload[actions][row] = action;
+        self.payload[ends][row] = end as u8;
+        let (rewards, _) = self.payload[rewards].as_chunks_mut();
         rewards[row] = reward.to_le_bytes();
-    }
-
-    /// The chunk as it travels: prefix and header, then the payload, uncopied.
-    ///
-    /// # Errors
-    /// A chunk over the codec's limits.
-    pub fn seal(&self, spec_hash: u64) -> Result<(Vec<u8>, &[u8]), CodecError> {
-        Ok((
-            codec::seal(spec_hash, &self.header, &self.payload)?,
-            &self.payload,
-        ))
     }
 
     /// The payload: all columns, one after the other.
@@ -239,55 +206,24 @@ impl Chunk {
         &self.payload
     }
 
-    /// The payload, to travel after a head from [`Chunk::seal`].
+    /// The payload, to travel after the header.
     pub fn into_payload(self) -> Buffer {
         self.payload
     }
 
-    /// Reads a chunk in one piece and checks lengths, actions, ends and rewards.
+    /// Reads a chunk in one piece and checks lengths, ends and rewards.
     ///
     /// # Errors
-    /// Whatever makes it unfit to be stored; the message says what.
-    pub fn decode(bytes: &[u8], spec_hash: u64, num_actions: u32) -> Result<Self, CodecError> {
+    /// Whatever makes it unfit to be stored in any run; the message says what.
+    pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<Self, CodecError> {
         let (header, payload) = codec::decode(bytes, Some(spec_hash))?;
-        Self::from_payload(header, payload.to_vec().into(), num_actions)
-    }
-
-    /// [`Chunk::decode`] of a message in `pieces`, `len` bytes in all; the chunk lies in own memory of `pool`.
-    ///
-    /// # Errors
-    /// As [`Chunk::decode`].
-    pub fn receive<'a>(
-        pieces: impl IntoIterator<Item = &'a [u8]>,
-        len: usize,
-        pool: &BufferPool,
-        spec_hash: u64,
-        num_actions: u32,
-    ) -> Result<Self, CodecError> {
-        let (header, payload) = codec::receive(pieces, len, pool, Some(spec_hash))?;
-        Self::from_payload(header, payload, num_actions)
+        Self::from_payload(header, payload.to_vec().into())
     }
 
     /// The chunk of a header and payload that were received; checks all that [`Chunk::decode`] does.
-    ///
-    /// # Errors
-    /// As [`Chunk::decode`].
-    pub fn from_payload(
-        header: ChunkHeader,
-        payload: Buffer,
-        num_actions: u32,
-    ) -> Result<Self, CodecError> {
+    pub fn from_payload(header: ChunkHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.checked(&payload)?;
         let chunk = Self { header, payload };
-        if let Some(action) = chunk
-            .actions()
-            .iter()
-            .find(|&&a| u32::from(a) >= num_actions)
-        {
-            return Err(CodecError::Header(format!(
-                "action {action} of {num_actions}"
-            )));
-        }
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));
         }

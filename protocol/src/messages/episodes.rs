@@ -13,6 +13,8 @@ pub const EPISODES_MAX: usize = 8_192;
 pub struct EpisodesRequest {
     /// Episodes that the asker knows of already.
     pub since: u64,
+    /// The asker is the run's launcher: what it does not know of is kept, whatever others know.
+    pub is_launcher: bool,
 }
 
 /// An episode that ended: by the rules of the world, or by its step limit.
@@ -53,9 +55,7 @@ impl EpisodesReply {
     pub const fn up_to(&self) -> u64 {
         self.before.saturating_add(self.episodes.len() as u64)
     }
-}
 
-impl EpisodesReply {
     /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.up_to() > self.ended || self.episodes.len() > EPISODES_MAX {

@@ -41,9 +41,7 @@ impl PriorityUpdate {
     pub fn rows(&self) -> usize {
         self.parts.iter().map(|part| part.transitions.len()).sum()
     }
-}
 
-impl PriorityUpdate {
     /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)?;

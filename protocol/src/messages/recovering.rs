@@ -42,9 +42,8 @@ impl fmt::Display for RecoveryProgress {
 pub struct Recovering {
     /// How far it is.
     pub progress: RecoveryProgress,
-    /// The run's resolved settings, TOML, if the question was for [`RunInfo`](super::run_info::RunInfo): with them a status says which run it
-    /// is.
-    pub config_toml: Option<String>,
+    /// The run's resolved settings, TOML: with them a status says which run it is.
+    pub config_toml: String,
 }
 
 impl fmt::Display for Recovering {
@@ -82,7 +81,7 @@ mod tests {
                 bytes: 11 << 30,
                 since_s: 33.7,
             },
-            config_toml: None,
+            config_toml: String::new(),
         };
         assert_eq!(
             recovering.to_string(),

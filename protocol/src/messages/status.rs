@@ -249,7 +249,7 @@ impl ReplayStatus {
         let squares: f64 = served()
             .map(|(k, &n)| (k as f64 - mean).powi(2) * n as f64)
             .sum();
-        let positives: u64 = served().map(|(_, n)| n).sum();
+        let positives: u128 = served().map(|(_, &n)| u128::from(n)).sum();
         Some((squares / positives as f64).sqrt())
     }
 }
@@ -379,5 +379,11 @@ mod tests {
         assert_eq!(merged, expected);
         assert_eq!(merged.returns.mean(), Some(1.5));
         assert_eq!(Returns::default().mean(), None);
+        // Counts of another process may be any.
+        let most = ReplayStatus {
+            k_histogram: vec![0, u64::MAX, u64::MAX],
+            ..merged
+        };
+        assert_eq!((most.mean_k(), most.sd_k()), (Some(1.5), Some(0.5)));
     }
 }

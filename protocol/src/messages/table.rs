@@ -29,7 +29,8 @@ use crate::wire::{
 /// `NUMBER NAME: TYPE [checked], at KEY of its actor (PRIORITY) -> REPLY;`
 ///
 /// `[checked]`: its method of this name is called for every one that is received. `of its actor`: each actor has its own key. The priority is
-/// `Data` unless it is named. Replies have no key, they travel back.
+/// `Data` unless it is named. Replies have no key, they travel back; a message that is its own reply is
+/// fetched, with a query that carries nothing.
 macro_rules! messages {
     ($(
         #[doc = $doc:literal]
@@ -96,11 +97,11 @@ messages! {
     /// An actor's last word.
     8 Leave: Leave, at "leave" of its actor -> Ack;
     /// The replay server's account of itself.
-    9 ReplayStatus: ReplayStatus, at "status/replay" (InteractiveHigh);
+    9 ReplayStatus: ReplayStatus, at "status/replay" (InteractiveHigh) -> ReplayStatus;
     /// The learner's account of itself.
-    10 LearnerStatus: LearnerStatus, at "status/learner" (InteractiveHigh);
+    10 LearnerStatus: LearnerStatus, at "status/learner" (InteractiveHigh) -> LearnerStatus;
     /// What a joining process needs to know.
-    11 RunInfo: RunInfo, at "run-info";
+    11 RunInfo: RunInfo, at "run-info" -> RunInfo;
     /// "Understood"; carries nothing.
     12 Ack: Ack;
     /// An actor that starts.
@@ -118,7 +119,7 @@ messages! {
     /// The state of an actor or the learner, to the replay server.
     19 Report: Report [checked], at "report" of an actor or the learner -> Ack;
     /// The replay server's account of who takes part.
-    20 ProcessesStatus: ProcessesStatus, at "status/processes" (InteractiveHigh);
+    20 ProcessesStatus: ProcessesStatus, at "status/processes" (InteractiveHigh) -> ProcessesStatus;
     /// Priorities of the rows of a batch, learner to replay server.
     21 Priorities: PriorityUpdate [checked], at "priorities" (DataHigh) -> Ack;
     /// A request for the episodes that ended.

@@ -113,9 +113,6 @@ impl WeightsHeader {
     }
 
     /// Checks that `safetensors` is what this describes.
-    ///
-    /// # Errors
-    /// It has another SHA-256.
     pub fn check(&self, safetensors: &[u8]) -> Result<(), CodecError> {
         if self.sha256 == <[u8; 32]>::from(Sha256::digest(safetensors)) {
             Ok(())

@@ -83,9 +83,6 @@ impl Shutdown {
     }
 
     /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
-    ///
-    /// # Errors
-    /// As [`termination::listen`].
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let shutdown = Self::default();
         let raised = shutdown.clone();
@@ -109,9 +106,6 @@ pub struct GracefulShutdown {
 impl GracefulShutdown {
     /// The first flag is raised at any reason to exit, the second at SIGINT and SIGTERM, and without a `parent` at any reason. With a
     /// parent, its death, SIGHUP or a closed stderr raise only the first: the other processes exit then, too.
-    ///
-    /// # Errors
-    /// As [`termination::listen`].
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
         let steps = Self::default();
         let raised = steps.clone();

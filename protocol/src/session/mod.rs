@@ -84,9 +84,6 @@ pub fn open_as(
 }
 
 /// [`open_as`] of a process that has to wait for its replay server; `None` if it is told to stop before.
-///
-/// # Errors
-/// As [`open_as`].
 pub fn open_unless(
     shutdown: &Shutdown,
     endpoints: Endpoints,

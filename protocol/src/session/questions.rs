@@ -133,9 +133,6 @@ impl PendingBytes {
 }
 
 /// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
-///
-/// # Errors
-/// As [`send`] and [`PendingBytes::wait`].
 pub fn ask(
     session: &Session,
     key: &str,

@@ -66,9 +66,6 @@ impl Credentials {
     }
 
     /// As [`Credentials::read`], and logs nothing.
-    ///
-    /// # Errors
-    /// As [`Credentials::read`].
     pub fn examine(folder: &Path, role: Role) -> Result<Self, TlsError> {
         if let Role::Actor(number) = role
             && number >= ACTORS_MAX

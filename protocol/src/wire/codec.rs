@@ -13,7 +13,7 @@ use super::{
 };
 
 /// The version of every message in this crate; processes of different versions reject each other.
-pub const PROTOCOL_VERSION: u16 = 7;
+pub const PROTOCOL_VERSION: u16 = 8;
 
 /// Length of the fixed prefix, bytes.
 pub const PREFIX_BYTES: usize = Prefix::BYTES;
@@ -91,9 +91,6 @@ pub fn seal<M: Message>(
 }
 
 /// A whole message in one piece, for small ones and for tests.
-///
-/// # Errors
-/// As [`seal`].
 pub fn encode<M: Message>(
     spec_hash: u64,
     message: &M,
@@ -125,9 +122,6 @@ pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[
 /// Checks a message that came in `pieces`, `len` bytes in all, and copies its payload into own memory of `pool`.
 ///
 /// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
-///
-/// # Errors
-/// As [`decode`].
 pub fn receive<'a, M: Message>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     len: usize,

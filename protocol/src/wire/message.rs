@@ -15,9 +15,6 @@ pub trait Message: Serialize + DeserializeOwned {
 
     /// Checks what the type alone does not promise, such as that the payload is as long as the header says. Called for every
     /// message that is received; unless it is overridden, no payload may follow the header.
-    ///
-    /// # Errors
-    /// What is wrong with it.
     fn validate(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)
     }

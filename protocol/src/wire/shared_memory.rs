@@ -88,9 +88,6 @@ pub fn free_bytes() -> Result<u64, String> {
 }
 
 /// Whether so many bytes are free in [`FOLDER`]. The system would grant more than there is, and kill the process that writes to it.
-///
-/// # Errors
-/// They are not; what to do, for a person.
 pub fn check_room(bytes: usize) -> Result<(), String> {
     let free = free_bytes()?;
     if free >= bytes as u64 {
@@ -147,9 +144,6 @@ pub(super) fn take_room<T>(
 }
 
 /// Whether this process may lock `bytes` bytes, as zenoh does with the shared memory that it makes and that it reads.
-///
-/// # Errors
-/// It may not; what to do, for a person.
 pub fn check_lockable(bytes: usize) -> Result<(), String> {
     match lockable_bytes() {
         Some(most) if most < bytes as u64 => Err(format!(

@@ -6,8 +6,8 @@ use std::fmt::Debug;
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, Batch, BatchHeader, BatchReply, BatchRequest, Buffer, Chunk,
     ChunkHeader, ChunkPoll, CodecError, End, EndedEpisode, EpisodesReply, EpisodesRequest,
-    InsertReply, JoinReply, Kind, Learned, LearnerJoin, LearnerStatus, Leave, LogStatus, Message,
-    NO_ACTION, Origin, Participant, Played, PriorityPart, PriorityUpdate, ProcessName,
+    InsertReply, JoinReply, Learned, LearnerJoin, LearnerStatus, Leave, LogStatus, Message,
+    NO_ACTION, NotReady, Origin, Participant, Played, PriorityPart, PriorityUpdate, ProcessName,
     ProcessStatus, ProcessesStatus, Recovering, RecoveryProgress, ReplayStatus, Report, RequestId,
     Returns, RowScalars, RunInfo, ShardCounts, StackedFrames, Waiting, Warning, WeightsHeader,
     WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion, Welcome,
@@ -15,7 +15,6 @@ use driml_protocol::{
 };
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
-pub(crate) const ACTIONS: u32 = 15;
 
 /// A message of one type, and whether some bytes are accepted in its place.
 pub(crate) struct Sample {
@@ -28,34 +27,42 @@ pub(crate) struct Sample {
 impl Sample {
     /// Encodes `header`, checks that it comes back, and keeps the bytes.
     pub(crate) fn of<M: Message + PartialEq + Debug>(header: &M) -> Self {
-        let bytes = codec::encode(SPEC, header, &[]).unwrap();
-        let (back, payload) = codec::decode::<M>(&bytes, Some(SPEC)).unwrap();
-        assert_eq!((&back, payload.len()), (header, 0));
-        let (back, _) = codec::decode::<M>(&bytes, None).unwrap();
-        assert_eq!(&back, header, "where any run is welcome");
+        Self::with(header, &[])
+    }
+
+    fn with<M: Message + PartialEq + Debug>(header: &M, payload: &[u8]) -> Self {
+        let bytes = codec::encode(SPEC, header, payload).unwrap();
+        for run in [Some(SPEC), None] {
+            let back = codec::decode::<M>(&bytes, run).unwrap();
+            assert_eq!((&back.0, back.1), (header, payload));
+        }
         Self {
             name: format!("{header:?}"),
             kind: M::KIND,
             bytes,
-            read: |bytes| codec::decode::<M>(bytes, Some(SPEC)).map(|_| ()),
+            read: |bytes| codec::decode::<M>(bytes, Some(SPEC)).map(drop),
+        }
+    }
+
+    fn batch(batch: Batch) -> Self {
+        let (header, payload) = batch.into_payload();
+        Self {
+            read: read_batch,
+            ..Self::with(&BatchReply::Batch(header), &payload)
         }
     }
 }
 
 pub(crate) fn read_chunk(bytes: &[u8]) -> Result<(), CodecError> {
-    Chunk::decode(bytes, SPEC, ACTIONS).map(|_| ())
+    Chunk::decode(bytes, SPEC).map(|_| ())
 }
 
 pub(crate) fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     let (reply, payload) = codec::decode::<BatchReply>(bytes, Some(SPEC))?;
-    match reply.header() {
-        Some(header) => Batch::from_payload(header, payload.to_vec().into()).map(|_| ()),
-        None => Ok(()),
+    match reply {
+        BatchReply::Batch(header) => Batch::from_payload(header, payload.to_vec().into()).map(drop),
+        BatchReply::NotReady(_) => Ok(()),
     }
-}
-
-pub(crate) fn read_weights(bytes: &[u8]) -> Result<(), CodecError> {
-    codec::decode::<WeightsUpload>(bytes, Some(SPEC)).map(|_| ())
 }
 
 pub(crate) fn chunk() -> Chunk {
@@ -168,25 +175,24 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
     batch
 }
 
-/// The bytes of a message as the wire joins them.
-pub(crate) fn join((mut head, payload): (Vec<u8>, impl AsRef<[u8]>)) -> Vec<u8> {
-    head.extend_from_slice(payload.as_ref());
-    head
+/// A chunk as it travels.
+pub(crate) fn sealed_chunk() -> Vec<u8> {
+    codec::encode(SPEC, &chunk().header, chunk().payload()).unwrap()
 }
 
 /// A batch as it travels.
 pub(crate) fn sealed(batch: Batch) -> Vec<u8> {
     let (header, payload) = batch.into_payload();
-    codec::encode(SPEC, &BatchReply::of(header), &payload).unwrap()
+    codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap()
 }
 
-pub(crate) fn weights() -> Vec<u8> {
+pub(crate) fn weights() -> (WeightsUpload, Vec<u8>) {
     let payload: Vec<u8> = (0..40).collect();
     let upload = WeightsUpload {
         learner: 5,
         weights: WeightsHeader::new(4, 312, &payload),
     };
-    codec::encode(SPEC, &upload, &payload).unwrap()
+    (upload, payload)
 }
 
 pub(crate) fn processes_status() -> ProcessesStatus {
@@ -322,7 +328,7 @@ pub(crate) fn samples() -> Vec<Sample> {
             bytes: 2,
             since_s: 3.5,
         },
-        config_toml: Some("[run]\nseed = 1\n".into()),
+        config_toml: "[run]\nseed = 1\n".into(),
     };
     let leave = Leave {
         actor: 1,
@@ -340,10 +346,12 @@ pub(crate) fn samples() -> Vec<Sample> {
         JoinReply::Refused { why: "b".into() },
     ];
     samples.extend(joined.map(|reply| Sample::of(&reply)));
-    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::Wait(waiting))));
+    samples.extend(waits.map(|waiting| Sample::of(&BatchReply::NotReady(NotReady::Wait(waiting)))));
     samples.extend([
-        Sample::of(&BatchReply::Finished),
-        Sample::of(&BatchReply::Refused { why: String::new() }),
+        Sample::of(&BatchReply::NotReady(NotReady::Finished)),
+        Sample::of(&BatchReply::NotReady(NotReady::Refused {
+            why: String::new(),
+        })),
         Sample::of(&BatchRequest {
             learner: 5,
             id: RequestId::first(u64::MAX).again(),
@@ -406,42 +414,23 @@ pub(crate) fn samples() -> Vec<Sample> {
             Some(Warning::new("a chunk was refused", 3.0)),
         )),
         Sample::of(&processes_status()),
-        Sample::of(&EpisodesRequest { since: 7 }),
+        Sample::of(&EpisodesRequest {
+            since: 7,
+            is_launcher: true,
+        }),
         Sample::of(&episodes()),
     ]);
-    let with_payload = [
-        (
-            "chunk",
-            Kind::Chunk,
-            join(chunk().seal(SPEC).unwrap()),
-            read_chunk as fn(&[u8]) -> _,
-        ),
-        ("batch", Kind::BatchReply, sealed(batch()), read_batch),
-        (
-            "batch drawn by priority",
-            Kind::BatchReply,
-            sealed(prioritised_batch()),
-            read_batch,
-        ),
-        (
-            "batch of stacked frames",
-            Kind::BatchReply,
-            sealed(stacked_batch(None)),
-            read_batch,
-        ),
-        (
-            "batch of stacked frames drawn by priority",
-            Kind::BatchReply,
-            sealed(stacked_batch(Some(ORIGIN))),
-            read_batch,
-        ),
-        ("weights", Kind::WeightsUpload, weights(), read_weights),
-    ];
-    samples.extend(with_payload.map(|(name, kind, bytes, read)| Sample {
-        name: name.into(),
-        kind: kind as u16,
-        bytes,
-        read,
-    }));
+    let (upload, payload) = weights();
+    samples.extend([
+        Sample {
+            read: read_chunk,
+            ..Sample::with(&chunk().header, chunk().payload())
+        },
+        Sample::batch(batch()),
+        Sample::batch(prioritised_batch()),
+        Sample::batch(stacked_batch(None)),
+        Sample::batch(stacked_batch(Some(ORIGIN))),
+        Sample::with(&upload, &payload),
+    ]);
     samples
 }

@@ -24,6 +24,9 @@ pub(crate) struct Statistics {
     /// How many the process that records them had when it asked last; none before it asks.
     #[serde(skip)]
     recorded: Option<u64>,
+    /// That process is the run's launcher.
+    #[serde(skip)]
+    is_launched: bool,
 }
 
 impl Statistics {
@@ -124,9 +127,12 @@ impl Statistics {
         }
     }
 
-    /// The recorder has the first so many of them.
-    pub(crate) fn note_recorded(&mut self, episodes: u64) {
-        self.recorded = Some(episodes.min(self.counted.episodes));
+    /// A recorder has the first so many of them: the launcher, or, where none records, one that watches the run.
+    pub(crate) fn note_recorded(&mut self, episodes: u64, is_launcher: bool) {
+        if is_launcher || !self.is_launched {
+            self.recorded = Some(episodes.min(self.counted.episodes));
+            self.is_launched = is_launcher;
+        }
     }
 
     /// Checks that these can be the counts of a replay; the error says why not.

@@ -21,6 +21,10 @@ use super::{
 };
 use crate::storage::frame_store::PackedChunk;
 
+/// A segment is at least this many times as long as the state that it begins with.
+const SNAPSHOTS: u64 = 4;
+/// How long the newest segment grows once another could not be begun, before that is tried again.
+const RETRY: Duration = Duration::from_secs(1);
 /// Marks that hold: if the newest is of a checkpoint that was not written whole, the one before it is wanted.
 const MARKS: usize = 2;
 
@@ -31,6 +35,8 @@ pub(super) struct Segment {
     /// The first transition that it may hold.
     pub(super) first_row: u64,
     pub(super) bytes: u64,
+    /// Those of the state that it begins with; 0 where they do not matter any more.
+    pub(super) snapshot_bytes: u64,
 }
 
 /// Where a log is continued.
@@ -59,7 +65,6 @@ struct Failing {
     since: Instant,
     /// What it said last.
     why: String,
-    said: LogLimiter,
 }
 
 /// The writing side of a log.
@@ -77,6 +82,9 @@ pub(crate) struct Journal {
     /// Records that the disk has refused so far; nothing is written before them.
     pending: Vec<u8>,
     failing: Option<Failing>,
+    /// When another segment could not be begun, if none was since.
+    not_begun: Option<Instant>,
+    said: LogLimiter,
     /// The last two marks that were not given up, the newest last, each with the oldest transition that was held: what they need stays.
     marks: VecDeque<(Mark, u64)>,
 }
@@ -109,6 +117,8 @@ impl Journal {
             syncer,
             pending: Vec::new(),
             failing: None,
+            not_begun: None,
+            said: LogLimiter::default(),
             marks: place.mark.into_iter().collect(),
         })
     }
@@ -214,10 +224,9 @@ impl Journal {
         let failing = self.failing.get_or_insert_with(|| Failing {
             since: Instant::now(),
             why: String::new(),
-            said: LogLimiter::default(),
         });
         failing.why = e.to_string();
-        if let Some(more) = failing.said.due() {
+        if let Some(more) = self.said.due() {
             tracing::error!(
                 "the replay's log in {} cannot be written: {e}; nothing more is stored until it can: make room or make it writable{more}",
                 self.folder.path.display()
@@ -225,15 +234,26 @@ impl Journal {
         }
     }
 
+    /// Whether another segment is due: the newest has its length, or may have lost what was written to it.
     pub(super) fn is_full(&self) -> bool {
-        let newest = self.segments.back();
-        self.pending.is_empty() && newest.is_some_and(|it| it.bytes >= self.limits.segment_bytes)
+        let is_full = |it: &Segment| {
+            it.bytes >= self.length(it.snapshot_bytes) || self.syncer.has_lost(it.number)
+        };
+        self.pending.is_empty()
+            && self.not_begun.is_none_or(|at| at.elapsed() >= RETRY)
+            && self.segments.back().is_some_and(is_full)
     }
 
-    /// Where the disk budget does not allow another segment: the oldest transition that may stay.
-    pub(super) fn over_budget(&self) -> Option<u64> {
+    /// From how many bytes on a segment that begins with such a state is followed by another.
+    fn length(&self, snapshot_bytes: u64) -> u64 {
+        let least = SNAPSHOTS * snapshot_bytes;
+        self.limits.segment_bytes.max(least)
+    }
+
+    /// Where the disk budget does not allow another segment, with `snapshot`: the oldest transition that may stay.
+    pub(super) fn over_budget(&self, snapshot: impl FnOnce() -> Snapshot) -> Option<u64> {
         let max = self.limits.disk_bytes_max?;
-        let mut bytes = self.bytes() + self.limits.segment_bytes + self.largest;
+        let mut bytes = self.bytes() + self.length(snapshot().bytes()) + self.largest;
         let mut keep = None;
         for (segment, next) in self.segments.iter().zip(self.segments.iter().skip(1)) {
             if bytes <= max {
@@ -256,7 +276,7 @@ impl Journal {
         let begun = begin_segment(&self.folder, self.id, number, self.ordinal + 1, snapshot);
         let (segment, file) = match begun {
             Ok(begun) => begun,
-            Err(e) => return self.note_failing(&e),
+            Err(e) => return self.note_not_begun(&e),
         };
         let closed = record::head(RecordKind::Closed, self.ordinal, &[], 0);
         if !self.write(&closed, &[]) {
@@ -265,9 +285,21 @@ impl Journal {
             return;
         }
         self.ordinal += 2;
+        self.not_begun = None;
         self.file = file.clone();
         self.syncer.opened(number, file);
         self.segments.push_back(segment);
+    }
+
+    fn note_not_begun(&mut self, e: &io::Error) {
+        self.not_begun = Some(Instant::now());
+        if let Some(more) = self.said.due() {
+            tracing::error!(
+                "no new file can be begun in the replay's log in {}: {e}; the newest one grows until it can: make room or make the folder \
+                 writable{more}",
+                self.folder.path.display()
+            );
+        }
     }
 
     /// Begins another segment with `snapshot`, which is on the disk when this returns and stays.
@@ -338,6 +370,7 @@ fn begin_segment(
         number,
         first_row: snapshot.inserted,
         bytes: head.len() as u64,
+        snapshot_bytes: head.len() as u64,
     };
     Ok((segment, Arc::new(file)))
 }

@@ -40,9 +40,6 @@ pub struct PersistArgs {
 
 impl Replay {
     /// The replay of a run that is kept in a folder: as it was, if it was kept there before, else an empty one.
-    ///
-    /// # Errors
-    /// Those of [`KeptReplay::find`] and [`KeptReplay::read`].
     pub fn open(
         args: &PersistArgs,
         spec: &RunSpec,

@@ -241,6 +241,7 @@ impl Reader<'_> {
             number,
             first_row,
             bytes: if is_last { at } else { bytes.len() } as u64,
+            snapshot_bytes: 0,
         });
         match ended {
             Ok(true) if is_last => self.warn(format!(
@@ -304,8 +305,8 @@ impl Reader<'_> {
             RecordKind::Segment => Err("a segment begins within another".into()),
             RecordKind::Chunk => {
                 let (hash, len) = (self.id.spec_hash, record.body.len());
-                let num_actions = self.replay.spec.num_actions;
-                let chunk = Chunk::receive([record.body], len, &self.pool, hash, num_actions)
+                let chunk = codec::receive([record.body], len, &self.pool, Some(hash))
+                    .and_then(|(header, payload)| Chunk::from_payload(header, payload))
                     .map_err(|e| e.to_string())?;
                 self.replay.check_chunk(&chunk)?;
                 self.replay.state.actors.check_known(&chunk.header)?;

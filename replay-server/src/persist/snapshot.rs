@@ -1,7 +1,7 @@
 //! All of the replay but the transitions themselves, as a value that is written and taken back, and what changes it between two chunks.
 //! When one is written is for the facade; where it lies, for `journal`.
 
-use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec};
+use driml_protocol::{ActorJoin, Learned, LearnerJoin, Leave, RunSpec, codec};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -90,6 +90,11 @@ pub(crate) struct Snapshot {
 }
 
 impl Snapshot {
+    /// How many it takes where it is written.
+    pub(crate) fn bytes(&self) -> u64 {
+        codec::encode_value(self).map_or(0, |it| it.len() as u64)
+    }
+
     /// Checks that this is of a replay like `ours`, whatever its checksum says; the error says why not. One that is taken can be counted
     /// on from: no count overflows, and none becomes less than nothing.
     pub(crate) fn check(&self, ours: &State) -> Result<(), &'static str> {

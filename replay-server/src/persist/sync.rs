@@ -2,7 +2,7 @@
 //! What the process has written survives its death without this; what the machine has flushed survives a power cut too.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs::File,
     io,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -20,7 +20,9 @@ struct Unflushed {
     segments: BTreeMap<u64, Arc<File>>,
     /// The folder, if a segment was made in it.
     folder: Option<Arc<File>>,
-    /// When the last flush that succeeded began.
+    /// Segments of which a flush failed. The system says so once, and may then take what it has lost for written.
+    lost: BTreeSet<u64>,
+    /// When the last flush began that succeeded while no segment was lost.
     flushed: Instant,
 }
 
@@ -43,17 +45,19 @@ impl Shared {
         let segments = std::mem::take(&mut unflushed.segments);
         let folder = unflushed.folder.take();
         drop(unflushed);
-        let mut files = segments.values();
-        let flushed = files
-            .try_for_each(|file| file.sync_data())
+        let mut lost = None;
+        let flushed = segments
+            .iter()
+            .try_for_each(|(&number, file)| file.sync_data().inspect_err(|_| lost = Some(number)))
             .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
         let mut unflushed = self.unflushed();
-        if flushed.is_ok() {
-            unflushed.flushed = begun;
-        } else {
+        if flushed.is_err() {
             // Due the next time again.
             unflushed.segments.extend(segments);
             unflushed.folder = unflushed.folder.take().or(folder);
+            unflushed.lost.extend(lost);
+        } else if unflushed.lost.is_empty() {
+            unflushed.flushed = begun;
         }
         flushed
     }
@@ -74,6 +78,7 @@ impl Syncer {
             unflushed: Mutex::new(Unflushed {
                 segments: BTreeMap::new(),
                 folder: None,
+                lost: BTreeSet::new(),
                 flushed: Instant::now(),
             }),
             flushing: Mutex::default(),
@@ -116,7 +121,14 @@ impl Syncer {
 
     /// Segment `number` is gone, and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
-        self.shared.unflushed().segments.remove(&number);
+        let mut unflushed = self.shared.unflushed();
+        unflushed.segments.remove(&number);
+        unflushed.lost.remove(&number);
+    }
+
+    /// Whether a flush of segment `number` failed. Where each write is flushed, one that fails is written again.
+    pub(super) fn has_lost(&self, number: u64) -> bool {
+        self.thread.is_some() && self.shared.unflushed().lost.contains(&number)
     }
 
     /// Something was written to segment `number`; where each write is flushed, the disk may refuse.
@@ -138,7 +150,7 @@ impl Syncer {
     /// Flushes now; a disk that refuses is a warning.
     pub(super) fn flush(&self) {
         if let Err(e) = self.flushed() {
-            tracing::warn!("the replay's log was not flushed at the end: {e}");
+            tracing::warn!("the replay's log was not flushed: {e}");
         }
     }
 }
@@ -164,5 +176,28 @@ fn work(shared: &Shared, stop: &Shutdown, period: Duration) {
                 "the replay's log was not flushed, a power cut may lose what was stored since: {e}{more}"
             );
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_failed_flush_lost_stays_unflushed_until_its_segment_is_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |path| Arc::new(File::open(path).unwrap());
+        let opened = File::open(folder.path()).unwrap();
+        let syncer = Syncer::start(opened, Duration::from_secs(3600)).unwrap();
+        let begun = Instant::now();
+        syncer.opened(1, file("/dev/null".as_ref()));
+        assert!(syncer.flushed().is_err());
+        // The system says it once.
+        syncer.opened(1, file(folder.path()));
+        assert!(syncer.flushed().is_ok());
+        let least = begun.elapsed().as_secs_f64();
+        assert!(syncer.flushed_s() >= least);
+        syncer.removed(1);
+        assert!(syncer.flushed().is_ok());
     }
 }

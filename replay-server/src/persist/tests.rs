@@ -7,13 +7,18 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, Horizon, Learned, LearnerJoin, Leave, RunSpec, ShardCounts, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, Horizon, InsertReply, Learned,
+    LearnerJoin, Leave, RunSpec, Sampling, ShardCounts, TimeoutRule,
 };
 
 use super::{PersistArgs, PersistError};
 use crate::{Config, Replay, ledger::actors::ACTORS_MAX};
 
 fn open(dir: &Path) -> Result<(Replay, Vec<String>), PersistError> {
+    open_drawn_by(dir, Sampling::default())
+}
+
+fn open_drawn_by(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), PersistError> {
     let spec = RunSpec {
         world: "counter".into(),
         agent: "c51".into(),
@@ -28,18 +33,14 @@ fn open(dir: &Path) -> Result<(Replay, Vec<String>), PersistError> {
         horizon: Horizon::None {},
         timeout: TimeoutRule::Terminal,
     };
-    let config: Config = toml::from_str(
-        "capacity_transitions = 1000
-         shards = 1
-         replay_ratio = 8.0
-         warmup_transitions = 10
-         slack_transitions = 100",
-    )
-    .unwrap();
+    let config = Config {
+        sampling,
+        ..Config::unlimited(2_000)
+    };
     let args = PersistArgs {
         dir: dir.to_owned(),
         shard: 0,
-        segment_bytes: Some(1 << 20),
+        segment_bytes: Some(4_000),
         mark: None,
     };
     let (replay, recovery) = Replay::open(&args, &spec, &config, 4)?;
@@ -66,6 +67,31 @@ fn refuse(replay: &mut Replay) -> Arc<File> {
     std::mem::replace(&mut log.file, full)
 }
 
+fn store(replay: &mut Replay, sequence: u64) {
+    let steps = 20;
+    let mut chunk = Chunk::zeroed(ChunkHeader {
+        incarnation: 1,
+        sequence,
+        first_transition: sequence * steps,
+        streams: 1,
+        steps: steps as u32,
+        frame_bytes: 1,
+        ..ChunkHeader::default()
+    });
+    chunk.set(0, 0, 0.0, End::Terminal);
+    let reply = replay.insert(&chunk);
+    assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
+}
+
+fn save_checkpoint(replay: &mut Replay) {
+    let learned = Learned {
+        updates: 1,
+        saved_updates: 1,
+        ..Learned::default()
+    };
+    replay.note_learned(learned).unwrap();
+}
+
 #[test]
 fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -85,12 +111,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     assert!(replay.is_refused_by_disk());
     replay.log.as_mut().unwrap().file = file;
     // The learner's checkpoint is the first that there is room for.
-    let learned = Learned {
-        updates: 1,
-        saved_updates: 1,
-        ..Learned::default()
-    };
-    replay.note_learned(learned).unwrap();
+    save_checkpoint(&mut replay);
     replay.join_actor(join(1, 1)).unwrap();
     let stored = replay.stored_bytes().unwrap();
     drop(replay);
@@ -129,5 +150,61 @@ fn what_cannot_be_read_is_refused_until_it_is_removed() {
         let refused = open(folder.path());
         assert!(matches!(refused, Err(PersistError::Unusable(..))));
         assert_eq!(fs::read(&segment).unwrap(), bytes);
+    }
+}
+
+#[test]
+fn a_segment_that_cannot_be_begun_stops_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut replay, _) = open(folder.path()).unwrap();
+    replay.join_actor(join(0, 1)).unwrap();
+    let next = folder.path().join("segment-000000000001.log");
+    fs::create_dir(&next).unwrap();
+    for sequence in 0..80 {
+        store(&mut replay, sequence);
+        assert!(!replay.is_refused_by_disk(), "what is stored is written");
+    }
+    fs::remove_dir(&next).unwrap();
+    save_checkpoint(&mut replay);
+    assert!(next.is_file());
+    store(&mut replay, 80);
+    let stored = replay.stored_bytes().unwrap();
+    drop(replay);
+    let (replay, warnings) = open(folder.path()).unwrap();
+    assert_eq!(warnings, [""; 0]);
+    assert!(replay.stored_bytes().unwrap() == stored);
+}
+
+/// With priorities a state has 8 bytes for each transition held.
+#[test]
+fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let sampling = Sampling::Prioritised {
+        alpha: 0.5,
+        beta_start: 0.5,
+        beta_end: 0.5,
+        beta_updates: 1,
+    };
+    let (mut replay, _) = open_drawn_by(folder.path(), sampling).unwrap();
+    replay.join_actor(join(0, 1)).unwrap();
+    let mut most = 0;
+    for sequence in 0..800 {
+        store(&mut replay, sequence);
+        most = most.max(replay.log.as_ref().unwrap().bytes());
+    }
+    // The 2,000 transitions held take 34 kB in chunks, and a state 16 kB.
+    assert!(most < 200_000, "{most}");
+}
+
+#[test]
+fn where_a_launcher_records_it_alone_says_which_episodes_need_not_be_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut replay, _) = open(folder.path()).unwrap();
+    replay.join_actor(join(0, 1)).unwrap();
+    store(&mut replay, 0);
+    for (since, is_launcher, kept) in [(1, false, 0), (0, true, 1), (1, false, 1), (1, true, 0)] {
+        replay.episodes(EpisodesRequest { since, is_launcher });
+        let kept_now = replay.snapshot().state.statistics.episodes_since(0);
+        assert_eq!(kept_now.episodes.len(), kept, "{since} {is_launcher}");
     }
 }

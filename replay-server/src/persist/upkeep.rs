@@ -60,7 +60,7 @@ impl Replay {
     /// Begins another segment when one is full, and removes those that are not needed any more.
     pub(crate) fn tidy(&mut self) {
         if let Some(log) = self.log.as_ref().filter(|log| log.is_full()) {
-            if let Some(oldest) = log.over_budget() {
+            if let Some(oldest) = log.over_budget(|| self.snapshot()) {
                 self.forget_before(oldest);
                 self.prune();
             }
@@ -163,9 +163,6 @@ impl Replay {
     }
 
     /// All but the transitions, as bytes that are the same where it is: what a mark brings back. For tests.
-    ///
-    /// # Errors
-    /// A state over the codec's limit.
     pub fn state_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let mut snapshot = self.snapshot();
         snapshot.state.statistics = snapshot.state.statistics.of_changes();
@@ -173,9 +170,6 @@ impl Replay {
     }
 
     /// The same without what was drawn: what a log brings back after its server died at any moment. For tests.
-    ///
-    /// # Errors
-    /// A state over the codec's limit.
     pub fn stored_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let Snapshot {
             mut counts, state, ..

@@ -2,11 +2,11 @@
 //! How rows are drawn and put together is for `sampling`.
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, PriorityUpdate, RequestId,
-    ShardCounts, Waiting,
+    AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, NotReady, PriorityUpdate,
+    RequestId, ShardCounts, Waiting,
 };
 
-use super::{NotReady, Replay};
+use super::Replay;
 use crate::{
     config,
     ledger::requests::Requests,
@@ -175,9 +175,6 @@ impl Replay {
 /// The batches that it is served.
 impl Replay {
     /// Makes a batch: [`Replay::draw`] and [`PackedBatch::unpack`] in one.
-    ///
-    /// # Errors
-    /// As [`Replay::draw`].
     pub fn sample(&mut self, rows: u32) -> Result<Batch, NotReady> {
         self.draw(rows, Buffer::zeroed).map(PackedBatch::unpack)
     }

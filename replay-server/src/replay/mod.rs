@@ -6,7 +6,7 @@ mod actors;
 mod learner;
 
 use driml_protocol::{
-    BatchReply, EpisodesReply, Origin, ReplayStatus, RunSpec, ShardCounts, Waiting,
+    EpisodesReply, EpisodesRequest, Origin, ReplayStatus, RunSpec, ShardCounts, Waiting,
     config::{ConfigError, check},
 };
 
@@ -18,30 +18,6 @@ use crate::{
     sampling::batch::BatchSampler,
     storage::{frame_store::Frames, ring::Ring},
 };
-
-/// Why there is no batch.
-#[derive(Clone, Debug, PartialEq)]
-pub enum NotReady {
-    /// Not yet: who waits for what.
-    Wait(Waiting),
-    /// Never again: all transitions are in and sampled.
-    Finished,
-    /// Never: the reason, for a person.
-    Refused {
-        /// Why, and what to do about it.
-        why: String,
-    },
-}
-
-impl From<NotReady> for BatchReply {
-    fn from(not_ready: NotReady) -> Self {
-        match not_ready {
-            NotReady::Wait(waiting) => Self::Wait(waiting),
-            NotReady::Finished => Self::Finished,
-            NotReady::Refused { why } => Self::Refused { why },
-        }
-    }
-}
 
 /// Everything the replay server knows. Kept in memory alone, or, with a log, on disk too: [`KeptReplay`](crate::KeptReplay).
 pub struct Replay {
@@ -175,14 +151,21 @@ impl Replay {
         }
     }
 
+    /// The episodes that are asked for, by one that has those before.
+    pub(crate) fn episodes(&mut self, request: EpisodesRequest) -> EpisodesReply {
+        let EpisodesRequest { since, is_launcher } = request;
+        self.state.statistics.note_recorded(since, is_launcher);
+        self.episodes_since(since)
+    }
+
     /// Episodes that ended after the first `since`, at most as many as one answer holds.
     pub fn episodes_since(&self, since: u64) -> EpisodesReply {
         self.state.statistics.episodes_since(since)
     }
 
-    /// The recorder has the first so many episodes that ended.
+    /// The launcher has the first so many episodes that ended.
     pub fn note_recorded(&mut self, episodes: u64) {
-        self.state.statistics.note_recorded(episodes);
+        self.state.statistics.note_recorded(episodes, true);
     }
 
     /// Checks the ring and the counts; panics at the first that is wrong. Slow: for tests.

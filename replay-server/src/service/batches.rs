@@ -3,13 +3,15 @@
 
 use std::time::Instant;
 
-use driml_protocol::{Alive, BatchReply, BatchRequest, Buffer, Incoming, Responder, fail_point};
+use driml_protocol::{
+    Alive, BatchReply, BatchRequest, Buffer, Incoming, NotReady, Responder, fail_point,
+};
 
 use super::{
     parked::{ParkedRequest, park_request},
     server::{Service, State},
 };
-use crate::{replay::NotReady, sampling::packed_batch::PackedBatch};
+use crate::sampling::packed_batch::PackedBatch;
 
 /// A request that waits, and who for.
 type Parked = ParkedRequest<Responder<BatchReply>>;
@@ -20,7 +22,7 @@ impl Service {
         let responder = incoming.into_responder();
         let Some(request) = request else {
             let why = "the request could not be read; the replay server's log says why".into();
-            return responder.reply(&BatchReply::Refused { why });
+            return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         };
         let mut state = self.state();
         let learner_status = self.note_learner(&mut state, &request);
@@ -28,7 +30,7 @@ impl Service {
             let line = format!("a request for a batch was refused: {why}");
             state.refuse("batch", &line);
             drop(state);
-            return responder.reply(&BatchReply::Refused { why });
+            return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         }
         let learner = Alive::learner(request.learner);
         state.participants.seen(learner, None, Instant::now());
@@ -86,10 +88,10 @@ impl Service {
             match drawn.map(PackedBatch::unpack) {
                 Ok(batch) => {
                     let (header, payload) = batch.into_payload();
-                    let (reply, payload) = (BatchReply::of(header), payload.freeze());
+                    let (reply, payload) = (BatchReply::Batch(header), payload.freeze());
                     parked.question.reply_with(&reply, payload);
                 }
-                Err(not_ready) => parked.question.reply(&not_ready.into()),
+                Err(not_ready) => parked.question.reply(&BatchReply::NotReady(not_ready)),
             }
         }
     }

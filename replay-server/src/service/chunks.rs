@@ -24,7 +24,7 @@ impl Service {
         let arrived = Instant::now();
         let chunk = incoming.receive(&self.pool).and_then(|(header, payload)| {
             self.check_version(&header)?;
-            Chunk::from_payload(header, payload, self.num_actions)
+            Chunk::from_payload(header, payload)
         });
         let responder = incoming.into_responder();
         let chunk = match chunk {

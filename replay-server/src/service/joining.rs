@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, Responder, RunInfo, Welcome,
+    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, RunInfo, Welcome,
 };
 use zenoh::sample::SampleKind;
 
@@ -25,7 +25,7 @@ impl Service {
         state.count_actors();
     }
 
-    pub(super) fn run_info(&self, responder: Responder<RunInfo>) {
+    pub(super) fn run_info(&self, incoming: Incoming<RunInfo>) {
         let state = self.state();
         let lives = state.participants.actor_lives();
         let run_info = RunInfo {
@@ -37,7 +37,7 @@ impl Service {
             shared_memory: self.shared_memory && lives < SHARED_LIVES_MAX,
         };
         drop(state);
-        responder.reply(&run_info);
+        incoming.into_responder().reply(&run_info);
     }
 
     pub(super) fn join_actor(&self, incoming: Incoming<ActorJoin>) {

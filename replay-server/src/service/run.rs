@@ -4,21 +4,21 @@
 use std::{
     collections::VecDeque,
     path::PathBuf,
-    sync::{Arc, Condvar, Mutex, OnceLock},
+    sync::{Arc, Condvar, Mutex, OnceLock, mpsc},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    BatchHeader, BufferPool, Incoming, Keyed, Keys, LogLimiters, POOL_BATCHES, QueryWorkers,
-    Request, Responder, RunClient, RunSpec, Sampling, Shutdown,
+    Alive, BatchHeader, BufferPool, Incoming, Keys, LogLimiters, POOL_BATCHES, QueryWorkers,
+    Request, RunClient, RunSpec, Sampling, Shutdown,
     config::{Settings, TransportConfig},
-    join_within,
+    fail_point, join_within,
     session::{self, Endpoints},
     shared_memory,
     tls::Credentials,
 };
-use zenoh::{Wait, pubsub::Subscriber, query::Queryable};
+use zenoh::{Wait, pubsub::Subscriber, query::Queryable, sample::SampleKind};
 
 use super::{
     limits::{Limits, number, shared_memory_bytes},
@@ -163,7 +163,6 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     // Of this process alone, so that priorities of rows that an earlier one drew do not count for other rows.
     replay.origin.incarnation = rand::random();
     let service = Arc::new(Service {
-        num_actions: spec.num_actions,
         limits,
         shard: (args.shard, config.shards),
         config_toml: args.config_toml,
@@ -184,11 +183,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         announcements: client.announce().map_err(declaring)?,
         shutdown: shutdown.clone(),
     });
-    let _alive = watch_members(&client, &service)
+    let (alive, members) = watch_members(&client, &service)
         .map_err(|e| anyhow::anyhow!("watching for actors and learner: {e}"))?;
     let opened = admission.service.set(service.clone());
     assert!(opened.is_ok(), "a replay is read back once");
     threads.extend(service.clone().start_working()?);
+    threads.push(members);
     service.wait_until_over(&args.ending, args.keep_alive);
     // Its threads wait for that.
     shutdown.set();
@@ -197,6 +197,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         "replay server stops with {} transitions stored",
         service.state().replay.inserted_total()
     );
+    drop(alive);
     let closed = close(&client, queryables, threads);
     let mut state = service.state();
     if let Some(log) = &mut state.replay.log {
@@ -264,7 +265,6 @@ type Threads = Vec<JoinHandle<()>>;
 struct Answers<'a> {
     client: &'a RunClient,
     admission: &'a Arc<Admission>,
-    limits: Limits,
     /// Dropping them ends the answers, and with them the threads.
     queryables: Queryables,
     threads: Threads,
@@ -281,7 +281,6 @@ impl<'a> Answers<'a> {
         let mut this = Self {
             client,
             admission,
-            limits,
             queryables: Vec::new(),
             threads: Threads::new(),
         };
@@ -293,15 +292,15 @@ impl<'a> Answers<'a> {
         if sampling.is_prioritised() {
             this.answer("priorities", 1, limits.priorities, Service::priorities)?;
         }
-        this.offer("run-info", Service::run_info)?;
+        this.answer("run-info", 1, small, Service::run_info)?;
         this.answer("join-actor", 1, small, Service::join_actor)?;
         this.answer("join-learner", 1, small, Service::join_learner)?;
         this.answer("leave", 1, small, Service::leave)?;
         this.answer("weights-upload", 1, limits.weights, Service::take_weights)?;
         this.answer("weights", WEIGHTS_THREADS, small, Service::give_weights)?;
         this.answer("report", 1, small, Service::report)?;
-        this.offer("status", Service::status)?;
-        this.offer("processes", Service::processes)?;
+        this.answer("status", 1, small, Service::status)?;
+        this.answer("processes", 1, small, Service::processes)?;
         this.answer("episodes", 1, small, Service::episodes)?;
         Ok(this)
     }
@@ -319,31 +318,7 @@ impl<'a> Answers<'a> {
             Some(service) => answer(service, incoming),
             None => incoming.into_responder().put_off(&admission.put_off()),
         };
-        let workers = QueryWorkers::answer(name, threads, spec_hash, answer)?;
-        self.add(name, bytes_max, workers)
-    }
-
-    /// Gives an `M` to those who fetch it, on a thread of this name.
-    fn offer<M: Keyed + 'static>(
-        &mut self,
-        name: &'static str,
-        give: fn(&Service, Responder<M>),
-    ) -> zenoh::Result<()> {
-        let (admission, spec_hash) = (self.admission.clone(), self.client.spec_hash());
-        let give = move |responder: Responder<M>| match admission.service.get() {
-            Some(service) => give(service, responder),
-            None => responder.put_off(&admission.put_off()),
-        };
-        let workers = QueryWorkers::offer(name, 1, spec_hash, give)?;
-        self.add(name, self.limits.small, workers)
-    }
-
-    fn add<M: Keyed + 'static>(
-        &mut self,
-        name: &'static str,
-        bytes_max: usize,
-        workers: QueryWorkers<M>,
-    ) -> zenoh::Result<()> {
+        let workers = QueryWorkers::start(name, threads, spec_hash, answer)?;
         let admission = self.admission.clone();
         let refused = move |bytes| match admission.service.get() {
             Some(service) => service.refuse_long(name, bytes, bytes_max),
@@ -356,20 +331,36 @@ impl<'a> Answers<'a> {
     }
 }
 
-/// Keeps track of who is connected.
-fn watch_members(client: &RunClient, service: &Arc<Service>) -> zenoh::Result<Subscriber<()>> {
+/// Keeps track of who is connected, on a thread that ends when the subscriber is dropped: the one that reads the socket must not wait for
+/// the replay.
+fn watch_members(
+    client: &RunClient,
+    service: &Arc<Service>,
+) -> zenoh::Result<(Subscriber<()>, JoinHandle<()>)> {
     let (service, keys) = (service.clone(), client.keys().clone());
-    client
+    let (noted, members) = mpsc::channel::<(Alive, SampleKind)>();
+    let next = move || {
+        fail_point::reach("members");
+        members.recv().ok()
+    };
+    let thread = std::thread::Builder::new()
+        .name("members".into())
+        .spawn(move || {
+            std::iter::from_fn(next).for_each(|(who, kind)| service.note_alive(who, kind));
+        })?;
+    let subscriber = client
         .session()
         .liveliness()
         .declare_subscriber(keys.all_alive())
         .history(true)
         .callback(move |sample| {
             if let Some(who) = keys.alive(sample.key_expr().as_str()) {
-                service.note_alive(who, sample.kind());
+                // It ends after this.
+                let _ = noted.send((who, sample.kind()));
             }
         })
-        .wait()
+        .wait()?;
+    Ok((subscriber, thread))
 }
 
 impl Service {

@@ -26,7 +26,6 @@ const IDLE: Duration = Duration::from_secs(60);
 
 /// What all threads share.
 pub(super) struct Service {
-    pub(super) num_actions: u32,
     pub(super) limits: Limits,
     pub(super) shard: (u32, u32),
     pub(super) config_toml: String,
@@ -141,7 +140,7 @@ impl Admission {
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
             progress: self.reading.progress(),
-            config_toml: Some(self.config_toml.clone()),
+            config_toml: self.config_toml.clone(),
         }
     }
 }

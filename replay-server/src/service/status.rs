@@ -7,8 +7,7 @@ use std::{
 
 use driml_protocol::{
     Ack, AffinityUpdate, EpisodesRequest, Incoming, Leave, PriorityUpdate, ProcessName,
-    ProcessesStatus, ReplayStatus, Report, Request, Responder, Shutdown, Warning, fail_point,
-    last_warning,
+    ProcessesStatus, ReplayStatus, Report, Request, Shutdown, Warning, fail_point, last_warning,
 };
 
 use super::server::{Service, State};
@@ -95,7 +94,7 @@ impl Service {
         incoming.into_responder().reply(&Ack);
     }
 
-    pub(super) fn processes(&self, responder: Responder<ProcessesStatus>) {
+    pub(super) fn processes(&self, incoming: Incoming<ProcessesStatus>) {
         let weights_version = self.weights().version();
         let (state, now) = (self.state(), Instant::now());
         let (waiting, waiting_s) = state.participants.waiting(now);
@@ -119,7 +118,7 @@ impl Service {
             processes: state.participants.processes(now, held_since),
         };
         drop(state);
-        responder.reply(&status);
+        incoming.into_responder().reply(&status);
     }
 
     /// Logs which process the run waits for, if it cannot continue without: after some seconds, then ever more seldom. This is the
@@ -178,14 +177,13 @@ impl Service {
     pub(super) fn episodes(&self, incoming: Incoming<EpisodesRequest>) {
         if let Some(request) = self.read(&incoming) {
             let mut state = self.state();
-            state.replay.note_recorded(request.since);
-            let reply = state.replay.episodes_since(request.since);
+            let reply = state.replay.episodes(request);
             drop(state);
             incoming.into_responder().reply(&reply);
         }
     }
 
-    pub(super) fn status(&self, responder: Responder<ReplayStatus>) {
+    pub(super) fn status(&self, incoming: Incoming<ReplayStatus>) {
         let state = self.state();
         let mut status = state.replay.status();
         status.learner_finished = state.participants.is_over();
@@ -196,6 +194,6 @@ impl Service {
         status.actors_waiting = state.chunks.line.len() as u32;
         state.timings.report(&mut status);
         drop(state);
-        responder.reply(&status);
+        incoming.into_responder().reply(&status);
     }
 }

@@ -6,14 +6,14 @@ use std::collections::{HashMap, HashSet};
 use driml_protocol::{
     Batch, BatchHeader, Chunk, ChunkHeader, Horizon, InsertReply, RunSpec, TimeoutRule, Waiting,
 };
-use driml_replay_server::{Compression, NotReady, PackedBatch, Replay};
+use driml_replay_server::{Compression, Config, NotReady, PackedBatch, Replay};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{Actor, is_refused, join, stored},
-    history::{History, identity, spec, unlimited},
+    history::{History, identity, spec},
 };
 
 /// Checks every row of `batch`, and what it says of itself, against the reference.
@@ -156,7 +156,7 @@ proptest! {
         if bootstrap {
             spec.timeout = TimeoutRule::Bootstrap;
         }
-        let mut config = unlimited(capacity);
+        let mut config = Config::unlimited(capacity);
         if lz4 {
             config.compression = Compression::Lz4;
         }

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{Actor, is_refused, is_stored, join},
-    history::{random_end, spec, unlimited},
+    history::{random_end, spec},
 };
 
 /// What frames show.
@@ -52,7 +52,7 @@ impl Content {
 fn lz4(capacity_transitions: u64) -> Config {
     Config {
         compression: Compression::Lz4,
-        ..unlimited(capacity_transitions)
+        ..Config::unlimited(capacity_transitions)
     }
 }
 
@@ -116,7 +116,7 @@ proptest! {
         if bootstrap {
             spec.timeout = TimeoutRule::Bootstrap;
         }
-        let mut plain = Replay::new(&spec, &unlimited(capacity), 16).unwrap();
+        let mut plain = Replay::new(&spec, &Config::unlimited(capacity), 16).unwrap();
         let mut packed = Replay::new(&spec, &lz4(capacity), 16).unwrap();
         join(&mut plain, 0, 1);
         join(&mut packed, 0, 1);

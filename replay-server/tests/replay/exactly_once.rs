@@ -15,7 +15,7 @@ use crate::{
         affinity, header, insert, is_refused, join, last_word, learned, learner, life, small,
         stored,
     },
-    history::{spec, unlimited},
+    history::spec,
 };
 
 proptest! {
@@ -26,7 +26,7 @@ proptest! {
         let mut replay = small(&Config {
             replay_ratio: 1.0,
             slack_transitions: 16,
-            ..unlimited(10_000)
+            ..Config::unlimited(10_000)
         });
         let mut next = vec![0u64; actors as usize];
         let mut in_flight: Vec<ChunkHeader> = vec![];
@@ -73,7 +73,7 @@ proptest! {
     #[test]
     fn batches_that_do_not_arrive_do_not_count(seed in any::<u64>(), clients in 1u64..4, batches in 1u64..30) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut config = unlimited(10_000);
+        let mut config = Config::unlimited(10_000);
         (config.replay_ratio, config.slack_transitions) = (1.0, 10_000);
         config.transitions_max = Some(8 * batches);
         let spec = spec(3, 1, 1, Horizon::Uniform { k_max: 3 });
@@ -167,7 +167,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
         (Sends(0, 2, 0, 0), (12, 0, 1), "the next life"),
     ];
     for story in [lost, duplicated, replaced] {
-        let mut replay = small(&unlimited(1000));
+        let mut replay = small(&Config::unlimited(1000));
         for (said, expected, what) in story {
             match *said {
                 Joins(actor, life) => join(&mut replay, actor, life),
@@ -191,7 +191,7 @@ fn what_was_lost_or_stored_twice_is_counted_once() {
 
 #[test]
 fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
-    let mut replay = small(&unlimited(1000));
+    let mut replay = small(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.leave(&last_word(0, 1, 6));
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
@@ -219,7 +219,7 @@ fn after_leave_or_a_new_start_only_retries_are_answered_stored() {
 fn a_claim_says_what_became_of_a_chunk() {
     let mut replay = small(&Config {
         transitions_max: Some(12),
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     });
     let poll = |incarnation, sequence| ChunkPoll {
         actor: 0,
@@ -245,7 +245,7 @@ fn with_three_chunks(transitions_max: Option<u64>) -> Replay {
         replay_ratio: 4.0,
         slack_transitions: 100,
         transitions_max,
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     });
     for sequence in 0..3 {
         insert(&mut replay, header(0, 1, sequence, 6 * sequence));

@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 
 use driml_protocol::{Chunk, ChunkHeader, End, Horizon, NO_ACTION, RunSpec, TimeoutRule};
-use driml_replay_server::Config;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -62,19 +61,6 @@ pub(crate) fn spec(
         horizon,
         timeout: TimeoutRule::Terminal,
     }
-}
-
-/// Settings under which neither side ever waits.
-pub(crate) fn unlimited(capacity_transitions: u64) -> Config {
-    let text = format!(
-        "capacity_transitions = {capacity_transitions}
-         shards = 1
-         replay_ratio = 1e6
-         warmup_transitions = 0
-         slack_transitions = {}",
-        1_u64 << 40
-    );
-    toml::from_str(&text).unwrap()
 }
 
 pub(crate) fn random_end(rng: &mut ChaCha8Rng) -> End {

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     calls::{Actor, affinity, join},
-    history::{History, identity, spec, unlimited},
+    history::{History, identity, spec},
     law::ChiSquare,
     rows::prioritised,
 };
@@ -89,7 +89,7 @@ fn an_older_or_broken_affinity_is_not_taken() {
 #[test]
 fn the_k_served_follow_the_law() {
     let mut rng = ChaCha8Rng::seed_from_u64(15);
-    for config in [unlimited(150), prioritised(150, 0.5)] {
+    for config in [Config::unlimited(150), prioritised(150, 0.5)] {
         let (mut replay, history) = filled(Horizon::Nhg { k_max: 5 }, &config, &mut rng);
         let equal = affinity(0, 5, vec![0.2; 25]);
         check_ks(&mut replay, &history, |actions| nhg_law(&equal, actions));
@@ -100,7 +100,11 @@ fn the_k_served_follow_the_law() {
         assert_eq!(status.affinity_version, 1);
         assert_eq!(status.k_histogram.iter().sum::<u64>(), status.rows_sampled);
     }
-    let (mut replay, history) = filled(Horizon::Uniform { k_max: 5 }, &unlimited(150), &mut rng);
+    let (mut replay, history) = filled(
+        Horizon::Uniform { k_max: 5 },
+        &Config::unlimited(150),
+        &mut rng,
+    );
     let equal = |actions: &[u8]| vec![1.0 / actions.len() as f64; actions.len()];
     check_ks(&mut replay, &history, equal);
 }

@@ -15,7 +15,7 @@ use crate::{
         Actor, affinity, counts, header, insert, is_refused, is_stored, join, last_word, life,
         small, small_spec, stored, wait,
     },
-    history::{History, spec, unlimited},
+    history::{History, spec},
 };
 
 const HUNGRY: Waiting = Waiting::LearnerWaitsForActors;
@@ -26,7 +26,7 @@ fn unfit_chunks_are_refused_with_a_reason() {
         n_step: 7,
         ..small_spec()
     };
-    let mut replay = Replay::new(&spec, &unlimited(100), 8).unwrap();
+    let mut replay = Replay::new(&spec, &Config::unlimited(100), 8).unwrap();
     insert(&mut replay, header(0, 1, 0, 0));
     type Spoil = fn(&mut ChunkHeader);
     let headers: [(Spoil, &str); 6] = [
@@ -69,7 +69,7 @@ fn unfit_chunks_are_refused_with_a_reason() {
 
 #[test]
 fn actors_and_streams_are_bounded() {
-    let mut replay = small(&unlimited(1 << 15));
+    let mut replay = small(&Config::unlimited(1 << 15));
     for actor in 0..ACTORS_MAX as u32 {
         join(&mut replay, actor, 1);
         let reply = replay.insert(&Chunk::zeroed(header(actor, 1, 0, 0)));
@@ -98,7 +98,7 @@ fn the_run_ends_when_all_is_in_and_sampled() {
         slack_transitions: 6,
         warmup_transitions: 6,
         transitions_max: Some(18),
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     });
     let warm_up = Waiting::WarmUp { have: 0, need: 6 };
     assert_eq!(replay.waiting(), warm_up);
@@ -131,7 +131,7 @@ fn a_blocked_insert_waits_and_what_can_never_be_served_is_refused() {
     let mut replay = small(&Config {
         replay_ratio: 4.0,
         slack_transitions: 2,
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     });
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
     assert_eq!(insert(&mut replay, header(0, 1, 1, 6)), wait(6));
@@ -165,7 +165,7 @@ fn without_any_anchor_actors_continue_and_the_end_has_a_reason() {
         replay_ratio: 64.0,
         slack_transitions: 1,
         transitions_max: Some(60),
-        ..unlimited(10_000)
+        ..Config::unlimited(10_000)
     };
     let mut replay = Replay::new(&spec(3, 1, 4, Horizon::None {}), &config, 64).unwrap();
     let chunk = |sequence| ChunkHeader {
@@ -196,7 +196,7 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
         replay_ratio: 4.0,
         slack_transitions: 100,
         transitions_max: Some(5000),
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     };
     let mut replay = small(&config);
     assert_eq!(insert(&mut replay, header(0, 1, 0, 0)), stored(6));
@@ -219,7 +219,7 @@ fn what_other_shards_are_said_to_have_counted_is_bounded() {
 
 #[test]
 fn a_version_of_the_affinity_that_no_run_reaches_is_refused() {
-    let mut replay = small(&unlimited(1000));
+    let mut replay = small(&Config::unlimited(1000));
     insert(&mut replay, header(0, 1, 0, 0));
     replay.sample(8).unwrap();
     let affinity = |version| affinity(version, 5, vec![0.2; 25]);
@@ -314,7 +314,7 @@ fn good() -> Config {
         warmup_transitions: 1000,
         slack_transitions: 32,
         transitions_max: Some(1032),
-        ..unlimited(10_000)
+        ..Config::unlimited(10_000)
     }
 }
 
@@ -360,6 +360,14 @@ fn each_fault_names_its_key_and_a_way_out() {
     }
     assert!(refusal(&good(), &spec, 0).contains("learner.batch_size = 0"));
     assert!(refusal(&good(), &spec, u32::MAX).contains("a batch of this run has 1 to"));
+    let vast = RunSpec {
+        frame_height: 4096,
+        frame_width: 4096,
+        frame_channels: 16,
+        frame_stack: 16,
+        ..spec.clone()
+    };
+    assert!(refusal(&good(), &vast, 256).contains("4 GiB"));
     let broken = RunSpec { gamma: 2.0, ..spec };
     let refused = good().validate(&broken, 256).unwrap_err().to_string();
     assert!(refused.starts_with("run.gamma = 2 "), "{refused}");
@@ -373,12 +381,12 @@ fn the_least_capacity_works_and_a_smaller_one_is_refused() {
             spec(3, stack, n_step, Horizon::None {}),
             u64::from(n_step + stack),
         );
-        let said = refusal(&unlimited(least - 1), &spec, 4);
+        let said = refusal(&Config::unlimited(least - 1), &spec, 4);
         let named = format!("replay.capacity_transitions = {} ", least - 1);
         assert!(said.starts_with(&named), "{said}");
         for capacity in least..least + 8 {
             let what = format!("n_step {n_step}, stack {stack}, capacity {capacity}");
-            let mut replay = Replay::new(&spec, &unlimited(capacity), 4).unwrap();
+            let mut replay = Replay::new(&spec, &Config::unlimited(capacity), 4).unwrap();
             let mut history = History::new(&spec, capacity);
             history.ends = false;
             let mut actor = Actor::new(0, 1);

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use driml_protocol::{Batch, Buffer, Chunk, Horizon, RequestId, RunSpec, Shutdown};
+use driml_protocol::{Batch, Buffer, Horizon, RequestId, RunSpec, Shutdown};
 use driml_replay_server::{
     Compression, Config, KeptReplay, PersistArgs, PersistError, Reading, Recovery, Replay,
 };
@@ -16,8 +16,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     batches::check_batch,
-    calls::{self, Actor, affinity, header, is_stored, join, learned, learner},
-    history::{History, spec, unlimited},
+    calls::{Actor, affinity, is_stored, join, learned, learner},
+    history::{History, spec},
 };
 
 /// Rows of a batch.
@@ -221,7 +221,7 @@ fn configs() -> impl Strategy<Value = Config> {
             replay_ratio,
             disk_bytes_max: (bounded == 0).then_some(4 << 20),
             fsync_ms: (bounded == 1).then_some(0),
-            ..unlimited(capacity)
+            ..Config::unlimited(capacity)
         },
     )
 }
@@ -286,39 +286,10 @@ proptest! {
     }
 }
 
-/// A chunk whose answer died with the server is recognised, and a batch whose answer did is taken back.
-#[test]
-fn retries_are_recognised_after_a_restart() {
-    let root = tempfile::tempdir().unwrap();
-    let mut life = StoredReplay::begin(root.path(), unlimited(1000), 4000, 5);
-    for _ in 0..20 {
-        life.store(0);
-    }
-    let id = life.requests[0];
-    assert!(life.draw(0).is_some());
-    let served = life.replay.status();
-    let (args, config) = life.end();
-
-    let (mut replay, recovery) = open(&args, &config).unwrap();
-    assert!(recovery.found);
-    assert_eq!(replay.learner(), Some(77));
-    let reply = replay.insert(&Chunk::zeroed(header(0, 1, 19, 0)));
-    assert_eq!(reply, calls::stored(served.transitions_inserted));
-    // The learner says how many rows it has; the batch that did not reach it is not among them.
-    let learned = learned(0, 0, served.rows_sampled - u64::from(ROWS));
-    replay.note_learned(learned).unwrap();
-    assert!(replay.draw_for(id.again(), ROWS, Buffer::zeroed).is_ok());
-    replay.note_learned(learned).unwrap();
-    let status = replay.status();
-    assert_eq!(status.rows_sampled, served.rows_sampled);
-    assert_eq!(status.transitions_inserted, served.transitions_inserted);
-    replay.check_valid();
-}
-
 #[test]
 fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     let root = tempfile::tempdir().unwrap();
-    let config = unlimited(100);
+    let config = Config::unlimited(100);
     let mut life = StoredReplay::begin(&root.path().join("ring"), config, 2_000, 5);
     for _ in 0..600 {
         life.store(0);
@@ -330,7 +301,7 @@ fn segments_go_with_their_transitions_and_the_budget_is_kept() {
     // A ring that is larger than the budget: the oldest leave it too.
     let config = Config {
         disk_bytes_max: Some(4 << 20),
-        ..unlimited(1_000_000)
+        ..Config::unlimited(1_000_000)
     };
     let mut life = StoredReplay::begin(&root.path().join("budget"), config, 200_000, 5);
     while life.history.inserted < 150_000 {
@@ -355,7 +326,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
     let config = Config {
         replay_ratio: 4.0,
         warmup_transitions: 10,
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     };
     let mut life = StoredReplay::begin(root.path(), config, 4000, 5);
     while life.history.inserted < 100 {
@@ -401,7 +372,7 @@ fn a_resumed_run_continues_with_what_was_kept() {
 #[test]
 fn reading_says_how_far_it_is_and_can_be_broken_off() {
     let root = tempfile::tempdir().unwrap();
-    let mut life = StoredReplay::begin(root.path(), unlimited(200), 2_000, 5);
+    let mut life = StoredReplay::begin(root.path(), Config::unlimited(200), 2_000, 5);
     for _ in 0..60 {
         life.act();
     }

@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::{check_batch, check_rows},
     calls::{header, is_stored},
-    history::{History, unlimited},
+    history::History,
     persist::{ROWS, StoredReplay, args, open, segments, stored, test_spec},
 };
 
@@ -33,7 +33,12 @@ struct Kept {
 impl Kept {
     fn new(capacity: u64) -> Self {
         let root = tempfile::tempdir().unwrap();
-        let mut life = StoredReplay::begin(&root.path().join("log"), unlimited(capacity), 4_000, 3);
+        let mut life = StoredReplay::begin(
+            &root.path().join("log"),
+            Config::unlimited(capacity),
+            4_000,
+            3,
+        );
         // Until the newest has some, too.
         let (mut newest, mut in_newest) = (None, 0);
         while life.history.inserted < 800 || in_newest < 5 {
@@ -333,7 +338,7 @@ fn a_folder_is_one_servers_and_one_runs() {
 fn a_run_may_go_on_with_another_capacity() {
     let kept = Kept::new(10_000);
     for capacity in [100, 50_000] {
-        let config = unlimited(capacity);
+        let config = Config::unlimited(capacity);
         let (mut replay, recovery) = open(&kept.args, &config).unwrap();
         assert_eq!(recovery.warnings, [""; 0]);
         let held = replay.status().transitions_held;
@@ -347,7 +352,7 @@ fn a_run_may_go_on_with_another_capacity() {
     segments[1..segments.len() - 2]
         .iter()
         .for_each(|it| remove(it));
-    let (replay, recovery) = open(&kept.args, &unlimited(60)).unwrap();
+    let (replay, recovery) = open(&kept.args, &Config::unlimited(60)).unwrap();
     assert!(recovery.warnings[0].contains("are gone"), "{recovery:?}");
     replay.check_valid();
     let status = replay.status();

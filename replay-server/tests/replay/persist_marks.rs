@@ -7,7 +7,6 @@ use driml_protocol::Batch;
 use driml_replay_server::{Config, Mark, PersistArgs, PersistError, Replay};
 
 use crate::{
-    history::unlimited,
     persist::{ROWS, StoredReplay, copy, open, segments, test_spec},
     rows::prioritised,
 };
@@ -64,7 +63,7 @@ fn a_log_goes_back_to_its_last_two_marks() {
         let folder = tempfile::tempdir().unwrap();
         let config = match is_prioritised {
             true => prioritised(60, 0.5),
-            false => unlimited(60),
+            false => Config::unlimited(60),
         };
         let mut life = begin(folder.path(), config, seed);
         life.replay.mark().unwrap().unwrap();
@@ -107,7 +106,7 @@ fn a_log_goes_back_to_its_last_two_marks() {
 #[test]
 fn marks_that_are_given_up_leave_the_one_before_them() {
     let folder = tempfile::tempdir().unwrap();
-    let mut life = begin(folder.path(), unlimited(60), 1);
+    let mut life = begin(folder.path(), Config::unlimited(60), 1);
     let kept = life.replay.mark().unwrap().unwrap();
     let before = state(&life.replay);
     for _ in 0..4 {
@@ -123,7 +122,7 @@ fn marks_that_are_given_up_leave_the_one_before_them() {
 #[test]
 fn a_log_with_marks_holds_no_more_than_these_need() {
     let folder = tempfile::tempdir().unwrap();
-    let mut life = begin(folder.path(), unlimited(60), 1);
+    let mut life = begin(folder.path(), Config::unlimited(60), 1);
     let mut most = 0;
     for round in 0..40 {
         store_some(&mut life);
@@ -138,6 +137,6 @@ fn a_log_with_marks_holds_no_more_than_these_need() {
 
 #[test]
 fn a_replay_in_memory_has_no_marks() {
-    let mut replay = Replay::new(&test_spec(), &unlimited(60), ROWS).unwrap();
+    let mut replay = Replay::new(&test_spec(), &Config::unlimited(60), ROWS).unwrap();
     assert_eq!(replay.mark().unwrap(), None);
 }

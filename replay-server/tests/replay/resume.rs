@@ -4,10 +4,7 @@
 use driml_protocol::LearnerJoin;
 use driml_replay_server::{Config, NotReady, Replay, Since};
 
-use crate::{
-    calls::{counts, header, insert, is_stored, learner, small_spec, stored},
-    history::unlimited,
-};
+use crate::calls::{counts, header, insert, is_stored, learner, small_spec, stored};
 
 fn config() -> Config {
     Config {
@@ -15,7 +12,7 @@ fn config() -> Config {
         warmup_transitions: 60,
         slack_transitions: 12,
         transitions_max: Some(180),
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     }
 }
 
@@ -86,7 +83,7 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
 fn a_run_of_more_than_2_to_the_32_updates_counts_on() {
     let config = Config {
         replay_ratio: 8.0,
-        ..unlimited(1000)
+        ..Config::unlimited(1000)
     };
     for updates in [1 << 32, 10_000_000_000, 1 << 48] {
         let before = 4 * updates;

@@ -14,7 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::{
     batches::check_rows,
     calls::{Actor, join},
-    history::{History, StreamKey, identity, spec, unlimited},
+    history::{History, StreamKey, identity, spec},
     law::ChiSquare,
 };
 
@@ -29,7 +29,7 @@ pub(crate) fn prioritised(capacity: u64, alpha: f64) -> Config {
             beta_end: 1.0,
             beta_updates: 100,
         },
-        ..unlimited(capacity)
+        ..Config::unlimited(capacity)
     }
 }
 
@@ -55,7 +55,9 @@ impl Setup {
             timeout,
             ..spec(3, frame_stack, 4, Horizon::Uniform { k_max: 6 })
         };
-        let config = alpha.map_or(unlimited(capacity), |alpha| prioritised(capacity, alpha));
+        let config = alpha.map_or(Config::unlimited(capacity), |alpha| {
+            prioritised(capacity, alpha)
+        });
         let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
         for actor in 0..4 {
             join(&mut replay, actor, 1);
@@ -293,7 +295,7 @@ fn what_was_never_stored_or_drawn_is_refused_or_ignored() {
     setup.replay.check_valid();
 
     let spec = setup.history.spec.clone();
-    let mut uniform = Replay::new(&spec, &unlimited(100), ROWS).unwrap();
+    let mut uniform = Replay::new(&spec, &Config::unlimited(100), ROWS).unwrap();
     let refused = uniform.set_priorities(&update).unwrap_err();
     assert_eq!(refused, "priorities, in a run that draws uniformly");
     assert_eq!(uniform.priority_counts(), None);

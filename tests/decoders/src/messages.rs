@@ -12,8 +12,6 @@ use driml_protocol::{
 
 /// The hash of the run that these messages are of.
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
-/// Actions of its world.
-const ACTIONS: u32 = 15;
 /// Bytes before the payload's length in what [`messages`] takes: the kind, and the length of the header.
 const FORGED_BYTES: usize = 3;
 
@@ -42,7 +40,7 @@ fn read<M: Message + Debug>(bytes: &[u8]) {
 
 fn read_chunk(bytes: &[u8]) {
     read::<ChunkHeader>(bytes);
-    if let Ok(chunk) = Chunk::decode(bytes, SPEC, ACTIONS) {
+    if let Ok(chunk) = Chunk::decode(bytes, SPEC) {
         for row in 0..chunk.header.transitions() {
             let _ = (chunk.end(row), chunk.reward(row));
         }
@@ -56,7 +54,7 @@ fn read_chunk(bytes: &[u8]) {
 fn read_batch(bytes: &[u8]) {
     read::<BatchReply>(bytes);
     let reply = codec::decode::<BatchReply>(bytes, Some(SPEC)).ok();
-    if let Some((header, payload)) = reply.and_then(|it| Some((it.0.header()?, it.1))) {
+    if let Some((BatchReply::Batch(header), payload)) = reply {
         // Its counts of states may not be those of its rows.
         let Ok(batch) = Batch::from_payload(header, payload.to_vec().into()) else {
             return;

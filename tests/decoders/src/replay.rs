@@ -5,7 +5,7 @@ use driml_protocol::{
     LearnerJoin, Leave, Origin, PriorityPart, PriorityUpdate, RequestId, RunSpec, Sampling,
     ShardCounts, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, Replay};
+use driml_replay_server::{Config, Replay};
 
 /// Rows drawn by priority.
 const PRIORITISED: Sampling = Sampling::Prioritised {
@@ -73,18 +73,13 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
 
 pub(crate) fn config(shards: u32, sampling: Sampling) -> Config {
     Config {
-        capacity_transitions: 64 * u64::from(shards),
         shards,
-        compression: Compression::None,
-        compressed_bytes_max: None,
         sampling,
-        disk_bytes_max: None,
-        fsync_ms: None,
         replay_ratio: 2.0,
         warmup_transitions: 8,
         slack_transitions: 16,
         transitions_max: (shards == 1).then_some(4096),
-        since: None,
+        ..Config::unlimited(64 * u64::from(shards))
     }
 }
 

@@ -172,7 +172,7 @@ fn add_stored(bytes: &[u8], stored: &mut HashSet<Step>) {
         let rest = &bytes[at..];
         if rest.starts_with(b"DRML")
             && let Some(length) = message_bytes(rest)
-            && let Ok(chunk) = Chunk::decode(&rest[..length], spec().hash(), ACTIONS)
+            && let Ok(chunk) = Chunk::decode(&rest[..length], spec().hash())
         {
             add_chunk(&chunk, stored);
         }

@@ -99,20 +99,14 @@ fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
     let served = served();
     let hash = served.client.spec.hash();
     let whole = served.client.seal(&served.chunk(0));
-    let (head, payload) = served
-        .chunk(0)
-        .seal(hash ^ 1)
-        .map(|(a, b)| (a, b.to_vec()))
-        .unwrap();
+    let chunk = served.chunk(0);
+    let foreign = codec::encode(hash ^ 1, &chunk.header, chunk.payload()).unwrap();
     let leave = sealed(&served.client, &leave(0, INCARNATION, 0));
     let mut huge = whole.clone();
     huge[20..28].copy_from_slice(&u64::MAX.to_le_bytes());
     let web = b"GET / HTTP/1.1\r\nHost: replay\r\nAccept: */*\r\n\r\n";
     served.refuses_chunks([
-        (
-            [head, payload].concat(),
-            "start every process with the same settings",
-        ),
+        (foreign, "start every process with the same settings"),
         (
             newer(whole.clone()),
             "run the same build of driml everywhere",
@@ -148,7 +142,9 @@ fn chunks_that_make_no_sense_in_this_run() {
         ..served.chunk(0).header
     };
     served.refuses_chunks([
-        row("action 3 of 3", &|it| it.set(4, 3, 0.0, End::Running)),
+        row("action 3; this run has 3", &|it| {
+            it.set(4, 3, 0.0, End::Running)
+        }),
         row("the reward of row 5 is not finite", &|it| {
             it.set(5, 0, f32::NAN, End::Running)
         }),

@@ -269,7 +269,7 @@ impl Launch<'_> {
             }
             let rss = self.processes.rss_mib();
             if view.is_answered() {
-                let ask = |shard, since| poller.episodes(shard, since);
+                let ask = |shard, since| poller.episodes(shard, since, true);
                 let mut warnings = recorder.record_episodes(view, ask);
                 warnings.extend(recorder.record(&mut poller.view, &rss));
                 warnings.iter().for_each(|line| self.screen.line(line));
@@ -334,7 +334,9 @@ impl Launch<'_> {
             if let Err(e) = poller.ask_replay() {
                 tracing::debug!("the replay server's last answer: {e:#}");
             }
-            recorder.record_episodes(&poller.view, |shard, since| poller.episodes(shard, since));
+            recorder.record_episodes(&poller.view, |shard, since| {
+                poller.episodes(shard, since, true)
+            });
             // Before its router goes away, so that it does not try to reach it again.
             poller.close();
         }

@@ -132,9 +132,14 @@ impl Poller {
         Ok(())
     }
 
-    /// Asks a shard for the episodes that ended after the first `since`.
-    pub(crate) fn episodes(&self, shard: usize, since: u64) -> Result<EpisodesReply, SessionError> {
-        let request = EpisodesRequest { since };
+    /// Asks a shard for the episodes that ended after the first `since`, for its launcher or for another process.
+    pub(crate) fn episodes(
+        &self,
+        shard: usize,
+        since: u64,
+        is_launcher: bool,
+    ) -> Result<EpisodesReply, SessionError> {
+        let request = EpisodesRequest { since, is_launcher };
         self.servers[shard].client.ask(&request, ANSWER_MAX)
     }
 
@@ -193,10 +198,7 @@ fn run_info(
             let after_updates = run_info.has_learner.then_some(run_info.after_updates);
             (run_info.config_toml, after_updates)
         }
-        Err(SessionError::Recovering(Recovering {
-            config_toml: Some(config_toml),
-            ..
-        })) => (config_toml, None),
+        Err(SessionError::Recovering(Recovering { config_toml, .. })) => (config_toml, None),
         Err(SessionError::Unreadable { why, .. }) => {
             let what = format!("the run info of the replay server on {endpoint}");
             return Err(why).context(what);

@@ -83,7 +83,7 @@ impl Watched {
             );
         }
         if let Some(recorder) = self.recorder.as_mut().filter(|_| poller.view.is_answered()) {
-            let ask = |shard, since| poller.episodes(shard, since);
+            let ask = |shard, since| poller.episodes(shard, since, false);
             let mut warnings = recorder.record_episodes(&poller.view, ask);
             warnings.extend(recorder.record(&mut poller.view, &[]));
             warnings.iter().for_each(|line| self.screen.line(line));

@@ -3,7 +3,7 @@
 
 use std::borrow::Cow;
 
-use driml_protocol::Chunk;
+use driml_protocol::{Chunk, codec};
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
 
 use super::layout::{Layout, PartEnds};
@@ -57,8 +57,8 @@ impl Packer {
                 .map(|run| PackedRun::new(run, Layout::new(chunk.header.frame_bytes as usize)))
                 .collect(),
         };
-        let sealed = self.seal_for.and_then(|hash| chunk.seal(hash).ok());
-        let sealed = sealed.map(|(head, _)| head);
+        let seal = |hash| codec::seal(hash, &chunk.header, chunk.payload()).ok();
+        let sealed = self.seal_for.and_then(seal);
         PackedChunk {
             chunk,
             packed,

@@ -1,9 +1,9 @@
 //! N-step returns and discounts, as a replay's batches have them.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
 };
-use driml_replay_server::{Compression, Config, RETURN_ERROR, Replay, return_sum_error};
+use driml_replay_server::{Config, RETURN_ERROR, Replay, return_sum_error};
 use rand::Rng;
 
 use crate::stability::{
@@ -42,20 +42,10 @@ pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
 }
 
 /// Of a replay in which neither side waits and rows are drawn uniformly.
-pub(super) const fn config(capacity_transitions: u64) -> Config {
+pub(super) fn config(capacity_transitions: u64) -> Config {
     Config {
-        capacity_transitions,
-        shards: 1,
-        compression: Compression::None,
-        compressed_bytes_max: None,
-        sampling: Sampling::Uniform {},
-        disk_bytes_max: None,
-        fsync_ms: None,
         replay_ratio: 8.0,
-        warmup_transitions: 0,
-        slack_transitions: 1 << 40,
-        transitions_max: None,
-        since: None,
+        ..Config::unlimited(capacity_transitions)
     }
 }
 
