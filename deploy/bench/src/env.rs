@@ -3,10 +3,11 @@
 
 use driml_envs::StepEnd;
 use driml_launch::console;
+use driml_machine::effort::Effort;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{effort::Effort, report::Measurement, settings};
+use crate::{report::Measurement, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
 /// Environments that are stepped together.

@@ -4,6 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{anyhow, ensure};
+use driml_machine::effort::{Effort, Work};
 use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply, Sampling};
 use driml_replay_server::Replay;
 use driml_settings::config::RunConfig;
@@ -11,7 +12,6 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    effort::{Effort, Work},
     recording::{CHUNKS, INCARNATION, Recording},
     report::Measurement,
     settings::{self, AGENT, CAPACITY},

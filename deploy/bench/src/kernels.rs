@@ -3,12 +3,12 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::DeviceName;
+use driml_machine::effort::Effort;
 use driml_model::{conv2d_relu, multiply_in_first_cache};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    effort::Effort,
     flags::BenchFlags,
     learner::counted_updates,
     report::{Measurement, named},

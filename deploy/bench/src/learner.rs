@@ -5,12 +5,12 @@ use driml_learner::{
     Agent, Compute, DeviceName, Kernels, OwnedBatch, Precision,
     cost::{UpdateCost, UpdateShape},
 };
+use driml_machine::effort::{Effort, Work};
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    effort::{Effort, Work},
     flags::{BenchFlags, BenchLearnerArgs},
     report::{Measurement, named},
     settings::{self, AGENT, WORLD},

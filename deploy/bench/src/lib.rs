@@ -38,11 +38,7 @@ mod subprocess;
 mod system;
 
 use driml_learner::DeviceName;
-use driml_machine::{
-    device,
-    effort::{self, Effort},
-    resources::MachineNote,
-};
+use driml_machine::{device, effort::Effort, resources::MachineNote};
 
 use crate::{
     flags::{BenchArgs, BenchCommand},

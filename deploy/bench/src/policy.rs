@@ -2,12 +2,12 @@
 //! It takes no action in a world.
 
 use driml_learner::DeviceName;
+use driml_machine::effort::Effort;
 use driml_model::{Parameters, PolicyNetwork};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    effort::Effort,
     flags::BenchFlags,
     report::{Measurement, named},
     settings,

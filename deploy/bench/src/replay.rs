@@ -9,9 +9,9 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::managed_process::ManagedProcess;
+use driml_machine::effort::Effort;
 
 use crate::{
-    effort::Effort,
     flags::BenchReplayArgs,
     in_process,
     recording::{CHUNKS, Recording},

@@ -6,10 +6,9 @@ use std::{fs, path::Path};
 use anyhow::Context;
 use driml_launch::console::{self, aligned, print};
 use driml_learner::Precision;
+use driml_machine::effort::median;
 use driml_machine::{resources::MachineNote, units::number};
 use serde::{Deserialize, Serialize};
-
-use crate::effort::median;
 
 /// One thing that was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

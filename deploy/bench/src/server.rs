@@ -14,6 +14,7 @@ use driml_learner::{
     LearnerConfig,
     remote::batch_source::{BatchSource, Counters, Next, Requests},
 };
+use driml_machine::effort::Effort;
 use driml_protocol::{
     ActorJoin, Alive, Keys, LearnerJoin, RunClient, ShardCounts, Shutdown, join,
     session::{self, Endpoints, MESSAGE_BYTES_MAX},
@@ -22,7 +23,6 @@ use driml_protocol::{
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use crate::{
-    effort::Effort,
     recording::{ChunkShape, INCARNATION, Recording},
     settings,
     subprocess::{start, wait_for},

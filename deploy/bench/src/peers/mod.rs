@@ -12,11 +12,11 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, aligned};
+use driml_machine::effort::median;
 use driml_machine::{resources::MachineNote, units::number};
 use serde::Serialize;
 
 use crate::{
-    effort::median,
     flags::{BenchFlags, BenchPeersArgs, Component},
     peers::{
         pairs::{Pair, pairs},
