@@ -52,7 +52,7 @@ pub struct Learner {
     preparation: Preparation,
 }
 
-/// What of an agent is no part of its state.
+/// What an agent has beside its state.
 fn configured(agent: Agent, config: &LearnerConfig) -> Agent {
     agent
         .with_deduplication(config.learner.deduplicate_states)

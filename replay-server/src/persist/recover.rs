@@ -268,10 +268,7 @@ impl Reader<'_> {
 
     /// Notes that a segment cannot be used.
     fn set_aside(&mut self, path: PathBuf, why: &str) {
-        self.warn(format!(
-            "{} cannot be used, {why}: its name now ends in {UNUSABLE}",
-            file_name(&path)
-        ));
+        self.warn(format!("{} cannot be used, {why}", file_name(&path)));
         self.aside.push(path);
     }
 
@@ -337,9 +334,11 @@ impl Reader<'_> {
             return Err(PersistError::Unusable(self.folder.path.clone(), why));
         }
         for path in std::mem::take(&mut self.aside) {
-            if let Err(e) = fs::rename(&path, path.with_extension(UNUSABLE)) {
-                self.warn(format!("{} cannot be renamed: {e}", file_name(&path)));
-            }
+            let (name, aside) = (file_name(&path), path.with_extension(UNUSABLE));
+            self.warn(match fs::rename(&path, &aside) {
+                Ok(()) => format!("{name} is now {}", file_name(&aside)),
+                Err(e) => format!("{name} stays there, as it cannot be renamed: {e}"),
+            });
         }
         // Older segments are removed once none of their transitions is held.
         let ring = &self.replay.ring;

@@ -92,6 +92,15 @@ fn save_checkpoint(replay: &mut Replay) {
     replay.note_learned(learned).unwrap();
 }
 
+/// Ends it, and opens its folder again: what was stored is there.
+fn check_comes_back(replay: Replay, dir: &Path) {
+    let stored = replay.stored_bytes().unwrap();
+    drop(replay);
+    let (replay, warnings) = open(dir).unwrap();
+    assert_eq!(warnings, [""; 0]);
+    assert!(replay.stored_bytes().unwrap() == stored);
+}
+
 #[test]
 fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -113,11 +122,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     // The learner's checkpoint is the first that there is room for.
     save_checkpoint(&mut replay);
     replay.join_actor(join(1, 1)).unwrap();
-    let stored = replay.stored_bytes().unwrap();
-    drop(replay);
-    let (replay, warnings) = open(folder.path()).unwrap();
-    assert_eq!(warnings, [""; 0]);
-    assert!(replay.stored_bytes().unwrap() == stored);
+    check_comes_back(replay, folder.path());
 }
 
 #[test]
@@ -129,11 +134,7 @@ fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
     }
     replay.forget_absent(|actor, _| actor > 0);
     replay.join_actor(join(9_999, 1)).unwrap();
-    let stored = replay.stored_bytes().unwrap();
-    drop(replay);
-    let (replay, warnings) = open(folder.path()).unwrap();
-    assert_eq!(warnings, [""; 0]);
-    assert!(replay.stored_bytes().unwrap() == stored);
+    check_comes_back(replay, folder.path());
 }
 
 #[test]
@@ -168,11 +169,7 @@ fn a_segment_that_cannot_be_begun_stops_nothing() {
     save_checkpoint(&mut replay);
     assert!(next.is_file());
     store(&mut replay, 80);
-    let stored = replay.stored_bytes().unwrap();
-    drop(replay);
-    let (replay, warnings) = open(folder.path()).unwrap();
-    assert_eq!(warnings, [""; 0]);
-    assert!(replay.stored_bytes().unwrap() == stored);
+    check_comes_back(replay, folder.path());
 }
 
 /// With priorities a state has 8 bytes for each transition held.

@@ -240,7 +240,7 @@ mod tests {
         assert_eq!(best.len(), 1);
         assert_eq!(fs::read_to_string(best[0].1.join("weights")).unwrap(), "20");
         assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
-        // What a process that was killed left is no checkpoint and in no one's way.
+        // What a process that was killed left does not count as a checkpoint.
         fs::create_dir(folder.best().join(NEW)).unwrap();
         let again = driml_learner::checkpoint::list(&folder.best()).unwrap();
         assert_eq!(again, best);

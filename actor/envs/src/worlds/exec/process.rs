@@ -264,7 +264,7 @@ impl WorldProcess {
 
     /// Kills it, what it started, and the guard; waits for their end.
     fn kill(&mut self) {
-        // The world itself may have made a group of its own, as `timeout` does.
+        // The world itself may lead another group, as `timeout` does.
         for process in [&mut self.guard, &mut self.child] {
             if matches!(process.try_wait(), Ok(Some(_))) {
                 continue;

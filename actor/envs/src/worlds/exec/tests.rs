@@ -398,7 +398,7 @@ fn nothing_is_left_of_a_world_and_of_what_it_started() {
     drop(world);
     assert_eq!(alive(&mark), [""; 0]);
 
-    // One that leads a group of its own ends as well.
+    // One that leads another group ends as well.
     let command = "exec timeout 600 sleep 590.5";
     declaration(command, 200, 1000).unwrap_err();
     assert_eq!(alive("590.5"), [""; 0]);
