@@ -217,11 +217,16 @@ impl Launch<'_> {
         let hash = self.config.run.hash();
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
-            let check_alive = || self.processes.check_alive(Revived::default());
-            if !wait_until_listening(endpoint, &self.interrupts, check_alive)? {
+            let mut check_alive = || self.processes.check_alive(Revived::default());
+            if !wait_until_listening(endpoint, &self.interrupts, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
-            let session = session::open(&Endpoints::to(vec![endpoint.clone()]))?;
+            let opened = session::open(&Endpoints::to(vec![endpoint.clone()]));
+            if opened.is_err() {
+                // One that died while this process connected says more than the connection.
+                check_alive()?;
+            }
+            let session = opened?;
             reached.push(Reached {
                 name: name.clone(),
                 endpoint: endpoint.clone(),
