@@ -11,7 +11,7 @@ const MAGIC: [u8; 4] = *b"DRL1";
 /// Longest body: a message's, and some.
 const BODY_BYTES_MAX: u64 = (1 << 29) + (1 << 21);
 /// Highest number of a record that is believed: no log has so many.
-const ORDINAL_MAX: u64 = 1 << 59;
+pub(super) const ORDINAL_MAX: u64 = 1 << 60;
 /// Places at which a record is looked for after one that is too long: those that look like one.
 const CANDIDATES_MAX: usize = 64;
 

@@ -14,7 +14,7 @@ use driml_protocol::{BufferPool, Chunk, RecoveryProgress, Shutdown, codec};
 use super::{
     folder::{LogFolder, LogId, Mark, PersistError, SegmentHeader},
     journal::{Place, Segment},
-    record::{self, Broken, Record, RecordKind},
+    record::{self, Broken, ORDINAL_MAX, Record, RecordKind},
     snapshot::Note,
 };
 use crate::{replay::Replay, storage::frame_store::Packer};
@@ -330,6 +330,14 @@ impl Reader<'_> {
             let why = self.recovery.warnings.join("; ");
             let why = format!(
                 "cannot be used: no segment can be read ({why}); to begin a new replay there, remove them"
+            );
+            return Err(PersistError::Unusable(self.folder.path.clone(), why));
+        }
+        // What is written next must be readable too.
+        if self.place.ordinal > ORDINAL_MAX / 2 {
+            let why = format!(
+                "cannot be used: its records are numbered up to {}, which no replay reaches; to begin a new replay there, remove them",
+                self.place.ordinal - 1
             );
             return Err(PersistError::Unusable(self.folder.path.clone(), why));
         }
