@@ -2,7 +2,7 @@
 """Makes a Gymnasium environment a world of driml: `driml train --env "exec:python3 driml_env.py ALE/Pong-v5 --atari"`.
 
 It needs nothing but what it wraps. `serve` alone, which needs nothing but Python, makes a world of any object with the fields and
-methods of `Gymnasium` below; what is said to driml is described in actor/envs/src/worlds/exec/mod.rs.
+methods of `Gymnasium` below; what is said to driml is described in actor/envs/src/worlds/exec/protocol.rs.
 """
 
 import argparse, array, importlib, inspect, io, json, mmap, os, pickle, platform, random, sys, types

@@ -1,5 +1,5 @@
 //! The worlds there are, and their names on a command line. A new world is a line in `worlds!` and a file in `worlds/`; one that a
-//! program adds without a change here is `own`'s.
+//! program adds without a change here is `plugin`'s.
 //! It holds no numbers: each world's settings are described beside that world.
 
 use std::collections::BTreeSet;

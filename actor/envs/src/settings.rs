@@ -27,7 +27,7 @@ pub trait WorldSettings {
     /// The shape of one frame.
     fn frame_shape(&self) -> FrameShape;
 
-    /// The names of the actions; an action is a place in this list, so there are at most 256.
+    /// The names of the actions; an action is a place in this list, so there are at most 255.
     fn action_names(&self) -> Vec<&str>;
 
     /// Steps a second at which a person plays the game, or can follow it.

@@ -49,14 +49,12 @@ mod library;
 mod nap;
 mod options;
 mod pinned;
-mod state;
 mod vec_game;
 mod wheel;
 
 pub use cache::Cache;
 pub use error::{InstallError, LoadError, ProcgenError, WITHOUT_ENGINE};
-pub use game::{DistributionMode, Game, ParseGameError};
+pub use game::{DistributionMode, Game};
 pub use install::Engine;
 pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options, OptionsError};
-pub use state::State;
-pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, VecGame};
+pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, State, VecGame};

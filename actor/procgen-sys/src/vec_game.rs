@@ -4,6 +4,8 @@
 use std::ffi::c_void;
 use std::time::Instant;
 
+use serde::{Deserialize, Serialize};
+
 use crate::error::ProcgenError;
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, Handle, LibenvBuffers, LibenvTensortype};
 use crate::game::Game;
@@ -12,7 +14,6 @@ use crate::library::{self, Api};
 use crate::nap::Nap;
 use crate::options::{NUM_ACTIONS, Options, RawOptions};
 use crate::pinned::Pinned;
-use crate::state::State;
 
 /// Rows and columns of a frame.
 pub const FRAME_SIDE: usize = 64;
@@ -26,6 +27,21 @@ pub const RESET: i32 = -1;
 /// Bytes set aside for a state at first; grown when states come near it. The engine ends the process if one does not
 /// fit; states seen are below 100 kB.
 const STATE_BYTES: usize = 1 << 20;
+
+/// An environment's complete state, as the engine wrote it. The engine trusts what it reads back: a forged one may end the process,
+/// so take states from your own files alone.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct State {
+    game: Game,
+    bytes: Vec<u8>,
+}
+
+impl State {
+    /// The engine's bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+}
 
 /// N environments of one game. One thread at a time may use it; different ones may be used by different threads.
 pub struct VecGame {
@@ -205,7 +221,10 @@ impl VecGame {
         }
         bytes.truncate(used);
         bytes.shrink_to_fit();
-        Ok(State::written_by_engine(self.game, bytes))
+        Ok(State {
+            game: self.game,
+            bytes,
+        })
     }
 
     /// Puts environment `env` into a state of the same game; its frame, reward and flags become those of that state.
@@ -214,21 +233,20 @@ impl VecGame {
     /// No such environment, or a state of another game.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
         let index = self.index(env)?;
-        if state.game() != self.game {
+        if state.game != self.game {
             return Err(ProcgenError::State(format!(
                 "a state of {} for an environment of {}",
-                state.game(),
-                self.game
+                state.game, self.game
             )));
         }
-        let len = i32::try_from(state.bytes().len()).expect("the engine gave its length as an i32");
+        let len = i32::try_from(state.bytes.len()).expect("the engine gave its length as an i32");
         // SAFETY: the handle is open, its buffers are set, `index` is one of its environments, and the bytes are what the
         // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
         unsafe {
             (self.api.set_state)(
                 self.handle,
                 index,
-                state.bytes().as_ptr().cast_mut().cast(),
+                state.bytes.as_ptr().cast_mut().cast(),
                 len,
             )
         };

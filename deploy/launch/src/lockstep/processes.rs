@@ -23,7 +23,7 @@ const INCARNATION: u64 = 1;
 const LEARNER: u64 = 1;
 
 /// How it is written; another way is rejected.
-const FORMAT: u32 = 4;
+const FORMAT: u32 = 5;
 
 /// The state of a run in lockstep, without the learner.
 #[derive(Serialize, Deserialize)]

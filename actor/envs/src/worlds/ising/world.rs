@@ -20,7 +20,7 @@ pub struct IsingConfig {
     pub lattice_size: usize,
     /// Side of the patch, in spins; at least 3, at most `lattice_size`.
     pub patch_size: usize,
-    /// Temperature of the patch, in units of J / k_B, above 0; low means nearly deterministic.
+    /// Temperature of the patch, in units of J / k_B, above 0 and at most 5; low means nearly deterministic.
     pub temperature: f64,
     /// Whether the patch's rim has neighbours on the far side (`periodic`) or none beyond it (`free`).
     pub boundary: Boundary,
@@ -41,20 +41,16 @@ pub struct IsingWorld {
 }
 
 struct Field {
+    now: Now,
+    patch: IsingLattice,
+}
+
+/// All of a [`Field`] that does not follow from the settings, but for the patch's spins.
+#[derive(Clone, Serialize, Deserialize)]
+pub(crate) struct Now {
     rng: ChaCha8Rng,
     /// Row and column of the patch's first site.
     origin: (usize, usize),
-    patch: IsingLattice,
-    frame: Vec<u8>,
-    episode_step: u32,
-}
-
-/// All of a [`Field`] that does not follow from the settings.
-#[derive(Serialize, Deserialize)]
-pub(crate) struct SavedField {
-    rng: ChaCha8Rng,
-    origin: (usize, usize),
-    spins: Vec<i8>,
     frame: Vec<u8>,
     episode_step: u32,
 }
@@ -76,13 +72,13 @@ impl IsingWorld {
             let patch =
                 IsingLattice::random(side, side, config.temperature, config.boundary, &mut rng)?;
             let frame = vec![0; config.frame_shape().bytes()];
-            let mut field = Field {
+            let now = Now {
                 rng,
                 origin: (0, 0),
-                patch,
                 frame,
                 episode_step: 0,
             };
+            let mut field = Field { now, patch };
             field.reset(config);
             Ok(field)
         };
@@ -95,7 +91,7 @@ impl IsingWorld {
 
     /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if `env` is out of range.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
-        self.envs.get(env).map(|field| field.origin)
+        self.envs.get(env).map(|field| field.now.origin)
     }
 }
 
@@ -145,7 +141,8 @@ impl WorldSettings for IsingConfig {
 }
 
 impl Envs for IsingWorld {
-    type Saved = SavedField;
+    /// With the patch's spins.
+    type Saved = (Now, Vec<i8>);
 
     fn shape(&self) -> FrameShape {
         self.config.frame_shape()
@@ -160,78 +157,64 @@ impl Envs for IsingWorld {
     }
 
     fn draw(&self, env: usize, frame: &mut [u8]) {
-        frame.copy_from_slice(&self.envs[env].frame);
+        frame.copy_from_slice(&self.envs[env].now.frame);
     }
 
     fn act(&mut self, env: usize, _: u8) -> (f32, StepEnd) {
         (0.0, self.envs[env].step(&self.config))
     }
 
-    fn saved(&self, env: usize) -> SavedField {
-        self.envs[env].saved()
+    fn saved(&self, env: usize) -> Self::Saved {
+        let Field { now, patch } = &self.envs[env];
+        (now.clone(), patch.spins().to_vec())
     }
 
-    fn restore(&mut self, env: usize, saved: SavedField) -> Result<(), EnvError> {
-        self.envs[env].load(saved, &self.config)
+    fn restore(&mut self, env: usize, (now, spins): Self::Saved) -> Result<(), EnvError> {
+        let (row, col) = now.origin;
+        let origin_max = self.config.lattice_size - self.config.patch_size;
+        saved::check(row.max(col) <= origin_max, "the patch's place")?;
+        let frame_bytes = self.config.frame_shape().bytes();
+        saved::check(now.frame.len() == frame_bytes, "a frame")?;
+        let field = &mut self.envs[env];
+        field.patch.set_spins(&spins)?;
+        field.now = now;
+        Ok(())
     }
 }
 
 impl Field {
-    fn saved(&self) -> SavedField {
-        SavedField {
-            rng: self.rng.clone(),
-            origin: self.origin,
-            spins: self.patch.spins().to_vec(),
-            frame: self.frame.clone(),
-            episode_step: self.episode_step,
-        }
-    }
-
-    fn load(&mut self, saved: SavedField, config: &IsingConfig) -> Result<(), EnvError> {
-        let (row, col) = saved.origin;
-        let origin_max = config.lattice_size - config.patch_size;
-        saved::check(row.max(col) <= origin_max, "the patch's place")?;
-        saved::check(saved.frame.len() == self.frame.len(), "a frame")?;
-        self.patch.set_spins(&saved.spins)?;
-        self.rng = saved.rng;
-        self.origin = saved.origin;
-        self.frame = saved.frame;
-        self.episode_step = saved.episode_step;
-        Ok(())
-    }
-
     fn reset(&mut self, config: &IsingConfig) {
         let origin_max = config.lattice_size - config.patch_size;
-        self.origin = (
-            self.rng.random_range(0..=origin_max),
-            self.rng.random_range(0..=origin_max),
+        self.now.origin = (
+            self.now.rng.random_range(0..=origin_max),
+            self.now.rng.random_range(0..=origin_max),
         );
-        self.patch.randomise(&mut self.rng);
-        self.episode_step = 0;
+        self.patch.randomise(&mut self.now.rng);
+        self.now.episode_step = 0;
         self.draw(config);
     }
 
     fn step(&mut self, config: &IsingConfig) -> StepEnd {
-        self.episode_step += 1;
-        if self.episode_step >= config.episode_steps {
+        self.now.episode_step += 1;
+        if self.now.episode_step >= config.episode_steps {
             self.reset(config);
             return StepEnd::TimedOut;
         }
         for _ in 0..config.sweeps_per_step {
-            self.patch.sweep(&mut self.rng);
+            self.patch.sweep(&mut self.now.rng);
         }
         self.draw(config);
         StepEnd::Running
     }
 
     fn draw(&mut self, config: &IsingConfig) {
-        for pixels in self.frame.chunks_mut(64) {
-            let bits: u64 = self.rng.random();
+        for pixels in self.now.frame.chunks_mut(64) {
+            let bits: u64 = self.now.rng.random();
             for (bit, pixel) in pixels.iter_mut().enumerate() {
                 *pixel = (bits >> bit & 1) as u8 * 255;
             }
         }
-        let (top, left) = self.origin;
+        let (top, left) = self.now.origin;
         for (row, spins) in self
             .patch
             .spins()
@@ -239,7 +222,7 @@ impl Field {
             .enumerate()
         {
             let start = (top + row) * config.lattice_size + left;
-            for (pixel, &spin) in self.frame[start..start + config.patch_size]
+            for (pixel, &spin) in self.now.frame[start..start + config.patch_size]
                 .iter_mut()
                 .zip(spins)
             {

@@ -59,7 +59,7 @@ pub struct LethalSchedule {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IsingOverlay {
-    /// Temperature, in units of J / k_B, above 0. The paper: 0.4, nearly deterministic.
+    /// Temperature, in units of J / k_B, above 0 and at most 5. The paper: 0.4, nearly deterministic.
     pub temperature: f64,
     /// Metropolis sweeps over the walls in one env step, at least 1.
     pub sweeps_per_step: u32,

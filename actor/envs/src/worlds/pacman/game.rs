@@ -2,19 +2,19 @@
 //! It neither starts anew what has ended, nor draws what moves.
 
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
 
 use super::{
     config::PacmanConfig,
     ghost::{Chance, Ghost},
-    maze::{GHOSTS, Item, Maze, Place},
+    maze::{DIRECTIONS, GHOSTS, Item, Maze, Place},
     render,
 };
-use crate::environment::StepEnd;
-use crate::envs::{RngUse, env_rng};
-use crate::error::EnvError;
-use crate::worlds::ising::IsingLattice;
+use crate::{environment::StepEnd, error::EnvError, saved::check};
 
-pub(super) struct Game {
+/// It is its own saved form: what never changes, the maze and the settings, is not in it.
+#[derive(Clone, Serialize, Deserialize)]
+pub(crate) struct Game {
     pub(super) rng: ChaCha8Rng,
     pub(super) agent: Place,
     pub(super) ghosts: [Ghost; GHOSTS],
@@ -28,55 +28,44 @@ pub(super) struct Game {
     pub(super) episodes: u64,
     /// The frame without what moves.
     pub(super) background: Vec<u8>,
-    /// Its own generator, so that the ghosts do the same with and without it.
-    pub(super) walls: Option<(IsingLattice, ChaCha8Rng)>,
 }
 
 impl Game {
-    pub(super) fn new(
+    /// The start of an episode, after so many others.
+    pub(super) fn start(
         config: &PacmanConfig,
         maze: &Maze,
         fresh: &[u8],
-        env: usize,
-        seed: u64,
-    ) -> Result<Self, EnvError> {
-        let mut overlay_rng = env_rng(seed, env, RngUse::Overlay);
-        let walls = match &config.ising {
-            Some(overlay) => Some((
-                overlay.lattice(&maze.walls(), &mut overlay_rng)?,
-                overlay_rng,
-            )),
-            None => None,
-        };
-        let mut game = Self {
-            rng: env_rng(seed, env, RngUse::Game),
+        rng: ChaCha8Rng,
+        episodes: u64,
+    ) -> Self {
+        Self {
+            rng,
             agent: maze.agent_start(),
             ghosts: maze.ghost_starts().map(Ghost::at),
-            lethal: config.lethal_in(0),
+            lethal: config.lethal_in(episodes),
             boost_left: 0,
             items: maze.items().to_vec(),
             pellets_left: maze.pellets(),
             episode_step: 0,
-            episodes: 0,
+            episodes,
             background: fresh.to_vec(),
-            walls,
-        };
-        game.reset(config, maze, fresh);
-        Ok(game)
+        }
     }
 
-    pub(super) fn reset(&mut self, config: &PacmanConfig, maze: &Maze, fresh: &[u8]) {
-        self.agent = maze.agent_start();
-        self.ghosts = maze.ghost_starts().map(Ghost::at);
-        self.lethal = config.lethal_in(self.episodes);
-        self.boost_left = 0;
-        self.items.copy_from_slice(maze.items());
-        self.pellets_left = maze.pellets();
-        self.episode_step = 0;
-        self.background.copy_from_slice(fresh);
-        if let Some((lattice, rng)) = &mut self.walls {
-            lattice.randomise(rng);
+    /// An error where no game in this maze is so.
+    pub(super) fn check(&self, maze: &Maze) -> Result<(), EnvError> {
+        let places = maze.items().len();
+        let is_place = |place: Place| usize::from(place) < places;
+        check(is_place(self.agent), "the agent's place")?;
+        for ghost in self.ghosts {
+            let heads = ghost.heading.is_none_or(|it| usize::from(it) < DIRECTIONS);
+            check(is_place(ghost.place) && heads, "a ghost's place")?;
         }
+        let pellets = self.items.iter().filter(|&&it| it == Item::Pellet).count();
+        let fits = self.items.len() == places && self.pellets_left as usize == pellets;
+        check(fits, "the food")?;
+        check(self.background.len() == render::FRAME_BYTES, "a frame")
     }
 
     /// One step of one game; it does not reset. Returns what was earned and what ended.

@@ -15,7 +15,6 @@ mod game;
 mod ghost;
 mod maze;
 mod render;
-mod saved;
 #[cfg(test)]
 mod state_tests;
 #[cfg(test)]
@@ -25,12 +24,14 @@ pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use game::Game;
 use ghost::Chance;
 use maze::{GHOSTS, Maze};
-use saved::SavedGame;
+use rand_chacha::ChaCha8Rng;
 
 use crate::environment::{Environment, FrameShape, StepEnd};
-use crate::envs::{Envs, check_num_envs};
+use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
+use crate::saved::check;
 use crate::settings::WorldSettings;
+use crate::worlds::ising::IsingLattice;
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
@@ -42,6 +43,9 @@ pub struct PacmanWorld {
     /// The frame at the start of an episode, without what moves.
     fresh: Vec<u8>,
     envs: Vec<Game>,
+    /// The spins in the walls of each game, where walls flicker. Their generators are their own, so that the ghosts do the same with
+    /// and without them.
+    walls: Vec<(IsingLattice, ChaCha8Rng)>,
 }
 
 impl PacmanWorld {
@@ -58,9 +62,16 @@ impl PacmanWorld {
         let maze = Maze::new();
         let mut fresh = vec![0; render::FRAME_BYTES];
         render::background(&maze, &mut fresh);
-        let envs = (0..num_envs)
-            .map(|env| Game::new(config, &maze, &fresh, env, seed))
-            .collect::<Result<Vec<_>, EnvError>>()?;
+        let start = |env| Game::start(config, &maze, &fresh, env_rng(seed, env, RngUse::Game), 0);
+        let mut walls = Vec::new();
+        if let Some(overlay) = &config.ising {
+            for env in 0..num_envs {
+                let mut rng = env_rng(seed, env, RngUse::Overlay);
+                let mut lattice = overlay.lattice(&maze.walls(), &mut rng)?;
+                lattice.randomise(&mut rng);
+                walls.push((lattice, rng));
+            }
+        }
         let chance = Chance {
             epsilon: config.epsilon,
             switch_probability: config.switch_probability,
@@ -68,9 +79,10 @@ impl PacmanWorld {
         Ok(Self {
             config: config.clone(),
             chance,
+            envs: (0..num_envs).map(start).collect(),
             maze,
             fresh,
-            envs,
+            walls,
         })
     }
 
@@ -109,7 +121,8 @@ impl WorldSettings for PacmanConfig {
 }
 
 impl Envs for PacmanWorld {
-    type Saved = SavedGame;
+    /// A game; and the spins in its walls with their generator, where walls flicker.
+    type Saved = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
     fn shape(&self) -> FrameShape {
         self.config.frame_shape()
@@ -126,7 +139,7 @@ impl Envs for PacmanWorld {
     fn draw(&self, env: usize, frame: &mut [u8]) {
         let game = &self.envs[env];
         frame.copy_from_slice(&game.background);
-        if let Some((lattice, _)) = &game.walls {
+        if let Some((lattice, _)) = self.walls.get(env) {
             render::overlay(lattice.spins(), frame);
         }
         let ghosts = game.ghosts.map(|ghost| ghost.place);
@@ -137,20 +150,36 @@ impl Envs for PacmanWorld {
         let game = &mut self.envs[env];
         let (reward, end) = game.step(&self.config, &self.maze, self.chance, action);
         if end != StepEnd::Running {
-            game.episodes += 1;
-            game.reset(&self.config, &self.maze, &self.fresh);
-        } else if let (Some((lattice, rng)), Some(overlay)) = (&mut game.walls, &self.config.ising)
+            let (rng, episodes) = (game.rng.clone(), game.episodes + 1);
+            *game = Game::start(&self.config, &self.maze, &self.fresh, rng, episodes);
+        }
+        if let (Some((lattice, rng)), Some(overlay)) = (self.walls.get_mut(env), &self.config.ising)
         {
-            (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng));
+            match end {
+                StepEnd::Running => (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng)),
+                _ => lattice.randomise(rng),
+            }
         }
         (reward, end)
     }
 
-    fn saved(&self, env: usize) -> SavedGame {
-        self.envs[env].saved()
+    fn saved(&self, env: usize) -> Self::Saved {
+        let walls = self.walls.get(env);
+        let walls = walls.map(|(lattice, rng)| (lattice.spins().to_vec(), rng.clone()));
+        (self.envs[env].clone(), walls)
     }
 
-    fn restore(&mut self, env: usize, saved: SavedGame) -> Result<(), EnvError> {
-        self.envs[env].load(saved, &self.maze)
+    fn restore(&mut self, env: usize, (game, walls): Self::Saved) -> Result<(), EnvError> {
+        game.check(&self.maze)?;
+        match (self.walls.get_mut(env), walls) {
+            (Some((lattice, own)), Some((spins, rng))) => {
+                lattice.set_spins(&spins)?;
+                *own = rng;
+            }
+            (None, None) => {}
+            _ => check(false, "the walls' flicker")?,
+        }
+        self.envs[env] = game;
+        Ok(())
     }
 }

@@ -75,13 +75,12 @@ fn a_game_continues_where_it_was_saved() {
 
 #[test]
 fn a_state_that_no_game_has_is_refused() {
-    let mut world = PacmanWorld::new(&config(), 1, 5).unwrap();
     let maze = Maze::new();
     let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
-    let mut refuse = |what: &str, change: fn(&mut Game)| {
+    let refuse = |what: &str, change: fn(&mut Game)| {
         let mut wrong = fine();
         change(&mut wrong);
-        let said = world.envs[0].load(wrong.saved(), &maze).unwrap_err();
+        let said = wrong.check(&maze).unwrap_err();
         assert!(said.to_string().contains(what), "{said}");
     };
     refuse("the agent's place", |game| game.agent = 10_000);

@@ -326,14 +326,14 @@ impl Environment for ProcgenWorld {
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
         let game = &mut self.game;
         let envs = self.steps_taken.iter().enumerate();
-        let envs = envs.map(|(env, &steps)| Ok((steps, game.state(env)?.sealed())));
+        let envs = envs.map(|(env, &steps)| Ok((steps, game.state(env)?)));
         saved::encode(&envs.collect::<Result<Vec<_>, ProcgenError>>()?)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let envs: Vec<(u32, Vec<u8>)> = saved::decode(state, self.num_envs())?;
-        for (env, (steps, sealed)) in envs.into_iter().enumerate() {
-            self.game.set_state(env, &State::unsealed(&sealed)?)?;
+        let envs: Vec<(u32, State)> = saved::decode(state, self.num_envs())?;
+        for (env, (steps, state)) in envs.into_iter().enumerate() {
+            self.game.set_state(env, &state)?;
             self.steps_taken[env] = steps;
         }
         Ok(())
