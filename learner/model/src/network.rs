@@ -12,7 +12,6 @@ use crate::features::FeatureLayers;
 use crate::heads::c51::C51Head;
 use crate::heads::dim::{ActionEmbedding, Head};
 use crate::heads::noise::HeadNoise;
-use crate::kernels::rows::select_rows;
 use crate::parameters::Parameters;
 
 /// What the torso makes of a batch of frames.
@@ -39,12 +38,13 @@ impl Features {
         })
     }
 
-    /// The features of these rows, each as often as listed. On the CPU only; gradients of a row's copies are summed first to last.
+    /// The features of these rows, each as often as listed. Gradients of a row's copies are summed first to last.
     pub fn select(&self, rows: &[u32]) -> candle_core::Result<Self> {
-        let selected = |f3: &Tensor| select_rows(f3, rows);
+        let rows = Tensor::new(rows, self.f4.device())?;
+        let selected = |features: &Tensor| features.index_select(&rows, 0);
         Ok(Self {
             f3: self.f3.as_ref().map(selected).transpose()?,
-            f4: select_rows(&self.f4, rows)?,
+            f4: selected(&self.f4)?,
         })
     }
 }

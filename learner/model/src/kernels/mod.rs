@@ -1,6 +1,6 @@
 //! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
 //!
-//! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`], [`dots`] and [`rows`] are candle operations with gradients, which split their work over the rayon pool.
+//! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`] and [`dots`] are candle operations with gradients, which split their work over the rayon pool.
 //! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does, with
 //! [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of [`panels`] and in
 //! tiles for an instruction set of [`isa`] with the type that it multiplies; all unsafe code of the crate is there.
@@ -25,7 +25,6 @@ pub(crate) mod precision;
 pub(crate) mod product;
 pub(crate) mod residual;
 pub(crate) mod rounding;
-pub(crate) mod rows;
 pub(crate) mod stack;
 pub(crate) mod stages;
 pub(crate) mod tensors;
