@@ -15,30 +15,22 @@ use crate::parameters::Parameters;
 #[derive(Debug)]
 pub(crate) struct Head {
     kernels: Kernels,
-    hidden_weight: Tensor,
-    hidden_bias: Tensor,
-    out_weight: Tensor,
-    out_bias: Tensor,
-    skip_weight: Tensor,
-    /// There in the action's embedding alone.
-    skip_bias: Option<Tensor>,
+    parameters: BlockParameters,
 }
 
 impl Head {
     pub(crate) fn new(name: &str, parameters: &Parameters, kernels: Kernels) -> Result<Self> {
-        let (hidden, out, skip) = (
-            format!("{name}.hidden"),
-            format!("{name}.out"),
-            format!("{name}.skip"),
-        );
+        let tensor = |layer: &str, part: &str| parameters.tensor(&format!("{name}.{layer}"), part);
+        let parameters = BlockParameters {
+            hidden_weight: tensor("hidden", "weight")?,
+            hidden_bias: tensor("hidden", "bias")?,
+            out_weight: tensor("out", "weight")?,
+            skip_weight: tensor("skip", "weight")?,
+            out_biases: vec![tensor("out", "bias")?],
+        };
         Ok(Self {
             kernels,
-            hidden_weight: parameters.tensor(&hidden, "weight")?,
-            hidden_bias: parameters.tensor(&hidden, "bias")?,
-            out_weight: parameters.tensor(&out, "weight")?,
-            out_bias: parameters.tensor(&out, "bias")?,
-            skip_weight: parameters.tensor(&skip, "weight")?,
-            skip_bias: None,
+            parameters,
         })
     }
 
@@ -50,15 +42,7 @@ impl Head {
         let Kernels::Fused(precision) = self.kernels else {
             return self.of_layers(x, joined);
         };
-        let out_biases = [Some(&self.out_bias), self.skip_bias.as_ref()];
-        let parameters = BlockParameters {
-            hidden_weight: self.hidden_weight.clone(),
-            hidden_bias: self.hidden_bias.clone(),
-            out_weight: self.out_weight.clone(),
-            skip_weight: self.skip_weight.clone(),
-            out_biases: out_biases.into_iter().flatten().cloned().collect(),
-        };
-        Ok(residual_block(x, joined, &parameters, precision)?)
+        Ok(residual_block(x, joined, &self.parameters, precision)?)
     }
 
     /// The same of candle's operations, layer by layer: W [x; joined] = W_x x + W_joined joined.
@@ -72,18 +56,16 @@ impl Head {
             let weight = weight.narrow(1, features, weight.dim(1)? - features)?;
             Ok(with.linear(joined, &weight, bias)?)
         };
-        let out_bias = match &self.skip_bias {
-            None => self.out_bias.clone(),
-            Some(skip_bias) => (&self.out_bias + skip_bias)?,
-        };
-        let hidden_bias = bias(&self.hidden_weight, &self.hidden_bias)?;
-        let skip_bias = bias(&self.skip_weight, &out_bias)?;
-        let hidden_weight = self.hidden_weight.narrow(1, 0, features)?;
-        let skip_weight = self.skip_weight.narrow(1, 0, features)?;
+        let block = &self.parameters;
+        let out_bias = Tensor::stack(&block.out_biases, 0)?.sum(0)?;
+        let hidden_bias = bias(&block.hidden_weight, &block.hidden_bias)?;
+        let skip_bias = bias(&block.skip_weight, &out_bias)?;
+        let hidden_weight = block.hidden_weight.narrow(1, 0, features)?;
+        let skip_weight = block.skip_weight.narrow(1, 0, features)?;
         let hidden = with.relu(&with.linear(x, &hidden_weight, &hidden_bias)?)?;
         // The skip's result is the bias of `out`, so nothing is added separately.
         let skip = with.linear(x, &skip_weight, &skip_bias)?;
-        Ok(with.linear(&hidden, &self.out_weight, &skip)?)
+        Ok(with.linear(&hidden, &block.out_weight, &skip)?)
     }
 }
 
@@ -101,7 +83,8 @@ impl ActionEmbedding {
         kernels: Kernels,
     ) -> Result<Self> {
         let mut block = Head::new("dim.action", parameters, kernels)?;
-        block.skip_bias = Some(parameters.tensor("dim.action.skip", "bias")?);
+        let skip_bias = parameters.tensor("dim.action.skip", "bias")?;
+        block.parameters.out_biases.push(skip_bias);
         Ok(Self {
             block,
             num_actions: config.num_actions,
@@ -128,7 +111,7 @@ impl ActionEmbedding {
         Ok(Tensor::from_vec(
             one_hot,
             (indices.len(), self.num_actions),
-            self.block.hidden_weight.device(),
+            self.block.parameters.hidden_weight.device(),
         )?)
     }
 }

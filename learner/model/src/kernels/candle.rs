@@ -126,49 +126,12 @@ pub(crate) fn relu(x: &Tensor) -> Result<Tensor> {
 
 /// As `dots::dot_products`: psi and phi [B, L, R] or [B, R] to [L, B, B].
 pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    match (psi.rank(), phi.rank()) {
-        (3, 3) => local_local_dots(psi, phi),
-        (3, _) => local_global_dots(psi, phi),
-        (_, 3) => global_local_dots(psi, phi),
-        _ => global_global_dots(psi, phi),
-    }
-}
-
-/// `batch` as a batched product takes it: the CPU's in any layout, others in one piece.
-fn as_operand(batch: Tensor) -> Result<Tensor> {
-    if batch.device().is_cpu() {
-        Ok(batch)
-    } else {
-        batch.contiguous()
-    }
-}
-
-/// `psi` [B, L, R], `phi` [B, L, R].
-fn local_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    as_operand(psi.transpose(0, 1)?)?.matmul(&as_operand(phi.permute((1, 2, 0))?)?)
-}
-
-/// `psi` [B, L, R], `phi` [B, R].
-fn local_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    let (rows, locations, width) = psi.dims3()?;
-    let dots = psi.reshape((rows * locations, width))?.matmul(&phi.t()?)?;
-    dots.reshape((rows, locations, rows))?
-        .transpose(0, 1)?
-        .contiguous()
-}
-
-/// `psi` [B, R], `phi` [B, L, R].
-fn global_local_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    let (rows, locations, width) = phi.dims3()?;
-    let dots = phi.reshape((rows * locations, width))?.matmul(&psi.t()?)?;
-    dots.reshape((rows, locations, rows))?
-        .permute((1, 2, 0))?
-        .contiguous()
-}
-
-/// `psi` [B, R], `phi` [B, R].
-fn global_global_dots(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
-    psi.matmul(&phi.t()?)?.unsqueeze(0)
+    let by_location = |vectors: &Tensor| match vectors.rank() {
+        3 => vectors.transpose(0, 1)?.contiguous(),
+        _ => vectors.unsqueeze(0),
+    };
+    let phi = by_location(phi)?.t()?.contiguous()?;
+    by_location(psi)?.broadcast_matmul(&phi)
 }
 
 /// Images [B, H, W, in] to [B, h, w, out], without ReLU.

@@ -29,10 +29,8 @@ const SUM_LEN: usize = 1 << 12;
 
 /// y = x w^T + b, differentiable in all arguments.
 ///
-/// `x` [..., in]; `w` [out, in]; `b` [out], or [groups..., out] where each entry serves an equal share of consecutive
-/// rows of `x`. Result [..., out]. All f32. With as many groups as rows this is x w^T + b for a whole tensor b, which
-/// saves the separate addition. Operands of products are rounded to `precision`: each result and gradient is right to
-/// [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
+/// `x` [..., in]; `w` [out, in]; `b` [out]. Result [..., out]. All f32. Operands of products are rounded to `precision`: each result and
+/// gradient is right to [`Precision::product_error`]. Results and gradients have the same bits whatever the number of threads.
 pub fn linear(x: &Tensor, w: &Tensor, b: &Tensor, precision: Precision) -> Result<Tensor> {
     apply(x, w, b, None, precision)
 }
@@ -66,11 +64,8 @@ fn apply(
         None => x.dims().last().copied().unwrap_or(0),
     };
     let outputs = w.dims().first().copied().unwrap_or(0);
-    let fits =
-        w.dims() == [outputs, inputs] && b.dims().last() == Some(&outputs) && inputs * outputs > 0;
-    let rows = x.elem_count() / inputs.max(1);
-    let groups = b.elem_count() / outputs.max(1);
-    if !fits || groups == 0 || !rows.is_multiple_of(groups) {
+    let fits = w.dims() == [outputs, inputs] && b.dims() == [outputs] && inputs * outputs > 0;
+    if !fits {
         bail!(
             "linear layer of x {:?} with weight {:?} and bias {:?}",
             x.shape(),
@@ -79,10 +74,9 @@ fn apply(
         );
     }
     let op = Linear {
-        rows,
+        rows: x.elem_count() / inputs,
         inputs,
         outputs,
-        groups,
         maps,
         precision,
         flat: OnceLock::new(),
@@ -95,7 +89,6 @@ struct Linear {
     rows: usize,
     inputs: usize,
     outputs: usize,
-    groups: usize,
     /// Locations and channels of x, if it is maps [.., locations, channels] to be flattened to [.., channels * locations].
     maps: Option<(usize, usize)>,
     precision: Precision,
@@ -122,7 +115,7 @@ impl CustomOp3 for Linear {
         let biases = Biases {
             values: floats(b, b_layout)?,
             outputs: self.outputs,
-            each: self.rows / self.groups,
+            each: self.rows,
         };
         let product = |x| {
             let x = Matrix::new(x, self.rows, self.inputs);
@@ -180,12 +173,8 @@ impl CustomOp3 for Linear {
         let x_values = Matrix::new(x_values, self.rows, self.inputs);
         let product = Product::new(self.precision, grad.transposed(), x_values);
         let grad_w = gradients::summed(w, |sum| product.summed(sum))?;
-        let grad_b = if b.track_op() && self.groups == self.rows {
-            Some(grad_y.reshape(b.shape())?)
-        } else {
-            let sums = || group_sums(&grad_values, self.groups, self.outputs);
-            gradients::summed(b, |sum| add_to(sum, sums()))?
-        };
+        let sums = || group_sums(&grad_values, 1, self.outputs);
+        let grad_b = gradients::summed(b, |sum| add_to(sum, sums()))?;
         Ok((grad_x.transpose()?, grad_w, grad_b))
     }
 }

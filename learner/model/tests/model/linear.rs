@@ -6,31 +6,23 @@ use driml_model::{Precision, linear, relu};
 
 use crate::support::{assert_layer, double, floats, rng, rounded, values, variable};
 
-/// The layer by candle's operations: x [rows, in], b [groups, out].
+/// The layer by candle's operations: x [rows, in], b [out].
 fn stock(x: &Tensor, w: &Tensor, b: &Tensor, with_relu: bool) -> Result<Tensor> {
-    let (rows, outputs, groups) = (x.dim(0)?, w.dim(0)?, b.dim(0)?);
-    let product = x
-        .matmul(&w.t()?)?
-        .reshape((groups, rows / groups, outputs))?;
-    let y = product
-        .broadcast_add(&b.reshape((groups, 1, outputs))?)?
-        .reshape((rows, outputs))?;
+    let y = x.matmul(&w.t()?)?.broadcast_add(b)?;
     if with_relu { y.relu() } else { Ok(y) }
 }
 
 #[test]
 fn it_matches_candle_forward_and_backward() -> Result<()> {
     let rng = &mut rng(1);
-    // Rows, in, out, groups.
     let shapes = [
-        [1, 1, 1, 1],
-        [7, 5, 3, 1],
-        [6, 33, 17, 3],
-        [6, 8, 16, 6],
-        [520, 12, 40, 1],
-        [300, 64, 255, 100],
+        [1, 1, 1],
+        [7, 5, 3],
+        [6, 33, 17],
+        [520, 12, 40],
+        [300, 64, 255],
     ];
-    for [rows, inputs, outputs, groups] in shapes {
+    for [rows, inputs, outputs] in shapes {
         for (with_relu, precision) in [false, true]
             .into_iter()
             .flat_map(|with_relu| Precision::ALL.map(|precision| (with_relu, precision)))
@@ -39,10 +31,10 @@ fn it_matches_candle_forward_and_backward() -> Result<()> {
             let args = [
                 rounded(&variable(&[rows, inputs], rng), precision),
                 rounded(&variable(&[outputs, inputs], rng), precision),
-                variable(&[groups, outputs], rng),
+                variable(&[outputs], rng),
             ];
             assert_layer(
-                &format!("{precision}, {rows}x{inputs} to {outputs}, {groups} groups"),
+                &format!("{precision}, {rows}x{inputs} to {outputs}"),
                 &args,
                 precision,
                 rng,
@@ -96,10 +88,6 @@ fn shapes_that_do_not_match_are_errors() {
     );
     assert!(linear(&x, &w, &b, Precision::F32).is_ok());
     assert!(linear(&x, &w, &floats(&[6], rng), Precision::F32).is_err());
-    assert!(
-        linear(&x, &w, &floats(&[4, 7], rng), Precision::F32).is_err(),
-        "four groups of six rows"
-    );
     assert!(linear(&x, &floats(&[7, 4], rng), &b, Precision::F32).is_err());
     assert!(linear(&double(&x).unwrap(), &w, &b, Precision::F32).is_err());
 }
