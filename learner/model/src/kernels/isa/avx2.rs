@@ -13,7 +13,7 @@ use half::bf16;
 use super::{
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
-    vector::{Vector, compute_sizes},
+    vector::{Sums, Vector, compute_sizes},
 };
 
 #[derive(Clone, Copy)]
@@ -70,32 +70,35 @@ unsafe fn vectorized<W: Loop>(work: W) {
     work.run();
 }
 
-/// Sums of 16 columns.
-type Sums = [__m256; 2];
+impl Sums for [__m256; 2] {
+    #[inline(always)]
+    unsafe fn zero() -> Self {
+        unsafe { [_mm256_setzero_ps(); 2] }
+    }
 
-/// Writes the first `count` of 16 sums.
-#[inline(always)]
-unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
-    // SAFETY: whole registers where the caller vouches for 16 scalars; else only the first `count` are touched.
-    unsafe {
-        if count == LANES {
-            for (half, sums) in sums.into_iter().enumerate() {
-                let at = at.add(half * 8);
-                let old = if add {
-                    _mm256_loadu_ps(at)
-                } else {
-                    _mm256_setzero_ps()
-                };
-                _mm256_storeu_ps(at, if add { _mm256_add_ps(old, sums) } else { sums });
+    #[inline(always)]
+    unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
+        // SAFETY: whole registers where the caller vouches for 16 scalars; else only the first `count` are touched.
+        unsafe {
+            if count == LANES {
+                for (half, sums) in self.into_iter().enumerate() {
+                    let at = at.add(half * 8);
+                    let old = if add {
+                        _mm256_loadu_ps(at)
+                    } else {
+                        _mm256_setzero_ps()
+                    };
+                    _mm256_storeu_ps(at, if add { _mm256_add_ps(old, sums) } else { sums });
+                }
+                return;
             }
-            return;
-        }
-        let mut values = [0f32; LANES];
-        _mm256_storeu_ps(values.as_mut_ptr(), sums[0]);
-        _mm256_storeu_ps(values.as_mut_ptr().add(8), sums[1]);
-        for (index, value) in values.into_iter().take(count).enumerate() {
-            let at = at.add(index);
-            *at = if add { *at + value } else { value };
+            let mut values = [0f32; LANES];
+            _mm256_storeu_ps(values.as_mut_ptr(), self[0]);
+            _mm256_storeu_ps(values.as_mut_ptr().add(8), self[1]);
+            for (index, value) in values.into_iter().take(count).enumerate() {
+                let at = at.add(index);
+                *at = if add { *at + value } else { value };
+            }
         }
     }
 }
@@ -104,37 +107,27 @@ unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
 
 impl Vector for F32 {
     type Element = f32;
-    type Sums = Sums;
-    type Operand = Sums;
+    type Sums = [__m256; 2];
+    type Operand = [__m256; 2];
 
     #[inline(always)]
-    unsafe fn zero() -> Sums {
-        unsafe { [_mm256_setzero_ps(); 2] }
-    }
-
-    #[inline(always)]
-    unsafe fn row(at: *const f32) -> Sums {
+    unsafe fn row(at: *const f32) -> [__m256; 2] {
         unsafe { [_mm256_set1_ps(*at); 2] }
     }
 
     #[inline(always)]
-    unsafe fn columns(at: *const f32) -> Sums {
+    unsafe fn columns(at: *const f32) -> [__m256; 2] {
         unsafe { [_mm256_loadu_ps(at), _mm256_loadu_ps(at.add(8))] }
     }
 
     #[inline(always)]
-    unsafe fn mul_add(sums: Sums, row: Sums, columns: Sums) -> Sums {
+    unsafe fn mul_add(sums: [__m256; 2], row: [__m256; 2], columns: [__m256; 2]) -> [__m256; 2] {
         unsafe {
             [
                 _mm256_fmadd_ps(row[0], columns[0], sums[0]),
                 _mm256_fmadd_ps(row[1], columns[1], sums[1]),
             ]
         }
-    }
-
-    #[inline(always)]
-    unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
-        unsafe { write(sums, at, count, add) }
     }
 }
 
@@ -166,13 +159,8 @@ unsafe fn mul_add_pairs(sums: __m256, row: __m256i, columns: __m256i) -> __m256 
 
 impl Vector for Bf16 {
     type Element = bf16;
-    type Sums = Sums;
+    type Sums = [__m256; 2];
     type Operand = [__m256i; 2];
-
-    #[inline(always)]
-    unsafe fn zero() -> Sums {
-        unsafe { [_mm256_setzero_ps(); 2] }
-    }
 
     #[inline(always)]
     unsafe fn row(at: *const bf16) -> [__m256i; 2] {
@@ -190,7 +178,7 @@ impl Vector for Bf16 {
     }
 
     #[inline(always)]
-    unsafe fn mul_add(sums: Sums, row: [__m256i; 2], columns: [__m256i; 2]) -> Sums {
+    unsafe fn mul_add(sums: [__m256; 2], row: [__m256i; 2], columns: [__m256i; 2]) -> [__m256; 2] {
         // No closure: it may be compiled without AVX2, and each instruction is then a call.
         unsafe {
             [
@@ -198,10 +186,5 @@ impl Vector for Bf16 {
                 mul_add_pairs(sums[1], row[1], columns[1]),
             ]
         }
-    }
-
-    #[inline(always)]
-    unsafe fn write(sums: Sums, at: *mut f32, count: usize, add: bool) {
-        unsafe { write(sums, at, count, add) }
     }
 }

@@ -16,7 +16,7 @@ use super::{
     avx512_rounding::{self, first_lanes},
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
-    vector::{Vector, compute_sizes},
+    vector::{Sums, Vector, compute_sizes},
 };
 
 /// Whether this processor, and the operating system, have AVX-512 as server processors do.
@@ -202,19 +202,25 @@ unsafe fn transposed(block: &mut [[u32; LANES]; LANES]) {
     }
 }
 
-/// Writes the first `count` of 16 sums.
-#[inline(always)]
-unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
-    debug_assert!(count <= LANES);
-    let mask = first_lanes(count);
-    // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
-    unsafe {
-        let sums = if add {
-            _mm512_add_ps(_mm512_maskz_loadu_ps(mask, at), sums)
-        } else {
-            sums
-        };
-        _mm512_mask_storeu_ps(at, mask, sums);
+impl Sums for __m512 {
+    #[inline(always)]
+    unsafe fn zero() -> Self {
+        unsafe { _mm512_setzero_ps() }
+    }
+
+    #[inline(always)]
+    unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
+        debug_assert!(count <= LANES);
+        let mask = first_lanes(count);
+        // SAFETY: the lanes that the mask leaves out are neither read nor written; the caller answers for the others.
+        unsafe {
+            let sums = if add {
+                _mm512_add_ps(_mm512_maskz_loadu_ps(mask, at), self)
+            } else {
+                self
+            };
+            _mm512_mask_storeu_ps(at, mask, sums);
+        }
     }
 }
 
@@ -224,11 +230,6 @@ impl Vector for F32 {
     type Element = f32;
     type Sums = __m512;
     type Operand = __m512;
-
-    #[inline(always)]
-    unsafe fn zero() -> __m512 {
-        unsafe { _mm512_setzero_ps() }
-    }
 
     #[inline(always)]
     unsafe fn row(at: *const f32) -> __m512 {
@@ -244,22 +245,12 @@ impl Vector for F32 {
     unsafe fn mul_add(sums: __m512, row: __m512, columns: __m512) -> __m512 {
         unsafe { _mm512_fmadd_ps(row, columns, sums) }
     }
-
-    #[inline(always)]
-    unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
-        unsafe { write(sums, at, count, add) }
-    }
 }
 
 impl Vector for Bf16 {
     type Element = bf16;
     type Sums = __m512;
     type Operand = __m512i;
-
-    #[inline(always)]
-    unsafe fn zero() -> __m512 {
-        unsafe { _mm512_setzero_ps() }
-    }
 
     #[inline(always)]
     unsafe fn row(at: *const bf16) -> __m512i {
@@ -283,10 +274,5 @@ impl Vector for Bf16 {
                 transmute::<__m512i, __m512bh>(row),
             )
         }
-    }
-
-    #[inline(always)]
-    unsafe fn write(sums: __m512, at: *mut f32, count: usize, add: bool) {
-        unsafe { write(sums, at, count, add) }
     }
 }

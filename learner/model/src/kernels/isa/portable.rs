@@ -5,7 +5,7 @@ use half::bf16;
 use super::{
     element::{Element, Rounding},
     simd::{LANES, Loop, RawTile, Simd},
-    vector::{Vector, compute_sizes},
+    vector::{Sums, Vector, compute_sizes},
 };
 
 #[derive(Clone, Copy)]
@@ -47,11 +47,6 @@ macro_rules! simd {
             type Operand = [[$element; <$element>::DEPTH]; LANES];
 
             #[inline(always)]
-            unsafe fn zero() -> Self::Sums {
-                [0.0; LANES]
-            }
-
-            #[inline(always)]
             unsafe fn row(at: *const $element) -> Self::Operand {
                 unsafe { [at.cast::<[$element; <$element>::DEPTH]>().read_unaligned(); LANES] }
             }
@@ -74,18 +69,25 @@ macro_rules! simd {
                 }
                 sums
             }
-
-            #[inline(always)]
-            unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool) {
-                for (index, sum) in sums.into_iter().take(count).enumerate() {
-                    unsafe {
-                        let at = at.add(index);
-                        *at = if add { *at + sum } else { sum };
-                    }
-                }
-            }
         }
     };
+}
+
+impl Sums for [f32; LANES] {
+    #[inline(always)]
+    unsafe fn zero() -> Self {
+        [0.0; LANES]
+    }
+
+    #[inline(always)]
+    unsafe fn write(self, at: *mut f32, count: usize, add: bool) {
+        for (index, sum) in self.into_iter().take(count).enumerate() {
+            unsafe {
+                let at = at.add(index);
+                *at = if add { *at + sum } else { sum };
+            }
+        }
+    }
 }
 
 simd!(F32, f32);

@@ -6,23 +6,27 @@ use super::{
     simd::{LANES, Mode, RawTile},
 };
 
+/// Sums of `LANES` columns, in registers.
+#[allow(unsafe_code, reason = "instructions of one kind of processor")]
+pub(super) trait Sums: Copy {
+    unsafe fn zero() -> Self;
+    /// Writes the first `count` sums, after adding what is there if `add`. `count` may be 0; `at` is then not looked at.
+    unsafe fn write(self, at: *mut f32, count: usize, add: bool);
+}
+
 /// The vector instructions that the shared loop is written in.
 #[allow(unsafe_code, reason = "instructions of one kind of processor")]
 pub(super) trait Vector: Copy {
     type Element: Element;
-    /// Sums of `LANES` columns.
-    type Sums: Copy;
+    type Sums: Sums;
     /// One step of `LANES` columns, or of one row.
     type Operand: Copy;
 
-    unsafe fn zero() -> Self::Sums;
     /// The step at this place, for all columns.
     unsafe fn row(at: *const Self::Element) -> Self::Operand;
     /// The steps of `LANES` neighbouring columns.
     unsafe fn columns(at: *const Self::Element) -> Self::Operand;
     unsafe fn mul_add(sums: Self::Sums, row: Self::Operand, columns: Self::Operand) -> Self::Sums;
-    /// Writes the first `count` sums, after adding what is there if `add`. `count` may be 0; `at` is then not looked at.
-    unsafe fn write(sums: Self::Sums, at: *mut f32, count: usize, add: bool);
 }
 
 /// The loop of every instruction set with vectors, to be compiled for it.
@@ -36,7 +40,7 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
 ) {
     // SAFETY: every address is one that `RawTile` says may be used; the caller answers for the instructions.
     unsafe {
-        let mut sums = [[V::zero(); VECS]; ROWS];
+        let mut sums = [[V::Sums::zero(); VECS]; ROWS];
         let (mut panel, mut run) = (tile.panel, tile.left);
         for _ in 0..tile.runs {
             let mut at = run;
@@ -63,12 +67,7 @@ pub(super) unsafe fn compute<V: Vector, const ROWS: usize, const VECS: usize>(
             let out = tile.out.add(r * tile.out_stride);
             for (v, sums) in sums.into_iter().enumerate() {
                 let count = tile.cols.saturating_sub(v * LANES).min(LANES);
-                V::write(
-                    sums,
-                    out.wrapping_add(v * LANES),
-                    count,
-                    tile.mode == Mode::Add,
-                );
+                sums.write(out.wrapping_add(v * LANES), count, tile.mode == Mode::Add);
             }
         }
     }
