@@ -366,11 +366,7 @@ impl ModelConfig {
 impl ModelConfig {
     /// A network for tests: 8 x 8 x 1, a map of 3 x 3 x 4, then 2 x 2 x 5; every DIM head.
     pub(crate) fn small() -> Self {
-        let conv = |out, kernel, stride| ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
+        let conv = |out, kernel, stride| ConvLayer::new(out, kernel, stride);
         Self {
             height: 8,
             width: 8,

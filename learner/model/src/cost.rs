@@ -169,33 +169,6 @@ mod tests {
         assert_eq!(dueling.3, ["head.value", "head.advantage"]);
     }
 
-    /// Mnih et al.'s network on 84 x 84 x 4: maps of 20 x 20, 9 x 9 and 7 x 7.
-    #[test]
-    fn a_known_network_is_counted() {
-        let conv = |out, kernel, stride| ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
-        let model = ModelConfig {
-            height: 84,
-            width: 84,
-            input_channels: 4,
-            conv: vec![conv(32, 8, 4), conv(64, 4, 2), conv(64, 3, 1)],
-            hidden: 512,
-            ..ModelConfig::small().without_dim()
-        };
-        let forward = model.layer_costs().into_iter().map(|layer| layer.forward);
-        let by_hand = [
-            20 * 20 * 32 * 4 * 64,
-            9 * 9 * 64 * 32 * 16,
-            7 * 7 * 64 * 64 * 9,
-            3136 * 512,
-            512 * 18,
-        ];
-        assert!(forward.eq(by_hand.map(|products| 2 * products)));
-    }
-
     /// The residual network of the Procgen paper on 64 x 64 x 3: maps of 64 x 64, and pooled 32 x 32, 16 x 16 and 8 x 8.
     #[test]
     fn a_residual_torso_is_counted() {

@@ -237,14 +237,6 @@ mod tests {
         }
     }
 
-    #[test]
-    fn four_to_one_repeats_each_pixel_four_times() {
-        let enlarge = Enlarge::new((1, 2), (4, 8), 1).unwrap();
-        let mut enlarged = [0; 32];
-        enlarge.apply(&[10, 20], &mut enlarged);
-        assert_eq!(enlarged, [10, 10, 10, 10, 20, 20, 20, 20].repeat(4)[..]);
-    }
-
     /// The upper left `part` of images [h, w, 1].
     fn cut(images: &[u8], width: usize, part: (usize, usize)) -> Vec<u8> {
         let rows = images.chunks_exact(width).take(part.0);
@@ -253,11 +245,8 @@ mod tests {
 
     #[test]
     fn what_is_read_is_the_same_of_a_part_as_of_the_whole() {
-        let conv = [(8, 4), (4, 2), (3, 1)].map(|(kernel, stride)| ConvLayer {
-            out: 1,
-            kernel,
-            stride,
-        });
+        let conv =
+            [(8, 4), (4, 2), (3, 1)].map(|(kernel, stride)| ConvLayer::new(1, kernel, stride));
         for (frame, input, read) in [
             ((64, 64), (64, 64), ((60, 60), (60, 60))),
             ((64, 64), (104, 80), ((100, 76), (62, 61))),

@@ -73,11 +73,7 @@ pub(crate) fn stack_of(
     for &(weight, bias, stride) in layers {
         let (out, weight_in, kernel, kernel_width) = weight.dims4()?;
         let fits = weight_in == input.2 && kernel == kernel_width && bias.dims() == [out];
-        let layer = ConvLayer {
-            out,
-            kernel,
-            stride,
-        };
+        let layer = ConvLayer::new(out, kernel, stride);
         let Some(shape) = ConvShape::new(input, layer).filter(|_| fits) else {
             let (height, width, channels) = input;
             let (weight, bias) = (weight.shape(), bias.shape());

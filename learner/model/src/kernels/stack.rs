@@ -149,11 +149,7 @@ mod tests {
         let layers = [(5, 3, 2), (70, 4, 1), (9, 2, 1)];
         let mut input = (17, 23, 3);
         let shape = |(out, kernel, stride)| {
-            let layer = ConvLayer {
-                out,
-                kernel,
-                stride,
-            };
+            let layer = ConvLayer::new(out, kernel, stride);
             let shape = ConvShape::new(input, layer).unwrap();
             input = shape.output();
             shape

@@ -9,76 +9,20 @@ use crate::support::{
     with_biases,
 };
 
-/// Logits as the paper writes them, V + A - mean_a A after two products, and the same of one action a row.
+/// At the start of a run every sigma is 0.5 / sqrt(19); noise is for noisy layers alone.
 #[test]
-fn a_dueling_head_is_the_sum_of_its_streams() -> Result<()> {
-    let config = small_with(DUELING);
-    let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
-    let f4 = floats(&[6, config.hidden], &mut rng(4));
-    let stream = |name: &str, outputs: &[usize]| -> Result<Tensor> {
-        let weight = parameters.get(&format!("{name}.weight")).unwrap();
-        let bias = parameters.get(&format!("{name}.bias")).unwrap();
-        let outputs = [&[6], outputs].concat();
-        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
-        y.reshape(outputs)
-    };
-    let value = stream("head.value", &[1, 11])?;
-    let advantage = stream("head.advantage", &[5, 11])?;
-    let centred = advantage.broadcast_sub(&advantage.mean_keepdim(1)?)?;
-    let wanted = centred.broadcast_add(&value)?;
-    let found = network.logits(&f4).unwrap();
-    assert_close("logits", &found, &wanted, 1e-6);
-    let taken = [4u8, 0, 3, 3, 1, 2];
-    let found = values(&network.taken_logits(&f4, &taken, None).unwrap());
-    let wanted = values(&wanted);
-    for (row, action) in taken.into_iter().enumerate() {
-        let wanted = &wanted[(row * 5 + usize::from(action)) * 11..][..11];
-        for (found, wanted) in found[row * 11..].iter().zip(wanted) {
-            assert!((found - wanted).abs() < 1e-5, "{found} and {wanted}");
-        }
-    }
-    Ok(())
-}
-
-/// Each layer as the paper writes it: (mu + sigma * eps) x, with the same noise for all rows.
-#[test]
-fn a_noisy_layer_is_its_mean_and_its_scaled_noise() -> Result<()> {
-    let config = small_with(NOISY);
-    let parameters = with_biases(&config);
-    let network = Network::new(&config, &parameters).unwrap();
-    let f4 = floats(&[6, config.hidden], &mut rng(4));
-    let noise = HeadNoise::draw(&config, &mut rng(5)).unwrap();
-    let (weight, bias) = noise.of_parameters(0);
-    let [weight, bias] =
-        [weight, bias].map(|it| it.into_iter().map(|it| it as f32).collect::<Vec<_>>());
-    let part = |part: &str| parameters.get(&format!("head.{part}")).unwrap();
-    // 0.5 / sqrt(19) everywhere, at the start of a run.
+fn a_noisy_layer_starts_with_its_sigma() {
+    let noisy = small_with(NOISY);
+    let drawn = parameters(&noisy, 1);
     for sigma in ["weight_sigma", "bias_sigma"] {
-        let found = values(part(sigma));
-        assert!(
-            found
-                .iter()
-                .all(|&it| (it - 0.5 / 19f64.sqrt()).abs() < 1e-8)
-        );
+        let found = values(drawn.get(&format!("head.{sigma}")).unwrap());
+        let is_sigma = |it: &f64| (it - 0.5 / 19f64.sqrt()).abs() < 1e-8;
+        assert!(found.iter().all(is_sigma));
     }
-    let weight = Tensor::from_vec(weight, (55, 19), &Device::Cpu)?;
-    let bias = Tensor::from_vec(bias, 55, &Device::Cpu)?;
-    let weight = (part("weight_mu").as_tensor() + (weight * part("weight_sigma").as_tensor())?)?;
-    let bias = (part("bias_mu").as_tensor() + (bias * part("bias_sigma").as_tensor())?)?;
-    let layer = |weight: &Tensor, bias: &Tensor| {
-        let y = f4.relu()?.matmul(&weight.t()?)?.broadcast_add(bias)?;
-        y.reshape((6, 5, 11))
-    };
-    let found = network.noisy_logits(&f4, Some(&noise)).unwrap();
-    assert_close("noisy", &found, &layer(&weight, &bias)?, 1e-6);
-    // Without noise its means alone, which is what evaluation takes.
-    let mean = layer(part("weight_mu"), part("bias_mu"))?;
-    assert_close("means", &network.logits(&f4).unwrap(), &mean, 1e-6);
-    let plain = small();
-    let plain = Network::new(&plain, &crate::support::parameters(&plain, 1)).unwrap();
-    assert!(plain.noisy_logits(&f4, Some(&noise)).is_err());
-    Ok(())
+    let noise = HeadNoise::draw(&noisy, &mut rng(5));
+    let plain = Network::new(&small(), &parameters(&small(), 1)).unwrap();
+    let f4 = floats(&[6, 19], &mut rng(4));
+    assert!(plain.noisy_logits(&f4, noise.as_ref()).is_err());
 }
 
 #[test]
@@ -126,47 +70,6 @@ fn values_over_a_support_far_from_0_are_those_near_it_moved() {
             }
         }
     }
-}
-
-/// Of the size that a head with PyTorch's first weights gives; an orthogonal head of gain sqrt(2) gives twice that.
-///
-/// A logit's variance is then v = (|relu(f4)|^2 + 1) / (3 * hidden), and for small logits that of a Q value is
-/// v * mean(z^2) / atoms.
-#[test]
-fn the_first_q_values_are_small() {
-    let config = ModelConfig {
-        num_actions: 15,
-        atoms: 51,
-        v_min: -10.0,
-        v_max: 10.0,
-        hidden: 512,
-        dim: DimHeads::NONE,
-        ..small()
-    };
-    let support = config.atoms_support();
-    let mean_square =
-        |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64;
-    let support: Vec<f64> = support.into_iter().map(f64::from).collect();
-    let (mut found, mut expected) = (0.0, 0.0);
-    for seed in 0..8 {
-        let network = Network::new(&config, &parameters(&config, seed)).unwrap();
-        let f4 = network
-            .features(&frames(&config, 4, &mut rng(seed)))
-            .unwrap()
-            .f4;
-        let logits = network.logits(&f4).unwrap();
-        let relu = values(&f4.relu().unwrap());
-        let norm = relu.iter().map(|f| f * f).sum::<f64>() / 4.0;
-        let logit_variance = (norm + 1.0) / (3.0 * 512.0);
-        assert!(logit_variance < 0.5, "{logit_variance}: not small");
-        expected += logit_variance * mean_square(&support) / 51.0;
-        found += mean_square(&values(&network.q_values(&logits).unwrap()));
-    }
-    let ratio = found / expected;
-    assert!(
-        (0.6..1.6).contains(&ratio),
-        "Q^2 is {ratio} of what it should be"
-    );
 }
 
 #[test]

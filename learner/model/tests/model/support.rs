@@ -110,21 +110,9 @@ pub(crate) fn small() -> ModelConfig {
         v_max: 3.0,
         torso: TorsoName::Nature,
         conv: vec![
-            ConvLayer {
-                out: 5,
-                kernel: 8,
-                stride: 4,
-            },
-            ConvLayer {
-                out: 7,
-                kernel: 3,
-                stride: 2,
-            },
-            ConvLayer {
-                out: 6,
-                kernel: 2,
-                stride: 1,
-            },
+            ConvLayer::new(5, 8, 4),
+            ConvLayer::new(7, 3, 2),
+            ConvLayer::new(6, 2, 1),
         ],
         channels: vec![],
         scale_blocks: false,

@@ -98,27 +98,6 @@ fn every_layer_starts_as_its_law_says() {
 }
 
 #[test]
-fn names_and_shapes_are_the_configuration_s() {
-    let config = small();
-    let parameters = parameters(&config, 1);
-    let shapes = config.parameter_shapes();
-    assert_eq!(shapes.len(), parameters.len());
-    for (name, shape) in shapes {
-        assert_eq!(parameters.get(&name).unwrap().dims(), shape, "{name}");
-    }
-    assert_eq!(
-        parameters.get("torso.conv1.weight").unwrap().dims(),
-        [5, 3, 8, 8]
-    );
-    assert_eq!(
-        parameters.get("dim.psi4.hidden.weight").unwrap().dims(),
-        [13, 19 + 9]
-    );
-    assert!(parameters.get("dim.psi4.skip.bias").is_none());
-    assert!(parameters.get("dim.action.skip.bias").is_some());
-}
-
-#[test]
 fn residual_blocks_start_smaller_where_that_is_asked_for() {
     let config = residual(TorsoName::Impala);
     let plain = ModelConfig {
