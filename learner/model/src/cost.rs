@@ -104,7 +104,6 @@ mod tests {
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
     use super::*;
-    use crate::geometry::ConvLayer;
     use crate::parameters::Parameters;
     use crate::torso::TorsoName;
 

@@ -2,11 +2,10 @@
 //! What comes before it is `network`'s.
 
 use candle_core::{Device, Result, Tensor};
-use driml_model::{Backward, DimHeads, HeadNoise, Kernels, LossLayer, ModelConfig, Network};
+use driml_model::{Backward, HeadNoise, Kernels, LossLayer, ModelConfig, Network};
 
 use crate::support::{
-    DUELING, NOISY, assert_close, floats, frames, parameters, rng, small, small_with, values,
-    with_biases,
+    NOISY, assert_close, floats, frames, parameters, rng, small, small_with, values,
 };
 
 /// At the start of a run every sigma is 0.5 / sqrt(19); noise is for noisy layers alone.

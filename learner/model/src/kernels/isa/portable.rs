@@ -73,6 +73,8 @@ macro_rules! simd {
     };
 }
 
+// SAFETY: writes are to the addresses that the caller vouches for.
+#[allow(unsafe_code, reason = "tiles are read and written through pointers")]
 impl Sums for [f32; LANES] {
     #[inline(always)]
     unsafe fn zero() -> Self {
