@@ -5,6 +5,7 @@
 
 mod by_hand;
 mod circles;
+mod cli;
 mod closed_terminal;
 mod company;
 mod disk_full;
@@ -12,6 +13,7 @@ mod diverging;
 mod doctor;
 mod durable;
 mod evaluate;
+mod experiments;
 mod failures;
 mod films;
 mod leftovers;
