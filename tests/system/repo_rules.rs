@@ -40,7 +40,7 @@ driml-experiments   deploy/experiments  : driml-protocol driml-envs driml-model 
 driml-bench         deploy/bench        : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
                                           driml-machine driml-settings driml-launch procgen-sys
 driml               deploy              : *
-driml-examples      deploy/examples     : driml driml-envs driml-learner driml-model driml-settings
+driml-examples      deploy/examples     : driml driml-envs driml-learner driml-model driml-tests
 driml-tests         tests               : *
 driml-decoders      tests/decoders      : driml-protocol driml-actor driml-replay-server driml-learner driml-settings
 ";
