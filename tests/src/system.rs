@@ -93,6 +93,11 @@ impl TestSystem {
         format!("unixsock-stream/{}", self.path("s").display())
     }
 
+    /// The call of a run in the folder `run` whose processes meet at this system's endpoint.
+    pub fn local(&self, flags: &str) -> String {
+        format!("local {flags} --listen {} --run-dir run", self.endpoint())
+    }
+
     /// Starts the program in the system's folder. Arguments are as in a shell, split at blanks.
     pub fn start(&self, args: &str) -> Process {
         Process::start(args.to_owned(), self.command(args))

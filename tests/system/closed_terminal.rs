@@ -79,10 +79,7 @@ impl Window {
 
 /// A run that writes all that it says to `output`.
 fn start(system: &TestSystem, output: impl Into<Stdio>, errors: impl Into<Stdio>) -> Child {
-    let run = format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
     let mut command = system.command(&run);
     command.stdin(Stdio::null()).stdout(output).stderr(errors);
     command.spawn().unwrap()
@@ -182,10 +179,7 @@ fn a_hangup_ends_a_launched_run_once() {
 #[test]
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
-    let run = format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
     let words = ["sh", "-c", "trap '' HUP; exec \"$0\" \"$@\""].map(String::from);
     let command = system.command_after(&words, &run);
     let process = Process::start("nohup driml local".into(), command);

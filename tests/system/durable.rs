@@ -65,10 +65,8 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     let longer = SHORT.replace("--frames 1280", "--frames 20000");
     assert_ne!(longer, SHORT);
     system.hold_at(5_500);
-    let process = system.start(&format!(
-        "local --durable --agent driml-ada {longer} --actors 2 --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let flags = format!("--durable --agent driml-ada {longer} --actors 2");
+    let process = system.start(&system.local(&flags));
     let run = system.run_folder("run");
     for updates in [900, 2_900, 4_900] {
         run.wait_for_updates(updates);

@@ -75,10 +75,7 @@ fn launched(system: &TestSystem, updates: u64) -> Process {
 
 /// A launched run with these flags that has learned more than so many `updates`.
 fn launched_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
-    let process = system.start(&format!(
-        "local {LONG} {flags} --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let process = system.start(&system.local(&format!("{LONG} {flags}")));
     system.connect().wait_for_updates(updates);
     process
 }

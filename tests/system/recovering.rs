@@ -272,11 +272,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
 #[test]
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
-    let mut process = system.start(&format!(
-        "local --durable {} --listen {} --run-dir run",
-        flags(),
-        system.endpoint()
-    ));
+    let mut process = system.start(&system.local(&format!("--durable {}", flags())));
     let client = system.connect();
     client.wait_for_updates(10);
     drop(client);

@@ -77,10 +77,7 @@ fn a_run_continues_when_others_fill_it_up() {
         return;
     };
     let system = system();
-    let run = format!(
-        "local --agent c51 {LONG} --actors 2 --run-dir run --listen {}",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent c51 {LONG} --actors 2"));
     let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
     let client = system.connect();
     client.wait_for_updates(100);
