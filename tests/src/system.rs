@@ -83,6 +83,13 @@ impl TestSystem {
         self.folder.path().join(name)
     }
 
+    /// The names of what lies in a folder of the system's.
+    pub fn names(&self, folder: &str) -> Vec<String> {
+        let entries = fs::read_dir(self.path(folder)).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        names.collect()
+    }
+
     /// A run folder in the system's folder, whether or not it is there yet.
     pub fn run_folder(&self, name: &str) -> RunFolder {
         RunFolder::new(self.path(name))

@@ -275,8 +275,7 @@ fn tradeoff() {
     assert_eq!(rows(&data(&folder), "levels.csv"), 2);
 
     // Of a level whose first seed is left out the others are reported.
-    let names = fs::read_dir(folder.join("runs")).unwrap();
-    let names = names.map(|it| it.unwrap().file_name().into_string().unwrap());
+    let names = system.names("t/runs").into_iter();
     let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
     for name in first {
         fs::remove_file(folder.join("runs").join(name).join("summary.json")).unwrap();
