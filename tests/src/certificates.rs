@@ -7,8 +7,6 @@ use std::{
     process::Command,
 };
 
-use crate::skipped::skip;
-
 /// A folder for `--tls-dir`, with everything in it.
 #[derive(Debug)]
 pub struct Certificates {
@@ -22,15 +20,6 @@ pub enum Valid {
     UntilYesterday,
     /// Not before the year 2090.
     From2090,
-}
-
-/// Whether a test that needs openssl is to be skipped; a line on stderr then names it.
-pub fn skipped_without_openssl() -> bool {
-    let is_there = Command::new("openssl").arg("version").output().is_ok();
-    if !is_there {
-        skip("openssl is not there");
-    }
-    !is_there
 }
 
 fn run(command: &mut Command) -> String {

@@ -8,7 +8,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Process, TestSystem, skip, wait_for};
+use driml_tests::{Process, TestSystem, succeeds, wait_for};
 
 use crate::{LONG, SHORT, system};
 
@@ -23,18 +23,10 @@ impl Disk {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
-        match mount.arg(&folder).output() {
-            Ok(output) if output.status.success() => Some(Self { folder }),
-            Ok(output) => {
-                let why = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                skip(&why);
-                None
-            }
-            Err(e) => {
-                skip(&format!("mount: {e}"));
-                None
-            }
+        if !succeeds(mount.arg(&folder)) {
+            return None;
         }
+        Some(Self { folder })
     }
 
     /// Takes all room that there is.
@@ -273,9 +265,8 @@ fn a_folder_that_cannot_be_used_is_said() {
     };
     let mut remount = Command::new("mount");
     remount.args(["-o", "remount,ro"]).arg(system.path("disk"));
-    match remount.status() {
-        Ok(status) if status.success() => {}
-        _ => return skip("no read-only file system"),
+    if !succeeds(&mut remount) {
+        return;
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()

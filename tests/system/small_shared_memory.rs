@@ -7,7 +7,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Ended, skip};
+use driml_tests::{Ended, succeeds};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -19,21 +19,8 @@ fn with_shared_memory(size: &str) -> Option<Vec<String>> {
     let words: Vec<String> = ["unshare", "-m", "sh", "-c", &mount]
         .map(String::from)
         .into();
-    let tried = Command::new(&words[0])
-        .args(&words[1..])
-        .arg("true")
-        .output();
-    match tried {
-        Ok(output) if output.status.success() => Some(words),
-        Ok(output) => {
-            skip(String::from_utf8_lossy(&output.stderr).trim());
-            None
-        }
-        Err(e) => {
-            skip(&format!("unshare: {e}"));
-            None
-        }
-    }
+    let mut tried = Command::new(&words[0]);
+    succeeds(tried.args(&words[1..]).arg("true")).then_some(words)
 }
 
 /// How often it was said that there is too little, or that what was sent so does not arrive.

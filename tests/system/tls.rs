@@ -3,6 +3,7 @@
 
 use std::{
     net::UdpSocket,
+    process::Command,
     time::{Duration, Instant},
 };
 
@@ -12,8 +13,7 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 use driml_tests::{
-    Certificates, Client, Process, TestSystem, Valid, check_nothing_lost, skipped_without_openssl,
-    wait_for,
+    Certificates, Client, Process, TestSystem, Valid, check_nothing_lost, succeeds, wait_for,
 };
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
@@ -33,7 +33,7 @@ pub(crate) struct TlsSystem {
 impl TlsSystem {
     /// With certificates for some actors; none where there is no openssl, and then the test is skipped by name.
     pub(crate) fn new() -> Option<Self> {
-        if skipped_without_openssl() {
+        if !succeeds(Command::new("openssl").arg("version")) {
             return None;
         }
         let system = system();
