@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{RunFolder, Survivor, TestSystem, check_nothing_lost, note, wait_for};
+use driml_tests::{RunFolder, Survivor, TestSystem, note, wait_for};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -127,9 +127,8 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
         actor.wait().expect_code(0);
     }
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned(replay.transitions_inserted));
-    check_nothing_lost(&replay);
     learner.stop().expect_code(0);
     drop(client);
     server

@@ -164,23 +164,9 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
         "the last 100 episodes, with exploration: {while_training} of {wanted}"
     );
 
-    let ended = system.run_ok("evaluate --run run --episodes 40");
-    let mean = |policy: &str| -> f64 {
-        let line = ended
-            .stdout
-            .lines()
-            .find(|line| line.starts_with(policy))
-            .expect("each policy has a line");
-        line.split_once("mean return")
-            .unwrap()
-            .1
-            .split(',')
-            .next()
-            .unwrap()
-            .trim()
-            .parse()
-            .unwrap()
-    };
+    let ended = system.run_ok("evaluate --run run --episodes 40 --json");
+    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    let mean = |policy: &str| told["policies"][policy]["mean_return"].as_f64().unwrap();
     let (learned, random) = (mean("c51"), mean("random"));
     assert!(learned >= wanted, "greedy: {learned} of {wanted}");
     // A random walk reaches the far end in one of seven episodes.

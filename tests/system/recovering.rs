@@ -9,9 +9,7 @@ use driml_protocol::{
     session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{
-    Process, SlowMachine, TestSystem, check_nothing_lost, connect, new_learner, wait_for,
-};
+use driml_tests::{Process, SlowMachine, TestSystem, connect, new_learner, wait_for};
 use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
@@ -219,13 +217,12 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     }
     let client = system.connect();
     let status = client.wait_for_learner("the learner's last update", |it| it.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     assert_eq!(
         (status.updates, replay.rows_sampled),
         (UPDATES, 16 * UPDATES)
     );
     assert_eq!(replay.transitions_inserted, FRAMES);
-    check_nothing_lost(&replay);
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait().expect_code(0);
     assert_eq!(system.run_folder("seen").summary().updates, UPDATES);
