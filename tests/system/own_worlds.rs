@@ -120,9 +120,7 @@ fn lockstep_continues(env: &str, flags: &str, frames: u64) {
         assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
         assert_eq!(result(resumed), whole, "{signal}");
         // A world whose run was killed is given a second to end by itself.
-        wait_for("the end of every world", || {
-            system.survivors().is_empty().then_some(())
-        });
+        system.wait_until_all_have_ended();
     }
 }
 

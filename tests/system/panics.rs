@@ -97,10 +97,7 @@ fn a_panic_in_a_thread_of_several_processes_ends_the_run() {
     for point in ["signals", "reporter", "connecting"] {
         let ended = panicking(&system(), point, "");
         assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
-        assert!(
-            ended.stderr.contains("was killed by signal 6 SIGABRT"),
-            "{point}: {ended:#?}"
-        );
+        ended.expect_said("was killed by signal 6 SIGABRT");
     }
 }
 
