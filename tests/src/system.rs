@@ -250,13 +250,6 @@ impl TestSystem {
             self.survivors().is_empty().then_some(())
         });
     }
-
-    /// Kills all processes that the program has started here, however they came about.
-    pub fn kill_processes(&self) {
-        self.survivors()
-            .iter()
-            .for_each(|it| it.signal(Signal::SIGKILL));
-    }
 }
 
 impl Survivor {
@@ -279,7 +272,7 @@ impl Drop for TestSystem {
             if left.is_empty() {
                 return;
             }
-            left.iter().for_each(|it| it.signal(Signal::SIGKILL));
+            Survivor::kill_all(&left);
         }
     }
 }

@@ -139,19 +139,13 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     check_saved(&system, end(&mut child));
 }
 
-/// A run of processes started by hand that has learned something: replay server, learner, actor.
-fn by_hand(system: &TestSystem) -> [Process; 3] {
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let processes = [server, system.start_learner("run"), system.start_actor(0)];
-    system.connect().wait_for_updates(100);
-    processes
-}
-
 /// A closed ssh session.
 #[test]
 fn a_hangup_ends_processes_in_order() {
     let system = system();
-    let [server, learner, actor] = by_hand(&system);
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
+    system.connect().wait_for_updates(100);
     for (role, says) in [
         (actor, "actor 0 leaves"),
         (learner, "finished after"),
