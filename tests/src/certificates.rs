@@ -7,6 +7,8 @@ use std::{
     process::Command,
 };
 
+use crate::process::run;
+
 /// A folder for `--tls-dir`, with everything in it.
 #[derive(Debug)]
 pub struct Certificates {
@@ -20,13 +22,6 @@ pub enum Valid {
     UntilYesterday,
     /// Not before the year 2090.
     From2090,
-}
-
-fn run(command: &mut Command) -> String {
-    let output = command.output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{command:?}: {said}");
-    String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 impl Certificates {

@@ -2,7 +2,7 @@
 //! It needs the right to make them, and changes nothing of the host's own network.
 
 use std::{
-    process::{Command, Output},
+    process::Command,
     sync::atomic::{AtomicU32, Ordering},
 };
 
@@ -18,15 +18,11 @@ pub struct Network {
 /// Runs `ip` with these words.
 fn ip(words: &str) -> Result<(), String> {
     let said = Command::new("ip").args(words.split_whitespace()).output();
-    check(words, said)
-}
-
-fn check(what: &str, said: std::io::Result<Output>) -> Result<(), String> {
-    let said = said.map_err(|e| format!("{what}: {e}"))?;
+    let said = said.map_err(|e| format!("{words}: {e}"))?;
     match said.status.success() {
         true => Ok(()),
         false => Err(format!(
-            "{what}: {}",
+            "{words}: {}",
             String::from_utf8_lossy(&said.stderr).trim()
         )),
     }

@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path};
 
-use driml_tests::{Process, Summary, TestSystem, skip, skipped_offline, wait_for};
+use driml_tests::{Process, Summary, TestSystem, python, skip, skipped_offline, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::system;
@@ -347,10 +347,5 @@ fn atari_continues_exactly_in_lockstep() {
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
     let Some(python) = gymnasium() else { return };
-    let output = std::process::Command::new(python)
-        .arg(file("tests/worlds/check_adapter.py"))
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
+    python::run(&python, &[&file("tests/worlds/check_adapter.py")], &[]);
 }
