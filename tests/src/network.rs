@@ -86,7 +86,7 @@ impl Network {
     }
 
     fn router(&self) -> String {
-        format!("{}-router", self.name)
+        self.namespace("router")
     }
 
     /// The router's end of a machine's link.
@@ -99,17 +99,10 @@ impl Network {
         format!("10.77.{}.2", self.number(machine))
     }
 
-    /// The words before a command that is to run on a machine.
+    /// The words before a command that is to run on a machine, or on the `router`, from which every machine can be reached.
     pub fn on(&self, machine: &str) -> Vec<String> {
         let words = ["ip", "netns", "exec", &self.namespace(machine)];
         words.map(str::to_owned).to_vec()
-    }
-
-    /// The words before a command that is to run on the router, from which every machine can be reached.
-    pub fn on_router(&self) -> Vec<String> {
-        ["ip", "netns", "exec", &self.router()]
-            .map(str::to_owned)
-            .to_vec()
     }
 
     /// Pulls a machine's cable: what is in flight is lost, without an error on either side.
