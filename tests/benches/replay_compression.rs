@@ -17,13 +17,12 @@ use std::{
 };
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use driml_envs::{
-    DistributionMode, Environment, Game, ProcgenConfig, ProcgenEngine, ProcgenWorld, StepEnd,
-};
-use driml_protocol::{
-    ActorJoin, Buffer, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
-};
+use driml_actor::ChunkRecorder;
+use driml_envs::{ProcgenEngine, StepEnd};
+use driml_machine::resources::Machine;
+use driml_protocol::{ActorJoin, Buffer, BufferPool, Chunk, InsertReply};
 use driml_replay_server::{Compression, Config, Replay};
+use driml_settings::{config::RunConfig, flags::of_names};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -35,91 +34,54 @@ const TRANSITIONS: u64 = (CHUNKS * COPIES * STEPS_PER_CHUNK) as u64;
 /// The action "right".
 const RIGHT: u8 = 7;
 
-fn replay(compression: Compression, frame_stack: u32) -> Replay {
-    let spec = RunSpec {
-        world: "bench".into(),
-        agent: "bench".into(),
-        seed: 1,
-        frame_height: 64,
-        frame_width: 64,
-        frame_channels: 3,
-        frame_stack,
-        num_actions: 15,
-        n_step: 7,
-        gamma: 0.99,
-        horizon: Horizon::Nhg { k_max: 5 },
-        timeout: TimeoutRule::Terminal,
+/// The paper's settings of a game, with frames as they are.
+fn settings(game: &str) -> RunConfig {
+    // What is free at this moment decides nothing here.
+    let machine = Machine {
+        memory_bytes: u64::MAX,
+        ..Machine::this()
     };
-    let config = Config {
+    let world = format!("procgen:{game}");
+    let config = of_names("paper", &world, "driml-ada", &[], &machine).unwrap();
+    config.with_whole_frames().unwrap()
+}
+
+fn replay(config: &RunConfig, compression: Compression) -> Replay {
+    let replay = Config {
         compression,
         ..Config::unlimited(TRANSITIONS)
     };
-    let mut replay = Replay::new(&spec, &config, ROWS).unwrap();
-    replay
-        .join_actor(ActorJoin {
-            actor: 0,
-            incarnation: 1,
-        })
-        .unwrap();
+    let mut replay = Replay::new(&config.run, &replay, ROWS).unwrap();
+    let join = ActorJoin {
+        actor: 0,
+        incarnation: 1,
+    };
+    replay.join_actor(join).unwrap();
     replay
 }
 
 /// Everything that 16 copies of a game show, as an actor would send it.
-fn chunks(engine: &ProcgenEngine, game: Game, runs_right: bool) -> Vec<Chunk> {
-    let config = ProcgenConfig {
-        game,
-        distribution_mode: DistributionMode::Easy,
-        num_levels: 500,
-        start_level: 0,
-        use_sequential_levels: true,
-        paint_vel_info: true,
-        use_backgrounds: true,
-        center_agent: true,
-        restrict_themes: false,
-        frame_side: 64,
-        grey: false,
-        library: None,
-    };
-    let mut world = ProcgenWorld::with_engine(engine, &config, COPIES, 1, 0).unwrap();
+fn chunks(config: &RunConfig, runs_right: bool) -> Vec<Chunk> {
+    let mut world = config.world.build(COPIES, 1, 0).unwrap();
     let frame_bytes = world.frame_shape().bytes();
+    let (pool, streams) = (BufferPool::new(0), COPIES as u32);
+    let mut recorder = ChunkRecorder::new(pool, 0, 1, streams, frame_bytes as u32);
+    recorder.begin(1, STEPS_PER_CHUNK as u32);
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut frames = vec![0; COPIES * frame_bytes];
     let (mut rewards, mut ends) = ([0.0; COPIES], [StepEnd::Running; COPIES]);
-    let mut chunk = |sequence: usize| {
-        let mut chunk = Chunk::zeroed(ChunkHeader {
-            actor: 0,
-            incarnation: 1,
-            sequence: sequence as u64,
-            first_transition: (sequence * COPIES * STEPS_PER_CHUNK) as u64,
-            weights_version: 1,
-            leaving: false,
-            streams: COPIES as u32,
-            steps: STEPS_PER_CHUNK as u32,
-            frame_bytes: frame_bytes as u32,
-        });
-        for step in 0..STEPS_PER_CHUNK {
-            let mut action = || match rng.random_range(0..15) {
-                _ if runs_right && rng.random_bool(0.7) => RIGHT,
-                action => action,
-            };
-            let actions: [u8; COPIES] = std::array::from_fn(|_| action());
-            world.observe(&mut frames);
-            world.step(&actions, &mut rewards, &mut ends).unwrap();
-            for (copy, frame) in frames.chunks(frame_bytes).enumerate() {
-                let row = copy * STEPS_PER_CHUNK + step;
-                chunk.frame_mut(row).copy_from_slice(frame);
-                let end = match ends[copy] {
-                    StepEnd::Running => End::Running,
-                    StepEnd::LevelChange => End::LevelChange,
-                    StepEnd::TimedOut => End::TimedOut,
-                    StepEnd::Terminal => End::Terminal,
-                };
-                chunk.set(row, actions[copy], rewards[copy], end);
-            }
-        }
-        chunk
+    let mut step = || {
+        let mut action = || match rng.random_range(0..15) {
+            _ if runs_right && rng.random_bool(0.7) => RIGHT,
+            action => action,
+        };
+        let actions: [u8; COPIES] = std::array::from_fn(|_| action());
+        world.observe(&mut frames);
+        world.step(&actions, &mut rewards, &mut ends).unwrap();
+        recorder.record(&frames, &actions, &rewards, &ends)
     };
-    (0..CHUNKS).map(&mut chunk).collect()
+    let steps = 0..CHUNKS * STEPS_PER_CHUNK;
+    steps.filter_map(|_| step()).collect()
 }
 
 /// Stores the next chunk of an endless repetition.
@@ -148,18 +110,19 @@ fn on_two_threads(replay: &Mutex<Replay>, batches: u64) -> Duration {
 }
 
 fn bench(criterion: &mut Criterion) {
-    let engine = ProcgenEngine::install(&mut |line| println!("{line}")).unwrap();
+    ProcgenEngine::install(&mut |line| println!("{line}")).unwrap();
     for (game, runs_right) in [
-        (Game::Bigfish, false),
-        (Game::Coinrun, false),
-        (Game::Coinrun, true),
-        (Game::Maze, false),
-        (Game::Starpilot, false),
+        ("bigfish", false),
+        ("coinrun", false),
+        ("coinrun", true),
+        ("maze", false),
+        ("starpilot", false),
     ] {
-        let name = format!("{}{}", game.name(), if runs_right { ", right" } else { "" });
-        let mut chunks = chunks(&engine, game, runs_right);
+        let name = format!("{game}{}", if runs_right { ", right" } else { "" });
+        let config = settings(game);
+        let mut chunks = chunks(&config, runs_right);
         for compression in [Compression::None, Compression::Lz4] {
-            let (mut replay, mut sequence) = (replay(compression, 1), 0);
+            let (mut replay, mut sequence) = (replay(&config, compression), 0);
             for _ in 0..CHUNKS {
                 insert_next(&mut replay, &mut chunks, &mut sequence);
             }

@@ -7,7 +7,7 @@ use std::{
     process::Command,
 };
 
-use crate::skipped::skip;
+use crate::process::run;
 
 /// A folder for `--tls-dir`, with everything in it.
 #[derive(Debug)]
@@ -22,22 +22,6 @@ pub enum Valid {
     UntilYesterday,
     /// Not before the year 2090.
     From2090,
-}
-
-/// Whether a test that needs openssl is to be skipped; a line on stderr then names it.
-pub fn skipped_without_openssl() -> bool {
-    let is_there = Command::new("openssl").arg("version").output().is_ok();
-    if !is_there {
-        skip("openssl is not there");
-    }
-    !is_there
-}
-
-fn run(command: &mut Command) -> String {
-    let output = command.output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{command:?}: {said}");
-    String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 impl Certificates {

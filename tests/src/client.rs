@@ -191,24 +191,19 @@ impl Client {
         join::take_part(&self.run(), &new_learner(learner), &never).unwrap();
     }
 
-    /// Sends a chunk as an actor would.
-    pub fn insert(&self, chunk: &Chunk) -> InsertReply {
-        self.insert_bytes(chunk.header.actor, self.seal(chunk))
-    }
-
     /// A chunk's bytes as a process of the run would send them.
     pub fn seal(&self, chunk: &Chunk) -> Vec<u8> {
         codec::encode(self.spec.hash(), &chunk.header, chunk.payload()).unwrap()
     }
 
-    /// Sends bytes to the place where the chunks of `actor` go.
+    /// Sends a chunk as an actor would.
     ///
     /// # Panics
     /// If no process answers, or the answer cannot be read.
-    pub fn insert_bytes(&self, actor: u32, bytes: Vec<u8>) -> InsertReply {
-        let reply = self
-            .ask(&self.keys.of_actor::<ChunkHeader>(actor), bytes)
-            .expect("chunks are always answered");
+    pub fn insert(&self, chunk: &Chunk) -> InsertReply {
+        let key = self.keys.of_actor::<ChunkHeader>(chunk.header.actor);
+        let reply = self.ask(&key, self.seal(chunk));
+        let reply = reply.expect("chunks are always answered");
         codec::decode(&reply, Some(self.spec.hash())).unwrap().0
     }
 }

@@ -18,12 +18,12 @@ mod slow_machine;
 mod system;
 mod waiting;
 
-pub use certificates::{Certificates, Valid, skipped_without_openssl};
+pub use certificates::{Certificates, Valid};
 pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
 pub use network::Network;
 pub use process::{Ended, Process};
 pub use run_folder::{EpisodeRow, RunFolder, Summary, updates_of};
-pub use skipped::{is_offline, note, skip, skipped_offline};
+pub use skipped::{is_offline, note, skip, skipped_offline, succeeds};
 pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};
 pub use waiting::{DEADLINE, wait_for};

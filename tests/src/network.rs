@@ -2,7 +2,7 @@
 //! It needs the right to make them, and changes nothing of the host's own network.
 
 use std::{
-    process::{Command, Output},
+    process::Command,
     sync::atomic::{AtomicU32, Ordering},
 };
 
@@ -18,15 +18,11 @@ pub struct Network {
 /// Runs `ip` with these words.
 fn ip(words: &str) -> Result<(), String> {
     let said = Command::new("ip").args(words.split_whitespace()).output();
-    check(words, said)
-}
-
-fn check(what: &str, said: std::io::Result<Output>) -> Result<(), String> {
-    let said = said.map_err(|e| format!("{what}: {e}"))?;
+    let said = said.map_err(|e| format!("{words}: {e}"))?;
     match said.status.success() {
         true => Ok(()),
         false => Err(format!(
-            "{what}: {}",
+            "{words}: {}",
             String::from_utf8_lossy(&said.stderr).trim()
         )),
     }
@@ -90,7 +86,7 @@ impl Network {
     }
 
     fn router(&self) -> String {
-        format!("{}-router", self.name)
+        self.namespace("router")
     }
 
     /// The router's end of a machine's link.
@@ -103,17 +99,10 @@ impl Network {
         format!("10.77.{}.2", self.number(machine))
     }
 
-    /// The words before a command that is to run on a machine.
+    /// The words before a command that is to run on a machine, or on the `router`, from which every machine can be reached.
     pub fn on(&self, machine: &str) -> Vec<String> {
         let words = ["ip", "netns", "exec", &self.namespace(machine)];
         words.map(str::to_owned).to_vec()
-    }
-
-    /// The words before a command that is to run on the router, from which every machine can be reached.
-    pub fn on_router(&self) -> Vec<String> {
-        ["ip", "netns", "exec", &self.router()]
-            .map(str::to_owned)
-            .to_vec()
     }
 
     /// Pulls a machine's cable: what is in flight is lost, without an error on either side.

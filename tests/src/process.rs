@@ -68,6 +68,17 @@ impl Output {
     }
 }
 
+/// What a command prints that is not the program.
+///
+/// # Panics
+/// If it fails, with what it said.
+pub(crate) fn run(command: &mut Command) -> String {
+    let output = command.output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}: {said}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
 impl Process {
     /// Starts a command that a test has put together; `name` is for messages.
     pub fn start(name: String, mut command: Command) -> Self {

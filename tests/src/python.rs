@@ -2,7 +2,7 @@
 
 use std::process::{Command, Stdio};
 
-use crate::skipped::skip;
+use crate::{process, skipped::skip};
 
 /// The variable that names the Python to take; without it `python3` is tried.
 const VARIABLE: &str = "DRIML_TEST_PYTHON";
@@ -31,14 +31,8 @@ pub fn python_with(modules: &[&str]) -> Option<String> {
 /// # Panics
 /// If it fails, with what it said.
 pub fn run(python: &str, script: &[&str], args: &[&str]) -> String {
-    let output = Command::new(python)
-        .args(script)
-        .args(args)
-        // Nothing is left beside the scripts.
-        .env("PYTHONDONTWRITEBYTECODE", "1")
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{script:?} {args:?}: {said}");
-    String::from_utf8(output.stdout).unwrap()
+    let mut command = Command::new(python);
+    // Nothing is left beside the scripts.
+    command.env("PYTHONDONTWRITEBYTECODE", "1");
+    process::run(command.args(script).args(args))
 }

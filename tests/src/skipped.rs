@@ -1,7 +1,7 @@
 //! Tests that are skipped for want of something, each by name.
 //! It looks for nothing but what the environment says.
 
-use std::{io::Write, thread};
+use std::{io::Write, process::Command, thread};
 
 /// Says on stderr that the test of this thread is skipped, and why.
 ///
@@ -10,6 +10,17 @@ pub fn skip(why: &str) {
     let test = thread::current();
     let name = test.name().unwrap_or("a test");
     note(&format!("skipped: {name} ({why})"));
+}
+
+/// Whether a command that a test needs succeeds; else the test is to be skipped, and a line on stderr names it.
+pub fn succeeds(command: &mut Command) -> bool {
+    let why = match command.output() {
+        Ok(output) if output.status.success() => return true,
+        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
+        Err(e) => format!("{}: {e}", command.get_program().display()),
+    };
+    skip(&why);
+    false
 }
 
 /// Says a line on stderr, past the test runner.

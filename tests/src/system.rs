@@ -83,6 +83,13 @@ impl TestSystem {
         self.folder.path().join(name)
     }
 
+    /// The names of what lies in a folder of the system's.
+    pub fn names(&self, folder: &str) -> Vec<String> {
+        let entries = fs::read_dir(self.path(folder)).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        names.collect()
+    }
+
     /// A run folder in the system's folder, whether or not it is there yet.
     pub fn run_folder(&self, name: &str) -> RunFolder {
         RunFolder::new(self.path(name))
@@ -91,6 +98,11 @@ impl TestSystem {
     /// The endpoint at which this system's processes meet: a unix socket, so that no port can be taken.
     pub fn endpoint(&self) -> String {
         format!("unixsock-stream/{}", self.path("s").display())
+    }
+
+    /// The call of a run in the folder `run` whose processes meet at this system's endpoint.
+    pub fn local(&self, flags: &str) -> String {
+        format!("local {flags} --listen {} --run-dir run", self.endpoint())
     }
 
     /// Starts the program in the system's folder. Arguments are as in a shell, split at blanks.
@@ -238,13 +250,6 @@ impl TestSystem {
             self.survivors().is_empty().then_some(())
         });
     }
-
-    /// Kills all processes that the program has started here, however they came about.
-    pub fn kill_processes(&self) {
-        self.survivors()
-            .iter()
-            .for_each(|it| it.signal(Signal::SIGKILL));
-    }
 }
 
 impl Survivor {
@@ -267,7 +272,7 @@ impl Drop for TestSystem {
             if left.is_empty() {
                 return;
             }
-            left.iter().for_each(|it| it.signal(Signal::SIGKILL));
+            Survivor::kill_all(&left);
         }
     }
 }

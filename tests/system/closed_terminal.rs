@@ -79,10 +79,7 @@ impl Window {
 
 /// A run that writes all that it says to `output`.
 fn start(system: &TestSystem, output: impl Into<Stdio>, errors: impl Into<Stdio>) -> Child {
-    let run = format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
     let mut command = system.command(&run);
     command.stdin(Stdio::null()).stdout(output).stderr(errors);
     command.spawn().unwrap()
@@ -142,14 +139,6 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     check_saved(&system, end(&mut child));
 }
 
-/// A run of processes started by hand that has learned something: replay server, learner, actor.
-fn by_hand(system: &TestSystem) -> [Process; 3] {
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let processes = [server, system.start_learner("run"), system.start_actor(0)];
-    system.connect().wait_for_updates(100);
-    processes
-}
-
 /// Under `nohup` all processes of a test ignore hangups.
 fn hangups_are_ignored() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
@@ -169,7 +158,9 @@ fn a_hangup_ends_processes_in_order() {
         return;
     }
     let system = system();
-    let [server, learner, actor] = by_hand(&system);
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
+    system.connect().wait_for_updates(100);
     for (role, says) in [
         (actor, "actor 0 leaves"),
         (learner, "finished after"),
@@ -200,10 +191,7 @@ fn a_hangup_ends_a_launched_run_once() {
 #[test]
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
-    let run = format!(
-        "local --agent driml-ada {LONG} --listen {} --run-dir run",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
     let words = ["sh", "-c", "trap '' HUP; exec \"$0\" \"$@\""].map(String::from);
     let command = system.command_after(&words, &run);
     let process = Process::start("nohup driml local".into(), command);

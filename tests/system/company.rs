@@ -28,11 +28,9 @@ fn twenty_four_actors_wait_for_one_learner() {
 #[test]
 fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let system = system();
-    let process = system.start(&format!(
-        "local --agent c51 {LONG} --actors 32 --set replay.replay_ratio=512 --set replay.warmup_transitions=2000 \
-         --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let waiting = "--set replay.replay_ratio=512 --set replay.warmup_transitions=2000";
+    let flags = format!("--agent c51 {LONG} --actors 32 {waiting}");
+    let process = system.start(&system.local(&flags));
     let client = system.connect();
     client.wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
     drop(client);

@@ -4,11 +4,11 @@
 use std::{
     fs::{self, File},
     io::Write,
-    path::{Path, PathBuf},
+    path::PathBuf,
     process::Command,
 };
 
-use driml_tests::{Process, TestSystem, skip, wait_for};
+use driml_tests::{Process, TestSystem, succeeds, wait_for};
 
 use crate::{LONG, SHORT, system};
 
@@ -23,18 +23,10 @@ impl Disk {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
-        match mount.arg(&folder).output() {
-            Ok(output) if output.status.success() => Some(Self { folder }),
-            Ok(output) => {
-                let why = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                skip(&why);
-                None
-            }
-            Err(e) => {
-                skip(&format!("mount: {e}"));
-                None
-            }
+        if !succeeds(mount.arg(&folder)) {
+            return None;
         }
+        Some(Self { folder })
     }
 
     /// Takes all room that there is.
@@ -113,7 +105,7 @@ fn a_run_continues_while_the_disk_is_full() {
     let (seconds, frames) = (numbers("seconds"), numbers("frames"));
     assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
     assert!(frames.is_sorted(), "{frames:?}");
-    check_nothing_is_left(&system, &system.path("disk/run"));
+    check_nothing_is_left(&system);
 }
 
 #[test]
@@ -147,7 +139,7 @@ fn the_first_error_is_the_one_shown() {
         );
     }
     filler.remove();
-    check_nothing_is_left(&system, &system.path("disk/run"));
+    check_nothing_is_left(&system);
 }
 
 #[test]
@@ -162,29 +154,27 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
     let client = system.connect();
     let then = client.learner().unwrap().updates;
     client.wait_for_updates(then + 600);
-    let run = system.path("disk/run");
     filler.remove();
     let now = client.learner().unwrap().updates;
     wait_for("a checkpoint after that", || {
-        let names = fs::read_dir(run.join("checkpoints")).unwrap();
-        let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
-        let mut saved = names.filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
+        let names = system.names("disk/run/checkpoints");
+        let mut saved = names
+            .iter()
+            .filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
         saved.any(|updates: u64| updates > now).then_some(())
     });
     process.interrupt().expect_code(130);
     system.run_folder("disk/run").check("interrupted");
-    check_nothing_is_left(&system, &run);
+    check_nothing_is_left(&system);
 }
 
 /// No process and no half of a file.
-fn check_nothing_is_left(system: &TestSystem, run: &Path) {
+fn check_nothing_is_left(system: &TestSystem) {
     assert_eq!(system.survivors(), []);
-    for folder in [run.to_owned(), run.join("checkpoints")] {
-        for entry in fs::read_dir(folder).unwrap() {
-            let name = entry.unwrap().file_name().into_string().unwrap();
-            let is_temporary = name.contains("tmp");
-            assert!(!is_temporary, "{name}");
-        }
+    for folder in ["disk/run", "disk/run/checkpoints"] {
+        let names = system.names(folder);
+        let temporary = names.iter().find(|name| name.contains("tmp"));
+        assert_eq!(temporary, None);
     }
 }
 
@@ -275,14 +265,13 @@ fn a_folder_that_cannot_be_used_is_said() {
     };
     let mut remount = Command::new("mount");
     remount.args(["-o", "remount,ro"]).arg(system.path("disk"));
-    match remount.status() {
-        Ok(status) if status.success() => {}
-        _ => return skip("no read-only file system"),
+    if !succeeds(&mut remount) {
+        return;
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()
         .expect_code(1)
         .expect_said("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
     drop(disk);
-    assert!(fs::read_dir(system.path("replay")).unwrap().count() > 2);
+    assert!(system.names("replay").len() > 2);
 }

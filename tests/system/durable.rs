@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{RunFolder, Survivor, TestSystem, check_nothing_lost, note, wait_for};
+use driml_tests::{RunFolder, Survivor, TestSystem, note, wait_for};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -65,10 +65,8 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     let longer = SHORT.replace("--frames 1280", "--frames 20000");
     assert_ne!(longer, SHORT);
     system.hold_at(5_500);
-    let process = system.start(&format!(
-        "local --durable --agent driml-ada {longer} --actors 2 --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let flags = format!("--durable --agent driml-ada {longer} --actors 2");
+    let process = system.start(&system.local(&flags));
     let run = system.run_folder("run");
     for updates in [900, 2_900, 4_900] {
         run.wait_for_updates(updates);
@@ -129,9 +127,8 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
         actor.wait().expect_code(0);
     }
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned(replay.transitions_inserted));
-    check_nothing_lost(&replay);
     learner.stop().expect_code(0);
     drop(client);
     server

@@ -110,12 +110,10 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
         ("--weights average", "averaged"),
         ("--weights online", "online"),
     ] {
-        let ended = system.run(&format!("evaluate run --episodes 2 {flags}"));
-        let words = format!("{weights} f32 weights after 540 updates");
-        let said = ended.expect_code(0).stdout;
-        assert!(said.lines().next().unwrap().contains(&words), "{said}");
-        let ended = system.run(&format!("evaluate run --episodes 2 --json {flags}"));
-        let told: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
+        let said = system.run_ok(&format!("evaluate run --episodes 2 {flags}"));
+        said.expect_printed(&format!("{weights} f32 weights after 540 updates"));
+        let json = system.run_ok(&format!("evaluate run --episodes 2 --json {flags}"));
+        let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
         assert_eq!(told["averaged"], weights == "averaged");
     }
     system.refuses("evaluate run --checkpoint average", "leave it out");
@@ -124,13 +122,9 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
 #[test]
 fn an_exported_network_is_played_without_its_run() {
     let system = with_averages();
-    let said = system.run_ok("evaluate run --export net.safetensors");
-    assert!(
-        said.stdout
-            .starts_with("averaged weights after 540 updates as f16"),
-        "{}",
-        said.stdout
-    );
+    system
+        .run_ok("evaluate run --export net.safetensors")
+        .expect_printed("averaged weights after 540 updates as f16");
     let run = system.run_ok("evaluate run --episodes 3 --exact");
     fs::rename(system.path("run"), system.path("moved")).unwrap();
     let net = system.run_ok("evaluate net.safetensors --episodes 3 --record play.gif --overlay");
@@ -151,8 +145,7 @@ fn an_exported_network_is_played_without_its_run() {
         ("pretrained:pong", "no pretrained weights of \"pong\""),
         ("moved --export net", "ends in .safetensors"),
     ] {
-        let ended = system.run(&format!("evaluate {args}")).expect_code(64);
-        ended.expect_said(said);
+        system.refuses(&format!("evaluate {args}"), said);
     }
 }
 
@@ -217,14 +210,9 @@ fn it_plays_checkpoints_while_the_run_continues() {
         let again = system.run_ok(&format!(
             "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
         ));
-        assert!(
-            again
-                .stdout
-                .contains(&format!("weights after {} updates", best[2]))
-                && again.stdout.contains(&format!("mean return {most:8.3}")),
-            "{}{table}",
-            again.stdout
-        );
+        again
+            .expect_printed(&format!("weights after {} updates", best[2]))
+            .expect_printed(&format!("mean return {most:8.3}"));
         system.run_ok(&format!(
             "plot {name} --column evaluated_return --out {name}.svg"
         ));
@@ -260,11 +248,9 @@ fn an_evaluation_can_be_kept_by_hand() {
         "run has no best checkpoint",
     );
     let keep = "evaluate run --keep --episodes 3";
-    let said = system.run_ok(keep).stdout;
-    assert!(
-        said.ends_with("over 3 episodes, the most so far\n"),
-        "{said}"
-    );
+    system
+        .run_ok(keep)
+        .expect_printed("over 3 episodes, the most so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");
     // The episodes that choose are never those of a report.
     system.refuses(&format!("{keep} --seed 0"), "'--keep' cannot be used with");
@@ -284,10 +270,7 @@ fn fewer_episodes_do_not_displace_the_best() {
     let system = with_run();
     let oldest = system.run_folder("run").checkpoints().remove(0);
     let updates = &updates_of(&oldest).to_string();
-    let keep = |flags: &str| {
-        let ended = system.run(&format!("evaluate run --keep {flags}"));
-        ended.expect_code(0).stdout
-    };
+    let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
     let rows = || {
         let text = fs::read_to_string(system.path("run/evaluations.csv")).unwrap();
         let column = |row: &str, at: usize| row.split(',').nth(at).unwrap().to_owned();
@@ -296,12 +279,8 @@ fn fewer_episodes_do_not_displace_the_best() {
             .collect::<Vec<_>>()
     };
     keep("--episodes 3");
-    let said = keep(&format!("--episodes 1 --checkpoint {updates}"));
-    assert!(
-        said.ends_with(
-            "; the best stays: it was played for 3 episodes, and fewer do not compare\n"
-        ),
-        "{said}"
+    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_printed(
+        "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
     );
     // Over more episodes the best is played again, as it was played for fewer.
     keep(&format!("--episodes 5 --checkpoint {updates}"));
@@ -327,9 +306,8 @@ fn it_plays_in_the_precision_of_the_run() {
         ("", "bf16 weights after 540 updates played in bf16"),
         ("--exact", "f32 weights after 540 updates played in f32"),
     ] {
-        let said = system.run(&format!("evaluate run --episodes 2 {flags}"));
-        let said = said.expect_code(0).stdout;
-        assert!(said.contains(words), "{said}");
+        let said = system.run_ok(&format!("evaluate run --episodes 2 {flags}"));
+        said.expect_printed(words);
     }
     let json = system.run_ok("evaluate run --episodes 2 --json");
     let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
@@ -344,15 +322,9 @@ fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();
     for folder in ["empty", "none"] {
-        let ended = system
-            .run(&format!("evaluate --run {folder}"))
-            .expect_code(64);
-        assert!(
-            ended
-                .stderr
-                .starts_with(&format!("error: {folder} is not the folder of a run")),
-            "{}",
-            ended.stderr
+        system.refuses(
+            &format!("evaluate --run {folder}"),
+            &format!("error: {folder} is not the folder of a run"),
         );
     }
     fs::write(system.path("empty/config.toml"), "[run]\n").unwrap();
@@ -374,15 +346,13 @@ fn a_damaged_checkpoint_is_named_and_not_used() {
         let whole = fs::read(&path).unwrap();
         for broken in [&whole[..whole.len() / 2], &whole[..0], &flipped(&whole)] {
             fs::write(&path, broken).unwrap();
-            let ended = system.run("evaluate --run run --episodes 1").expect_code(1);
-            let said = ended.stderr.lines().last().unwrap();
-            assert!(
-                said.starts_with(&format!(
+            system
+                .run("evaluate --run run --episodes 1")
+                .expect_code(1)
+                .expect_said(&format!(
                     "error: run/checkpoints/{name}/{file} is damaged: "
-                )),
-                "{said}"
-            );
-            assert!(said.contains("remove the folder it is in"), "{said}");
+                ))
+                .expect_said("remove the folder it is in");
         }
         fs::remove_file(&path).unwrap();
         system

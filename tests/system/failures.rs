@@ -67,11 +67,8 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
 
 /// A run of two actors, of which one stands still, that has learned from all its transitions.
 fn complete_but_for_a_frozen_actor(system: &TestSystem) -> Process {
-    let flags = "--env chain --agent c51 --preset smoke --frames 6000 --actors 2";
-    let process = system.start(&format!(
-        "local {flags} --set replay.replay_ratio=8 --run-dir run --listen {}",
-        system.endpoint()
-    ));
+    let flags = "--env chain --agent c51 --preset smoke --frames 6000 --actors 2 --set replay.replay_ratio=8";
+    let process = system.start(&system.local(flags));
     let client = system.connect();
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     system.find_process("actor").signal(Signal::SIGSTOP);
@@ -138,12 +135,9 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
 #[test]
 fn a_dead_actor_is_started_again() {
     let system = system();
-    let flags = "--env chain --agent c51 --preset smoke --frames 12000 --actors 2";
+    let flags = "--env chain --agent c51 --preset smoke --frames 12000 --actors 2 --set replay.replay_ratio=32";
     system.hold_at(4_000);
-    let mut process = system.start(&format!(
-        "local {flags} --set replay.replay_ratio=32 --run-dir run --listen {}",
-        system.endpoint()
-    ));
+    let mut process = system.start(&system.local(flags));
     let client = system.connect();
     for (restarts, signal) in [(1, Signal::SIGKILL), (2, Signal::SIGTERM)] {
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
@@ -175,10 +169,8 @@ fn a_dead_actor_is_started_again() {
 fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     let system = system();
     let flags = "--env mspacman --agent c51 --preset smoke --frames 100000 --actors 1";
-    let process = system.start(&format!(
-        "local {flags} --set world.lethal_schedule={{episodes_per_task=5,order=[0,1]}} --run-dir run --listen {}",
-        system.endpoint()
-    ));
+    let changing = "--set world.lethal_schedule={episodes_per_task=5,order=[0,1]}";
+    let process = system.start(&system.local(&format!("{flags} {changing}")));
     let client = system.connect();
     client.wait_for_replay("some transitions", |replay| replay.transitions_inserted > 0);
     system.find_process("actor").signal(Signal::SIGKILL);

@@ -75,19 +75,6 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     check_gone(&segments);
 }
 
-/// The shared memory that a process has open.
-fn shared_memory_of(pid: i32) -> Vec<PathBuf> {
-    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
-    let mut files: Vec<_> = maps
-        .lines()
-        .filter_map(|line| line.split_whitespace().nth(5))
-        .filter(|path| path.ends_with(".zenoh"))
-        .map(PathBuf::from)
-        .collect();
-    files.dedup();
-    files
-}
-
 #[test]
 fn shared_memory_of_killed_processes_is_removed() {
     let system = system();
@@ -101,8 +88,15 @@ fn shared_memory_of_killed_processes_is_removed() {
 
 /// The shared memory that the processes have open.
 fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
-    let files = processes.iter().flat_map(|it| shared_memory_of(it.pid));
-    let files: Vec<_> = files.collect();
+    let mut files = Vec::new();
+    for process in processes {
+        let maps = fs::read_to_string(format!("/proc/{}/maps", process.pid)).unwrap();
+        let paths = maps
+            .lines()
+            .filter_map(|line| line.split_whitespace().nth(5));
+        files.extend(paths.filter(|it| it.ends_with(".zenoh")).map(PathBuf::from));
+    }
+    files.dedup();
     assert!(files.len() > 1, "the processes share memory: {files:?}");
     files
 }

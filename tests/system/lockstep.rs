@@ -3,7 +3,7 @@
 
 use driml_envs::{ChainConfig, optimal_return};
 use driml_settings::presets::AGENTS;
-use driml_tests::{Summary, TestSystem, is_offline, note};
+use driml_tests::{Process, Summary, TestSystem, is_offline, note};
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, SHORT, system};
@@ -45,52 +45,79 @@ fn seed_and_settings_decide_the_weights() {
     }
 }
 
-/// Starts a run, ends it with `signal` some time after a save, and resumes it to its end.
-fn interrupted(system: &TestSystem, flags: &str, signal: Signal) -> Summary {
-    system.hold_at(400);
-    let process = system.start(&format!("local --lockstep {flags} --run-dir run"));
-    let run = system.run_folder("run");
-    // The first checkpoint is after 200.
-    run.wait_for_updates(300);
-    process.signal(signal);
-    system.let_go();
-    let ended = process.wait();
-    if signal == Signal::SIGINT {
-        ended
-            .expect_code(130)
-            .expect_said("`driml train --resume run` resumes it");
-    }
-    system
-        .run_ok("local --resume run")
-        .expect_printed("with everything in lockstep");
-    let summary = run.check_finished();
-    assert!((200..6_300).contains(&summary.resumed_after_updates));
-    summary
+/// What a run came to.
+fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
+    let Summary {
+        weights_sha256,
+        mean_return,
+        k_histogram,
+        episodes,
+        ..
+    } = summary;
+    (weights_sha256, mean_return, k_histogram, episodes)
 }
 
-/// By Ctrl-C, which saves, and by death, after which what was learned since the last checkpoint is learned again.
+/// Runs it whole; finished after half of its frames and prolonged; and resumed after each signal: Ctrl-C, which saves, and death, after
+/// which what was learned since the last checkpoint is learned again. All come to the same.
+pub(crate) fn continues_exactly(env: &str, flags: &str, frames: u64) {
+    let start = |system: &TestSystem, frames: u64, name: &str| {
+        let args = format!(
+            "local --lockstep {flags} --actors 2 --frames {frames} --set replay.replay_ratio=8 \
+             --set learner.checkpoint_period_updates=100 --run-dir {name}"
+        );
+        let mut command = system.command(&args);
+        // Its name may have blanks.
+        command.args(["--env", env]);
+        Process::start(format!("{args} --env {env:?}"), command)
+    };
+    let system = system();
+    let run = |frames: u64, name: &str| {
+        start(&system, frames, name).wait().expect_code(0);
+        system.run_folder(name).check_finished()
+    };
+    let whole = run(frames, "whole");
+    assert!(whole.updates > 300 && whole.episodes > 0, "{whole:#?}");
+    let whole = result(whole);
+
+    let half = run(frames / 2, "half");
+    assert_ne!(half.weights_sha256, whole.0);
+    system.run_ok(&format!("local --resume half --frames {frames}"));
+    let prolonged = system.run_folder("half").check_finished();
+    assert_eq!(result(prolonged), whole, "prolonged");
+
+    for signal in [Signal::SIGINT, Signal::SIGKILL] {
+        let system = crate::system();
+        system.hold_at(150);
+        let process = start(&system, frames, "run");
+        let run = system.run_folder("run");
+        // After a checkpoint and before the next.
+        run.wait_for_updates(110);
+        process.signal(signal);
+        system.let_go();
+        let ended = process.wait();
+        if signal == Signal::SIGINT {
+            ended
+                .expect_code(130)
+                .expect_said("`driml train --resume run` resumes it");
+        }
+        system
+            .run_ok("local --resume run")
+            .expect_printed("with everything in lockstep");
+        let resumed = run.check_finished();
+        assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
+        assert_eq!(result(resumed), whole, "{signal}");
+        // A world whose run was killed is given a second to end by itself.
+        system.wait_until_all_have_ended();
+    }
+}
+
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
-    // 6,300 updates.
-    let flags = "--env chain --preset smoke --frames 12800 --actors 2 \
-                 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=200";
-    let of = |agent: &str| format!("{flags} --agent {agent}");
-    let whole = run(&system(), &of("driml-ada"), "whole");
-    // Its noise continues, in the learner and in the actors.
-    let rainbow = run(&system(), &of("rainbow"), "whole");
-    for (agent, whole, signal) in [
-        ("driml-ada", &whole, Signal::SIGINT),
-        ("driml-ada", &whole, Signal::SIGKILL),
-        ("rainbow", &rainbow, Signal::SIGKILL),
-    ] {
-        let resumed = interrupted(&system(), &of(agent), signal);
-        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{signal}");
-        assert_eq!(
-            (resumed.updates, resumed.episodes, resumed.k_histogram),
-            (whole.updates, whole.episodes, whole.k_histogram.clone()),
-            "{signal}"
-        );
-    }
+    continues_exactly("chain", "--preset smoke --agent driml-ada", 4096);
+    // Its noise continues, in the learner and in the actors. Else beta rises over a run's own length.
+    let beta = "--set replay.sampling.beta_updates=500";
+    let flags = format!("--preset smoke --agent rainbow {beta}");
+    continues_exactly("chain", &flags, 4096);
 }
 
 /// N updates, saved and resumed for N more, are 2 N.
@@ -164,23 +191,9 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
         "the last 100 episodes, with exploration: {while_training} of {wanted}"
     );
 
-    let ended = system.run_ok("evaluate --run run --episodes 40");
-    let mean = |policy: &str| -> f64 {
-        let line = ended
-            .stdout
-            .lines()
-            .find(|line| line.starts_with(policy))
-            .expect("each policy has a line");
-        line.split_once("mean return")
-            .unwrap()
-            .1
-            .split(',')
-            .next()
-            .unwrap()
-            .trim()
-            .parse()
-            .unwrap()
-    };
+    let ended = system.run_ok("evaluate --run run --episodes 40 --json");
+    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    let mean = |policy: &str| told["policies"][policy]["mean_return"].as_f64().unwrap();
     let (learned, random) = (mean("c51"), mean("random"));
     assert!(learned >= wanted, "greedy: {learned} of {wanted}");
     // A random walk reaches the far end in one of seven episodes.

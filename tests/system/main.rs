@@ -5,6 +5,7 @@
 
 mod by_hand;
 mod circles;
+mod cli;
 mod closed_terminal;
 mod company;
 mod disk_full;
@@ -12,6 +13,7 @@ mod diverging;
 mod doctor;
 mod durable;
 mod evaluate;
+mod experiments;
 mod failures;
 mod films;
 mod leftovers;
@@ -73,10 +75,7 @@ fn launched(system: &TestSystem, updates: u64) -> Process {
 
 /// A launched run with these flags that has learned more than so many `updates`.
 fn launched_with(system: &TestSystem, flags: &str, updates: u64) -> Process {
-    let process = system.start(&format!(
-        "local {LONG} {flags} --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let process = system.start(&system.local(&format!("{LONG} {flags}")));
     system.connect().wait_for_updates(updates);
     process
 }

@@ -3,10 +3,9 @@
 
 use std::{fs, path::Path};
 
-use driml_tests::{Process, Summary, TestSystem, skip, skipped_offline, wait_for};
-use nix::sys::signal::Signal;
+use driml_tests::{Process, TestSystem, python, skip, skipped_offline, wait_for};
 
-use crate::system;
+use crate::{lockstep::continues_exactly, system};
 
 /// What a world with frames of 12 x 12 needs beside the preset `smoke`.
 const SMALL: &str =
@@ -74,64 +73,10 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     assert_eq!(system.survivors(), []);
 }
 
-/// What a run in lockstep came to.
-fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
-    let Summary {
-        weights_sha256,
-        mean_return,
-        k_histogram,
-        episodes,
-        ..
-    } = summary;
-    (weights_sha256, mean_return, k_histogram, episodes)
-}
-
-/// Runs it whole; ended by each signal and resumed; and finished after half of its frames and prolonged. All come to the same.
-fn lockstep_continues(env: &str, flags: &str, frames: u64) {
-    let system = system();
-    let run = |frames: u64, name: &str| {
-        let args = format!("local --lockstep {flags} --frames {frames} --run-dir {name}");
-        start(&system, &args, env).wait().expect_code(0);
-        system.run_folder(name).check_finished()
-    };
-    let whole = run(frames, "whole");
-    assert!(whole.updates > 300 && whole.episodes > 0, "{whole:#?}");
-    let whole = result(whole);
-
-    let half = run(frames / 2, "half");
-    assert_ne!(half.weights_sha256, whole.0);
-    system.run_ok(&format!("local --resume half --frames {frames}"));
-    let prolonged = system.run_folder("half").check_finished();
-    assert_eq!(result(prolonged), whole, "prolonged");
-
-    for signal in [Signal::SIGINT, Signal::SIGKILL] {
-        let system = crate::system();
-        system.hold_at(150);
-        let args = format!("local --lockstep {flags} --frames {frames} --run-dir {signal}");
-        let process = start(&system, &args, env);
-        let run = system.run_folder(signal.as_str());
-        // After a checkpoint and before the next: what follows it is done again.
-        run.wait_for_updates(110);
-        process.signal(signal);
-        system.let_go();
-        process.wait();
-        system.run_ok(&format!("local --resume {signal}"));
-        let resumed = run.check_finished();
-        assert!(resumed.resumed_after_updates >= 100, "{resumed:#?}");
-        assert_eq!(result(resumed), whole, "{signal}");
-        // A world whose run was killed is given a second to end by itself.
-        wait_for("the end of every world", || {
-            system.survivors().is_empty().then_some(())
-        });
-    }
-}
-
 #[test]
 fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
-    let flags = format!(
-        "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
-    );
-    lockstep_continues(&numbered("saves"), &flags, 4096);
+    let flags = format!("{SMALL} --agent driml-ada");
+    continues_exactly(&numbered("saves"), &flags, 4096);
 }
 
 #[test]
@@ -339,20 +284,12 @@ fn atari_continues_exactly_in_lockstep() {
         "exec:{python} {} ALE/Breakout-v5 --atari --clip --size 20",
         file("deploy/python/driml_env.py")
     );
-    let flags = format!(
-        "{SMALL} --agent driml-ada --actors 2 --set replay.replay_ratio=8 --set learner.checkpoint_period_updates=100"
-    );
-    lockstep_continues(&env, &flags, 2048);
+    continues_exactly(&env, &format!("{SMALL} --agent driml-ada"), 2048);
 }
 
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.
 #[test]
 fn the_adapter_keeps_gymnasium_s_episodes() {
     let Some(python) = gymnasium() else { return };
-    let output = std::process::Command::new(python)
-        .arg(file("tests/worlds/check_adapter.py"))
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
+    python::run(&python, &[&file("tests/worlds/check_adapter.py")], &[]);
 }

@@ -52,10 +52,8 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
     let system = system();
     let longer = SHORT.replace("--frames 1280", "--frames 6400");
     system.hold_at(1_000);
-    let process = system.start(&format!(
-        "local --durable --agent c51 {longer} {PRIORITISED} --listen {} --run-dir run",
-        system.endpoint()
-    ));
+    let flags = format!("--durable --agent c51 {longer} {PRIORITISED}");
+    let process = system.start(&system.local(&flags));
     let client = system.connect();
     client.wait_for_updates(500);
     system.find_process("replay-server").signal(Signal::SIGKILL);

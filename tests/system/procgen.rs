@@ -17,14 +17,9 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     let summary = system.run_folder("run").check_finished();
     assert_eq!((summary.frames, summary.updates), (608, 25));
     assert!(summary.mean_k.is_some());
-    let ended = system.run_ok("evaluate --run run --episodes 2 --levels unseen");
-    assert!(
-        ended
-            .stdout
-            .starts_with("procgen:bigfish on unseen levels, 2 episodes each"),
-        "{}",
-        ended.stdout
-    );
+    system
+        .run_ok("evaluate --run run --episodes 2 --levels unseen")
+        .expect_printed("procgen:bigfish on unseen levels, 2 episodes each");
 }
 
 /// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.

@@ -8,7 +8,10 @@ use std::{
 };
 
 use driml_envs::{ChainWorld, IsingWorld, PacmanWorld, ProcgenWorld};
-use driml_learner::{Agent, Compute, checkpoint, insight::Insight};
+use driml_learner::{
+    Agent, Compute, checkpoint,
+    insight::{Insight, Seen},
+};
 use driml_settings::config::RunConfig;
 use driml_tests::{
     TestSystem, note,
@@ -60,8 +63,8 @@ const RUNS: [&str; 5] = [
     "--env chain --agent c51 --preset smoke --frames 320 --set model.torso=impoola --set model.channels=[4,6]",
 ];
 
-/// A run, what its network is, and random states in a file beside it.
-fn trained(system: &TestSystem, flags: &str) -> (Agent, Vec<u8>) {
+/// A run's agent, and what it makes of random states in a file beside the run.
+fn trained(system: &TestSystem, flags: &str) -> (Agent, Seen) {
     let _ = fs::remove_dir_all(system.path("run"));
     system.run_ok(&format!("local --lockstep {flags} --run-dir run"));
     let text = fs::read_to_string(system.path("run/config.toml")).unwrap();
@@ -73,7 +76,10 @@ fn trained(system: &TestSystem, flags: &str) -> (Agent, Vec<u8>) {
     let mut states = vec![0; STATES * model.frame_len()];
     ChaCha8Rng::seed_from_u64(1).fill_bytes(&mut states);
     fs::write(system.path("states"), &states).unwrap();
-    (restored.unwrap().unwrap().agent, states)
+    let agent = restored.unwrap().unwrap().agent;
+    let insight = Insight::of(&agent, Compute::CPU).unwrap();
+    let seen = insight.look(&states).unwrap();
+    (agent, seen)
 }
 
 fn largest_difference(ours: &[f32], theirs: &serde_json::Value) -> f64 {
@@ -92,11 +98,7 @@ fn pytorch_computes_what_driml_does() {
     let system = system();
     let scripts = root().join("deploy/python");
     for flags in RUNS {
-        let (agent, states) = trained(&system, flags);
-        let seen = Insight::of(&agent, Compute::CPU)
-            .unwrap()
-            .look(&states)
-            .unwrap();
+        let (agent, seen) = trained(&system, flags);
         let path = |name: &str| system.path(name).display().to_string();
         let args = [
             &scripts.display().to_string(),
@@ -136,11 +138,7 @@ fn onnx_runtime_computes_what_driml_does() {
         .to_string();
     let path = |name: &str| system.path(name).display().to_string();
     for flags in RUNS {
-        let (agent, states) = trained(&system, flags);
-        let seen = Insight::of(&agent, Compute::CPU)
-            .unwrap()
-            .look(&states)
-            .unwrap();
+        let (agent, seen) = trained(&system, flags);
         let (net, folder) = (path("net.onnx"), path("run"));
         let said = run(&python, &[&script], &[&folder, "--onnx", &net]);
         assert!(said.contains("wrote"), "{said}");
@@ -214,14 +212,9 @@ fn a_helper_without_its_package_says_which() {
     ] {
         // Without `site` no installed package is found.
         let mut command = Command::new(&python);
-        command.args([
-            "-S",
-            &root()
-                .join("deploy/python")
-                .join(script)
-                .display()
-                .to_string(),
-        ]);
+        command
+            .arg("-S")
+            .arg(root().join("deploy/python").join(script));
         command.args(args).env_remove("PYTHONPATH");
         command.stdin(Stdio::piped()).stderr(Stdio::piped());
         let mut process = command.spawn().unwrap();

@@ -9,9 +9,7 @@ use driml_protocol::{
     session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{
-    Process, SlowMachine, TestSystem, check_nothing_lost, connect, new_learner, wait_for,
-};
+use driml_tests::{Process, SlowMachine, TestSystem, connect, new_learner, wait_for};
 use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
@@ -219,13 +217,12 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     }
     let client = system.connect();
     let status = client.wait_for_learner("the learner's last update", |it| it.finished);
-    let replay = client.replay().unwrap();
+    let replay = client.check_nothing_lost();
     assert_eq!(
         (status.updates, replay.rows_sampled),
         (UPDATES, 16 * UPDATES)
     );
     assert_eq!(replay.transitions_inserted, FRAMES);
-    check_nothing_lost(&replay);
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait().expect_code(0);
     assert_eq!(system.run_folder("seen").summary().updates, UPDATES);
@@ -272,11 +269,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
 #[test]
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
-    let mut process = system.start(&format!(
-        "local --durable {} --listen {} --run-dir run",
-        flags(),
-        system.endpoint()
-    ));
+    let mut process = system.start(&system.local(&format!("--durable {}", flags())));
     let client = system.connect();
     client.wait_for_updates(10);
     drop(client);

@@ -1,11 +1,10 @@
 //! The rules of the repository that no compiler holds: which crate may know which, and what may be where.
-//! It builds nothing and needs no network; the graph of other people's crates is read from `Cargo.lock`.
+//! It builds nothing and needs no network; the graph of crates is read from `Cargo.lock`.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs,
     path::{Path, PathBuf},
-    process::Command,
 };
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
@@ -40,7 +39,7 @@ driml-experiments   deploy/experiments  : driml-protocol driml-envs driml-model 
 driml-bench         deploy/bench        : driml-protocol driml-envs driml-model driml-actor driml-replay-server driml-learner \
                                           driml-machine driml-settings driml-launch procgen-sys
 driml               deploy              : *
-driml-examples      deploy/examples     : driml driml-envs driml-learner driml-model driml-settings
+driml-examples      deploy/examples     : driml driml-envs driml-learner driml-model driml-tests
 driml-tests         tests               : *
 driml-decoders      tests/decoders      : driml-protocol driml-actor driml-replay-server driml-learner driml-settings
 ";
@@ -69,93 +68,57 @@ pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
     arrows().map(|(_, folder, _)| folder)
 }
 
-/// Packages of ours by name: their folder, and the packages of ours that they depend on in any way.
-fn ours() -> BTreeMap<String, (PathBuf, BTreeSet<String>)> {
-    let output = Command::new(env!("CARGO"))
-        .args([
-            "metadata",
-            "--no-deps",
-            "--format-version",
-            "1",
-            "--offline",
-        ])
-        .current_dir(root())
-        .output()
-        .unwrap();
-    assert!(
-        output.status.success(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
-    let metadata: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    let packages = metadata["packages"].as_array().unwrap();
-    let text = |value: &serde_json::Value| value.as_str().unwrap().to_owned();
-    let package = |package: &serde_json::Value| {
-        let folder = PathBuf::from(text(&package["manifest_path"]))
-            .parent()
-            .unwrap()
-            .to_owned();
-        let dependencies = package["dependencies"].as_array().unwrap().iter();
-        // Those with a path are ours, by whatever name they are used.
-        let ours = dependencies
-            .filter(|it| it["path"].is_string())
-            .map(|it| text(&it["name"]))
-            .collect();
-        (text(&package["name"]), (folder, ours))
-    };
-    packages.iter().map(package).collect()
+/// A file of TOML, by its path from the root.
+fn toml(path: impl AsRef<Path>) -> toml::Table {
+    let text = fs::read_to_string(root().join(path)).unwrap();
+    text.parse().unwrap()
+}
+
+/// What each package of `Cargo.lock` depends on: on any platform, with tests and benches. Versions of one are taken together.
+fn locked() -> BTreeMap<String, BTreeSet<String>> {
+    let mut packages = BTreeMap::<_, BTreeSet<_>>::new();
+    for package in toml("Cargo.lock")["package"].as_array().unwrap() {
+        let name = package["name"].as_str().unwrap().to_owned();
+        let dependencies = package.get("dependencies").into_iter();
+        // "name", or "name version" where there are several.
+        let names = dependencies.flat_map(|it| it.as_array().unwrap());
+        let names = names.map(|it| it.as_str().unwrap().split(' ').next().unwrap().to_owned());
+        packages.entry(name).or_default().extend(names);
+    }
+    packages
 }
 
 #[test]
 fn arrows_between_crates_point_one_way() {
-    let ours = ours();
-    let names: BTreeSet<_> = ours.keys().map(String::as_str).collect();
-    let listed: BTreeSet<_> = arrows().map(|(name, ..)| name).collect();
+    let workspace = toml("Cargo.toml");
+    let members = workspace["workspace"]["members"].as_array().unwrap();
+    let members: BTreeSet<_> = members.iter().map(|it| it.as_str().unwrap()).collect();
     assert_eq!(
-        names, listed,
+        members,
+        folders_of_crates().collect(),
         "a new package needs a line in ARROWS, and a reason"
     );
-    for (name, folder, allowed) in arrows() {
-        let (found, dependencies) = &ours[name];
-        assert_eq!(
-            found.strip_prefix(root()).unwrap(),
-            Path::new(folder),
-            "{name}"
-        );
-        for dependency in dependencies {
+    let ours: BTreeSet<_> = arrows().map(|(name, ..)| name).collect();
+    let locked = locked();
+    for (name, _, allowed) in arrows() {
+        for dependency in &locked[name] {
+            let dependency = dependency.as_str();
             assert!(
-                allowed == ["*"] || allowed.contains(&dependency.as_str()),
+                !ours.contains(dependency) || allowed == ["*"] || allowed.contains(&dependency),
                 "{name} may not know {dependency}"
             );
         }
     }
 }
 
-/// Everything that `package` depends on according to `Cargo.lock`: on any platform, with tests and benches.
+/// Everything that `package` depends on in any way.
 fn depends_on(package: &str) -> BTreeSet<String> {
-    let lock: toml::Table = fs::read_to_string(root().join("Cargo.lock"))
-        .unwrap()
-        .parse()
-        .unwrap();
-    let mut edges = BTreeMap::<&str, Vec<&str>>::new();
-    for package in lock["package"].as_array().unwrap() {
-        let dependencies = package
-            .get("dependencies")
-            .and_then(toml::Value::as_array)
-            .into_iter()
-            .flatten();
-        // "name", or "name version" where there are several: versions of one crate are taken together.
-        let names = dependencies.map(|it| it.as_str().unwrap().split(' ').next().unwrap());
-        edges
-            .entry(package["name"].as_str().unwrap())
-            .or_default()
-            .extend(names);
-    }
+    let locked = locked();
     let mut seen = BTreeSet::new();
     let mut next = vec![package];
     while let Some(name) = next.pop() {
         if seen.insert(name.to_owned()) {
-            next.extend(&edges[name]);
+            next.extend(locked[name].iter().map(String::as_str));
         }
     }
     seen
@@ -357,11 +320,9 @@ fn points_at(line: &str, place: &str) -> bool {
 
 #[test]
 fn every_package_takes_the_workspace_s_lints_and_versions() {
-    for folder in folders_of_crates() {
-        let manifest: toml::Table = fs::read_to_string(root().join(folder).join("Cargo.toml"))
-            .unwrap()
-            .parse()
-            .unwrap();
+    for (name, folder, _) in arrows() {
+        let manifest = toml(Path::new(folder).join("Cargo.toml"));
+        assert_eq!(manifest["package"]["name"].as_str(), Some(name), "{folder}");
         assert_eq!(
             manifest["lints"]["workspace"].as_bool(),
             Some(true),

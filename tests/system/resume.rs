@@ -109,24 +109,20 @@ fn a_run_whose_processes_were_all_killed_continues() {
 #[test]
 fn what_cannot_be_resumed() {
     let system = system();
-    let refused = |args: &str, words: &str| {
-        system.refuses(args, words);
-    };
-    refused(
+    system.refuses(
         "local --resume nowhere",
         "--resume takes the folder of a run that was interrupted",
     );
-    refused("local --resume run --agent c51", "cannot be used with");
+    system.refuses("local --resume run --agent c51", "cannot be used with");
     let run = format!("local --agent c51 {SHORT} --run-dir run");
     system.run_ok(&run);
     for less in ["", "--frames 700"] {
-        let ended = system.run(&format!("local --resume run {less}"));
-        let said = &ended.expect_code(0).stdout;
+        let ended = system.run_ok(&format!("local --resume run {less}"));
         let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
-        assert!(said.contains(nothing), "{less}: {said}");
+        ended.expect_printed(nothing);
     }
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    refused("local --resume run --frames 2000", "there is no checkpoint");
+    system.refuses("local --resume run --frames 2000", "there is no checkpoint");
 }
 
 /// All was learned when the launcher was killed: only the run's end is missing, and its shards hold nothing any more.

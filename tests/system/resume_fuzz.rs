@@ -4,7 +4,7 @@
 
 use std::{fmt::Write as _, fs, time::Duration};
 
-use driml_tests::{RunFolder, TestSystem};
+use driml_tests::{RunFolder, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
@@ -238,8 +238,7 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
             system.wait_until_all_have_ended();
         }
         Stop::KillAll => {
-            system.kill_processes();
-            process.signal(Signal::SIGKILL);
+            Survivor::kill_all(&system.survivors());
             process.wait();
         }
     }

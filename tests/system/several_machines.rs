@@ -82,7 +82,7 @@ impl Run {
     /// The status of the run, fetched from the router; none while no process answers.
     fn status(&self) -> Option<Value> {
         let args = format!("status --json --connect {}", self.endpoint());
-        let ended = self.system.run_after(&self.network.on_router(), &args);
+        let ended = self.system.run_after(&self.network.on("router"), &args);
         let status: Value = serde_json::from_str(ended.stdout.lines().next()?).unwrap();
         status["servers"][0]["replay"].is_object().then_some(status)
     }

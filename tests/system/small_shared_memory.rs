@@ -7,7 +7,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Ended, skip};
+use driml_tests::{Ended, succeeds};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -19,21 +19,8 @@ fn with_shared_memory(size: &str) -> Option<Vec<String>> {
     let words: Vec<String> = ["unshare", "-m", "sh", "-c", &mount]
         .map(String::from)
         .into();
-    let tried = Command::new(&words[0])
-        .args(&words[1..])
-        .arg("true")
-        .output();
-    match tried {
-        Ok(output) if output.status.success() => Some(words),
-        Ok(output) => {
-            skip(String::from_utf8_lossy(&output.stderr).trim());
-            None
-        }
-        Err(e) => {
-            skip(&format!("unshare: {e}"));
-            None
-        }
-    }
+    let mut tried = Command::new(&words[0]);
+    succeeds(tried.args(&words[1..]).arg("true")).then_some(words)
 }
 
 /// How often it was said that there is too little, or that what was sent so does not arrive.
@@ -77,10 +64,7 @@ fn a_run_continues_when_others_fill_it_up() {
         return;
     };
     let system = system();
-    let run = format!(
-        "local --agent c51 {LONG} --actors 2 --run-dir run --listen {}",
-        system.endpoint()
-    );
+    let run = system.local(&format!("--agent c51 {LONG} --actors 2"));
     let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
     let client = system.connect();
     client.wait_for_updates(100);

@@ -7,8 +7,8 @@ use nix::sys::signal::Signal;
 use crate::{LONG, SHORT, system};
 
 fn status(system: &TestSystem) -> String {
-    let ended = system.run(&format!("status --connect {}", system.endpoint()));
-    ended.expect_code(0).stdout
+    let call = format!("status --connect {}", system.endpoint());
+    system.run_ok(&call).stdout
 }
 
 /// Asks until the answer holds all of `words`.
@@ -76,8 +76,7 @@ fn missing_processes_are_named_with_what_to_do() {
     server.signal(Signal::SIGSTOP);
     let ended = system.run(&format!("status --connect {endpoint}"));
     server.signal(Signal::SIGCONT);
-    assert_eq!(ended.code, Some(1), "{}{}", ended.stdout, ended.stderr);
-    ended.expect_said("endpoint");
+    ended.expect_code(1).expect_said("endpoint");
 }
 
 #[test]
@@ -92,15 +91,10 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         live(system.run("status --run run"))
     });
     process.interrupt().expect_code(130);
-    let ended = system.run_ok("status --run run");
-    assert!(
-        ended.stdout.contains("no process runs in run, which holds")
-            && ended
-                .stdout
-                .contains("`driml train --resume run` resumes it"),
-        "{}",
-        ended.stdout
-    );
+    system
+        .run_ok("status --run run")
+        .expect_printed("no process runs in run, which holds")
+        .expect_printed("`driml train --resume run` resumes it");
     system.refuses("status --run nowhere", "nowhere is not the folder of a run");
 }
 
@@ -112,9 +106,9 @@ fn a_run_that_is_ending_is_no_riddle() {
         "local --agent c51 {SHORT} --eval-interval 1000 --eval-episodes 1000000 --run-dir run"
     ));
     process.wait_for_stderr("playing the last checkpoint");
-    let ended = system.run_ok("status --run run");
-    let said = "the run in run is stopping: all frames are stored";
-    ended.expect_printed(said);
+    system
+        .run_ok("status --run run")
+        .expect_printed("the run in run is stopping: all frames are stored");
     process.interrupt().expect_code(0);
     system
         .run_ok("status --run run")

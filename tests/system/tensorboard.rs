@@ -1,7 +1,7 @@
 //! `driml local --tensorboard`: event files as TensorBoard itself reads them, beside the rows of `metrics.csv`.
 //! That records are whole and right by their sums is tested where they are written.
 
-use std::{collections::BTreeMap, fs};
+use std::collections::BTreeMap;
 
 use driml_tests::{
     TestSystem,
@@ -28,18 +28,14 @@ print(json.dumps({
 
 /// The columns of `metrics.csv`, empty cells left out: frames and value.
 fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
-    let text = fs::read_to_string(system.path("run/metrics.csv")).unwrap();
-    let mut rows = text.lines().map(|line| line.split(',').collect::<Vec<_>>());
-    let header = rows.next().unwrap();
+    let (header, rows) = system.run_folder("run").metrics();
     let mut columns = BTreeMap::<_, Vec<_>>::new();
     for row in rows {
         let frames: u64 = row[1].parse().unwrap();
         for (name, cell) in header.iter().zip(&row) {
             if let Ok(value) = cell.parse() {
-                columns
-                    .entry((*name).to_owned())
-                    .or_default()
-                    .push((frames, value));
+                let column = columns.entry(name.clone()).or_default();
+                column.push((frames, value));
             }
         }
     }
@@ -102,14 +98,8 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
     let columns = columns(&system);
     check_points(&second, &columns);
     assert_eq!(columns["mean_age"].last().unwrap().0, 480);
-    let files = fs::read_dir(system.path("run")).unwrap();
-    let files = files.filter(|it| {
-        it.as_ref()
-            .unwrap()
-            .file_name()
-            .to_string_lossy()
-            .contains("tfevents")
-    });
+    let names = system.names("run").into_iter();
+    let files = names.filter(|name| name.contains("tfevents"));
     assert_eq!(files.count(), 2, "a file for each time it was started");
 }
 
@@ -119,11 +109,6 @@ fn without_the_flag_there_are_no_events() {
     system.run_ok(
         "local --lockstep --env chain --agent c51 --preset smoke --frames 256 --run-dir run",
     );
-    let mut files = fs::read_dir(system.path("run")).unwrap();
-    assert!(!files.any(|it| {
-        it.unwrap()
-            .file_name()
-            .to_string_lossy()
-            .contains("tfevents")
-    }));
+    let names = system.names("run");
+    assert!(!names.iter().any(|name| name.contains("tfevents")));
 }

@@ -9,7 +9,7 @@ use std::{
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
     Process, TestSystem,
-    python::{python_with, run as run_python},
+    python::{python_with, run},
     wait_for,
 };
 use nix::sys::signal::Signal;
@@ -22,19 +22,14 @@ fn watch(system: &TestSystem, flags: &str) -> Process {
     system.start(&format!("watch --connect {} {flags}", system.endpoint()))
 }
 
-fn run(system: &TestSystem, args: &str) -> Process {
-    system.start_process(args)
-}
-
 #[test]
 fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let system = system();
     let endpoint = system.endpoint();
     let flags = "--agent driml-ada --actors 2";
-    let server = run(
-        &system,
-        &format!("replay-server --listen {endpoint} {flags} {SHORT}"),
-    );
+    let server = system.start_process(&format!(
+        "replay-server --listen {endpoint} {flags} {SHORT}"
+    ));
     let client = system.connect();
     let watch = watch(&system, "--run-dir run --tensorboard");
     wait_for("the folder", || {
@@ -44,10 +39,7 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     // Into the same folder, which is then as good as a launched run's.
-    let learner = run(
-        &system,
-        &format!("learner --connect {endpoint} --run-dir run"),
-    );
+    let learner = system.start_process(&format!("learner --connect {endpoint} --run-dir run"));
     watch
         .wait()
         .expect_code(0)
@@ -74,9 +66,8 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     assert_eq!(header, system.run_folder("launched").metrics().0);
     assert_eq!(watched.column("rss_mib_learner").pop().unwrap(), "");
     system.run_ok("plot run launched --out plot.svg");
-    let files = fs::read_dir(system.path("run")).unwrap();
-    let names = files.map(|it| it.unwrap().file_name().into_string().unwrap());
-    assert!(names.into_iter().any(|name| name.contains("tfevents")));
+    let names = system.names("run");
+    assert!(names.iter().any(|name| name.contains("tfevents")));
 }
 
 #[test]
@@ -120,11 +111,8 @@ fn a_launched_run_is_watched_and_continues_without() {
 #[test]
 fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let system = system();
-    let endpoint = system.endpoint();
-    let listen = format!(
-        "replay-server --keep-alive --listen {endpoint} --replay-dir replay --agent c51 {LONG}"
-    );
-    let server = run(&system, &listen);
+    let flags = format!("--replay-dir replay --agent c51 {LONG}");
+    let server = system.start_replay_server(&flags);
     let client = system.connect();
     let mut watched = watch(&system, "--run-dir seen");
     watched.wait_for_stderr("no learner has joined yet; no actor has joined yet");
@@ -139,7 +127,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     drop(client);
     server.kill();
     watched.wait_for_stderr("replay server: no answer for ");
-    let _server = run(&system, &listen);
+    let _server = system.start_replay_server(&flags);
     let frames = || {
         let text = fs::read_to_string(system.path("seen/metrics.csv")).ok()?;
         let row = text.get(..text.rfind('\n')?)?.lines().last()?;
@@ -298,7 +286,7 @@ print(next(it for it in parse(open(sys.argv[1]).read()) if it.name == 'driml_upd
 ";
     let updates = || {
         path.exists().then(|| {
-            let said = run_python(&python, &["-c", read], &[&path.display().to_string()]);
+            let said = run(&python, &["-c", read], &[&path.display().to_string()]);
             said.trim().parse::<f64>().unwrap()
         })
     };

@@ -2,11 +2,7 @@
 //! Its own numbers are those of a replay that is soon full.
 
 use driml_machine::{error::Usage, resources::Machine};
-use driml_settings::{
-    config::RunConfig,
-    flags::{self, RunFlags},
-    resolve::Flags,
-};
+use driml_settings::{config::RunConfig, flags};
 
 /// The world where it does not matter which.
 pub(super) const WORLD: &str = "procgen:bigfish";
@@ -32,15 +28,5 @@ pub(super) fn of_run(
     preset: &str,
     sets: &[&str],
 ) -> Result<RunConfig, Usage> {
-    let flags = RunFlags {
-        env: Some(world.into()),
-        agent: Some(agent.into()),
-        preset: Some(preset.into()),
-        config: None,
-        over: Flags {
-            sets: sets.iter().map(|&set| set.to_owned()).collect(),
-            ..Flags::default()
-        },
-    };
-    Ok(flags::resolve(&flags, &Machine::this())?.0)
+    flags::of_names(preset, world, agent, sets, &Machine::this())
 }

@@ -3,11 +3,7 @@
 use driml_learner::Compute;
 use driml_machine::resources::Machine;
 use driml_model::Parameters;
-use driml_settings::{
-    config::RunConfig,
-    presets::preset,
-    resolve::{Flags, Source, resolve},
-};
+use driml_settings::{config::RunConfig, flags::of_names};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -27,23 +23,12 @@ pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
 }
 
 /// The settings of a preset, world and agent, with these `--set`s.
-pub(crate) fn config(
-    preset_name: &str,
-    world: &str,
-    agent: &'static str,
-    sets: &[&str],
-) -> RunConfig {
-    let world = world.parse().unwrap();
-    let source = Source::Layers(preset(preset_name).unwrap(), world, agent);
-    let flags = Flags {
-        sets: sets.iter().map(|&set| set.into()).collect(),
-        ..Flags::default()
-    };
-    resolve(&source, &flags, &MACHINE).unwrap()
+pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> RunConfig {
+    of_names(preset, world, agent, sets, &MACHINE).unwrap()
 }
 
 /// An untrained network of this world's and agent's, with DIM's heads if the agent has them.
-pub(crate) fn untrained(world: &str, agent: &'static str) -> Player {
+pub(crate) fn untrained(world: &str, agent: &str) -> Player {
     let config = config("smoke", world, agent, &[]);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();

@@ -62,3 +62,24 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
     };
     Ok((resolve::resolve(&source, &args.over, machine)?, from))
 }
+
+/// [`resolve`] of names and `--set`s, for code that has no command line.
+pub fn of_names(
+    preset: &str,
+    world: &str,
+    agent: &str,
+    sets: &[&str],
+    machine: &Machine,
+) -> Result<RunConfig, Usage> {
+    let flags = RunFlags {
+        env: Some(world.into()),
+        agent: Some(agent.into()),
+        preset: Some(preset.into()),
+        config: None,
+        over: Flags {
+            sets: sets.iter().map(|&set| set.into()).collect(),
+            ..Flags::default()
+        },
+    };
+    Ok(resolve(&flags, machine)?.0)
+}

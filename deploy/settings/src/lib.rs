@@ -1,23 +1,15 @@
 //! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
 //!
 //! Start with [`resolve::resolve`], which makes a [`config::RunConfig`] of a [`resolve::Source`] and [`resolve::Flags`]; the
-//! commands that start a run do so through [`flags::resolve`]. `presets/*.toml` has every number, each with its source.
+//! commands that start a run do so through [`flags::resolve`], and code by names. `presets/*.toml` has every number, each with its
+//! source.
 //!
 //! ```
 //! use driml_machine::resources::Machine;
-//! use driml_settings::{
-//!     presets,
-//!     resolve::{Flags, Source, resolve},
-//! };
+//! use driml_settings::flags::of_names;
 //!
-//! let world = presets::world("bigfish")?;
-//! let source = Source::Layers(presets::preset("paper")?, world, "driml-ada");
-//! let flags = Flags {
-//!     frames: Some(200_000),
-//!     sets: vec!["learner.update.adam.lr=1e-4".into()],
-//!     ..Flags::default()
-//! };
-//! let config = resolve(&source, &flags, &Machine::this())?;
+//! let sets = ["replay.transitions_max=200000", "learner.update.adam.lr=1e-4"];
+//! let config = of_names("paper", "procgen:bigfish", "driml-ada", &sets, &Machine::this())?;
 //! assert_eq!(config.run.world, "procgen:bigfish");
 //! assert_eq!(config.frames(), 200_000);
 //! # Ok::<(), driml_machine::error::Usage>(())

@@ -12,8 +12,6 @@ use driml_protocol::{
 
 /// The hash of the run that these messages are of.
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
-/// Bytes before the payload's length in what [`messages`] takes: the kind, and the length of the header.
-const FORGED_BYTES: usize = 3;
 
 /// Reads bytes as one type of message.
 type Read = fn(&[u8]);
@@ -123,14 +121,9 @@ pub(crate) fn wire(bytes: &[u8]) {
 
 /// A message with a good prefix: one byte chooses the kind, two are the header's length, the rest is header and payload.
 pub(crate) fn messages(bytes: &[u8]) {
-    let Some((bytes, read)) = sealed(bytes) else {
+    let Some((&[kind, low, high], rest)) = bytes.split_first_chunk() else {
         return;
     };
-    read(&bytes);
-}
-
-fn sealed(bytes: &[u8]) -> Option<(Vec<u8>, Read)> {
-    let (&[kind, low, high], rest) = bytes.split_first_chunk::<FORGED_BYTES>()?;
     let (kind, read) = KINDS[usize::from(kind) % KINDS.len()];
     let header = usize::from(u16::from_le_bytes([low, high])).min(rest.len());
     let mut message = Vec::with_capacity(codec::PREFIX_BYTES + rest.len());
@@ -145,7 +138,7 @@ fn sealed(bytes: &[u8]) -> Option<(Vec<u8>, Read)> {
     sum.update(rest);
     message.extend_from_slice(&sum.finalize().to_le_bytes());
     message.extend_from_slice(rest);
-    Some((message, read))
+    read(&message);
 }
 
 /// What the decoder `messages` takes, of a message's bytes.

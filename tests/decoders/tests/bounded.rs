@@ -5,6 +5,7 @@
 
 use std::{
     fs,
+    io::Write,
     path::{Path, PathBuf},
 };
 
@@ -113,13 +114,9 @@ impl Drop for Said<'_> {
         let file = std::env::temp_dir().join(format!("driml-decoder-{name}-{number}"));
         // The panic is what fails the test; where its bytes are is a help alone.
         let _ = fs::write(&file, bytes);
-        driml_decoders_said(&format!("{name}, execution {number}: {}", file.display()));
+        let said = format!("{name}, execution {number}: {}\n", file.display());
+        let _ = std::io::stderr().write_all(said.as_bytes());
     }
-}
-
-fn driml_decoders_said(text: &str) {
-    use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "{text}");
 }
 
 #[test]

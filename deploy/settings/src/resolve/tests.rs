@@ -5,7 +5,10 @@ use driml_protocol::Sampling;
 use expect_test::{expect, expect_file};
 
 use super::*;
-use crate::presets::{AGENTS, PRESETS};
+use crate::{
+    flags::of_names,
+    presets::{AGENTS, PRESETS},
+};
 
 const MACHINE: Machine = Machine {
     cores: 2,
@@ -39,7 +42,7 @@ fn of_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> 
 }
 
 fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
-    resolve(&source("paper", world, agent), &sets(set), &MACHINE).map_err(|e| e.to_string())
+    of_names("paper", world, agent, set, &MACHINE).map_err(|e| e.to_string())
 }
 
 #[test]
@@ -153,8 +156,8 @@ fn settings_follow_from_one_another() {
     let answers = answered(text, |row| {
         let (row, asked) = row.split_once(" ? ").unwrap();
         let words: Vec<_> = row.split(' ').collect();
-        let source = source(words[0], words[1], words[2]);
-        let config = resolve(&source, &sets(&words[3..]), &MACHINE).unwrap();
+        let [preset, world, agent] = [words[0], words[1], words[2]];
+        let config = of_names(preset, world, agent, &words[3..], &MACHINE).unwrap();
         let text = config.to_toml();
         assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
         let table = config.to_table();
@@ -200,9 +203,8 @@ fn a_file_at_odds_with_itself_is_refused() {
 #[test]
 fn a_run_prints_what_its_preset_gives_up() {
     let printed = |preset| {
-        let source = source(preset, "mspacman", "c51");
-        let notes = resolve(&source, &Flags::default(), &MACHINE).unwrap().notes;
-        notes.join("\n")
+        let config = of_names(preset, "mspacman", "c51", &[], &MACHINE).unwrap();
+        config.notes.join("\n")
     };
     assert!(!printed("exact").contains("results/tradeoff"));
     for (preset, price) in [("balanced", "6%"), ("fast", "15%")] {
@@ -241,8 +243,7 @@ fn an_automatic_precision_is_the_processors_fastest_and_f32_on_a_gpu() {
             fast_bf16,
             ..MACHINE
         };
-        let source = source("tuned", "procgen:maze", "c51");
-        let config = resolve(&source, &sets(set), &machine).unwrap();
+        let config = of_names("tuned", "procgen:maze", "c51", set, &machine).unwrap();
         [config.actor.precision, config.learner.precision].map(|it| it.to_string())
     };
     let cuda = "local.learner_device=cuda:0";

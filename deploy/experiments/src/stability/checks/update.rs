@@ -8,10 +8,7 @@ use driml_learner::{
 use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
-use driml_settings::{
-    presets::PRESETS,
-    resolve::{Flags, Source, resolve},
-};
+use driml_settings::flags::of_names;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -70,8 +67,7 @@ impl Setting {
     }
 
     fn learner(&self) -> anyhow::Result<LearnerSettings> {
-        let source = Source::Layers(&PRESETS[0], "chain".parse()?, "driml-fix");
-        let run = resolve(&source, &Flags::default(), &Machine::this())?;
+        let run = of_names("paper", "chain", "driml-fix", &[], &Machine::this())?;
         Ok(LearnerSettings {
             lambda: Lambda {
                 l3t3: 0.5,

@@ -3,14 +3,11 @@
 
 mod training;
 
-use driml_envs::{WorldConfig, WorldName};
+use driml_envs::WorldConfig;
 use driml_figure::{Axis, Chart, Field, Figure, GREY, Heat, Lattice, Mark, Outline, Panel, Series};
 use driml_launch::metrics::rounded;
 use driml_machine::{error::usage, resources::Machine};
-use driml_settings::{
-    presets,
-    resolve::{Flags, Source, resolve},
-};
+use driml_settings::flags::of_names;
 use minijinja::{Value, context};
 
 use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
@@ -27,16 +24,11 @@ const LOSS_WINDOW: usize = 10;
 
 /// World, network and optimiser as a run has them.
 fn task(settings: &Settings) -> anyhow::Result<Task> {
+    let sets: Vec<_> = settings.sets.iter().map(String::as_str).collect();
     // DIM with k = 1; what else distinguishes the agents is not used here.
-    let agent = "driml-fix";
-    let world: WorldName = "ising".parse().expect("it is in the registry of worlds");
-    let source = Source::Layers(&presets::PRESETS[0], world, agent);
-    let flags = Flags {
-        sets: settings.sets.clone(),
-        ..Flags::default()
-    };
+    let config = of_names("paper", "ising", "driml-fix", &sets, &Machine::this())?;
     // The experiment plays in the world itself, whose frames are whole.
-    let config = resolve(&source, &flags, &Machine::this())?.with_whole_frames()?;
+    let config = config.with_whole_frames()?;
     let WorldConfig::Ising(world) = config.world else {
         return Err(usage!("the Ising world's settings are those of another world").into());
     };

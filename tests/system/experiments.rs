@@ -1,42 +1,9 @@
 //! The experiments from end to end, in their smoke length: every file there, the same every time, resumed and refused.
 //! What their numbers mean at full length is on the pages in `deploy/experiments/results/`.
 
-#![allow(clippy::unwrap_used)]
+use std::{collections::BTreeMap, fs, path::Path};
 
-use std::{
-    collections::BTreeMap,
-    fs,
-    path::Path,
-    process::{Command, Output},
-    time::{Duration, Instant},
-};
-
-use driml_protocol::fail_point;
-
-/// Calls the program with these words.
-fn driml(folder: &Path, call: &str) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_driml"))
-        .args(call.split_whitespace())
-        .current_dir(folder)
-        .env_remove("DRIML_LOG")
-        .output()
-        .unwrap()
-}
-
-/// What a call says on stderr that ends with this exit code.
-fn said(folder: &Path, call: &str, code: i32) -> String {
-    let output = driml(folder, call);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(code), "{call}: {said}");
-    said
-}
-
-fn run(folder: &Path, call: &str) -> String {
-    let output = driml(folder, call);
-    let stderr = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(0), "{call}: {stderr}");
-    String::from_utf8(output.stdout).unwrap()
-}
+use crate::system;
 
 /// Every file of a folder but the page, which has the time it took.
 fn data(folder: &Path) -> BTreeMap<String, Vec<u8>> {
@@ -85,17 +52,17 @@ fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
 }
 
 fn check(name: &str, files: &str) {
-    let root = tempfile::tempdir().unwrap();
+    let system = system();
     let call = format!("experiment {name} --smoke");
-    let printed = run(root.path(), &call);
-    let folder = root.path().join("experiments").join(name);
+    let printed = system.run_ok(&call).stdout;
+    let folder = system.path("experiments").join(name);
     assert!(printed.ends_with("README.md\n"), "{printed}");
     check_page(&folder, &["**Time.**", "**Expected.**"], files);
     let first = data(&folder);
 
     // Elsewhere: the same bytes. Again, with one piece lost: that one is made anew, to the same bytes.
-    run(root.path(), &format!("{call} --out other"));
-    assert_eq!(data(&root.path().join("other")), first);
+    system.run_ok(&format!("{call} --out other"));
+    assert_eq!(data(&system.path("other")), first);
     let mut pieces: Vec<_> = fs::read_dir(folder.join("pieces"))
         .unwrap()
         .map(|entry| entry.unwrap().path())
@@ -107,13 +74,12 @@ fn check(name: &str, files: &str) {
         .collect();
     pieces.sort();
     fs::remove_file(&pieces[0]).unwrap();
-    run(root.path(), &call);
+    system.run_ok(&call);
     assert_eq!(data(&folder), first);
 
     // More seeds are more pieces of the same grid; the full length is another grid.
-    run(root.path(), &format!("{call} --seeds 3"));
-    let said = said(root.path(), &format!("experiment {name}"), 64);
-    assert!(said.contains("made with other settings"), "{said}");
+    system.run_ok(&format!("{call} --seeds 3"));
+    system.refuses(&format!("experiment {name}"), "made with other settings");
 }
 
 #[test]
@@ -141,10 +107,10 @@ fn stability() {
 /// Through real processes, so no two runs are alike; but what is finished stays as it was.
 #[test]
 fn procgen_without_the_engine() {
-    let root = tempfile::tempdir().unwrap();
+    let system = system();
     let call = "experiment procgen --smoke";
-    run(root.path(), call);
-    let folder = root.path().join("experiments/procgen");
+    system.run_ok(call);
+    let folder = system.path("experiments/procgen");
     let files = "curves.png curves.svg table.csv";
     let page = check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
     let words = page.split_whitespace().count();
@@ -167,7 +133,7 @@ fn procgen_without_the_engine() {
     assert!(!page.contains("Interquartile"), "of two seeds: {page}");
 
     // Nothing is run again, and the same runs give the same files.
-    run(root.path(), call);
+    system.run_ok(call);
     assert_eq!(data(&folder), first);
 
     // A run that failed is moved aside and made anew, and played anew; the others stay. What was played before is made recognisable.
@@ -185,8 +151,9 @@ fn procgen_without_the_engine() {
     fs::write(summary("chain-c51-seed2"), failed).unwrap();
     // Runs of programs that did not note their commit are adopted.
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
-    let said = said(root.path(), call, 0);
-    assert!(said.contains("chain-c51-seed2 was not finished"), "{said}");
+    system
+        .run_ok(call)
+        .expect_said("chain-c51-seed2 was not finished");
     assert!(summary("chain-c51-seed2.unfinished-1").exists());
     let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
     assert!(again.contains("\"finished\""), "{again}");
@@ -204,15 +171,14 @@ fn procgen_without_the_engine() {
     assert!(line("chain", "c51", "1").ends_with(','), "no commit");
 
     // More agents can be added; another length cannot.
-    run(root.path(), &format!("{call} --agents c51,cpc --report"));
+    system.run_ok(&format!("{call} --agents c51,cpc --report"));
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     assert!(page.contains("Not finished: chain-cpc-seed1"), "{page}");
-    let refused = driml(root.path(), &format!("{call} --frames 900"));
-    assert_eq!(refused.status.code(), Some(64));
+    system.run(&format!("{call} --frames 900")).expect_code(64);
 
     // Runs that lie there beside their calls, and nothing else, are reported.
     fs::remove_dir_all(&pieces).unwrap();
-    run(root.path(), &format!("{call} --report"));
+    system.run_ok(&format!("{call} --report"));
     let table = String::from_utf8(data(&folder)["table.csv"].clone()).unwrap();
     assert!(
         table.lines().count() == 9 && !table.contains(",777.0,"),
@@ -222,9 +188,9 @@ fn procgen_without_the_engine() {
 
 #[test]
 fn pacman() {
-    let root = tempfile::tempdir().unwrap();
-    run(root.path(), "experiment pacman --smoke");
-    let folder = root.path().join("experiments/pacman");
+    let system = system();
+    system.run_ok("experiment pacman --smoke");
+    let folder = system.path("experiments/pacman");
     let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
     check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
     let config = |name: &str| {
@@ -244,12 +210,12 @@ fn pacman() {
 /// A plan, then one dial, then one more in the same folder: what is finished stays unchanged.
 #[test]
 fn tradeoff() {
-    let root = tempfile::tempdir().unwrap();
+    let system = system();
     let call = |more: &str| {
         let call = format!("tradeoff --env chain --smoke --out t {more}");
-        run(root.path(), &call)
+        system.run_ok(&call).stdout
     };
-    let folder = root.path().join("t");
+    let folder = system.path("t");
     let planned = call("--dials learner.precision --plan");
     assert!(
         planned.contains("level       learner.precision = bf16: about"),
@@ -309,8 +275,7 @@ fn tradeoff() {
     assert_eq!(rows(&data(&folder), "levels.csv"), 2);
 
     // Of a level whose first seed is left out the others are reported.
-    let names = fs::read_dir(folder.join("runs")).unwrap();
-    let names = names.map(|it| it.unwrap().file_name().into_string().unwrap());
+    let names = system.names("t/runs").into_iter();
     let first = names.filter(|it| it.contains("bf16") && it.ends_with("-seed1"));
     for name in first {
         fs::remove_file(folder.join("runs").join(name).join("summary.json")).unwrap();
@@ -323,71 +288,52 @@ fn tradeoff() {
 /// A killed experiment takes its runs with it, and resumes at the next call.
 #[test]
 fn killed_and_resumed() {
-    let root = tempfile::tempdir().unwrap();
-    let go = root.path().join("go");
+    let system = system();
     let call =
         "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 20000";
-    let mut child = Command::new(env!("CARGO_BIN_EXE_driml"))
-        .args(call.split(' '))
-        .current_dir(root.path())
-        // Its run is not over before it is killed.
-        .env(fail_point::HOLD, format!("100 {}", go.display()))
-        .spawn()
-        .unwrap();
-    let run = root.path().join("x/runs/mspacman-c51-seed1");
-    let deadline = Instant::now() + Duration::from_secs(180);
-    let has_learned = || {
-        let text = fs::read_to_string(run.join("metrics.csv")).unwrap_or_default();
-        let mut updates = text.lines().skip(1).filter_map(|row| row.split(',').nth(2));
-        updates.any(|updates| updates != "0")
-    };
-    while !has_learned() {
-        assert!(Instant::now() < deadline, "no update in time");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    child.kill().unwrap();
-    fs::write(&go, "").unwrap();
-    child.wait().unwrap();
-    let said = said(root.path(), call, 0);
+    // Its run is not over before it is killed.
+    system.hold_at(100);
+    let process = system.start(call);
+    let run = system.run_folder("x/runs/mspacman-c51-seed1");
+    run.wait_for_updates(0);
+    process.kill();
+    system.let_go();
+    system
+        .run_ok(call)
+        .expect_said("mspacman-c51-seed1 resumes from its checkpoint");
+    let summary = run.summary();
     assert!(
-        said.contains("mspacman-c51-seed1 resumes from its checkpoint"),
-        "{said}"
+        summary.outcome == "finished" && summary.resumed_after_updates > 0,
+        "{summary:#?}"
     );
-    let summary = fs::read_to_string(run.join("summary.json")).unwrap();
-    assert!(
-        summary.contains("\"finished\"") && !summary.contains("\"resumed_after_updates\": 0,"),
-        "{summary}"
-    );
-    let page = fs::read_to_string(root.path().join("x/README.md")).unwrap();
+    let page = fs::read_to_string(system.path("x/README.md")).unwrap();
     assert!(page.contains("* 1 of 1 runs are finished"), "{page}");
 }
 
 #[test]
 fn a_file_where_the_folder_should_be_is_an_error() {
-    let root = tempfile::tempdir().unwrap();
-    fs::write(root.path().join("file"), "").unwrap();
-    let said = said(root.path(), "experiment random-walk --smoke --out file", 1);
-    assert!(said.contains("making file/pieces"), "{said}");
+    let system = system();
+    fs::write(system.path("file"), "").unwrap();
+    system
+        .run("experiment random-walk --smoke --out file")
+        .expect_code(1)
+        .expect_said("making file/pieces");
 }
 
 #[test]
 fn a_grid_makes_every_combination_once() {
-    let root = tempfile::tempdir().unwrap();
+    let system = system();
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";
     let call = format!("{fixed} --frames 320 --set learner.update.adam.lr=1e-4,1e-3");
-    let refused = |call: &str, words: &[&str]| {
-        let text = said(root.path(), call, 64);
-        assert!(words.iter().all(|it| text.contains(it)), "{text}");
-    };
     // What cannot work is rejected before anything starts.
     let unfit = format!("{fixed} --set learner.update.adam.lr=1e-4,fast");
-    refused(&unfit, &["agent=c51", "lr=fast"]);
+    system.refuses(&unfit, "agent=c51").expect_said("lr=fast");
     let twice = format!("{call} --set learner.update.adam.lr=1");
-    refused(&twice, &["is set twice"]);
-    refused(&format!("{call} --report"), &["there is nothing to report"]);
+    system.refuses(&twice, "is set twice");
+    system.refuses(&format!("{call} --report"), "there is nothing to report");
 
-    let printed = run(root.path(), &format!("{call} --jobs 2"));
-    let folder = root.path().join("experiments/grid");
+    let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;
+    let folder = system.path("experiments/grid");
     assert!(printed.ends_with("grid.svg\n"), "{printed}");
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
     let rows: Vec<Vec<&str>> = table.lines().map(|row| row.split(',').collect()).collect();
@@ -408,15 +354,15 @@ fn a_grid_makes_every_combination_once() {
     // One seed more makes what is missing alone.
     let made = || fs::metadata(&summary).unwrap().modified().unwrap();
     let before = made();
-    run(root.path(), &format!("{call} --seeds 2 --jobs 2"));
+    system.run_ok(&format!("{call} --seeds 2 --jobs 2"));
     assert_eq!(made(), before);
     let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
     let mut seeds = table.lines().skip(1).map(|row| row.split(',').nth(3));
     assert!(seeds.all(|seeds| seeds == Some("2")), "{table}");
     // A report of the folder has all that is there.
-    run(root.path(), "grid --report");
+    system.run_ok("grid --report");
     let reported = fs::read_to_string(folder.join("grid.csv")).unwrap();
     assert_eq!(reported, table);
     // Another grid does not mix with it.
-    refused(&format!("{fixed} --frames 352"), &["other settings"]);
+    system.refuses(&format!("{fixed} --frames 352"), "other settings");
 }

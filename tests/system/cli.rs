@@ -1,55 +1,32 @@
 //! The program as a user calls it wrongly: each call is answered by a sentence that says what to do, and the right code.
-//! No run is started here; the end-to-end tests do that.
+//! No run is started here.
 
-#![allow(clippy::unwrap_used)]
+use std::{fs, os::unix::process::CommandExt};
 
-use std::{
-    fs,
-    path::Path,
-    process::{Command, Output},
-};
-
+use driml_tests::Process;
 use expect_test::expect_file;
 
-fn driml(call: &str) -> Output {
-    driml_in(Path::new(env!("CARGO_TARGET_TMPDIR")), call)
-}
-
-/// Runs the program with these words.
-fn driml_in(folder: &Path, call: &str) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_driml"))
-        .args(call.split_whitespace())
-        .current_dir(folder)
-        .env_remove("DRIML_LOG")
-        .env("RANK_OF_A_TEST", "x3")
-        .env("OTHER_RANK_OF_A_TEST", "17")
-        .output()
-        .unwrap()
-}
-
-/// What a call says that ends with this exit code.
-fn said(folder: &Path, call: &str, code: i32) -> String {
-    let output = driml_in(folder, call);
-    let text = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(code), "{call}: {text}");
-    text
-}
-
-fn usage(call: &str) -> String {
-    said(Path::new(env!("CARGO_TARGET_TMPDIR")), call, 64)
-}
+use crate::system;
 
 /// A row of the file is a call; the answer stands below it.
 #[test]
 fn calls_that_cannot_work_are_answered_with_what_to_do() {
-    let folder = tempfile::tempdir().unwrap();
-    let used = folder.path().join("used");
+    let system = system();
+    let used = system.path("used");
     fs::create_dir(&used).unwrap();
     fs::write(used.join("metrics.csv"), "old").unwrap();
-    fs::write(folder.path().join("odd.toml"), "[run]\nworld = \"chain\"\n").unwrap();
+    fs::write(system.path("odd.toml"), "[run]\nworld = \"chain\"\n").unwrap();
+    let said = |call: &str| {
+        let mut command = system.command(call);
+        // Usage has the name by which the program was called.
+        command.arg0("driml");
+        command.envs([("RANK_OF_A_TEST", "x3"), ("OTHER_RANK_OF_A_TEST", "17")]);
+        let ended = Process::start(call.into(), command).wait();
+        ended.expect_code(64).stderr
+    };
     let rows = include_str!("snapshots/refusals.txt").lines();
     let answered = rows.filter_map(|row| match row.strip_prefix("$ driml ") {
-        Some(call) => Some(format!("{row}\n{}", said(folder.path(), call, 64))),
+        Some(call) => Some(format!("{row}\n{}", said(call))),
         None => row.starts_with('#').then(|| format!("{row}\n")),
     });
     expect_file!["snapshots/refusals.txt"].assert_eq(&answered.collect::<String>());
@@ -60,14 +37,14 @@ fn calls_that_cannot_work_are_answered_with_what_to_do() {
 
 #[test]
 fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
+    let system = system();
     for call in ["", "bench", "experiment"] {
-        assert!(usage(call).contains("Usage: "), "{call}");
+        system.refuses(call, "Usage: ");
     }
     for call in ["--help", "--version", "local --help", "presets"] {
-        let output = driml(call);
-        assert_eq!(output.status.code(), Some(0), "{call}");
+        let ended = system.run_ok(call);
         assert!(
-            !output.stdout.is_empty() && output.stderr.is_empty(),
+            !ended.stdout.is_empty() && ended.stderr.is_empty(),
             "{call}"
         );
     }
@@ -76,11 +53,11 @@ fn a_call_that_asks_for_help_or_leaves_the_command_out_prints_it() {
 /// These can only be known at run time: exit code 1.
 #[test]
 fn files_and_runs_that_are_not_there() {
-    let folder = tempfile::tempdir().unwrap();
+    let system = system();
     // A safetensors file whose header is announced with 100 bytes, cut off after 10.
     let mut cut = 100u64.to_le_bytes().to_vec();
     cut.extend(b"{\"input.fr");
-    fs::write(folder.path().join("cut.safetensors"), cut).unwrap();
+    fs::write(system.path("cut.safetensors"), cut).unwrap();
     for (call, why) in [
         (
             "parity cut.safetensors",
@@ -93,24 +70,21 @@ fn files_and_runs_that_are_not_there() {
         ("actor --connect unixsock-stream/absent.sock", "error: "),
         ("man /proc/none/man1", "writing pages into /proc/none/man1"),
     ] {
-        let text = said(folder.path(), call, 1);
-        assert!(
-            text.contains(why) && !text.contains("panicked"),
-            "{call}: {text}"
-        );
+        system.run(call).expect_code(1).expect_said(why);
     }
 }
 
 #[test]
 fn benches_give_figures_and_name_the_peer_that_is_missing() {
+    let system = system();
     // How many figures, and how many of them are of arithmetic.
     for (bench, count, of_arithmetic) in [
         ("policy", 12, 0),
         ("learner --growth --precision bf16", 26, 13),
         ("learner --kernels --precision bf16", 6, 6),
     ] {
-        let output = driml(&format!("bench {bench} --quick --json -"));
-        let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let ended = system.run_ok(&format!("bench {bench} --quick --json -"));
+        let report: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
         let figures = report["figures"].as_array().unwrap();
         assert!(bench.starts_with(report["bench"].as_str().unwrap()));
         assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));
@@ -118,9 +92,8 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
         let counts = (figures.len(), of_unit.count());
         assert_eq!(counts, (count, of_arithmetic), "{bench}");
     }
-    let output = driml("bench peers --quick --only policy --python no-such-python");
-    let table = String::from_utf8(output.stdout).unwrap();
-    assert_eq!(output.status.code(), Some(0), "{table}");
+    let peers = "bench peers --quick --only policy --python no-such-python";
+    let table = system.run_ok(peers).stdout;
     const SKIPPED: &str = "skipped: no-such-python cannot be started (No such file or directory (os error 2)): name a Python that has PyTorch with --torch-python";
     let lines = |is: fn(&str) -> bool| table.lines().filter(|line| is(line)).count();
     assert_eq!(lines(|line| line.ends_with("  skipped")), 12, "{table}");
@@ -129,19 +102,16 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
 
 #[test]
 fn completions_and_pages() {
+    let system = system();
     for (shell, text) in [
         ("bash", "complete -F"),
         ("zsh", "#compdef driml"),
         ("fish", "complete -c driml"),
     ] {
-        let output = driml(&format!("completions {shell}"));
-        assert!(output.status.success());
-        let script = String::from_utf8(output.stdout).unwrap();
-        let has = |text| script.contains(text);
-        assert!(has(text) && has("eval-interval"), "{script}");
+        let ended = system.run_ok(&format!("completions {shell}"));
+        ended.expect_printed(text).expect_printed("eval-interval");
     }
-    let root = tempfile::tempdir().unwrap();
-    assert!(driml_in(root.path(), "man man1").status.success());
-    let page = fs::read_to_string(root.path().join("man1/driml-train.1")).unwrap();
+    system.run_ok("man man1");
+    let page = fs::read_to_string(system.path("man1/driml-train.1")).unwrap();
     assert!(page.contains("\\-\\-frames"), "{page}");
 }
