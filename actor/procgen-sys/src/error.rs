@@ -82,7 +82,7 @@ pub enum InstallError {
     /// pip is missing, or failed.
     #[error("fetching procgen's engine: {0} {WITHOUT_ENGINE}")]
     Fetch(String),
-    /// The wheel is not the pinned one, or cannot be unpacked.
+    /// The wheel, or the library in it, is not the pinned one.
     #[error("unpacking {}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}", .path.display())]
     Wheel {
         /// The wheel's file, or the one from it.
