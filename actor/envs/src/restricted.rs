@@ -111,7 +111,7 @@ impl Environment for RestrictedWorld {
         for &action in actions {
             let Some(&own) = self.actions.get(usize::from(action)) else {
                 let count = self.actions.len();
-                return Err(EnvError::Config(format!("action {action} of {count}")));
+                return Err(EnvError::Step(format!("action {action} of {count}")));
             };
             self.step.push(own);
         }

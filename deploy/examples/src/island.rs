@@ -142,11 +142,10 @@ impl Environment for Islands {
         let last = self.side - 1;
         for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {
             let Some((down, right)) = MOVES.get(usize::from(action)) else {
-                return Err(EnvError::ActionOutOfRange {
-                    env,
-                    action,
-                    num_actions: MOVES.len(),
-                });
+                return Err(EnvError::Step(format!(
+                    "action {action} of environment {env} is out of range: this world has {} actions",
+                    MOVES.len()
+                )));
             };
             let (row, column) = island.agent;
             island.agent = (

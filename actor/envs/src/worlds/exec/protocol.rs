@@ -46,7 +46,7 @@ use serde::{Deserialize, Serialize};
 
 use super::config::ExecConfig;
 use crate::environment::FrameShape;
-use crate::error::{EnvError, Fault};
+use crate::error::EnvError;
 use crate::saved;
 use crate::settings::WorldSettings;
 
@@ -87,23 +87,23 @@ pub(super) struct Declaration {
 }
 
 impl Declaration {
-    pub(super) fn parse(line: &[u8]) -> Result<Self, Fault> {
+    pub(super) fn parse(line: &[u8]) -> Result<Self, String> {
         let no_world = |why: String| {
             let line = String::from_utf8_lossy(line);
             let line: String = line.chars().take(SHOWN_MAX).collect();
-            Fault::Other(format!(
+            format!(
                 "does not declare itself as a world: its first line on stdout is {line:?} and not JSON with \"driml_env\" and the shapes ({why}); \
                  deploy/python/driml_env.py makes a Gymnasium environment such a world"
-            ))
+            )
         };
         let value: serde_json::Value =
             serde_json::from_slice(line).map_err(|e| no_world(e.to_string()))?;
         let found = value.get("driml_env").and_then(serde_json::Value::as_u64);
         match found {
             Some(VERSION) => serde_json::from_value(value).map_err(|e| no_world(e.to_string())),
-            Some(found) => Err(Fault::Other(format!(
+            Some(found) => Err(format!(
                 "speaks version {found} of the protocol, and this driml speaks version {VERSION}: take the driml_env.py that came with it"
-            ))),
+            )),
             None => Err(no_world("\"driml_env\" is missing".into())),
         }
     }

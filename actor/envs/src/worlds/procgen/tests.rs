@@ -291,19 +291,12 @@ fn wrong_steps_are_refused() {
     let mut world = ProcgenWorld::with_engine(engine, &config(Game::Coinrun), 2, 1, 0).unwrap();
     let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
     let error = world.step(&[0, 15], &mut rewards, &mut ends).unwrap_err();
-    assert!(
-        matches!(
-            error,
-            EnvError::ActionOutOfRange {
-                env: 1,
-                action: 15,
-                num_actions: 15
-            }
-        ),
-        "{error}"
+    assert_eq!(
+        error.to_string(),
+        "action 15 of environment 1 is out of range: this world has 15 actions"
     );
     let error = world.step(&[0], &mut rewards, &mut ends).unwrap_err();
-    assert!(matches!(error, EnvError::BufferLength { .. }), "{error}");
+    assert!(matches!(error, EnvError::Step(_)), "{error}");
 }
 
 /// Does every action in the same saved states and compares all that follows for six steps; see `visible_actions`.
