@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
-use serde::Serialize;
+use serde_json::Value;
 use tracing::Level;
 
 use crate::error::EnvError;
@@ -139,11 +139,11 @@ impl WorldProcess {
     pub(super) fn say_line(
         &mut self,
         before: &[u8],
-        message: &impl Serialize,
+        message: &Value,
         doing: &'static str,
     ) -> Result<(), EnvError> {
         let mut line = before.to_vec();
-        line.extend(serde_json::to_vec(message).expect("plain text and numbers are JSON"));
+        line.extend(message.to_string().bytes());
         line.push(b'\n');
         self.say(&line, doing)
     }

@@ -2,16 +2,16 @@
 //! What passes between them is for `protocol`. A command is asked here what world it is.
 
 use rand::Rng;
+use serde_json::json;
 use tracing::Level;
 
 use super::config::{ExecConfig, describe, start_patience};
 use super::process::{Patience, WorldProcess};
-use super::protocol::{
-    Block, Declaration, Opening, Request, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
-};
+use super::protocol::{Block, Declaration, SavedExec, StateMemory, VERSION, WORLD_STATE_BYTES_MAX};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::EnvError;
+use crate::saved;
 use crate::settings::{Variants, WorldSettings};
 
 /// Longest side of a frame, in pixels.
@@ -88,12 +88,8 @@ impl ExecWorld {
         }
         let block = Block::new(num_envs, shape)
             .map_err(|e| process.system("making the memory that it shares", &e))?;
-        let opening = Opening {
-            block: &block.path(),
-            layout: block.layout(),
-        };
         let doing = "before its first frames";
-        process.say_line(b"", &opening, doing)?;
+        process.say_line(b"", &block.opening(), doing)?;
         let mut world = Self {
             process,
             block,
@@ -125,10 +121,7 @@ impl ExecWorld {
         memory: &StateMemory,
         doing: &'static str,
     ) -> Result<(), EnvError> {
-        let place = StatePlace {
-            state: &memory.path(),
-            bytes_max: WORLD_STATE_BYTES_MAX,
-        };
+        let place = json!({"state": memory.path(), "bytes_max": WORLD_STATE_BYTES_MAX});
         self.process.say_line(&[what], &place, doing)
     }
 
@@ -185,7 +178,8 @@ fn introduce(
 ) -> Result<(WorldProcess, Declaration), EnvError> {
     let mut process = WorldProcess::start(command, level)?;
     let doing = "before it declared itself";
-    process.say_line(b"", &Request::new(seeds), doing)?;
+    let request = json!({"driml_env": VERSION, "copies": seeds.len(), "seeds": seeds});
+    process.say_line(b"", &request, doing)?;
     let line = process.line(patience, doing)?;
     let declaration = Declaration::parse(&line).map_err(|why| process.fail(&why))?;
     Ok((process, declaration))
@@ -367,7 +361,12 @@ impl Environment for ExecWorld {
         let state = self.save_process()?;
         let mut frames = vec![0; self.num_envs * self.config.frame_shape().bytes()];
         self.observe(&mut frames);
-        SavedExec::new(&self.config, self.num_envs, frames, state).to_bytes()
+        saved::encode(&SavedExec {
+            config: self.config.clone(),
+            copies: self.num_envs,
+            frames,
+            state,
+        })
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
