@@ -38,14 +38,6 @@ impl FrameStack {
         })
     }
 
-    /// The shape of one stacked observation: [H, W, C * stack].
-    pub fn shape(&self) -> FrameShape {
-        FrameShape {
-            channels: self.frame.channels * self.stack,
-            ..self.frame
-        }
-    }
-
     /// Takes the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
     ///
     /// # Panics
@@ -99,23 +91,6 @@ impl FrameStack {
         self.stacked.copy_from_slice(stacked);
         Ok(())
     }
-
-    /// Copies the stacked observations into `out` [N, H, W, C * stack].
-    ///
-    /// # Panics
-    /// If `out` has another length.
-    pub fn write(&self, out: &mut [u8]) {
-        out.copy_from_slice(&self.stacked);
-    }
-
-    /// `push`, then `write`.
-    ///
-    /// # Panics
-    /// As these two.
-    pub fn push_into(&mut self, frames: &[u8], first: &[bool], out: &mut [u8]) {
-        self.push(frames, first);
-        self.write(out);
-    }
 }
 
 #[cfg(test)]
@@ -159,12 +134,10 @@ mod tests {
             for t in 0..steps {
                 let frame: Vec<u8> = (0..shape.bytes() * num_envs).map(|_| rng.random()).collect();
                 let first: Vec<bool> = (0..num_envs).map(|_| t == 0 || rng.random_bool(0.2)).collect();
-                let mut out = vec![0; shape.bytes() * stack * num_envs];
-                frames.push_into(&frame, &first, &mut out);
+                frames.push(&frame, &first);
                 history.push((frame, first));
                 let expected: Vec<u8> =
                     (0..num_envs).flat_map(|env| reference(&history, t, env, shape, stack)).collect();
-                prop_assert_eq!(&out, &expected);
                 prop_assert_eq!(frames.stacked(), &expected[..]);
             }
         }
@@ -182,14 +155,6 @@ mod tests {
         assert_eq!(frames.stacked(), [1, 2, 1, 2, 3, 4, 3, 4]);
         frames.push(&[5, 6, 7, 8], &[false]);
         assert_eq!(frames.stacked(), [1, 2, 5, 6, 3, 4, 7, 8]);
-        assert_eq!(
-            frames.shape(),
-            FrameShape {
-                height: 1,
-                width: 2,
-                channels: 4
-            }
-        );
     }
 
     #[test]
