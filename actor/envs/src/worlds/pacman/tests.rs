@@ -41,7 +41,7 @@ fn steady(config: &PacmanConfig) -> PacmanConfig {
 }
 
 fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
-    let places = world.maze.items().len() as u16;
+    let places = world.maze.items.len() as u16;
     (0..places)
         .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
         .unwrap()
@@ -211,7 +211,7 @@ fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
         let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
         world.envs[0].boost_left = 5;
         assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
-        let home = Ghost::at(world.maze.ghost_starts()[0]);
+        let home = Ghost::at(world.maze.ghost_starts[0]);
         assert_eq!(
             world.envs[0].ghosts[0], home,
             "back at its start, wandering"
