@@ -63,9 +63,7 @@ pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
-pub use procgen_sys::{
-    DistributionMode, Engine as ProcgenEngine, Game, InstallError, ProcgenError,
-};
+pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{Levels, Variants, WorldSettings};

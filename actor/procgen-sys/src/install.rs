@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::cache::{Cache, check_private};
-use crate::error::{InstallError, LoadError};
+use crate::error::ProcgenError;
 use crate::library;
 use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 
@@ -28,7 +28,7 @@ impl Engine {
     ///
     /// # Errors
     /// Not installed, something is gone, others can change it, or a machine that cannot run it.
-    pub fn locate() -> Result<Engine, InstallError> {
+    pub fn locate() -> Result<Engine, ProcgenError> {
         Engine::locate_in(&Cache::from_env()?)
     }
 
@@ -39,7 +39,7 @@ impl Engine {
     ///
     /// # Errors
     /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
-    pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, InstallError> {
+    pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, ProcgenError> {
         let cache = Cache::from_env()?;
         Engine::install_in(&cache, LIBRARY_SHA256, progress, wheel::unpack)
     }
@@ -48,7 +48,7 @@ impl Engine {
     ///
     /// # Errors
     /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
-    pub fn source() -> Result<String, InstallError> {
+    pub fn source() -> Result<String, ProcgenError> {
         let cache = Cache::from_env()?;
         let provided = cache.provided("it is not installed")?;
         wheel::check_pip()?;
@@ -64,17 +64,17 @@ impl Engine {
     ///
     /// # Errors
     /// A library or pictures that are not there, or a machine that cannot run it.
-    pub fn other(library: &Path) -> Result<Engine, InstallError> {
+    pub fn other(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         // The loader takes a name without a folder for one of the system's.
         let library = fs::canonicalize(library)
-            .map_err(|error| LoadError::library(library, error.to_string()))?;
+            .map_err(|error| ProcgenError::library(library, error.to_string()))?;
         let mut folders = library.ancestors().skip(1).take(2);
         let assets =
             folders.find_map(|folder| Some(folder.join("assets")).filter(|it| it.is_dir()));
         let assets = assets.ok_or_else(|| {
             let reason = "put Procgen's folder `assets` beside it or beside its folder";
-            LoadError::library(&library, reason)
+            ProcgenError::library(&library, reason)
         })?;
         Ok(Engine { library, assets })
     }
@@ -83,7 +83,7 @@ impl Engine {
     ///
     /// # Errors
     /// A library of the system that is missing, or anything else that the loader reports.
-    pub fn check_loads(&self) -> Result<(), LoadError> {
+    pub fn check_loads(&self) -> Result<(), ProcgenError> {
         library::load(&self.library).map(drop)
     }
 
@@ -97,7 +97,7 @@ impl Engine {
         &self.assets
     }
 
-    fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
+    fn locate_in(cache: &Cache) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         let root = cache.root();
         let engine = Engine {
@@ -121,10 +121,10 @@ impl Engine {
         cache: &Cache,
         library_sha256: &str,
         progress: &mut dyn FnMut(&str),
-        unpack: impl Fn(&Path, Option<&Path>) -> Result<(), InstallError>,
-    ) -> Result<Engine, InstallError> {
+        unpack: impl Fn(&Path, Option<&Path>) -> Result<(), ProcgenError>,
+    ) -> Result<Engine, ProcgenError> {
         let reason = match Engine::locate_in(cache) {
-            Err(InstallError::Missing { reason, .. }) => reason,
+            Err(ProcgenError::Missing { reason, .. }) => reason,
             other => return other,
         };
         let provided = cache.provided(&reason)?;
@@ -138,7 +138,7 @@ impl Engine {
         let folder = tempfile::Builder::new()
             .prefix("install-")
             .tempdir_in(&cache.folder)
-            .map_err(InstallError::io("making a folder in", &cache.folder))?;
+            .map_err(ProcgenError::io("making a folder in", &cache.folder))?;
         let root = cache.root();
         let (fresh, into) = (folder.path().join("fresh"), root.display());
         if let Some(wheel) = &provided {
@@ -157,9 +157,9 @@ impl Engine {
         if root.exists() {
             // What is moved into the temporary folder goes with it.
             fs::rename(&root, folder.path().join("damaged"))
-                .map_err(InstallError::io("moving away the damaged", &root))?;
+                .map_err(ProcgenError::io("moving away the damaged", &root))?;
         }
-        let renamed = fs::rename(&fresh, &root).map_err(InstallError::io("renaming", &root));
+        let renamed = fs::rename(&fresh, &root).map_err(ProcgenError::io("renaming", &root));
         // Where files cannot be locked, another process may have put the same there.
         Engine::locate_in(cache).map_err(|error| renamed.err().unwrap_or(error))
     }
@@ -170,8 +170,8 @@ impl Cache {
         self.folder.join("procgen-0.10.7")
     }
 
-    fn missing(&self, reason: &str) -> InstallError {
-        InstallError::Missing {
+    fn missing(&self, reason: &str) -> ProcgenError {
+        ProcgenError::Missing {
             root: self.root(),
             reason: reason.to_owned(),
             fetched_by: wheel::command_for_people(),
@@ -179,7 +179,7 @@ impl Cache {
     }
 
     /// The wheel that the user has put into the cache folder; an error where there is none and none may be fetched.
-    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, InstallError> {
+    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, ProcgenError> {
         let provided = self.folder.join(WHEEL_NAME);
         if provided.is_file() {
             return Ok(Some(provided));
@@ -229,7 +229,7 @@ mod tests {
     }
 
     /// Installs with what stands for pip.
-    fn install(cache: &Cache, library: &str) -> Result<Engine, InstallError> {
+    fn install(cache: &Cache, library: &str) -> Result<Engine, ProcgenError> {
         let unpack = |to: &Path, _: Option<&Path>| {
             wheel::make_folder(&to.join("assets/b"))?;
             for file in ["libenv.so", "assets/b/c.png"] {
@@ -296,7 +296,7 @@ mod tests {
         fs::set_permissions(&cache.folder, fs::Permissions::from_mode(0o777)).unwrap();
         assert!(matches!(
             install(&cache, LIBRARY_HASH),
-            Err(InstallError::Cache(_))
+            Err(ProcgenError::Cache(_))
         ));
     }
 
@@ -304,7 +304,7 @@ mod tests {
     fn what_cannot_be_had_is_said_with_what_to_do_and_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let mut cache = cache_in(folder.path());
-        let unpack = |_: &Path, _: Option<&Path>| Err(InstallError::Fetch("no route".to_owned()));
+        let unpack = |_: &Path, _: Option<&Path>| Err(ProcgenError::Fetch("no route".to_owned()));
         let said = |cache: &Cache, lines| {
             let mut told = 0;
             let error = Engine::install_in(cache, LIBRARY_SHA256, &mut |_| told += 1, unpack);

@@ -9,7 +9,7 @@ use std::process::{Command, Output, Stdio};
 
 use sha2::{Digest, Sha256};
 
-use crate::error::InstallError;
+use crate::error::ProcgenError;
 
 /// The wheel's file name. It is the one for CPython 3.10, but no Python is needed to use the engine in it.
 pub(crate) const WHEEL_NAME: &str =
@@ -46,14 +46,14 @@ pub(crate) fn command_for_people() -> String {
 
 /// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip does it, and
 /// checks the wheel's hash: of the one in the folder `provided`, else of the index's.
-pub(crate) fn unpack(to: &Path, provided: Option<&Path>) -> Result<(), InstallError> {
+pub(crate) fn unpack(to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
     unpack_with("python3", to, provided)
 }
 
-fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), InstallError> {
+fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
     let [all, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
     let text = format!("procgen==0.10.7 --hash=sha256:{WHEEL_SHA256}\n");
-    fs::write(&pins, text).map_err(InstallError::io("writing", &pins))?;
+    fs::write(&pins, text).map_err(ProcgenError::io("writing", &pins))?;
     let [all_text, pins] = [&all, &pins].map(|path| path.display().to_string());
     let mut arguments = vec!["install", "--no-compile", "--require-hashes", "-r", &pins];
     arguments.extend(["--target", &all_text]);
@@ -67,7 +67,7 @@ fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), I
         make_folder(to)?;
         for (path, name) in NEEDED {
             let path = all.join(path);
-            fs::rename(&path, to.join(name)).map_err(InstallError::io("moving", &path))?;
+            fs::rename(&path, to.join(name)).map_err(ProcgenError::io("moving", &path))?;
         }
         return Ok(());
     }
@@ -77,18 +77,18 @@ fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), I
         .filter(|line| !line.trim().is_empty())
         .collect();
     let last = &lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..];
-    Err(InstallError::Fetch(format!(
+    Err(ProcgenError::Fetch(format!(
         "`{python} -m pip install` failed ({}); check the network and which package index pip uses. Its output:\n  {}\n",
         output.status,
         last.join("\n  ")
     )))
 }
 
-pub(crate) fn check_pip() -> Result<(), InstallError> {
+pub(crate) fn check_pip() -> Result<(), ProcgenError> {
     pip("python3", &["--version"]).map(drop)
 }
 
-fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
+fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
     // Other users can change nothing of what it writes, whatever the umask says.
     let mut command = Command::new("sh");
     command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
@@ -98,10 +98,10 @@ fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
         let text = format!(
             "{what} is not installed; install Python and pip (`apt-get install python3-pip`, `dnf install python3-pip`)"
         );
-        Err(InstallError::Fetch(text))
+        Err(ProcgenError::Fetch(text))
     };
     match command.stdin(Stdio::null()).output() {
-        Err(error) => Err(InstallError::io("running", Path::new("sh"))(error)),
+        Err(error) => Err(ProcgenError::io("running", Path::new("sh"))(error)),
         // The status of a shell that finds no Python, or of a launcher with none behind it.
         Ok(output) if output.status.code() == Some(127) => missing(python),
         Ok(output) if String::from_utf8_lossy(&output.stderr).contains("No module named pip") => {
@@ -111,26 +111,26 @@ fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
     }
 }
 
-pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), InstallError> {
+pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError> {
     let mut hasher = Sha256::new();
-    let mut file = File::open(path).map_err(InstallError::io("opening", path))?;
-    io::copy(&mut file, &mut hasher).map_err(InstallError::io("reading", path))?;
+    let mut file = File::open(path).map_err(ProcgenError::io("opening", path))?;
+    io::copy(&mut file, &mut hasher).map_err(ProcgenError::io("reading", path))?;
     let bytes = hasher.finalize();
     let actual: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
     if actual == expected {
         return Ok(());
     }
     let reason = format!("its SHA-256 is {actual}, expected {expected}");
-    Err(InstallError::Wheel {
+    Err(ProcgenError::Wheel {
         path: path.to_owned(),
         reason,
     })
 }
 
 /// Makes a folder, and those above it, in which other users can change nothing.
-pub(crate) fn make_folder(path: &Path) -> Result<(), InstallError> {
+pub(crate) fn make_folder(path: &Path) -> Result<(), ProcgenError> {
     let made = DirBuilder::new().recursive(true).mode(0o755).create(path);
-    made.map_err(InstallError::io("making", path))
+    made.map_err(ProcgenError::io("making", path))
 }
 
 #[cfg(test)]
@@ -151,7 +151,7 @@ mod tests {
     }
 
     /// Unpacks into the folder's `fresh` with a Python that is this script, which runs in the folder.
-    fn unpack_by(script: &str, folder: &Path, provided: Option<&Path>) -> Result<(), InstallError> {
+    fn unpack_by(script: &str, folder: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
         let python = folder.join("python3");
         let script = format!("#!/bin/sh\ncd \"${{0%/*}}\"\n{script}\n");
         fs::write(&python, script).unwrap();
