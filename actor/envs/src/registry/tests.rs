@@ -213,8 +213,9 @@ fn shapes_and_actions_are_those_of_the_built_world() {
 }
 
 #[test]
-fn no_environments_and_wrong_buffers_are_errors() {
-    for config in configs() {
+fn no_environments_wrong_buffers_and_wrong_actions_are_errors() {
+    let with_engine = procgen::tests::engine().map(|_| procgen(0, 500));
+    for config in configs().into_iter().chain(with_engine) {
         assert!(config.build(0, 1, 0).is_err());
         let mut world = config.build(2, 1, 0).unwrap();
         let (mut rewards, mut ends) = ([0.0; 2], [Default::default(); 2]);
@@ -228,7 +229,14 @@ fn no_environments_and_wrong_buffers_are_errors() {
         );
         assert!(world.step(&[0; 2], &mut rewards[..1], &mut ends).is_err());
         assert!(world.step(&[0; 2], &mut rewards, &mut ends[..1]).is_err());
-        assert!(world.step(&[0, 200], &mut rewards, &mut ends).is_err());
+        let actions = world.num_actions();
+        let error = world.step(&[0, actions as u8], &mut rewards, &mut ends);
+        assert_eq!(
+            error.unwrap_err().to_string(),
+            format!(
+                "action {actions} of environment 1 is out of range: this world has {actions} actions"
+            )
+        );
     }
 }
 

@@ -283,12 +283,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn bad_actions_and_settings_are_errors() {
-        let mut world = ChainWorld::new(&config(), 1).unwrap();
-        for wrong in [&[3][..], &[0, 0]] {
-            let step = world.step(wrong, &mut [0.0], &mut [StepEnd::Running]);
-            assert!(step.is_err(), "{wrong:?}");
-        }
+    fn bad_settings_are_errors() {
         let changes: [fn(&mut ChainConfig); 5] = [
             |it| it.cells = 2,
             |it| it.width = 7,
