@@ -67,7 +67,7 @@ pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenEr
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{Levels, Variants, WorldSettings};
-pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return, optimal_return};
+pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return};
 pub use worlds::exec::{ExecConfig, ExecWorld, declaration as exec_declaration};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};

@@ -31,11 +31,6 @@ pub struct ChainConfig {
     pub reward_right: f32,
 }
 
-/// The best undiscounted return of one episode: `optimal_discounted_return` with gamma = 1.
-pub fn optimal_return(config: &ChainConfig) -> f64 {
-    optimal_discounted_return(config, 1.0)
-}
-
 /// The best return from the start with discount `gamma` in 0..=1: max(0, r_left, gamma^(cells - 3) r_right).
 ///
 /// The right end is `cells` - 2 steps away, so its reward is the (`cells` - 2)-th, and it counts only if the step limit
@@ -219,7 +214,7 @@ pub(crate) mod tests {
     #[test]
     fn the_best_policy_attains_the_optimum() {
         let base = config();
-        assert_eq!(optimal_return(&base), 1.0);
+        assert_eq!(optimal_discounted_return(&base, 1.0), 1.0);
         for (cells, step_limit, reward_left) in [
             (8, 30, 0.1),
             (8, 6, 0.1),
