@@ -84,4 +84,3 @@ pub use policy::{NetworkPolicy, Policy, RandomPolicy};
 pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};
 pub use schedule::{BeyondLadder, Schedule};
-pub use weights::{NewestWeights, WeightsError, WeightsSource};
