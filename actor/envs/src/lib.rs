@@ -52,6 +52,8 @@ mod environment;
 mod envs;
 mod error;
 mod frame_stack;
+#[cfg(test)]
+mod playing;
 mod plugin;
 mod registry;
 mod restricted;

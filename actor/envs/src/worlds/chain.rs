@@ -183,6 +183,7 @@ impl Envs for ChainWorld {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::playing::{frames, step};
 
     /// A corridor in which 0.1 is near and 1 is far.
     pub(crate) fn config() -> ChainConfig {
@@ -201,12 +202,11 @@ pub(crate) mod tests {
         let mut world = ChainWorld::new(config, 1).unwrap();
         let (mut total, mut discount) = (0.0, 1.0);
         loop {
-            let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
-            world.step(&[action], &mut reward, &mut end).unwrap();
-            total += discount * f64::from(reward[0]);
+            let (rewards, ends) = step(&mut world, &[action]);
+            total += discount * f64::from(rewards[0]);
             discount *= gamma;
-            if end[0] != StepEnd::Running {
-                return (total, end[0]);
+            if ends[0] != StepEnd::Running {
+                return (total, ends[0]);
             }
         }
     }
@@ -260,15 +260,11 @@ pub(crate) mod tests {
     fn each_cell_has_its_own_frame() {
         let mut world = ChainWorld::new(&config(), 2).unwrap();
         let mut seen = std::collections::BTreeSet::new();
-        let mut frames = vec![0; 2 * 144];
         for _ in 1..7 {
-            world.observe(&mut frames);
-            assert!(seen.insert(frames[144..].to_vec()));
-            world
-                .step(&[0, 2], &mut [0.0; 2], &mut [StepEnd::Running; 2])
-                .unwrap();
+            assert!(seen.insert(frames(&mut world)[144..].to_vec()));
+            step(&mut world, &[0, 2]);
         }
-        world.observe(&mut frames);
+        let frames = frames(&mut world);
         assert_eq!(
             frames[..144],
             frames[144..],
