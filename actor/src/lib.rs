@@ -15,7 +15,7 @@
 //!
 //! impl Environment for Counter {
 //!     fn frame_shape(&self) -> FrameShape {
-//!         FrameShape { height: 1, width: 1, channels: 1 }
+//!         FrameShape::new(1, 1, 1)
 //!     }
 //!     fn num_actions(&self) -> usize {
 //!         3

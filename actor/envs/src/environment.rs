@@ -15,6 +15,15 @@ pub struct FrameShape {
 }
 
 impl FrameShape {
+    /// As a shape [H, W, C] is written.
+    pub const fn new(height: usize, width: usize, channels: usize) -> Self {
+        Self {
+            height,
+            width,
+            channels,
+        }
+    }
+
     /// Bytes in one frame.
     pub const fn bytes(&self) -> usize {
         self.height * self.width * self.channels

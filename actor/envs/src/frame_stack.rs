@@ -128,7 +128,7 @@ mod tests {
         ) {
             use rand::{Rng, SeedableRng};
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-            let shape = FrameShape { height, width, channels };
+            let shape = FrameShape::new(height, width, channels);
             let mut frames = FrameStack::new(shape, stack, num_envs).unwrap();
             let mut history = vec![];
             for t in 0..steps {
@@ -145,11 +145,7 @@ mod tests {
 
     #[test]
     fn oldest_channels_come_first() {
-        let shape = FrameShape {
-            height: 1,
-            width: 2,
-            channels: 2,
-        };
+        let shape = FrameShape::new(1, 2, 2);
         let mut frames = FrameStack::new(shape, 2, 1).unwrap();
         frames.push(&[1, 2, 3, 4], &[true]);
         assert_eq!(frames.stacked(), [1, 2, 1, 2, 3, 4, 3, 4]);
@@ -159,11 +155,7 @@ mod tests {
 
     #[test]
     fn a_stack_of_none_is_an_error() {
-        let shape = FrameShape {
-            height: 1,
-            width: 1,
-            channels: 1,
-        };
+        let shape = FrameShape::new(1, 1, 1);
         assert!(FrameStack::new(shape, 0, 1).is_err());
         assert!(FrameStack::new(shape, 65, 1).is_err());
     }

@@ -43,11 +43,7 @@ impl RestrictedWorld {
         (height, width): (usize, usize),
     ) -> Result<Box<dyn Environment>, EnvError> {
         let (whole, count) = (world.frame_shape(), world.num_actions());
-        let shape = FrameShape {
-            height,
-            width,
-            channels: whole.channels,
-        };
+        let shape = FrameShape::new(height, width, whole.channels);
         let has_all = actions.iter().map(|&it| usize::from(it)).eq(0..count);
         if shape == whole && has_all {
             return Ok(world);

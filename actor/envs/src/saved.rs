@@ -140,11 +140,7 @@ pub(crate) mod tests {
         struct Silent;
         impl Environment for Silent {
             fn frame_shape(&self) -> crate::FrameShape {
-                crate::FrameShape {
-                    height: 1,
-                    width: 1,
-                    channels: 1,
-                }
+                crate::FrameShape::new(1, 1, 1)
             }
             fn num_actions(&self) -> usize {
                 1

@@ -34,11 +34,7 @@ impl WorldSettings for IslandConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.side * FIELD,
-            width: self.side * FIELD,
-            channels: 1,
-        }
+        FrameShape::new(self.side * FIELD, self.side * FIELD, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {

@@ -125,11 +125,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
             Ok(())
         }
         fn frame_shape(&self) -> FrameShape {
-            FrameShape {
-                height: self.reward as usize,
-                width: 2,
-                channels: 1,
-            }
+            FrameShape::new(self.reward as usize, 2, 1)
         }
         fn action_names(&self) -> Vec<&str> {
             vec!["only"]

@@ -103,11 +103,7 @@ impl WorldSettings for ChainConfig {
 
     /// `height` x `width` x 1.
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.height,
-            width: self.width,
-            channels: 1,
-        }
+        FrameShape::new(self.height, self.width, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {

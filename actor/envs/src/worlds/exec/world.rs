@@ -66,11 +66,7 @@ impl ExecWorld {
             seeds(seed, num_envs),
             Level::INFO,
         )?;
-        let shape = FrameShape {
-            height: declared.height,
-            width: declared.width,
-            channels: declared.channels,
-        };
+        let shape = FrameShape::new(declared.height, declared.width, declared.channels);
         if shape != config.frame_shape() || declared.actions != config.actions {
             let found = describe(shape, &declared.actions);
             let promised = describe(config.frame_shape(), &config.actions);
@@ -262,11 +258,7 @@ impl WorldSettings for ExecConfig {
 
     /// `height` x `width` x `channels`.
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.height,
-            width: self.width,
-            channels: self.channels,
-        }
+        FrameShape::new(self.height, self.width, self.channels)
     }
 
     fn action_names(&self) -> Vec<&str> {

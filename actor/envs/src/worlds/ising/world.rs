@@ -119,11 +119,7 @@ impl WorldSettings for IsingConfig {
 
     /// `lattice_size` x `lattice_size` x 1.
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.lattice_size,
-            width: self.lattice_size,
-            channels: 1,
-        }
+        FrameShape::new(self.lattice_size, self.lattice_size, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {
