@@ -28,7 +28,6 @@ pub struct Acting {
     stack: FrameStack,
     rng: ChaCha8Rng,
     frames: Vec<u8>,
-    states: Vec<u8>,
     actions: Vec<u8>,
     rewards: Vec<f32>,
     ends: Vec<StepEnd>,
@@ -60,7 +59,6 @@ impl Acting {
             stack: FrameStack::new(shape, frame_stack, envs)?,
             rng,
             frames: vec![0; envs * shape.bytes()],
-            states: vec![0; envs * shape.bytes() * frame_stack],
             actions: vec![0; envs],
             rewards: vec![0.0; envs],
             ends: vec![StepEnd::Running; envs],
@@ -76,8 +74,8 @@ impl Acting {
     pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> Result<Step<'_>, ActError> {
         self.world.observe(&mut self.frames);
         self.stack.push(&self.frames, &self.first);
-        self.stack.write(&mut self.states);
-        policy.act(&self.states, epsilon, &mut self.rng, &mut self.actions)?;
+        let states = self.stack.stacked();
+        policy.act(states, epsilon, &mut self.rng, &mut self.actions)?;
         self.world
             .step(&self.actions, &mut self.rewards, &mut self.ends)?;
         for (first, end) in self.first.iter_mut().zip(&self.ends) {
@@ -85,7 +83,7 @@ impl Acting {
         }
         Ok(Step {
             frames: &self.frames,
-            states: &self.states,
+            states,
             actions: &self.actions,
             rewards: &self.rewards,
             ends: &self.ends,

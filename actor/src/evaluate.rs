@@ -98,11 +98,7 @@ mod tests {
 
     impl Environment for Scripted {
         fn frame_shape(&self) -> FrameShape {
-            FrameShape {
-                height: 1,
-                width: 1,
-                channels: 1,
-            }
+            FrameShape::new(1, 1, 1)
         }
 
         fn num_actions(&self) -> usize {

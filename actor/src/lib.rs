@@ -15,7 +15,7 @@
 //!
 //! impl Environment for Counter {
 //!     fn frame_shape(&self) -> FrameShape {
-//!         FrameShape { height: 1, width: 1, channels: 1 }
+//!         FrameShape::new(1, 1, 1)
 //!     }
 //!     fn num_actions(&self) -> usize {
 //!         3
@@ -84,4 +84,3 @@ pub use policy::{NetworkPolicy, Policy, RandomPolicy};
 pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};
 pub use schedule::{BeyondLadder, Schedule};
-pub use weights::{NewestWeights, WeightsError, WeightsSource};

@@ -16,7 +16,7 @@ use crate::{
     collect::{Collector, Incarnation},
     config::ActorSettings,
     delivery::{Delivery, DeliveryLimits},
-    weights::{NewestWeights, WeightsSource},
+    weights::{self, NewestWeights},
 };
 
 /// How long an actor waits for a learner with weights.
@@ -103,10 +103,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         activity.clone(),
         shutdown.clone(),
     )?;
-    let source = WeightsSource {
-        client: client.clone(),
-    };
-    let Some(first) = source.first(WEIGHTS_WAIT_MAX, shutdown)? else {
+    let Some(first) = weights::first(&client, WEIGHTS_WAIT_MAX, shutdown)? else {
         return Ok(());
     };
     // The learner has joined by now, and with it the replay server knows where a resumed run stands.
@@ -129,7 +126,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         first.header.version,
         &first.safetensors,
     )?;
-    let newest = source.watch(first.header.version, shutdown.clone())?;
+    let newest = weights::watch(client.clone(), first.header.version, shutdown.clone())?;
     let delivery = Delivery::start(
         client.clone(),
         run_info.inserted_total,

@@ -27,7 +27,7 @@ const SILENT_MAX: Duration = Duration::from_secs(5);
 
 /// Why there are no weights, or no newer ones.
 #[derive(Debug, thiserror::Error)]
-pub enum WeightsError {
+pub(crate) enum WeightsError {
     /// The learner has sent none yet, or they could not be pulled in the time given.
     #[error(
         "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
@@ -54,7 +54,7 @@ pub enum WeightsError {
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
-pub struct NewestWeights {
+pub(crate) struct NewestWeights {
     shared: Arc<(Mutex<State>, Condvar)>,
 }
 
@@ -89,7 +89,7 @@ impl NewestWeights {
 
     /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
     /// for, at most for `wait_max`.
-    pub fn take_within(&self, wait_max: Duration) -> Option<Weights> {
+    pub(crate) fn take_within(&self, wait_max: Duration) -> Option<Weights> {
         let mut state = self.state();
         state.is_wanted = true;
         self.shared.1.notify_all();
@@ -137,153 +137,149 @@ impl NewestWeights {
     }
 }
 
-/// Where weights come from.
-#[derive(Clone, Debug)]
-pub struct WeightsSource {
-    /// A client of the replay server.
-    pub client: RunClient,
-}
-
-impl WeightsSource {
-    /// Pulls the first weights, waiting until the learner has sent some; `None` if told to stop before.
-    ///
-    /// # Errors
-    /// No weights within `wait_max`, not counting the time in which the replay server reads its replay back from disk.
-    pub fn first(
-        &self,
-        wait_max: Duration,
-        shutdown: &Shutdown,
-    ) -> Result<Option<Weights>, WeightsError> {
-        let mut started = Instant::now();
-        let mut said = LogLimiter::default();
-        loop {
-            let pulled = self.pull(0);
-            match pulled {
-                Err(WeightsError::Session(SessionError::Recovering(recovering))) => {
-                    started = Instant::now();
-                    if recovering.progress.is_slow() && said.due().is_some() {
-                        tracing::info!("waiting for weights for as long as it takes: {recovering}");
-                    }
+/// Pulls the first weights, waiting until the learner has sent some; `None` if told to stop before.
+///
+/// # Errors
+/// No weights within `wait_max`, not counting the time in which the replay server reads its replay back from disk.
+pub(crate) fn first(
+    client: &RunClient,
+    wait_max: Duration,
+    shutdown: &Shutdown,
+) -> Result<Option<Weights>, WeightsError> {
+    let mut started = Instant::now();
+    let mut said = LogLimiter::default();
+    loop {
+        let pulled = pull(client, 0);
+        match pulled {
+            Err(WeightsError::Session(SessionError::Recovering(recovering))) => {
+                started = Instant::now();
+                if recovering.progress.is_slow() && said.due().is_some() {
+                    tracing::info!("waiting for weights for as long as it takes: {recovering}");
                 }
-                Ok(Some(weights)) => return Ok(Some(weights)),
-                pulled if started.elapsed() > wait_max => {
-                    let source = pulled.err().map(Box::new);
-                    return Err(WeightsError::NoneInTime { wait_max, source });
-                }
-                Err(e) => tracing::debug!("no weights yet: {e}"),
-                Ok(None) => {}
             }
-            if started.elapsed() > SILENT_MAX && said.due().is_some() {
-                tracing::info!("waiting for the learner's first weights");
+            Ok(Some(weights)) => return Ok(Some(weights)),
+            pulled if started.elapsed() > wait_max => {
+                let source = pulled.err().map(Box::new);
+                return Err(WeightsError::NoneInTime { wait_max, source });
             }
-            if shutdown.wait_timeout(PAUSE) {
-                return Ok(None);
-            }
+            Err(e) => tracing::debug!("no weights yet: {e}"),
+            Ok(None) => {}
+        }
+        if started.elapsed() > SILENT_MAX && said.due().is_some() {
+            tracing::info!("waiting for the learner's first weights");
+        }
+        if shutdown.wait_timeout(PAUSE) {
+            return Ok(None);
         }
     }
+}
 
-    /// Watches until `shutdown`, on its own thread.
-    ///
-    /// # Errors
-    /// No subscription, or no thread.
-    pub fn watch(self, version: u64, shutdown: Shutdown) -> Result<NewestWeights, WeightsError> {
-        let newest = NewestWeights::after(version);
-        let slot = newest.clone();
-        let on_announcement = move |announced: Result<WeightsVersion, CodecError>| match announced {
-            Ok(announced) => slot.announce(announced.version),
-            Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
-        };
-        let announcements = self
-            .client
-            .subscribe(on_announcement)
-            .map_err(|e| WeightsError::Failed(format!("listening for new weights: {e}")))?;
-        let slot = newest.clone();
-        let work = move || {
-            // For as long as the thread lives.
-            let _announcements = announcements;
-            let mut looked = Instant::now();
-            while !shutdown.is_set() {
-                fail_point::reach("weights-watch");
-                let wanted = slot.wait_until_wanted(TICK);
-                let Some(version) = wanted.or_else(|| {
-                    // An announcement may have been lost.
-                    let look = looked.elapsed() > PULL_ANYWAY;
-                    look.then(|| slot.state().pulled)
-                }) else {
-                    continue;
-                };
-                looked = Instant::now();
-                match self.pull(version) {
-                    Ok(weights) => slot.put(weights),
-                    // The actor leaves: its session closes under this thread.
-                    Err(_) if self.client.session().is_closed() => return,
-                    Err(e) => {
-                        tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
-                        slot.put(None);
-                    }
+/// Watches until `shutdown`, on its own thread.
+///
+/// # Errors
+/// No subscription, or no thread.
+pub(crate) fn watch(
+    client: RunClient,
+    version: u64,
+    shutdown: Shutdown,
+) -> Result<NewestWeights, WeightsError> {
+    let newest = NewestWeights::after(version);
+    let slot = newest.clone();
+    let on_announcement = move |announced: Result<WeightsVersion, CodecError>| match announced {
+        Ok(announced) => slot.announce(announced.version),
+        Err(e) => tracing::warn!("an announcement of weights was dropped: {e}"),
+    };
+    let announcements = client
+        .subscribe(on_announcement)
+        .map_err(|e| WeightsError::Failed(format!("listening for new weights: {e}")))?;
+    let slot = newest.clone();
+    let work = move || {
+        // For as long as the thread lives.
+        let _announcements = announcements;
+        let mut looked = Instant::now();
+        while !shutdown.is_set() {
+            fail_point::reach("weights-watch");
+            let wanted = slot.wait_until_wanted(TICK);
+            let Some(version) = wanted.or_else(|| {
+                // An announcement may have been lost.
+                let look = looked.elapsed() > PULL_ANYWAY;
+                look.then(|| slot.state().pulled)
+            }) else {
+                continue;
+            };
+            looked = Instant::now();
+            match pull(&client, version) {
+                Ok(weights) => slot.put(weights),
+                // The actor leaves: its session closes under this thread.
+                Err(_) if client.session().is_closed() => return,
+                Err(e) => {
+                    tracing::warn!("keeping weights {version}, newer ones did not come: {e}");
+                    slot.put(None);
                 }
             }
-        };
-        std::thread::Builder::new()
-            .name("weights-watch".into())
-            .spawn(work)?;
-        Ok(newest)
-    }
+        }
+    };
+    std::thread::Builder::new()
+        .name("weights-watch".into())
+        .spawn(work)?;
+    Ok(newest)
+}
 
-    /// The newest weights, piece by piece; none if they are not newer than `version`.
-    fn pull(&self, version: u64) -> Result<Option<Weights>, WeightsError> {
-        let pool = BufferPool::new(PIECES_IN_FLIGHT);
-        let first = self.ask(WeightsRequest::NewerThan(version))?;
-        let (reply, piece) = first.receive(&pool)?;
+/// The newest weights, piece by piece; none if they are not newer than `version`.
+fn pull(client: &RunClient, version: u64) -> Result<Option<Weights>, WeightsError> {
+    let pool = BufferPool::new(PIECES_IN_FLIGHT);
+    let first = ask(client, WeightsRequest::NewerThan(version))?;
+    let (reply, piece) = first.receive(&pool)?;
+    let WeightsReply::Piece {
+        weights,
+        bytes,
+        offset,
+    } = reply
+    else {
+        return Ok(None);
+    };
+    let mut assembly = Assembly::new(weights, bytes)?;
+    assembly.take(weights, offset, &piece)?;
+    let offsets = (assembly.next_offset()..assembly.bytes()).step_by(PIECE_BYTES);
+    let mut requests = offsets.map(|offset| WeightsRequest::Piece {
+        version: weights.version,
+        offset,
+    });
+    let mut asked = VecDeque::new();
+    while !assembly.is_whole() {
+        while asked.len() < PIECES_IN_FLIGHT
+            && let Some(request) = requests.next()
+        {
+            asked.push_back(ask(client, request)?);
+        }
+        let failed = |what: &str| {
+            let version = weights.version;
+            WeightsError::Failed(format!("weights {version} {what}"))
+        };
+        let next = asked.pop_front();
+        let next = next.ok_or_else(|| failed("have no last piece"))?;
+        let (reply, piece) = next.receive(&pool)?;
+        // Newer versions came so often that the replay server dropped this one.
         let WeightsReply::Piece {
-            weights,
-            bytes,
-            offset,
+            weights, offset, ..
         } = reply
         else {
-            return Ok(None);
+            return Err(failed("were replaced too often while they were pulled"));
         };
-        let mut assembly = Assembly::new(weights, bytes)?;
         assembly.take(weights, offset, &piece)?;
-        let offsets = (assembly.next_offset()..assembly.bytes()).step_by(PIECE_BYTES);
-        let mut requests = offsets.map(|offset| WeightsRequest::Piece {
-            version: weights.version,
-            offset,
-        });
-        let mut asked = VecDeque::new();
-        while !assembly.is_whole() {
-            while asked.len() < PIECES_IN_FLIGHT
-                && let Some(request) = requests.next()
-            {
-                asked.push_back(self.ask(request)?);
-            }
-            let failed = |what: &str| {
-                let version = weights.version;
-                WeightsError::Failed(format!("weights {version} {what}"))
-            };
-            let next = asked.pop_front();
-            let next = next.ok_or_else(|| failed("have no last piece"))?;
-            let (reply, piece) = next.receive(&pool)?;
-            // Newer versions came so often that the replay server dropped this one.
-            let WeightsReply::Piece {
-                weights, offset, ..
-            } = reply
-            else {
-                return Err(failed("were replaced too often while they were pulled"));
-            };
-            assembly.take(weights, offset, &piece)?;
-        }
-        Ok(Some(assembly.finish()?))
     }
-
-    fn ask(&self, request: WeightsRequest) -> Result<PendingReply<WeightsReply>, WeightsError> {
-        let request = self.client.seal(&request)?;
-        self.client
-            .send(request, PIECE_TIMEOUT)
-            .map_err(|e| WeightsError::Failed(format!("asking for weights: {e}")))
-    }
+    Ok(Some(assembly.finish()?))
 }
 
+fn ask(
+    client: &RunClient,
+    request: WeightsRequest,
+) -> Result<PendingReply<WeightsReply>, WeightsError> {
+    let request = client.seal(&request)?;
+    client
+        .send(request, PIECE_TIMEOUT)
+        .map_err(|e| WeightsError::Failed(format!("asking for weights: {e}")))
+}
 #[cfg(test)]
 mod tests {
     use driml_protocol::WeightsHeader;

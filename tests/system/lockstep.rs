@@ -1,7 +1,7 @@
 //! `driml local --lockstep`: the same seed gives the same weights, and an agent learns what can be learned.
 //! It starts one process only.
 
-use driml_envs::{ChainConfig, optimal_return};
+use driml_envs::{ChainConfig, optimal_discounted_return};
 use driml_settings::presets::AGENTS;
 use driml_tests::{Process, Summary, TestSystem, is_offline, note};
 use nix::sys::signal::Signal;
@@ -184,7 +184,7 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
     let mut world = folder.config()["world"].as_table().unwrap().clone();
     world.remove("kind");
     let world: ChainConfig = world.try_into().unwrap();
-    let wanted = 0.9 * optimal_return(&world);
+    let wanted = 0.9 * optimal_discounted_return(&world, 1.0);
     let while_training = summary.mean_return.unwrap();
     assert!(
         while_training >= wanted,

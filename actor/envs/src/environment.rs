@@ -15,6 +15,15 @@ pub struct FrameShape {
 }
 
 impl FrameShape {
+    /// As a shape [H, W, C] is written.
+    pub const fn new(height: usize, width: usize, channels: usize) -> Self {
+        Self {
+            height,
+            width,
+            channels,
+        }
+    }
+
     /// Bytes in one frame.
     pub const fn bytes(&self) -> usize {
         self.height * self.width * self.channels
@@ -70,10 +79,9 @@ pub trait Environment: Send {
     /// exactly as this one does.
     ///
     /// # Errors
-    /// One that [`is_not_saved`](EnvError::is_not_saved) where a world cannot do this, [`EnvError::NotSaved`] unless it says otherwise; a
-    /// fault of the engine.
+    /// [`EnvError::NotSaved`] where a world cannot do this, which is the default; a fault of the engine.
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        Err(EnvError::NotSaved)
+        Err(EnvError::not_saved())
     }
 
     /// Takes the state that [`save`](Self::save) gave. That the bytes are undamaged is the caller's to check.
@@ -81,6 +89,6 @@ pub trait Environment: Send {
     /// # Errors
     /// Bytes of another world, of other settings or of another number of environments; the world must then not be used any more.
     fn load(&mut self, _state: &[u8]) -> Result<(), EnvError> {
-        Err(EnvError::NotSaved)
+        Err(EnvError::not_saved())
     }
 }

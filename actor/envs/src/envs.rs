@@ -126,22 +126,16 @@ pub(crate) fn check_step(
         ("ends", ends.len()),
     ] {
         if got != num_envs {
-            return Err(EnvError::BufferLength {
-                name,
-                got,
-                num_envs,
-            });
+            return Err(EnvError::Step(format!(
+                "{name} has {got} entries, but the world has {num_envs} environments"
+            )));
         }
     }
-    match actions
-        .iter()
-        .position(|&action| usize::from(action) >= num_actions)
-    {
-        Some(env) => Err(EnvError::ActionOutOfRange {
-            env,
-            action: actions[env],
-            num_actions,
-        }),
+    let mut numbered = actions.iter().enumerate();
+    match numbered.find(|(_, action)| usize::from(**action) >= num_actions) {
+        Some((env, action)) => Err(EnvError::Step(format!(
+            "action {action} of environment {env} is out of range: this world has {num_actions} actions"
+        ))),
         None => Ok(()),
     }
 }

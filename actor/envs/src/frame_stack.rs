@@ -38,14 +38,6 @@ impl FrameStack {
         })
     }
 
-    /// The shape of one stacked observation: [H, W, C * stack].
-    pub fn shape(&self) -> FrameShape {
-        FrameShape {
-            channels: self.frame.channels * self.stack,
-            ..self.frame
-        }
-    }
-
     /// Takes the current `frames` [N, H, W, C]; `first` [N] says which are the first of an episode or level.
     ///
     /// # Panics
@@ -99,23 +91,6 @@ impl FrameStack {
         self.stacked.copy_from_slice(stacked);
         Ok(())
     }
-
-    /// Copies the stacked observations into `out` [N, H, W, C * stack].
-    ///
-    /// # Panics
-    /// If `out` has another length.
-    pub fn write(&self, out: &mut [u8]) {
-        out.copy_from_slice(&self.stacked);
-    }
-
-    /// `push`, then `write`.
-    ///
-    /// # Panics
-    /// As these two.
-    pub fn push_into(&mut self, frames: &[u8], first: &[bool], out: &mut [u8]) {
-        self.push(frames, first);
-        self.write(out);
-    }
 }
 
 #[cfg(test)]
@@ -153,18 +128,16 @@ mod tests {
         ) {
             use rand::{Rng, SeedableRng};
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-            let shape = FrameShape { height, width, channels };
+            let shape = FrameShape::new(height, width, channels);
             let mut frames = FrameStack::new(shape, stack, num_envs).unwrap();
             let mut history = vec![];
             for t in 0..steps {
                 let frame: Vec<u8> = (0..shape.bytes() * num_envs).map(|_| rng.random()).collect();
                 let first: Vec<bool> = (0..num_envs).map(|_| t == 0 || rng.random_bool(0.2)).collect();
-                let mut out = vec![0; shape.bytes() * stack * num_envs];
-                frames.push_into(&frame, &first, &mut out);
+                frames.push(&frame, &first);
                 history.push((frame, first));
                 let expected: Vec<u8> =
                     (0..num_envs).flat_map(|env| reference(&history, t, env, shape, stack)).collect();
-                prop_assert_eq!(&out, &expected);
                 prop_assert_eq!(frames.stacked(), &expected[..]);
             }
         }
@@ -172,33 +145,17 @@ mod tests {
 
     #[test]
     fn oldest_channels_come_first() {
-        let shape = FrameShape {
-            height: 1,
-            width: 2,
-            channels: 2,
-        };
+        let shape = FrameShape::new(1, 2, 2);
         let mut frames = FrameStack::new(shape, 2, 1).unwrap();
         frames.push(&[1, 2, 3, 4], &[true]);
         assert_eq!(frames.stacked(), [1, 2, 1, 2, 3, 4, 3, 4]);
         frames.push(&[5, 6, 7, 8], &[false]);
         assert_eq!(frames.stacked(), [1, 2, 5, 6, 3, 4, 7, 8]);
-        assert_eq!(
-            frames.shape(),
-            FrameShape {
-                height: 1,
-                width: 2,
-                channels: 4
-            }
-        );
     }
 
     #[test]
     fn a_stack_of_none_is_an_error() {
-        let shape = FrameShape {
-            height: 1,
-            width: 1,
-            channels: 1,
-        };
+        let shape = FrameShape::new(1, 1, 1);
         assert!(FrameStack::new(shape, 0, 1).is_err());
         assert!(FrameStack::new(shape, 65, 1).is_err());
     }

@@ -52,6 +52,8 @@ mod environment;
 mod envs;
 mod error;
 mod frame_stack;
+#[cfg(test)]
+mod playing;
 mod plugin;
 mod registry;
 mod restricted;
@@ -63,14 +65,12 @@ pub use environment::{Environment, FrameShape, StepEnd};
 pub use error::EnvError;
 pub use frame_stack::FrameStack;
 pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
-pub use procgen_sys::{
-    DistributionMode, Engine as ProcgenEngine, Game, InstallError, ProcgenError,
-};
+pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
 pub use settings::{Levels, Variants, WorldSettings};
-pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return, optimal_return};
-pub use worlds::exec::{ExecConfig, ExecError, ExecWorld, declaration as exec_declaration};
+pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return};
+pub use worlds::exec::{ExecConfig, ExecWorld, declaration as exec_declaration};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};
 pub use worlds::pacman::{IsingOverlay, LethalSchedule, PacmanConfig, PacmanWorld};
 pub use worlds::procgen::{ProcgenConfig, ProcgenWorld, visible_actions};

@@ -43,11 +43,7 @@ impl RestrictedWorld {
         (height, width): (usize, usize),
     ) -> Result<Box<dyn Environment>, EnvError> {
         let (whole, count) = (world.frame_shape(), world.num_actions());
-        let shape = FrameShape {
-            height,
-            width,
-            channels: whole.channels,
-        };
+        let shape = FrameShape::new(height, width, whole.channels);
         let has_all = actions.iter().map(|&it| usize::from(it)).eq(0..count);
         if shape == whole && has_all {
             return Ok(world);
@@ -111,7 +107,7 @@ impl Environment for RestrictedWorld {
         for &action in actions {
             let Some(&own) = self.actions.get(usize::from(action)) else {
                 let count = self.actions.len();
-                return Err(EnvError::Config(format!("action {action} of {count}")));
+                return Err(EnvError::Step(format!("action {action} of {count}")));
             };
             self.step.push(own);
         }
@@ -130,6 +126,7 @@ impl Environment for RestrictedWorld {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::playing::{frames, step};
     use crate::settings::WorldSettings;
     use crate::worlds::chain::{ChainConfig, tests::config};
 
@@ -150,22 +147,18 @@ mod tests {
         let mut world = part(&[2, 1], (2, 3)).unwrap();
         assert_eq!((world.num_envs(), world.num_actions()), (2, 2));
         assert_eq!(world.frame_shape().bytes(), 6);
-        let mut frames = [7; 12];
         // The agent's cell is the middle one: columns 2 and 3.
-        world.observe(&mut frames);
-        assert_eq!(frames, [0, 0, 255].repeat(4)[..]);
-        let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
+        assert_eq!(frames(&mut *world), [0, 0, 255].repeat(4));
         // Right is 2 in the corridor, left 1.
-        world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
-        assert_eq!((rewards, ends), ([1.0, -1.0], [StepEnd::Terminal; 2]));
+        let (mut rewards, mut ends) = step(&mut *world, &[0, 1]);
+        assert_eq!(rewards, [1.0, -1.0]);
+        assert_eq!(ends, [StepEnd::Terminal; 2]);
         assert!(world.step(&[0, 2], &mut rewards, &mut ends).is_err());
         // No-op is 0, and left is not among these.
         let mut world = part(&[0, 2], (2, 3)).unwrap();
-        world.step(&[1, 0], &mut rewards, &mut ends).unwrap();
-        assert_eq!(
-            (rewards, ends),
-            ([1.0, 0.0], [StepEnd::Terminal, StepEnd::Running])
-        );
+        let (rewards, ends) = step(&mut *world, &[1, 0]);
+        assert_eq!(rewards, [1.0, 0.0]);
+        assert_eq!(ends, [StepEnd::Terminal, StepEnd::Running]);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use nix::unistd::geteuid;
 
-use crate::error::InstallError;
+use crate::error::ProcgenError;
 
 /// The cache folder and whether fetching is allowed.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -24,12 +24,12 @@ impl Cache {
     ///
     /// # Errors
     /// No variable says where it is.
-    pub fn from_env() -> Result<Cache, InstallError> {
+    pub fn from_env() -> Result<Cache, ProcgenError> {
         Cache::from_variables(|name| std::env::var_os(name))
     }
 
     /// `DRIML_CACHE`, else `$XDG_CACHE_HOME/driml`, else `$HOME/.cache/driml`. Empty counts as not set.
-    fn from_variables(get: impl Fn(&str) -> Option<OsString>) -> Result<Cache, InstallError> {
+    fn from_variables(get: impl Fn(&str) -> Option<OsString>) -> Result<Cache, ProcgenError> {
         let set = |name: &str| get(name).filter(|value| !value.is_empty());
         let below = |name: &str, path: &str| set(name).map(|it| PathBuf::from(it).join(path));
         let folder = set("DRIML_CACHE")
@@ -38,7 +38,7 @@ impl Cache {
             .or_else(|| below("HOME", ".cache/driml"));
         let none = "there is no folder for it: set DRIML_CACHE, XDG_CACHE_HOME or HOME";
         Ok(Cache {
-            folder: folder.ok_or_else(|| InstallError::Cache(none.to_owned()))?,
+            folder: folder.ok_or_else(|| ProcgenError::Cache(none.to_owned()))?,
             offline: set("DRIML_OFFLINE").is_some_and(|value| value != "0"),
         })
     }
@@ -46,7 +46,7 @@ impl Cache {
 
 /// Checks that only this user and root can change the file or folder, as the engine is code that runs as this user. One that is not
 /// there passes.
-pub(crate) fn check_private(path: &Path) -> Result<(), InstallError> {
+pub(crate) fn check_private(path: &Path) -> Result<(), ProcgenError> {
     let Ok(data) = fs::metadata(path) else {
         return Ok(());
     };
@@ -58,7 +58,7 @@ pub(crate) fn check_private(path: &Path) -> Result<(), InstallError> {
         return Ok(());
     };
     let path = path.display();
-    Err(InstallError::Cache(format!(
+    Err(ProcgenError::Cache(format!(
         "it is code that would run as you, and others can change {path}: {why}. Make it yours alone (`chown -R \"$(id -u)\" {path}` as \
          root, `chmod -R go-w {path}`), or set DRIML_CACHE to another folder"
     )))

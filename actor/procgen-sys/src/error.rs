@@ -3,65 +3,12 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::options::OptionsError;
-
 /// What every error about the engine ends with: a world that works without it.
 pub const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no engine)";
 
-/// Why the engine could not be made or driven.
+/// Why the engine is not there, could not be put there, made or driven.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcgenError {
-    /// The engine is not on this machine and could not be put there.
-    #[error(transparent)]
-    Install(#[from] InstallError),
-    /// The engine is on this machine but cannot be loaded.
-    #[error(transparent)]
-    Load(#[from] LoadError),
-    /// The settings would end the process inside the engine.
-    #[error(transparent)]
-    Options(#[from] OptionsError),
-    /// An action, or their number, is not one the engine takes.
-    #[error("stepping procgen: {0}")]
-    Action(String),
-    /// A state belongs to another game, or an environment's number is out of range.
-    #[error("moving a procgen state: {0}")]
-    State(String),
-    /// The engine does not describe its buffers as version 0.10.7 does.
-    #[error("procgen's engine is not the one this was written for: {0} {WITHOUT_ENGINE}")]
-    Unexpected(String),
-}
-
-/// Why the engine's library cannot be loaded.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum LoadError {
-    /// The engine is built for Linux on x86-64 with AVX only.
-    #[error("procgen's engine cannot run here: {0} {WITHOUT_ENGINE}")]
-    Machine(String),
-    /// The library is missing, or the loader rejects it.
-    #[error("loading procgen's engine from {}: {reason} {WITHOUT_ENGINE}", .path.display())]
-    Library {
-        /// The library's file.
-        path: PathBuf,
-        /// What is wrong with it and what to do.
-        reason: String,
-    },
-}
-
-impl LoadError {
-    pub(crate) fn library(path: &Path, reason: impl Into<String>) -> LoadError {
-        LoadError::Library {
-            path: path.to_owned(),
-            reason: reason.into(),
-        }
-    }
-}
-
-/// Why the engine is not there and could not be put there.
-#[derive(Debug, thiserror::Error)]
-pub enum InstallError {
-    /// The engine cannot run on this machine, or another build of it cannot be found.
-    #[error(transparent)]
-    Load(#[from] LoadError),
     /// The engine is not installed, or something of it is gone; and how to get it, with and without a network.
     #[error(
         "procgen's engine in {}: {reason}; run with network access and without DRIML_OFFLINE, or fetch the wheel where there is a network \
@@ -82,7 +29,7 @@ pub enum InstallError {
     /// pip is missing, or failed.
     #[error("fetching procgen's engine: {0} {WITHOUT_ENGINE}")]
     Fetch(String),
-    /// The wheel is not the pinned one, or cannot be unpacked.
+    /// The wheel, or the library in it, is not the pinned one.
     #[error("unpacking {}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}", .path.display())]
     Wheel {
         /// The wheel's file, or the one from it.
@@ -100,13 +47,43 @@ pub enum InstallError {
         /// What the system reported.
         source: io::Error,
     },
+    /// The engine is built for Linux on x86-64 with AVX only.
+    #[error("procgen's engine cannot run here: {0} {WITHOUT_ENGINE}")]
+    Machine(String),
+    /// The library is missing, or the loader rejects it.
+    #[error("loading procgen's engine from {}: {reason} {WITHOUT_ENGINE}", .path.display())]
+    Library {
+        /// The library's file.
+        path: PathBuf,
+        /// What is wrong with it and what to do.
+        reason: String,
+    },
+    /// The engine would end the process with these settings; what to do instead.
+    #[error("procgen settings: {0}")]
+    Options(String),
+    /// An action, or their number, is not one the engine takes.
+    #[error("stepping procgen: {0}")]
+    Action(String),
+    /// A state belongs to another game, or an environment's number is out of range.
+    #[error("moving a procgen state: {0}")]
+    State(String),
+    /// The engine does not describe its buffers as version 0.10.7 does.
+    #[error("procgen's engine is not the one this was written for: {0} {WITHOUT_ENGINE}")]
+    Unexpected(String),
 }
 
-impl InstallError {
+impl ProcgenError {
+    pub(crate) fn library(path: &Path, reason: impl Into<String>) -> ProcgenError {
+        ProcgenError::Library {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+
     /// Adds to an error of the file system what was being done, and with which file.
-    pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> InstallError {
+    pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ProcgenError {
         let path = path.to_owned();
-        move |source| InstallError::Io {
+        move |source| ProcgenError::Io {
             doing,
             path,
             source,

@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::cache::{Cache, check_private};
-use crate::error::{InstallError, LoadError};
+use crate::error::ProcgenError;
 use crate::library;
-use crate::wheel::{self, Hashes, PINNED, WHEEL_NAME};
+use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 
 /// How long to wait for another process that installs; then this one does it too.
 const WAIT_MAX: Duration = Duration::from_secs(120);
@@ -28,7 +28,7 @@ impl Engine {
     ///
     /// # Errors
     /// Not installed, something is gone, others can change it, or a machine that cannot run it.
-    pub fn locate() -> Result<Engine, InstallError> {
+    pub fn locate() -> Result<Engine, ProcgenError> {
         Engine::locate_in(&Cache::from_env()?)
     }
 
@@ -39,21 +39,23 @@ impl Engine {
     ///
     /// # Errors
     /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
-    pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, InstallError> {
-        Engine::install_in(&Cache::from_env()?, PINNED, progress, wheel::fetch)
+    pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, ProcgenError> {
+        let cache = Cache::from_env()?;
+        Engine::install_in(&cache, LIBRARY_SHA256, progress, wheel::unpack)
     }
 
     /// From where [`Engine::install`] would take the engine, for a person. Nothing is fetched or looked at more closely.
     ///
     /// # Errors
     /// No pip, or `DRIML_OFFLINE=1` and no wheel in the cache folder.
-    pub fn source() -> Result<String, InstallError> {
+    pub fn source() -> Result<String, ProcgenError> {
         let cache = Cache::from_env()?;
-        if let Some(provided) = cache.provided("it is not installed")? {
-            return Ok(provided.display().to_string());
-        }
+        let provided = cache.provided("it is not installed")?;
         wheel::check_pip()?;
-        Ok("the package index with `python3 -m pip`".to_owned())
+        Ok(provided.map_or_else(
+            || "the package index with `python3 -m pip`".to_owned(),
+            |wheel| wheel.display().to_string(),
+        ))
     }
 
     /// Another build of the engine than the published one, by the path of its library. Its pictures are in the folder `assets`
@@ -62,17 +64,17 @@ impl Engine {
     ///
     /// # Errors
     /// A library or pictures that are not there, or a machine that cannot run it.
-    pub fn other(library: &Path) -> Result<Engine, InstallError> {
+    pub fn other(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         // The loader takes a name without a folder for one of the system's.
         let library = fs::canonicalize(library)
-            .map_err(|error| LoadError::library(library, error.to_string()))?;
+            .map_err(|error| ProcgenError::library(library, error.to_string()))?;
         let mut folders = library.ancestors().skip(1).take(2);
         let assets =
             folders.find_map(|folder| Some(folder.join("assets")).filter(|it| it.is_dir()));
         let assets = assets.ok_or_else(|| {
             let reason = "put Procgen's folder `assets` beside it or beside its folder";
-            LoadError::library(&library, reason)
+            ProcgenError::library(&library, reason)
         })?;
         Ok(Engine { library, assets })
     }
@@ -81,7 +83,7 @@ impl Engine {
     ///
     /// # Errors
     /// A library of the system that is missing, or anything else that the loader reports.
-    pub fn check_loads(&self) -> Result<(), LoadError> {
+    pub fn check_loads(&self) -> Result<(), ProcgenError> {
         library::load(&self.library).map(drop)
     }
 
@@ -95,7 +97,7 @@ impl Engine {
         &self.assets
     }
 
-    fn locate_in(cache: &Cache) -> Result<Engine, InstallError> {
+    fn locate_in(cache: &Cache) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         let root = cache.root();
         let engine = Engine {
@@ -117,12 +119,12 @@ impl Engine {
 
     fn install_in(
         cache: &Cache,
-        hashes: Hashes<'_>,
+        library_sha256: &str,
         progress: &mut dyn FnMut(&str),
-        fetch: impl Fn(&Path) -> Result<PathBuf, InstallError>,
-    ) -> Result<Engine, InstallError> {
+        unpack: impl Fn(&Path, Option<&Path>) -> Result<(), ProcgenError>,
+    ) -> Result<Engine, ProcgenError> {
         let reason = match Engine::locate_in(cache) {
-            Err(InstallError::Missing { reason, .. }) => reason,
+            Err(ProcgenError::Missing { reason, .. }) => reason,
             other => return other,
         };
         let provided = cache.provided(&reason)?;
@@ -136,30 +138,28 @@ impl Engine {
         let folder = tempfile::Builder::new()
             .prefix("install-")
             .tempdir_in(&cache.folder)
-            .map_err(InstallError::io("making a folder in", &cache.folder))?;
+            .map_err(ProcgenError::io("making a folder in", &cache.folder))?;
         let root = cache.root();
         let (fresh, into) = (folder.path().join("fresh"), root.display());
-        let wheel = if let Some(wheel) = provided {
+        if let Some(wheel) = &provided {
             let from = wheel.display();
             progress(&format!("procgen's engine: unpacking {from} into {into}"));
-            wheel::check_hash(&wheel, hashes.wheel)?;
-            wheel
+            wheel::check_hash(wheel, WHEEL_SHA256)?;
         } else {
             progress(&format!(
                 "procgen's engine: {reason}; fetching it with pip (36 MB) into {into}"
             ));
-            fetch(folder.path())?
-        };
-        wheel::unpack(&wheel, &fresh)?;
-        wheel::check_hash(&fresh.join("libenv.so"), hashes.library)?;
+        }
+        unpack(&fresh, provided.is_some().then_some(&*cache.folder))?;
+        wheel::check_hash(&fresh.join("libenv.so"), library_sha256)?;
         // A crash of the machine must not leave a folder in place whose files are empty.
         let _ = File::open(&fresh).map(nix::unistd::syncfs);
         if root.exists() {
             // What is moved into the temporary folder goes with it.
             fs::rename(&root, folder.path().join("damaged"))
-                .map_err(InstallError::io("moving away the damaged", &root))?;
+                .map_err(ProcgenError::io("moving away the damaged", &root))?;
         }
-        let renamed = fs::rename(&fresh, &root).map_err(InstallError::io("renaming", &root));
+        let renamed = fs::rename(&fresh, &root).map_err(ProcgenError::io("renaming", &root));
         // Where files cannot be locked, another process may have put the same there.
         Engine::locate_in(cache).map_err(|error| renamed.err().unwrap_or(error))
     }
@@ -170,8 +170,8 @@ impl Cache {
         self.folder.join("procgen-0.10.7")
     }
 
-    fn missing(&self, reason: &str) -> InstallError {
-        InstallError::Missing {
+    fn missing(&self, reason: &str) -> ProcgenError {
+        ProcgenError::Missing {
             root: self.root(),
             reason: reason.to_owned(),
             fetched_by: wheel::command_for_people(),
@@ -179,7 +179,7 @@ impl Cache {
     }
 
     /// The wheel that the user has put into the cache folder; an error where there is none and none may be fetched.
-    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, InstallError> {
+    fn provided(&self, reason: &str) -> Result<Option<PathBuf>, ProcgenError> {
         let provided = self.folder.join(WHEEL_NAME);
         if provided.is_file() {
             return Ok(Some(provided));
@@ -218,33 +218,26 @@ mod tests {
     use super::*;
     use crate::error::WITHOUT_ENGINE;
 
-    /// Those of the made-up wheel; its own is computed.
-    const LIBRARY_HASH: &str = "a2100e1d73fedddfd22587d2ef8b33dd37a9f6480032176d4e0c80b3923f48e1";
+    /// That of the library that stands for the engine's.
+    const LIBRARY_HASH: &str = "8c08842bdcdbaa0dde9e6598c215af56513417ebd79c758c2cc8cd6a63f3f296";
 
     fn cache_in(folder: &Path) -> Cache {
         let folder = folder.join("cache");
         fs::create_dir_all(&folder).unwrap();
-        let offline = true;
+        let offline = false;
         Cache { folder, offline }
     }
 
-    fn provide_wheel(cache: &Cache) {
-        let names = [
-            "procgen/data/prebuilt/libenv.so",
-            "procgen/data/assets/b/c.png",
-        ];
-        let entries = names.map(|name| (name, name.as_bytes()));
-        wheel::tests::archive(&cache.folder.join(WHEEL_NAME), &entries);
-    }
-
-    /// Installs from a wheel in the cache folder, with its hash in place of the pinned one.
-    fn install(cache: &Cache, library: &str) -> Result<Engine, InstallError> {
-        let path = cache.folder.join(WHEEL_NAME);
-        let wheel = wheel::check_hash(&path, "").unwrap_err().to_string();
-        let wheel = wheel.split("SHA-256 is ").nth(1).unwrap()[..64].to_owned();
-        let wheel = wheel.as_str();
-        let hashes = Hashes { wheel, library };
-        Engine::install_in(cache, hashes, &mut |_| {}, |_| panic!("fetched"))
+    /// Installs with what stands for pip.
+    fn install(cache: &Cache, library: &str) -> Result<Engine, ProcgenError> {
+        let unpack = |to: &Path, _: Option<&Path>| {
+            wheel::make_folder(&to.join("assets/b"))?;
+            for file in ["libenv.so", "assets/b/c.png"] {
+                fs::write(to.join(file), file).unwrap();
+            }
+            Ok(())
+        };
+        Engine::install_in(cache, library, &mut |_| {}, unpack)
     }
 
     /// Names of what lies in the cache folder, sorted.
@@ -260,7 +253,6 @@ mod tests {
     fn installers_that_race_all_succeed_and_damage_is_repaired() {
         let folder = tempfile::tempdir().unwrap();
         let cache = cache_in(folder.path());
-        provide_wheel(&cache);
         for damaged in ["", "libenv.so", "assets"] {
             if !damaged.is_empty() {
                 fs::rename(cache.root().join(damaged), folder.path().join(damaged)).unwrap();
@@ -283,7 +275,6 @@ mod tests {
     fn a_cache_that_others_can_change_is_rejected() {
         let folder = tempfile::tempdir().unwrap();
         let cache = cache_in(folder.path());
-        provide_wheel(&cache);
         let engine = install(&cache, LIBRARY_HASH).unwrap();
         for path in [
             &cache.folder,
@@ -305,7 +296,7 @@ mod tests {
         fs::set_permissions(&cache.folder, fs::Permissions::from_mode(0o777)).unwrap();
         assert!(matches!(
             install(&cache, LIBRARY_HASH),
-            Err(InstallError::Cache(_))
+            Err(ProcgenError::Cache(_))
         ));
     }
 
@@ -313,14 +304,15 @@ mod tests {
     fn what_cannot_be_had_is_said_with_what_to_do_and_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let mut cache = cache_in(folder.path());
-        let fetch = |_: &Path| Err(InstallError::Fetch("no route".to_owned()));
+        let unpack = |_: &Path, _: Option<&Path>| Err(ProcgenError::Fetch("no route".to_owned()));
         let said = |cache: &Cache, lines| {
             let mut told = 0;
-            let error = Engine::install_in(cache, PINNED, &mut |_| told += 1, fetch);
+            let error = Engine::install_in(cache, LIBRARY_SHA256, &mut |_| told += 1, unpack);
             let text = error.unwrap_err().to_string();
             assert!(text.ends_with(WITHOUT_ENGINE) && told == lines, "{text}");
             text
         };
+        cache.offline = true;
         let text = said(&cache, 0);
         assert!(
             text.contains("it is not installed, and DRIML_OFFLINE=1 forbids"),
@@ -336,14 +328,12 @@ mod tests {
             text.starts_with("fetching procgen's engine: no route"),
             "{text}"
         );
-        provide_wheel(&cache);
-        let text = said(&cache, 1);
-        assert!(
-            text.contains(&format!("expected {}", PINNED.wheel)),
-            "{text}"
-        );
-        let error = install(&cache, PINNED.library).unwrap_err().to_string();
+        let error = install(&cache, LIBRARY_SHA256).unwrap_err().to_string();
         assert!(error.contains("libenv.so: its SHA-256 is"), "{error}");
+        fs::write(cache.folder.join(WHEEL_NAME), b"no wheel").unwrap();
+        let text = said(&cache, 1);
+        let expected = format!("expected {WHEEL_SHA256}");
+        assert!(text.contains(&expected), "{text}");
         assert_eq!(left(&cache), ["install.lock"]);
         // A cache folder that cannot be written: a file is in its place.
         cache.folder = cache.folder.join("install.lock");

@@ -53,8 +53,8 @@ mod vec_game;
 mod wheel;
 
 pub use cache::Cache;
-pub use error::{InstallError, LoadError, ProcgenError, WITHOUT_ENGINE};
+pub use error::{ProcgenError, WITHOUT_ENGINE};
 pub use game::{DistributionMode, Game};
 pub use install::Engine;
-pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options, OptionsError};
+pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options};
 pub use vec_game::{FRAME_BYTES, FRAME_SIDE, RESET, State, VecGame};

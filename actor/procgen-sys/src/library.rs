@@ -7,7 +7,7 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 
-use crate::error::LoadError;
+use crate::error::ProcgenError;
 use crate::ffi::{
     GetState, GetTensortypes, LIBENV_VERSION, Make, SetBuffers, SetState, Unit, Version,
 };
@@ -37,7 +37,7 @@ const PACKAGES: [(&str, &str, &str); 6] = [
 ];
 
 /// Loads the library at `path`, or finds it already loaded.
-pub(crate) fn load(path: &Path) -> Result<&'static Api, LoadError> {
+pub(crate) fn load(path: &Path) -> Result<&'static Api, ProcgenError> {
     static LOADED: OnceLock<Mutex<BTreeMap<PathBuf, &'static Api>>> = OnceLock::new();
     check_machine()?;
     let loaded = LOADED.get_or_init(Mutex::default);
@@ -51,9 +51,9 @@ pub(crate) fn load(path: &Path) -> Result<&'static Api, LoadError> {
 }
 
 /// Says whether the engine can run on this machine: Linux on x86-64 with AVX.
-pub(crate) fn check_machine() -> Result<(), LoadError> {
+pub(crate) fn check_machine() -> Result<(), ProcgenError> {
     if !cfg!(all(target_os = "linux", target_arch = "x86_64")) {
-        return Err(LoadError::Machine(format!(
+        return Err(ProcgenError::Machine(format!(
             "it is built for Linux on x86-64, and this is {} on {}",
             std::env::consts::OS,
             std::env::consts::ARCH
@@ -61,27 +61,27 @@ pub(crate) fn check_machine() -> Result<(), LoadError> {
     }
     #[cfg(target_arch = "x86_64")]
     if !std::is_x86_feature_detected!("avx") {
-        return Err(LoadError::Machine(
+        return Err(ProcgenError::Machine(
             "it needs a processor with AVX, and this one has none".to_owned(),
         ));
     }
     Ok(())
 }
 
-fn open(path: &Path) -> Result<Api, LoadError> {
+fn open(path: &Path) -> Result<Api, ProcgenError> {
     // SAFETY: running the library's initialisers is what loading means; either its hash was compared with the pinned one when it was
     // installed, where only this user can change it, or a person has named another build.
     let library = unsafe { Library::open(Some(path), RTLD_NOW | RTLD_LOCAL) };
     let library = library.map_err(|error| explain(path, &error.to_string()))?;
     // SAFETY: the types are those of gym3's `libenv.h`, and the version is checked before any other function is called.
     let found = unsafe { functions(&library) };
-    let (version, api) = found.map_err(|error| LoadError::library(path, error.to_string()))?;
+    let (version, api) = found.map_err(|error| ProcgenError::library(path, error.to_string()))?;
     // Keep it loaded for the rest of the process, so that the function pointers stay valid.
     std::mem::forget(library);
     // SAFETY: `libenv_version` takes nothing and returns a constant.
     match unsafe { version() } {
         LIBENV_VERSION => Ok(api),
-        found => Err(LoadError::library(
+        found => Err(ProcgenError::library(
             path,
             format!("its interface is version {found}, not {LIBENV_VERSION}"),
         )),
@@ -108,7 +108,7 @@ unsafe fn functions(library: &Library) -> Result<(Version, Api), libloading::Err
 }
 
 /// Turns what `dlopen` said into what to do about it.
-fn explain(path: &Path, said: &str) -> LoadError {
+fn explain(path: &Path, said: &str) -> ProcgenError {
     let is_missing = |library: &str| said.contains(library) && said.contains("cannot open shared");
     let missing = PACKAGES.iter().find(|(library, ..)| is_missing(library));
     let reason = if let Some((library, debian, fedora)) = missing {
@@ -124,7 +124,7 @@ fn explain(path: &Path, said: &str) -> LoadError {
     } else {
         said.to_owned()
     };
-    LoadError::library(path, reason)
+    ProcgenError::library(path, reason)
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 use std::ffi::c_void;
 
+use crate::error::ProcgenError;
 use crate::ffi::{self, DTYPE_INT32, DTYPE_UINT8, LibenvOption, LibenvOptions};
 use crate::game::{DistributionMode, Game};
 
@@ -44,17 +45,12 @@ pub struct Options {
     pub restrict_themes: bool,
 }
 
-/// Settings with which the engine would end the process, and what to do instead.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("procgen settings: {0}")]
-pub struct OptionsError(String);
-
 impl Options {
     /// Says why the engine could not take these settings.
     ///
     /// # Errors
     /// Numbers out of range, or a mode that the game does not have.
-    pub fn validate(&self) -> Result<(), OptionsError> {
+    pub fn validate(&self) -> Result<(), ProcgenError> {
         let Options {
             game,
             num_envs,
@@ -90,7 +86,7 @@ impl Options {
         } else {
             return Ok(());
         };
-        Err(OptionsError(text))
+        Err(ProcgenError::Options(text))
     }
 }
 
@@ -178,7 +174,7 @@ mod tests {
 
     #[test]
     fn what_would_end_the_process_is_rejected_with_the_value() {
-        assert_eq!(OPTIONS.validate(), Ok(()));
+        OPTIONS.validate().unwrap();
         let rejected = |change: fn(&mut Options), text: &str| {
             let mut options = OPTIONS;
             change(&mut options);

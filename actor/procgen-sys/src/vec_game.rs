@@ -116,11 +116,6 @@ impl VecGame {
         Ok(game)
     }
 
-    /// The game.
-    pub fn game(&self) -> Game {
-        self.game
-    }
-
     /// Number of environments, N.
     pub fn num_envs(&self) -> usize {
         self.num_envs

@@ -1,36 +1,34 @@
-//! The pinned wheel of procgen: which one it is, fetching it with pip, unpacking what the engine needs of it.
+//! The pinned wheel of procgen: which one it is, and what the engine needs of it, unpacked by pip.
 //! It decides nothing about where things end up; `install` does.
 
 use std::fs::{self, DirBuilder, File};
-use std::io::{self, ErrorKind};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
+use std::io;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use sha2::{Digest, Sha256};
 
-use crate::error::InstallError;
+use crate::error::ProcgenError;
 
 /// The wheel's file name. It is the one for CPython 3.10, but no Python is needed to use the engine in it.
 pub(crate) const WHEEL_NAME: &str =
     "procgen-0.10.7-cp310-cp310-manylinux_2_17_x86_64.manylinux2014_x86_64.whl";
 
-/// SHA-256 of a wheel and of the library in it, in lower-case hexadecimal.
-#[derive(Clone, Copy)]
-pub(crate) struct Hashes<'a> {
-    pub(crate) wheel: &'a str,
-    pub(crate) library: &'a str,
-}
+/// SHA-256 of the wheel that the Python package index serves, in lower-case hexadecimal.
+pub(crate) const WHEEL_SHA256: &str =
+    "4b594d14e42f0f2166e59a9e294477b906eb99c90c3343b570b7124cbc865f53";
 
-/// Those of the wheel that the Python package index serves.
-pub(crate) const PINNED: Hashes<'static> = Hashes {
-    wheel: "4b594d14e42f0f2166e59a9e294477b906eb99c90c3343b570b7124cbc865f53",
-    library: "f44786431a902e9ae1a32cd44f4aa650f4bdad893240a322e49e6098d6a7a2ea",
-};
+/// SHA-256 of the library in it.
+pub(crate) const LIBRARY_SHA256: &str =
+    "f44786431a902e9ae1a32cd44f4aa650f4bdad893240a322e49e6098d6a7a2ea";
 
-const LIBRARY_ENTRY: &str = "procgen/data/prebuilt/libenv.so";
-const ASSETS_ENTRY: &str = "procgen/data/assets";
-const LICENSE_ENTRY: &str = "procgen-0.10.7.dist-info/LICENSE";
+/// What the engine needs of the wheel, and its name where it is installed.
+const NEEDED: [(&str, &str); 3] = [
+    ("procgen/data/prebuilt/libenv.so", "libenv.so"),
+    ("procgen/data/assets", "assets"),
+    ("procgen-0.10.7.dist-info/LICENSE", "LICENSE"),
+];
 
 /// Which wheel pip is to take, whatever Python it runs on.
 const PIP_SELECTION: &str = "--no-deps --only-binary=:all: --python-version 3.10 --abi cp310 --platform manylinux2014_x86_64";
@@ -46,23 +44,32 @@ pub(crate) fn command_for_people() -> String {
     format!("python3 -m pip download procgen==0.10.7 {PIP_SELECTION}")
 }
 
-/// Fetches the wheel into the folder `to` with pip, which checks its hash, and gives its path.
-pub(crate) fn fetch(to: &Path) -> Result<PathBuf, InstallError> {
-    fetch_with("python3", to)
+/// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip does it, and
+/// checks the wheel's hash: of the one in the folder `provided`, else of the index's.
+pub(crate) fn unpack(to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
+    unpack_with("python3", to, provided)
 }
 
-fn fetch_with(python: &str, to: &Path) -> Result<PathBuf, InstallError> {
-    let pins = to.join("requirements.txt");
-    let text = format!("procgen==0.10.7 --hash=sha256:{}\n", PINNED.wheel);
-    fs::write(&pins, text).map_err(InstallError::io("writing", &pins))?;
-    let [to_text, pins] = [to, &pins].map(|path| path.display().to_string());
-    let mut arguments = vec!["download", "--require-hashes", "-r", &pins];
-    arguments.extend(["--dest", &to_text]);
+fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
+    let [all, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
+    let text = format!("procgen==0.10.7 --hash=sha256:{WHEEL_SHA256}\n");
+    fs::write(&pins, text).map_err(ProcgenError::io("writing", &pins))?;
+    let [all_text, pins] = [&all, &pins].map(|path| path.display().to_string());
+    let mut arguments = vec!["install", "--no-compile", "--require-hashes", "-r", &pins];
+    arguments.extend(["--target", &all_text]);
     arguments.extend(PIP_SELECTION.split(' ').chain(PIP_LIMITS.split(' ')));
+    let provided = provided.map(|folder| folder.display().to_string());
+    if let Some(folder) = &provided {
+        arguments.extend(["--no-index", "--find-links", folder]);
+    }
     let output = pip(python, &arguments)?;
-    let wheel = to.join(WHEEL_NAME);
-    if output.status.success() && wheel.is_file() {
-        return Ok(wheel);
+    if output.status.success() {
+        make_folder(to)?;
+        for (path, name) in NEEDED {
+            let path = all.join(path);
+            fs::rename(&path, to.join(name)).map_err(ProcgenError::io("moving", &path))?;
+        }
+        return Ok(());
     }
     let said = String::from_utf8_lossy(&output.stderr);
     let lines: Vec<&str> = said
@@ -70,30 +77,32 @@ fn fetch_with(python: &str, to: &Path) -> Result<PathBuf, InstallError> {
         .filter(|line| !line.trim().is_empty())
         .collect();
     let last = &lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..];
-    Err(InstallError::Fetch(format!(
-        "`{python} -m pip download` failed ({}); check the network and which package index pip uses. Its output:\n  {}\n",
+    Err(ProcgenError::Fetch(format!(
+        "`{python} -m pip install` failed ({}); check the network and which package index pip uses. Its output:\n  {}\n",
         output.status,
         last.join("\n  ")
     )))
 }
 
-pub(crate) fn check_pip() -> Result<(), InstallError> {
+pub(crate) fn check_pip() -> Result<(), ProcgenError> {
     pip("python3", &["--version"]).map(drop)
 }
 
-fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
-    let mut command = Command::new(python);
-    command.args(["-m", "pip"]).args(arguments);
+fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
+    // Other users can change nothing of what it writes, whatever the umask says.
+    let mut command = Command::new("sh");
+    command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
+    // A configuration with `user = true` does not go with `--target`.
+    command.args(arguments).env("PIP_USER", "0");
     let missing = |what: &str| {
         let text = format!(
             "{what} is not installed; install Python and pip (`apt-get install python3-pip`, `dnf install python3-pip`)"
         );
-        Err(InstallError::Fetch(text))
+        Err(ProcgenError::Fetch(text))
     };
     match command.stdin(Stdio::null()).output() {
-        Err(error) if error.kind() == ErrorKind::NotFound => missing(python),
-        Err(error) => Err(InstallError::io("running", Path::new(python))(error)),
-        // The status of a launcher that finds no Python behind it.
+        Err(error) => Err(ProcgenError::io("running", Path::new("sh"))(error)),
+        // The status of a shell that finds no Python, or of a launcher with none behind it.
         Ok(output) if output.status.code() == Some(127) => missing(python),
         Ok(output) if String::from_utf8_lossy(&output.stderr).contains("No module named pip") => {
             missing("pip")
@@ -102,125 +111,33 @@ fn pip(python: &str, arguments: &[&str]) -> Result<Output, InstallError> {
     }
 }
 
-pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), InstallError> {
+pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError> {
     let mut hasher = Sha256::new();
-    let mut file = File::open(path).map_err(InstallError::io("opening", path))?;
-    io::copy(&mut file, &mut hasher).map_err(InstallError::io("reading", path))?;
+    let mut file = File::open(path).map_err(ProcgenError::io("opening", path))?;
+    io::copy(&mut file, &mut hasher).map_err(ProcgenError::io("reading", path))?;
     let bytes = hasher.finalize();
     let actual: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
     if actual == expected {
         return Ok(());
     }
     let reason = format!("its SHA-256 is {actual}, expected {expected}");
-    Err(bad(path)(reason))
-}
-
-fn bad<E: ToString>(path: &Path) -> impl Fn(E) -> InstallError {
-    move |reason| InstallError::Wheel {
+    Err(ProcgenError::Wheel {
         path: path.to_owned(),
-        reason: reason.to_string(),
-    }
-}
-
-/// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. Other users can
-/// change none of it, whatever the umask says.
-///
-/// An entry whose name leaves its folder (`..`) is an error, and nothing after it is unpacked.
-pub(crate) fn unpack(wheel: &Path, to: &Path) -> Result<(), InstallError> {
-    let file = File::open(wheel).map_err(InstallError::io("opening", wheel))?;
-    let mut archive = zip::ZipArchive::new(file).map_err(bad(wheel))?;
-    make_folder(&to.join("assets"))?;
-    for index in 0..archive.len() {
-        let mut entry = archive.by_index(index).map_err(bad(wheel))?;
-        let name = entry.enclosed_name().ok_or_else(|| {
-            bad(wheel)(format!("entry {index} would be written outside its folder"))
-        })?;
-        let target = if name == Path::new(LIBRARY_ENTRY) {
-            to.join("libenv.so")
-        } else if name == Path::new(LICENSE_ENTRY) {
-            to.join("LICENSE")
-        } else if let Ok(asset) = name.strip_prefix(ASSETS_ENTRY) {
-            to.join("assets").join(asset)
-        } else {
-            continue;
-        };
-        if entry.is_dir() {
-            make_folder(&target)?;
-            continue;
-        }
-        make_folder(target.parent().unwrap_or(to))?;
-        let mut new = File::options();
-        new.write(true).create_new(true).mode(0o644);
-        new.open(&target)
-            .and_then(|mut file| io::copy(&mut entry, &mut file))
-            .map_err(InstallError::io("writing", &target))?;
-    }
-    match to.join("libenv.so").is_file() {
-        true => Ok(()),
-        false => Err(bad(wheel)(format!("it has no {LIBRARY_ENTRY}"))),
-    }
+        reason,
+    })
 }
 
 /// Makes a folder, and those above it, in which other users can change nothing.
-pub(crate) fn make_folder(path: &Path) -> Result<(), InstallError> {
+pub(crate) fn make_folder(path: &Path) -> Result<(), ProcgenError> {
     let made = DirBuilder::new().recursive(true).mode(0o755).create(path);
-    made.map_err(InstallError::io("making", path))
+    made.map_err(ProcgenError::io("making", path))
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use std::io::Write;
+mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
-
-    pub(crate) fn archive(path: &Path, entries: &[(&str, &[u8])]) {
-        let mut writer = zip::ZipWriter::new(File::create(path).unwrap());
-        for (name, bytes) in entries {
-            let options = zip::write::SimpleFileOptions::default();
-            writer.start_file(*name, options).unwrap();
-            writer.write_all(bytes).unwrap();
-        }
-        writer.finish().unwrap();
-    }
-
-    #[test]
-    fn the_library_and_the_pictures_are_unpacked_and_nothing_else() {
-        let folder = tempfile::tempdir().unwrap();
-        let [wheel, to] = ["some.whl", "a/b/c/d"].map(|name| folder.path().join(name));
-        let entries: [(&str, &[u8]); 4] = [
-            (LIBRARY_ENTRY, b"elf"),
-            ("procgen/data/assets/a/b.png", b"png"),
-            ("procgen/env.py", b"print()"),
-            (LICENSE_ENTRY, b"MIT"),
-        ];
-        archive(&wheel, &entries);
-        unpack(&wheel, &to).unwrap();
-        assert_eq!(fs::read(to.join("libenv.so")).unwrap(), b"elf");
-        assert_eq!(fs::read(to.join("assets/a/b.png")).unwrap(), b"png");
-        assert_eq!(fs::read_dir(&to).unwrap().count(), 3);
-
-        for (entry, reason) in [
-            (
-                "procgen/env.py",
-                "it has no procgen/data/prebuilt/libenv.so",
-            ),
-            (
-                "procgen/data/assets/../../../../../evil",
-                "outside its folder",
-            ),
-            ("../evil", "outside its folder"),
-        ] {
-            fs::remove_dir_all(&to).unwrap();
-            archive(&wheel, &[(entry, b"evil")]);
-            let error = unpack(&wheel, &to).unwrap_err().to_string();
-            assert!(error.contains(reason), "{entry}: {error}");
-            assert!(!folder.path().join("a/b/evil").exists(), "{entry}");
-        }
-        fs::write(&wheel, b"no zip").unwrap();
-        let error = unpack(&wheel, &to).unwrap_err();
-        assert!(matches!(error, InstallError::Wheel { .. }), "{error}");
-    }
 
     #[test]
     fn a_hash_is_sha256() {
@@ -228,15 +145,45 @@ pub(crate) mod tests {
         fs::write(file.path(), b"abc").unwrap();
         let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
         check_hash(file.path(), abc).unwrap();
-        let error = check_hash(file.path(), PINNED.wheel).unwrap_err();
-        let text = format!("its SHA-256 is {abc}, expected {}", PINNED.wheel);
+        let error = check_hash(file.path(), WHEEL_SHA256).unwrap_err();
+        let text = format!("its SHA-256 is {abc}, expected {WHEEL_SHA256}");
         assert!(error.to_string().contains(&text), "{error}");
     }
 
+    /// Unpacks into the folder's `fresh` with a Python that is this script, which runs in the folder.
+    fn unpack_by(script: &str, folder: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
+        let python = folder.join("python3");
+        let script = format!("#!/bin/sh\ncd \"${{0%/*}}\"\n{script}\n");
+        fs::write(&python, script).unwrap();
+        fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+        unpack_with(python.to_str().unwrap(), &folder.join("fresh"), provided)
+    }
+
+    /// One test, as a script cannot be started while a process that another test starts has it open.
     #[test]
-    fn each_way_pip_can_fail_has_its_message() {
+    fn pip_unpacks_what_the_engine_needs_and_each_way_it_can_fail_has_its_message() {
+        for provided in [false, true] {
+            let folder = tempfile::tempdir().unwrap();
+            let folder = folder.path();
+            let script = "
+                mkdir -p fresh.wheel/procgen/data/prebuilt fresh.wheel/procgen/data/assets/a
+                mkdir fresh.wheel/procgen-0.10.7.dist-info
+                cd fresh.wheel
+                touch procgen/env.py procgen-0.10.7.dist-info/LICENSE
+                echo \"$@\" >procgen/data/prebuilt/libenv.so
+                echo png >procgen/data/assets/a/b.png";
+            unpack_by(script, folder, provided.then_some(folder)).unwrap();
+            let fresh = folder.join("fresh");
+            assert!(fresh.join("assets/a/b.png").is_file());
+            assert_eq!(fs::read_dir(&fresh).unwrap().count(), 3);
+            let arguments = fs::read_to_string(fresh.join("libenv.so")).unwrap();
+            let offline = format!("--no-index --find-links {}\n", folder.display());
+            assert!(arguments.contains("--require-hashes"), "{arguments}");
+            assert_eq!(arguments.ends_with(&offline), provided, "{arguments}");
+            let mode = fs::metadata(fresh.join("libenv.so")).unwrap().permissions();
+            assert_eq!(mode.mode() & 0o777, 0o644);
+        }
         let folder = tempfile::tempdir().unwrap();
-        let python = folder.path().join("python3");
         for (script, texts) in [
             ("exit 127", &["python3 is not installed", "python3-pip"][..]),
             (
@@ -247,17 +194,16 @@ pub(crate) mod tests {
                 "echo first >&2; echo 'ERROR: no such version' >&2; exit 1",
                 &["(exit status: 1)", "  first\n  ERROR: no such version"],
             ),
-            ("exit 0", &["failed (exit status: 0)"]),
+            ("exit 0", &["moving ", "procgen/data/prebuilt/libenv.so"]),
         ] {
-            fs::write(&python, format!("#!/bin/sh\n{script}\n")).unwrap();
-            fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
-            let error = fetch_with(python.to_str().unwrap(), folder.path());
-            let error = error.unwrap_err().to_string();
+            let error = unpack_by(script, folder.path(), None).unwrap_err();
+            let error = error.to_string();
             for text in texts {
                 assert!(error.contains(text), "{script}: {error}");
             }
         }
-        let error = fetch_with("/nowhere/python3", folder.path()).unwrap_err();
+        let to = folder.path().join("fresh");
+        let error = unpack_with("/nowhere/python3", &to, None).unwrap_err();
         assert!(error.to_string().contains("is not installed"), "{error}");
     }
 }

@@ -34,11 +34,7 @@ impl WorldSettings for IslandConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.side * FIELD,
-            width: self.side * FIELD,
-            channels: 1,
-        }
+        FrameShape::new(self.side * FIELD, self.side * FIELD, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -142,11 +138,10 @@ impl Environment for Islands {
         let last = self.side - 1;
         for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {
             let Some((down, right)) = MOVES.get(usize::from(action)) else {
-                return Err(EnvError::ActionOutOfRange {
-                    env,
-                    action,
-                    num_actions: MOVES.len(),
-                });
+                return Err(EnvError::Step(format!(
+                    "action {action} of environment {env} is out of range: this world has {} actions",
+                    MOVES.len()
+                )));
             };
             let (row, column) = island.agent;
             island.agent = (

@@ -1,7 +1,11 @@
 //! Names, reading settings, and what each world says of itself before it is built.
 
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 use super::*;
-use crate::environment::{Environment, FrameShape};
+use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::playing::{frames, step};
 use crate::plugin::CustomKind;
 use crate::worlds::{chain, exec, ising, pacman, procgen};
 
@@ -121,11 +125,7 @@ fn a_world_that_a_program_adds_is_as_the_others() {
             Ok(())
         }
         fn frame_shape(&self) -> FrameShape {
-            FrameShape {
-                height: self.reward as usize,
-                width: 2,
-                channels: 1,
-            }
+            FrameShape::new(self.reward as usize, 2, 1)
         }
         fn action_names(&self) -> Vec<&str> {
             vec!["only"]
@@ -213,8 +213,9 @@ fn shapes_and_actions_are_those_of_the_built_world() {
 }
 
 #[test]
-fn no_environments_and_wrong_buffers_are_errors() {
-    for config in configs() {
+fn no_environments_wrong_buffers_and_wrong_actions_are_errors() {
+    let with_engine = procgen::tests::engine().map(|_| procgen(0, 500));
+    for config in configs().into_iter().chain(with_engine) {
         assert!(config.build(0, 1, 0).is_err());
         let mut world = config.build(2, 1, 0).unwrap();
         let (mut rewards, mut ends) = ([0.0; 2], [Default::default(); 2]);
@@ -228,7 +229,41 @@ fn no_environments_and_wrong_buffers_are_errors() {
         );
         assert!(world.step(&[0; 2], &mut rewards[..1], &mut ends).is_err());
         assert!(world.step(&[0; 2], &mut rewards, &mut ends[..1]).is_err());
-        assert!(world.step(&[0, 200], &mut rewards, &mut ends).is_err());
+        let actions = world.num_actions();
+        let error = world.step(&[0, actions as u8], &mut rewards, &mut ends);
+        assert_eq!(
+            error.unwrap_err().to_string(),
+            format!(
+                "action {actions} of environment 1 is out of range: this world has {actions} actions"
+            )
+        );
+    }
+}
+
+#[test]
+fn an_environment_depends_on_seed_and_index_only() {
+    let [_, _, ising, pacman] = configs();
+    for (config, steps) in [(ising, 20), (pacman, 2_000)] {
+        let played = |num_envs, seed| {
+            let mut world = config.build(num_envs, seed, 0).unwrap();
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let mut take_step = || {
+                // The same in every environment, which so differ by their own chance alone.
+                let actions = vec![rng.random_range(0..config.num_actions() as u8); num_envs];
+                (frames(&mut *world), step(&mut *world, &actions))
+            };
+            (0..steps).map(|_| take_step()).collect::<Vec<_>>()
+        };
+        let (one, three) = (played(1, 3), played(3, 3));
+        assert!(one == played(1, 3));
+        assert!(one != played(1, 4), "seeds differ");
+        let ended = |ends: &[StepEnd]| ends[0] != StepEnd::Running;
+        assert!(one.iter().any(|(_, (_, ends))| ended(ends)));
+        let bytes = config.frame_shape().bytes();
+        let mut frames = one.iter().zip(&three);
+        assert!(frames.all(|((one, _), (three, _))| one[..] == three[..bytes]));
+        let mut frames = three.iter().map(|(frames, _)| frames.split_at(bytes));
+        assert!(frames.any(|(first, rest)| first[..] != rest[..bytes]));
     }
 }
 

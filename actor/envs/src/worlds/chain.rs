@@ -31,11 +31,6 @@ pub struct ChainConfig {
     pub reward_right: f32,
 }
 
-/// The best undiscounted return of one episode: `optimal_discounted_return` with gamma = 1.
-pub fn optimal_return(config: &ChainConfig) -> f64 {
-    optimal_discounted_return(config, 1.0)
-}
-
 /// The best return from the start with discount `gamma` in 0..=1: max(0, r_left, gamma^(cells - 3) r_right).
 ///
 /// The right end is `cells` - 2 steps away, so its reward is the (`cells` - 2)-th, and it counts only if the step limit
@@ -108,11 +103,7 @@ impl WorldSettings for ChainConfig {
 
     /// `height` x `width` x 1.
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.height,
-            width: self.width,
-            channels: 1,
-        }
+        FrameShape::new(self.height, self.width, 1)
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -188,6 +179,7 @@ impl Envs for ChainWorld {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::playing::{frames, step};
 
     /// A corridor in which 0.1 is near and 1 is far.
     pub(crate) fn config() -> ChainConfig {
@@ -206,12 +198,11 @@ pub(crate) mod tests {
         let mut world = ChainWorld::new(config, 1).unwrap();
         let (mut total, mut discount) = (0.0, 1.0);
         loop {
-            let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
-            world.step(&[action], &mut reward, &mut end).unwrap();
-            total += discount * f64::from(reward[0]);
+            let (rewards, ends) = step(&mut world, &[action]);
+            total += discount * f64::from(rewards[0]);
             discount *= gamma;
-            if end[0] != StepEnd::Running {
-                return (total, end[0]);
+            if ends[0] != StepEnd::Running {
+                return (total, ends[0]);
             }
         }
     }
@@ -219,7 +210,7 @@ pub(crate) mod tests {
     #[test]
     fn the_best_policy_attains_the_optimum() {
         let base = config();
-        assert_eq!(optimal_return(&base), 1.0);
+        assert_eq!(optimal_discounted_return(&base, 1.0), 1.0);
         for (cells, step_limit, reward_left) in [
             (8, 30, 0.1),
             (8, 6, 0.1),
@@ -265,15 +256,11 @@ pub(crate) mod tests {
     fn each_cell_has_its_own_frame() {
         let mut world = ChainWorld::new(&config(), 2).unwrap();
         let mut seen = std::collections::BTreeSet::new();
-        let mut frames = vec![0; 2 * 144];
         for _ in 1..7 {
-            world.observe(&mut frames);
-            assert!(seen.insert(frames[144..].to_vec()));
-            world
-                .step(&[0, 2], &mut [0.0; 2], &mut [StepEnd::Running; 2])
-                .unwrap();
+            assert!(seen.insert(frames(&mut world)[144..].to_vec()));
+            step(&mut world, &[0, 2]);
         }
-        world.observe(&mut frames);
+        let frames = frames(&mut world);
         assert_eq!(
             frames[..144],
             frames[144..],
@@ -283,12 +270,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn bad_actions_and_settings_are_errors() {
-        let mut world = ChainWorld::new(&config(), 1).unwrap();
-        for wrong in [&[3][..], &[0, 0]] {
-            let step = world.step(wrong, &mut [0.0], &mut [StepEnd::Running]);
-            assert!(step.is_err(), "{wrong:?}");
-        }
+    fn bad_settings_are_errors() {
         let changes: [fn(&mut ChainConfig); 5] = [
             |it| it.cells = 2,
             |it| it.width = 7,

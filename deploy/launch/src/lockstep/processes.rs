@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use driml_actor::{ActError, ActorSettings, Collector, CollectorState, Incarnation};
+use driml_envs::EnvError;
 use driml_learner::{Learner, LearnerConfig, ServedPart, checkpoint};
 use driml_machine::error::usage;
 use driml_protocol::{
@@ -104,7 +105,7 @@ impl Lockstep {
         let mut this = Self::in_memory(config)?;
         if let Err(e) = this.actor_states() {
             return match e {
-                ActError::World(e) if e.is_not_saved() => {
+                ActError::World(e @ EnvError::NotSaved(_)) => {
                     console::line(&format!("{e}: the run cannot be resumed, only repeated"));
                     Ok(this)
                 }

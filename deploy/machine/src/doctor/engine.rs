@@ -1,7 +1,7 @@
 //! Procgen's engine: whether it is there and loads, or how it would be had.
 //! It fetches nothing and plays nothing.
 
-use procgen_sys::{Engine, InstallError};
+use procgen_sys::{Engine, ProcgenError};
 
 use super::fact::Fact;
 
@@ -17,13 +17,13 @@ pub(super) fn fact() -> Fact {
                 Err(why) => Fact::missing(WHAT, why.to_string()),
             }
         }
-        Err(InstallError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
+        Err(ProcgenError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
         Err(why) => Fact::missing(WHAT, why.to_string()),
     }
 }
 
 /// The fact where the engine is not there; `source` is where it would come from.
-fn not_there(reason: &str, source: Result<String, InstallError>) -> Fact {
+fn not_there(reason: &str, source: Result<String, ProcgenError>) -> Fact {
     match source {
         Ok(source) => Fact::note(
             WHAT,
@@ -42,7 +42,7 @@ mod tests {
 
     #[test]
     fn an_engine_that_can_be_fetched_is_a_note_and_one_that_cannot_is_missing() {
-        let no_pip = InstallError::Fetch("install python3-pip".into());
+        let no_pip = ProcgenError::Fetch("install python3-pip".into());
         for (source, state, text) in [
             (Ok("`pip`".into()), State::Note, "`driml procgen install`"),
             (Err(no_pip), State::Missing, "python3-pip"),

@@ -9,4 +9,3 @@ mod world;
 
 pub use self::config::ExecConfig;
 pub use self::world::{ExecWorld, declaration};
-pub use crate::error::ExecError;

@@ -14,10 +14,10 @@ use std::time::{Duration, Instant};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
-use serde::Serialize;
+use serde_json::Value;
 use tracing::Level;
 
-use crate::error::{ExecError, Fault};
+use crate::error::EnvError;
 
 const SHELL: &str = "/bin/sh";
 
@@ -66,11 +66,11 @@ pub(super) struct WorldProcess {
 
 impl WorldProcess {
     /// Starts the command; what it writes to stderr is logged at `level`.
-    pub(super) fn start(command: &str, level: Level) -> Result<Self, ExecError> {
-        Self::try_start(command, level).map_err(|source| ExecError {
-            command: command.into(),
-            fault: Fault::Other(format!("cannot be used: starting it: {source}")),
-            words: String::new(),
+    pub(super) fn start(command: &str, level: Level) -> Result<Self, EnvError> {
+        Self::try_start(command, level).map_err(|source| {
+            EnvError::Exec(format!(
+                "the world `{command}` cannot be used: starting it: {source}"
+            ))
         })
     }
 
@@ -123,7 +123,7 @@ impl WorldProcess {
     }
 
     /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
-    pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), ExecError> {
+    pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), EnvError> {
         let said = match &mut self.to {
             Some(to) => to.write_all(bytes).and_then(|()| to.flush()),
             None => Ok(()),
@@ -139,11 +139,11 @@ impl WorldProcess {
     pub(super) fn say_line(
         &mut self,
         before: &[u8],
-        message: &impl Serialize,
+        message: &Value,
         doing: &'static str,
-    ) -> Result<(), ExecError> {
+    ) -> Result<(), EnvError> {
         let mut line = before.to_vec();
-        line.extend(serde_json::to_vec(message).expect("plain text and numbers are JSON"));
+        line.extend(message.to_string().bytes());
         line.push(b'\n');
         self.say(&line, doing)
     }
@@ -152,7 +152,7 @@ impl WorldProcess {
         &mut self,
         patience: Patience,
         doing: &'static str,
-    ) -> Result<Vec<u8>, ExecError> {
+    ) -> Result<Vec<u8>, EnvError> {
         let deadline = Instant::now() + patience.limit;
         let mut line = Vec::new();
         loop {
@@ -165,11 +165,7 @@ impl WorldProcess {
         }
     }
 
-    pub(super) fn byte(
-        &mut self,
-        patience: Patience,
-        doing: &'static str,
-    ) -> Result<u8, ExecError> {
+    pub(super) fn byte(&mut self, patience: Patience, doing: &'static str) -> Result<u8, EnvError> {
         self.byte_until(Instant::now() + patience.limit, patience, doing)
     }
 
@@ -178,7 +174,7 @@ impl WorldProcess {
         deadline: Instant,
         patience: Patience,
         doing: &'static str,
-    ) -> Result<u8, ExecError> {
+    ) -> Result<u8, EnvError> {
         let mut byte = [0];
         match self.read_until(&mut byte, deadline) {
             Ok(0) => Err(self.ended(doing)),
@@ -186,10 +182,10 @@ impl WorldProcess {
             Err(e) if e.kind() == ErrorKind::TimedOut => {
                 self.kill();
                 let Patience { limit, setting } = patience;
-                Err(self.fail(Fault::Dead(format!(
+                Err(self.dead(&format!(
                     "has not answered for {} s {doing}, and was killed: if it needs longer, --set {setting}=N",
                     limit.as_secs_f64()
-                ))))
+                )))
             }
             Err(source) => Err(self.system(doing, &source)),
         }
@@ -212,43 +208,37 @@ impl WorldProcess {
     }
 
     /// What to say of a process that is not there any more.
-    fn ended(&mut self, doing: &'static str) -> ExecError {
+    fn ended(&mut self, doing: &'static str) -> EnvError {
         self.to = None;
         let how = match self.end_within(END_MAX) {
             Some(status) => format!("ended {doing} ({})", describe(status)),
             None => format!("closed its stdout {doing} without ending, and was killed"),
         };
         self.kill();
-        self.fail(Fault::Dead(how))
+        self.dead(&how)
+    }
+
+    /// What to say of a dead process, whose last output may still arrive.
+    fn dead(&self, how: &str) -> EnvError {
+        // Nothing is sent on this channel.
+        let _ = self.spoken.recv_timeout(END_MAX);
+        self.fail(how)
     }
 
     /// What to say of this fault, with the process's last words.
-    pub(super) fn fail(&self, fault: Fault) -> ExecError {
-        if matches!(fault, Fault::Dead(_)) {
-            // It is dead; its last output may still arrive. Nothing is sent on this channel.
-            let _ = self.spoken.recv_timeout(END_MAX);
-        }
+    pub(super) fn fail(&self, how: &str) -> EnvError {
         let words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
-        let words = words.iter().map(|line| format!("\n  {line}"));
-        let words: String = words.collect();
-        ExecError {
-            command: self.command.clone(),
-            fault,
-            words: match words.is_empty() {
-                true => words,
-                false => format!(". Its last words:{words}"),
-            },
-        }
-    }
-
-    /// What to say of something that it should not do.
-    pub(super) fn other(&self, text: String) -> ExecError {
-        self.fail(Fault::Other(text))
+        let words: String = words.iter().map(|line| format!("\n  {line}")).collect();
+        let words = match words.is_empty() {
+            true => words,
+            false => format!(". Its last words:{words}"),
+        };
+        EnvError::Exec(format!("the world `{}` {how}{words}", self.command))
     }
 
     /// What to say of an error of the operating system.
-    pub(super) fn system(&self, doing: &str, source: &io::Error) -> ExecError {
-        self.other(format!("cannot be used: {doing}: {source}"))
+    pub(super) fn system(&self, doing: &str, source: &io::Error) -> EnvError {
+        self.fail(&format!("cannot be used: {doing}: {source}"))
     }
 
     fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {

@@ -43,10 +43,11 @@ use std::os::unix::fs::FileExt;
 use nix::fcntl::{FcntlArg, SealFlag, fcntl};
 use nix::sys::memfd::{MFdFlags, memfd_create};
 use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use super::config::ExecConfig;
 use crate::environment::FrameShape;
-use crate::error::{EnvError, Fault};
+use crate::error::EnvError;
 use crate::saved;
 use crate::settings::WorldSettings;
 
@@ -55,23 +56,6 @@ pub(super) const VERSION: u64 = 1;
 
 /// Most characters of a line that a message repeats.
 const SHOWN_MAX: usize = 200;
-
-#[derive(Debug, Serialize)]
-pub(super) struct Request {
-    driml_env: u64,
-    copies: usize,
-    seeds: Vec<u32>,
-}
-
-impl Request {
-    pub(super) const fn new(seeds: Vec<u32>) -> Self {
-        Self {
-            driml_env: VERSION,
-            copies: seeds.len(),
-            seeds,
-        }
-    }
-}
 
 /// What a world is, by its own word.
 #[derive(Debug, Deserialize)]
@@ -87,41 +71,25 @@ pub(super) struct Declaration {
 }
 
 impl Declaration {
-    pub(super) fn parse(line: &[u8]) -> Result<Self, Fault> {
+    pub(super) fn parse(line: &[u8]) -> Result<Self, String> {
         let no_world = |why: String| {
             let line = String::from_utf8_lossy(line);
             let line: String = line.chars().take(SHOWN_MAX).collect();
-            Fault::Other(format!(
+            format!(
                 "does not declare itself as a world: its first line on stdout is {line:?} and not JSON with \"driml_env\" and the shapes ({why}); \
                  deploy/python/driml_env.py makes a Gymnasium environment such a world"
-            ))
+            )
         };
-        let value: serde_json::Value =
-            serde_json::from_slice(line).map_err(|e| no_world(e.to_string()))?;
-        let found = value.get("driml_env").and_then(serde_json::Value::as_u64);
+        let value: Value = serde_json::from_slice(line).map_err(|e| no_world(e.to_string()))?;
+        let found = value.get("driml_env").and_then(Value::as_u64);
         match found {
             Some(VERSION) => serde_json::from_value(value).map_err(|e| no_world(e.to_string())),
-            Some(found) => Err(Fault::Other(format!(
+            Some(found) => Err(format!(
                 "speaks version {found} of the protocol, and this driml speaks version {VERSION}: take the driml_env.py that came with it"
-            ))),
+            )),
             None => Err(no_world("\"driml_env\" is missing".into())),
         }
     }
-}
-
-/// Where the memory is that both sides share.
-#[derive(Debug, Serialize)]
-pub(super) struct Opening<'a> {
-    pub(super) block: &'a str,
-    #[serde(flatten)]
-    pub(super) layout: Layout,
-}
-
-/// Where a state is to be written, or lies.
-#[derive(Debug, Serialize)]
-pub(super) struct StatePlace<'a> {
-    pub(super) state: &'a str,
-    pub(super) bytes_max: u64,
 }
 
 /// Each column begins at a multiple of this, so that no two of them share a line of a processor's cache.
@@ -129,7 +97,7 @@ const ALIGNMENT: usize = 64;
 
 /// Where each column begins, and how long the whole is; bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub(super) struct Layout {
+struct Layout {
     bytes: usize,
     actions: usize,
     rewards: usize,
@@ -138,7 +106,7 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    pub(super) const fn new(copies: usize, shape: FrameShape) -> Self {
+    const fn new(copies: usize, shape: FrameShape) -> Self {
         let rewards = copies.next_multiple_of(ALIGNMENT);
         let ends = (rewards + copies * size_of::<f32>()).next_multiple_of(ALIGNMENT);
         let frames = (ends + copies).next_multiple_of(ALIGNMENT);
@@ -178,12 +146,11 @@ impl Block {
         })
     }
 
-    pub(super) const fn layout(&self) -> Layout {
-        self.layout
-    }
-
-    pub(super) fn path(&self) -> String {
-        path(&self.file)
+    /// The line that says where the memory is, and the columns in it.
+    pub(super) fn opening(&self) -> Value {
+        let mut opening = json!(self.layout);
+        opening["block"] = path(&self.file).into();
+        opening
     }
 
     /// Puts down the actions [N].
@@ -258,48 +225,30 @@ pub(super) const WORLD_STATE_BYTES_MAX: u64 = 64 << 20;
 /// How a world stands, and which world it is.
 #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct SavedExec {
-    command: String,
-    copies: usize,
-    /// Rows, columns, bytes a pixel.
-    shape: [usize; 3],
-    actions: Vec<String>,
+    pub(super) config: ExecConfig,
+    pub(super) copies: usize,
     /// Those in which the next actions are taken [N, H, W, C].
     pub(super) frames: Vec<u8>,
     pub(super) state: Vec<u8>,
 }
 
 impl SavedExec {
-    pub(super) fn new(config: &ExecConfig, copies: usize, frames: Vec<u8>, state: Vec<u8>) -> Self {
-        Self {
-            command: config.command.clone(),
-            copies,
-            shape: [config.height, config.width, config.channels],
-            actions: config.actions.clone(),
-            frames,
-            state,
-        }
-    }
-
-    pub(super) fn to_bytes(&self) -> Result<Vec<u8>, EnvError> {
-        saved::encode(self)
-    }
-
     pub(super) fn from_bytes(
         bytes: &[u8],
         config: &ExecConfig,
         num_envs: usize,
     ) -> Result<Self, EnvError> {
         let this: Self = saved::decode_whole(bytes)?;
-        if this.command != config.command {
+        let of = &this.config;
+        if of.command != config.command {
             return Err(EnvError::State(format!(
                 "it is of the world `{}`, and this is `{}`: give the command as it was",
-                this.command, config.command
+                of.command, config.command
             )));
         }
         saved::check_env_count(this.copies, num_envs)?;
-        let shape = [config.height, config.width, config.channels];
         saved::check(
-            this.shape == shape && this.actions == config.actions,
+            of.frame_shape() == config.frame_shape() && of.actions == config.actions,
             "the shape of its frames or its actions",
         )?;
         let frame_bytes = num_envs * config.frame_shape().bytes();

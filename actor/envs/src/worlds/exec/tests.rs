@@ -9,6 +9,7 @@ use super::world::seeds;
 use super::*;
 use crate::environment::{Environment, StepEnd};
 use crate::error::EnvError;
+use crate::playing::{frames, step};
 use crate::saved::tests::continues;
 use crate::settings::WorldSettings;
 
@@ -32,8 +33,8 @@ pub(crate) fn config(command: String) -> ExecConfig {
     }
 }
 
-fn said(error: impl Into<EnvError>) -> String {
-    error.into().to_string()
+fn said(error: EnvError) -> String {
+    error.to_string()
 }
 
 #[test]
@@ -66,17 +67,14 @@ fn every_frame_reward_and_end_is_the_one_that_the_process_made() {
         .into_iter()
         .map(|seed| (seed % 65_536) as u16)
         .collect();
-    let mut frames = vec![0; COPIES * 144];
-    let (mut rewards, mut ends) = ([0.0; COPIES], [StepEnd::Running; COPIES]);
     let (mut episodes, mut steps) = ([0; COPIES], [0; COPIES]);
     for round in 0..100 {
-        world.observe(&mut frames);
         let expected: Vec<_> = (0..COPIES)
             .map(|copy| [copy as u16, episodes[copy], seeds[copy], steps[copy]])
             .collect();
-        assert_eq!(numbers(&frames), expected, "round {round}");
+        assert_eq!(numbers(&frames(&mut world)), expected, "round {round}");
         let actions = [0, 1, 2].map(|copy| ((copy + round) % 3) as u8);
-        world.step(&actions, &mut rewards, &mut ends).unwrap();
+        let (rewards, ends) = step(&mut world, &actions);
         for copy in 0..COPIES {
             steps[copy] += 1;
             let last = steps[copy] == 3 + copy as u16;
@@ -253,14 +251,10 @@ fn a_world_that_offers_it_continues_where_it_was_saved() {
     assert!(ended > 20, "{ended}");
     // The frames that its next actions are taken in are those that there were.
     let mut world = ExecWorld::new(&config, 2, 1).unwrap();
-    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
-    world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
-    let (mut frames, mut other_frames) = (vec![0; 2 * 144], vec![0; 2 * 144]);
-    world.observe(&mut frames);
+    step(&mut world, &[0, 1]);
     let mut other = ExecWorld::new(&config, 2, 2).unwrap();
     other.load(&world.save().unwrap()).unwrap();
-    other.observe(&mut other_frames);
-    assert_eq!(numbers(&other_frames), numbers(&frames));
+    assert_eq!(frames(&mut other), frames(&mut world));
 }
 
 /// The error of a world that offers to save its state, when it is asked to.
@@ -316,7 +310,8 @@ fn each_way_in_which_saving_can_fail_has_its_sentence() {
         ),
     ] {
         let error = save_fault(kind);
-        assert_eq!(error.is_not_saved(), kind == "never", "{kind}");
+        let not_saved = matches!(error, EnvError::NotSaved(_));
+        assert_eq!(not_saved, kind == "never", "{kind}");
         let text = said(error);
         assert!(
             text.starts_with("the world `exec python3 "),
@@ -331,10 +326,9 @@ fn each_way_in_which_saving_can_fail_has_its_sentence() {
 #[test]
 fn a_world_that_does_not_offer_it_is_not_asked() {
     let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
-    assert!(matches!(world.save(), Err(EnvError::NotSaved)));
+    assert!(matches!(world.save(), Err(EnvError::NotSaved(_))));
     // It is not told, and continues.
-    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
-    world.step(&[0, 1], &mut rewards, &mut ends).unwrap();
+    step(&mut world, &[0, 1]);
 }
 
 #[test]

@@ -2,16 +2,16 @@
 //! What passes between them is for `protocol`. A command is asked here what world it is.
 
 use rand::Rng;
+use serde_json::json;
 use tracing::Level;
 
 use super::config::{ExecConfig, describe, start_patience};
 use super::process::{Patience, WorldProcess};
-use super::protocol::{
-    Block, Declaration, Opening, Request, SavedExec, StateMemory, StatePlace, WORLD_STATE_BYTES_MAX,
-};
+use super::protocol::{Block, Declaration, SavedExec, StateMemory, VERSION, WORLD_STATE_BYTES_MAX};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
-use crate::error::{EnvError, ExecError, Fault};
+use crate::error::EnvError;
+use crate::saved;
 use crate::settings::{Variants, WorldSettings};
 
 /// Longest side of a frame, in pixels.
@@ -66,34 +66,26 @@ impl ExecWorld {
             seeds(seed, num_envs),
             Level::INFO,
         )?;
-        let shape = FrameShape {
-            height: declared.height,
-            width: declared.width,
-            channels: declared.channels,
-        };
+        let shape = FrameShape::new(declared.height, declared.width, declared.channels);
         if shape != config.frame_shape() || declared.actions != config.actions {
             let found = describe(shape, &declared.actions);
             let promised = describe(config.frame_shape(), &config.actions);
             let other = format!(
                 "declares {found}, but the run's settings say {promised}: start the run anew, or the command as it was"
             );
-            return Err(process.other(other).into());
+            return Err(process.fail(&other));
         }
         let copies = declared.copies;
         if copies != num_envs {
             let other = format!(
                 "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
             );
-            return Err(process.other(other).into());
+            return Err(process.fail(&other));
         }
         let block = Block::new(num_envs, shape)
             .map_err(|e| process.system("making the memory that it shares", &e))?;
-        let opening = Opening {
-            block: &block.path(),
-            layout: block.layout(),
-        };
         let doing = "before its first frames";
-        process.say_line(b"", &opening, doing)?;
+        process.say_line(b"", &block.opening(), doing)?;
         let mut world = Self {
             process,
             block,
@@ -105,15 +97,15 @@ impl ExecWorld {
         Ok(world)
     }
 
-    fn hear_done(&mut self, patience: Patience, doing: &'static str) -> Result<(), ExecError> {
+    fn hear_done(&mut self, patience: Patience, doing: &'static str) -> Result<(), EnvError> {
         match self.process.byte(patience, doing)? {
             DONE => Ok(()),
             byte => Err(self.other_byte(doing, byte)),
         }
     }
 
-    fn other_byte(&self, doing: &str, byte: u8) -> ExecError {
-        self.process.other(format!(
+    fn other_byte(&self, doing: &str, byte: u8) -> EnvError {
+        self.process.fail(&format!(
             "answered {doing} with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
         ))
     }
@@ -124,16 +116,13 @@ impl ExecWorld {
         what: u8,
         memory: &StateMemory,
         doing: &'static str,
-    ) -> Result<(), ExecError> {
-        let place = StatePlace {
-            state: &memory.path(),
-            bytes_max: WORLD_STATE_BYTES_MAX,
-        };
+    ) -> Result<(), EnvError> {
+        let place = json!({"state": memory.path(), "bytes_max": WORLD_STATE_BYTES_MAX});
         self.process.say_line(&[what], &place, doing)
     }
 
     /// The process's own bytes for how its copies stand.
-    fn save_process(&mut self) -> Result<Vec<u8>, ExecError> {
+    fn save_process(&mut self) -> Result<Vec<u8>, EnvError> {
         let doing = "in the middle of saving its state";
         let patience = self.config.step_patience();
         let memory = StateMemory::new(&[]).map_err(|e| self.process.system(doing, &e))?;
@@ -144,21 +133,20 @@ impl ExecWorld {
                 let line = self.process.line(patience, doing)?;
                 let why = String::from_utf8_lossy(&line).trim().to_owned();
                 // It lives on, and has said all there is to say.
-                return Err(ExecError {
-                    words: String::new(),
-                    ..self.process.fail(Fault::NotSaved(why))
-                });
+                let command = &self.config.command;
+                let text = format!("the world `{command}` cannot save its state: {why}");
+                return Err(EnvError::NotSaved(text));
             }
             byte => return Err(self.other_byte(doing, byte)),
         }
         let bytes = memory.len().map_err(|e| self.process.system(doing, &e))?;
         if bytes == 0 {
-            return Err(self.process.other(format!(
+            return Err(self.process.fail(&format!(
                 "wrote no state: where it says `.` {doing}, the bytes have to lie in \"state\""
             )));
         }
         if bytes > WORLD_STATE_BYTES_MAX {
-            return Err(self.process.other(format!(
+            return Err(self.process.fail(&format!(
                 "wrote a state of {bytes} bytes; {WORLD_STATE_BYTES_MAX} are possible for all its copies together"
             )));
         }
@@ -166,7 +154,7 @@ impl ExecWorld {
         state.map_err(|e| self.process.system(doing, &e))
     }
 
-    fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), ExecError> {
+    fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), EnvError> {
         let doing = "in the middle of loading its state";
         let written = StateMemory::new(state)
             .and_then(|memory| self.block.write_frames(frames).map(|()| memory));
@@ -183,12 +171,13 @@ fn introduce(
     patience: Patience,
     seeds: Vec<u32>,
     level: Level,
-) -> Result<(WorldProcess, Declaration), ExecError> {
+) -> Result<(WorldProcess, Declaration), EnvError> {
     let mut process = WorldProcess::start(command, level)?;
     let doing = "before it declared itself";
-    process.say_line(b"", &Request::new(seeds), doing)?;
+    let request = json!({"driml_env": VERSION, "copies": seeds.len(), "seeds": seeds});
+    process.say_line(b"", &request, doing)?;
     let line = process.line(patience, doing)?;
-    let declaration = Declaration::parse(&line).map_err(|fault| process.fail(fault))?;
+    let declaration = Declaration::parse(&line).map_err(|why| process.fail(&why))?;
     Ok((process, declaration))
 }
 
@@ -269,11 +258,7 @@ impl WorldSettings for ExecConfig {
 
     /// `height` x `width` x `channels`.
     fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: self.height,
-            width: self.width,
-            channels: self.channels,
-        }
+        FrameShape::new(self.height, self.width, self.channels)
     }
 
     fn action_names(&self) -> Vec<&str> {
@@ -356,27 +341,32 @@ impl Environment for ExecWorld {
             wrong.get_or_insert_with(|| format!("gave copy {copy} the reward {reward}"));
         }
         match wrong {
-            Some(text) => Err(self.process.other(text).into()),
+            Some(text) => Err(self.process.fail(&text)),
             None => Ok(()),
         }
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
         if !self.saves {
-            return Err(EnvError::NotSaved);
+            return Err(EnvError::not_saved());
         }
         let state = self.save_process()?;
         let mut frames = vec![0; self.num_envs * self.config.frame_shape().bytes()];
         self.observe(&mut frames);
-        SavedExec::new(&self.config, self.num_envs, frames, state).to_bytes()
+        saved::encode(&SavedExec {
+            config: self.config.clone(),
+            copies: self.num_envs,
+            frames,
+            state,
+        })
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
         let SavedExec { frames, state, .. } =
             SavedExec::from_bytes(state, &self.config, self.num_envs)?;
         if !self.saves {
-            return Err(EnvError::NotSaved);
+            return Err(EnvError::not_saved());
         }
-        Ok(self.load_process(&state, &frames)?)
+        self.load_process(&state, &frames)
     }
 }

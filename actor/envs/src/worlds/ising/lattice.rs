@@ -172,11 +172,6 @@ impl IsingLattice {
         &self.spins[..self.height * self.width]
     }
 
-    /// Rows and columns.
-    pub fn size(&self) -> (usize, usize) {
-        (self.height, self.width)
-    }
-
     /// Asserts that the kept energy and magnetisation are those of the spins, and that every spin is legal.
     pub fn check_valid(&self) {
         assert_eq!(

@@ -108,11 +108,7 @@ impl PacmanConfig {
 
     /// 21 x 19 x 3.
     pub const fn frame_shape(&self) -> FrameShape {
-        FrameShape {
-            height: HEIGHT,
-            width: WIDTH,
-            channels: super::render::CHANNELS,
-        }
+        FrameShape::new(HEIGHT, WIDTH, super::render::CHANNELS)
     }
 
     /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0.

@@ -41,12 +41,12 @@ impl Game {
     ) -> Self {
         Self {
             rng,
-            agent: maze.agent_start(),
-            ghosts: maze.ghost_starts().map(Ghost::at),
+            agent: maze.agent_start,
+            ghosts: maze.ghost_starts.map(Ghost::at),
             lethal: config.lethal_in(episodes),
             boost_left: 0,
-            items: maze.items().to_vec(),
-            pellets_left: maze.pellets(),
+            items: maze.items.clone(),
+            pellets_left: maze.pellets,
             episode_step: 0,
             episodes,
             background: fresh.to_vec(),
@@ -55,7 +55,7 @@ impl Game {
 
     /// An error where no game in this maze is so.
     pub(super) fn check(&self, maze: &Maze) -> Result<(), EnvError> {
-        let places = maze.items().len();
+        let places = maze.items.len();
         let is_place = |place: Place| usize::from(place) < places;
         check(is_place(self.agent), "the agent's place")?;
         for ghost in self.ghosts {
@@ -100,7 +100,7 @@ impl Game {
                 continue;
             }
             if boosted {
-                self.ghosts[index] = Ghost::at(maze.ghost_starts()[index]);
+                self.ghosts[index] = Ghost::at(maze.ghost_starts[index]);
                 if self.lethal[index] {
                     reward += config.reward_ghost;
                 }
@@ -116,7 +116,8 @@ impl Game {
 
     fn eat(&mut self, config: &PacmanConfig, maze: &Maze, item: Item) -> f32 {
         if item != Item::Nothing {
-            render::erase(maze, self.agent, &mut self.background);
+            let pixel = maze.pixel(self.agent);
+            render::paint(&mut self.background, pixel, render::FLOOR);
         }
         match item {
             Item::Nothing => 0.0,

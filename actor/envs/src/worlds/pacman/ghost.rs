@@ -124,7 +124,7 @@ mod tests {
     fn followers_close_in_and_avoiders_do_not() {
         let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let places = maze.items().len() as u16;
+        let places = maze.items.len() as u16;
         for place in 0..places {
             for agent in (0..places).filter(|&agent| agent != place && maze.in_sight(place, agent))
             {
@@ -149,7 +149,7 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let mut ghost = Ghost {
             mode: Mode::Follow,
-            ..Ghost::at(maze.ghost_starts()[2])
+            ..Ghost::at(maze.ghost_starts[2])
         };
         let agent = 0;
         assert!(!maze.in_sight(ghost.place, agent));
@@ -172,7 +172,7 @@ mod tests {
     fn modes_change_over_with_the_given_probability() {
         let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let start = Ghost::at(maze.agent_start());
+        let start = Ghost::at(maze.agent_start);
         let (trials, p) = (20_000, 0.3);
         let changed = (0..trials)
             .filter(|_| {
@@ -202,7 +202,7 @@ mod tests {
     fn random_moves_are_uniform() {
         let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let crossing = (0..maze.items().len() as u16)
+        let crossing = (0..maze.items.len() as u16)
             .find(|&p| maze.open(p) == 0b1111)
             .unwrap();
         let mut counts = [0i32; 4];
@@ -242,7 +242,7 @@ mod tests {
             epsilon: 0.0,
             switch_probability: 0.0,
         };
-        let mut ghost = Ghost::at(maze.ghost_starts()[1]);
+        let mut ghost = Ghost::at(maze.ghost_starts[1]);
         let mut visited = std::collections::BTreeSet::new();
         for _ in 0..20_000 {
             let before = ghost;
@@ -255,7 +255,7 @@ mod tests {
         }
         assert_eq!(
             visited.len(),
-            maze.items().len(),
+            maze.items.len(),
             "a wanderer gets everywhere"
         );
     }

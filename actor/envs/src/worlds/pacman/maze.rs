@@ -62,10 +62,12 @@ pub(crate) struct Maze {
     runs: Vec<(u16, u16)>,
     /// [places, places]: moves on the shortest way.
     distances: Vec<u8>,
-    items: Vec<Item>,
-    pellets: u32,
-    agent_start: Place,
-    ghost_starts: [Place; GHOSTS],
+    /// What lies in each open cell at the start of an episode.
+    pub(crate) items: Vec<Item>,
+    /// Pellets at the start of an episode.
+    pub(crate) pellets: u32,
+    pub(crate) agent_start: Place,
+    pub(crate) ghost_starts: [Place; GHOSTS],
 }
 
 impl Maze {
@@ -145,24 +147,6 @@ impl Maze {
         self.distances[usize::from(a) * self.pixels.len() + usize::from(b)]
     }
 
-    /// What lies in each open cell at the start of an episode.
-    pub(crate) fn items(&self) -> &[Item] {
-        &self.items
-    }
-
-    /// Pellets at the start of an episode.
-    pub(crate) fn pellets(&self) -> u32 {
-        self.pellets
-    }
-
-    pub(crate) fn agent_start(&self) -> Place {
-        self.agent_start
-    }
-
-    pub(crate) fn ghost_starts(&self) -> [Place; GHOSTS] {
-        self.ghost_starts
-    }
-
     /// [H * W]: whether each pixel is wall.
     pub(crate) fn walls(&self) -> Vec<bool> {
         LAYOUT
@@ -223,12 +207,12 @@ mod tests {
     #[test]
     fn every_open_cell_is_reachable_and_the_food_is_counted() {
         let maze = Maze::new();
-        let places = maze.items().len();
-        assert!((0..places as u16).all(|place| maze.distance(maze.agent_start(), place) < u8::MAX));
+        let places = maze.items.len();
+        assert!((0..places as u16).all(|place| maze.distance(maze.agent_start, place) < u8::MAX));
         assert_eq!(places, 196);
-        assert_eq!(maze.pellets(), 187);
+        assert_eq!(maze.pellets, 187);
         assert_eq!(
-            maze.items()
+            maze.items
                 .iter()
                 .filter(|&&item| item == Item::Boost)
                 .count(),
@@ -250,8 +234,8 @@ mod tests {
     #[test]
     fn only_the_house_has_dead_ends_and_only_the_tunnel_leaves_the_rim() {
         let maze = Maze::new();
-        let house = maze.ghost_starts();
-        for place in 0..maze.items().len() as u16 {
+        let house = maze.ghost_starts;
+        for place in 0..maze.items.len() as u16 {
             assert!(
                 maze.open(place).count_ones() >= 2 || house.contains(&place),
                 "pixel {}",
@@ -281,7 +265,7 @@ mod tests {
     fn sight_is_a_straight_line_without_walls() {
         let maze = Maze::new();
         let at = |row: usize, column: usize| {
-            (0..maze.items().len() as u16)
+            (0..maze.items.len() as u16)
                 .find(|&p| maze.pixel(p) == row * WIDTH + column)
                 .unwrap()
         };

@@ -23,7 +23,7 @@ pub(crate) mod tests;
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use game::Game;
 use ghost::Chance;
-use maze::{GHOSTS, Maze};
+use maze::Maze;
 use rand_chacha::ChaCha8Rng;
 
 use crate::environment::{Environment, FrameShape, StepEnd};
@@ -84,11 +84,6 @@ impl PacmanWorld {
             fresh,
             walls,
         })
-    }
-
-    /// Which ghosts are lethal in environment `env`'s current episode; `None` if `env` is out of range.
-    pub fn lethal(&self, env: usize) -> Option<[bool; GHOSTS]> {
-        self.envs.get(env).map(|game| game.lethal)
     }
 }
 

@@ -26,7 +26,7 @@ pub(crate) fn background(maze: &Maze, frame: &mut [u8]) {
     for (pixel, wall) in maze.walls().into_iter().enumerate() {
         paint(frame, pixel, if wall { WALL } else { FLOOR });
     }
-    for (place, item) in maze.items().iter().enumerate() {
+    for (place, item) in maze.items.iter().enumerate() {
         let colour = match item {
             Item::Nothing => FLOOR,
             Item::Pellet => PELLET,
@@ -34,10 +34,6 @@ pub(crate) fn background(maze: &Maze, frame: &mut [u8]) {
         };
         paint(frame, maze.pixel(place as Place), colour);
     }
-}
-
-pub(crate) fn erase(maze: &Maze, place: Place, frame: &mut [u8]) {
-    paint(frame, maze.pixel(place), FLOOR);
 }
 
 /// Paints the walls by their spins [21 * 19]: fuchsia +1, wall -1; 0 (open cells) is left alone.
@@ -69,7 +65,7 @@ pub(crate) fn actors(
     );
 }
 
-fn paint(frame: &mut [u8], pixel: usize, colour: Colour) {
+pub(crate) fn paint(frame: &mut [u8], pixel: usize, colour: Colour) {
     frame[pixel * CHANNELS..][..CHANNELS].copy_from_slice(&colour);
 }
 

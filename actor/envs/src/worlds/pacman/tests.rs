@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::ghost::{Ghost, Mode};
 use super::maze::{Item, Place, WIDTH};
 use super::*;
+use crate::playing::{self, frames, play};
 
 pub(crate) fn config() -> PacmanConfig {
     PacmanConfig {
@@ -41,22 +42,15 @@ fn steady(config: &PacmanConfig) -> PacmanConfig {
 }
 
 fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
-    let places = world.maze.items().len() as u16;
+    let places = world.maze.items.len() as u16;
     (0..places)
         .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
         .unwrap()
 }
 
 fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
-    let (mut reward, mut end) = ([0.0], [StepEnd::Running]);
-    world.step(&[action], &mut reward, &mut end).unwrap();
-    (reward[0], end[0])
-}
-
-fn frame(world: &mut PacmanWorld) -> Vec<u8> {
-    let mut frames = vec![0; world.num_envs() * render::FRAME_BYTES];
-    world.observe(&mut frames);
-    frames
+    let (rewards, ends) = playing::step(world, &[action]);
+    (rewards[0], ends[0])
 }
 
 /// The bottom corridor, agent in column 9 and ghost 0 `apart` to the right, sure to come closer; the rest far away.
@@ -74,49 +68,10 @@ fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
     world
 }
 
-/// Frames, rewards and ends of `steps` random steps.
-fn play(
-    world: &mut PacmanWorld,
-    steps: usize,
-    seed: u64,
-) -> (Vec<Vec<u8>>, Vec<f32>, Vec<StepEnd>) {
-    let n = world.num_envs();
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let (mut frames, mut all_rewards, mut all_ends) = (vec![], vec![], vec![]);
-    for _ in 0..steps {
-        frames.push(frame(world));
-        // The same action in every environment, so that an environment's play does not depend on how many there are.
-        let actions = vec![rng.random_range(0..5); n];
-        let (mut rewards, mut ends) = (vec![0.0; n], vec![StepEnd::Running; n]);
-        world.step(&actions, &mut rewards, &mut ends).unwrap();
-        all_rewards.extend(rewards);
-        all_ends.extend(ends);
-    }
-    (frames, all_rewards, all_ends)
-}
-
-#[test]
-fn an_environment_depends_on_seed_and_index_only() {
-    let (one, rewards, ends) = play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
-    let (again, same_rewards, same_ends) =
-        play(&mut PacmanWorld::new(&config(), 1, 3).unwrap(), 2_000, 1);
-    assert_eq!((&one, &rewards, &ends), (&again, &same_rewards, &same_ends));
-    let (three, ..) = play(&mut PacmanWorld::new(&config(), 3, 3).unwrap(), 2_000, 1);
-    let (other, ..) = play(&mut PacmanWorld::new(&config(), 1, 4).unwrap(), 2_000, 1);
-    let bytes = render::FRAME_BYTES;
-    assert!(one.iter().zip(&three).all(|(a, b)| a[..] == b[..bytes]));
-    assert!(
-        three.iter().any(|f| f[..bytes] != f[bytes..2 * bytes]),
-        "environments differ"
-    );
-    assert_ne!(one, other, "seeds differ");
-    assert!(ends.contains(&StepEnd::Terminal), "some episode ended");
-}
-
 #[test]
 fn the_first_frame_shows_everything() {
     let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
-    let frame = frame(&mut world);
+    let frame = frames(&mut world);
     let count = |colour: render::Colour| frame.chunks_exact(3).filter(|&p| p == colour).count();
     assert_eq!(
         (
@@ -177,10 +132,10 @@ fn contact_with_a_lethal_ghost_ends_the_episode() {
 #[test]
 fn the_game_starts_again_after_an_end() {
     let mut world = duel(&config(), 1);
-    let start = frame(&mut PacmanWorld::new(&config(), 1, 0).unwrap());
-    assert_ne!(frame(&mut world), start);
+    let start = frames(&mut PacmanWorld::new(&config(), 1, 0).unwrap());
+    assert_ne!(frames(&mut world), start);
     assert_eq!(step(&mut world, 0).1, StepEnd::Terminal);
-    assert_eq!(frame(&mut world), start);
+    assert_eq!(frames(&mut world), start);
     assert_eq!(
         (world.envs[0].pellets_left, world.envs[0].episode_step),
         (187, 0)
@@ -211,7 +166,7 @@ fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
         let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
         world.envs[0].boost_left = 5;
         assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
-        let home = Ghost::at(world.maze.ghost_starts()[0]);
+        let home = Ghost::at(world.maze.ghost_starts[0]);
         assert_eq!(
             world.envs[0].ghosts[0], home,
             "back at its start, wandering"
@@ -239,7 +194,7 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
         } else {
             render::AGENT
         };
-        assert_eq!(frame(&mut world)[pixel..][..3], colour);
+        assert_eq!(frames(&mut world)[pixel..][..3], colour);
         world.envs[0].ghosts[0] = Ghost {
             mode: Mode::Follow,
             ..Ghost::at(beside)
@@ -305,13 +260,15 @@ fn episodes_are_cut_off_at_the_step_limit() {
         step_limit: 7,
         ..harmless()
     };
-    let (_, _, ends) = play(&mut PacmanWorld::new(&config, 1, 6).unwrap(), 21, 1);
-    let cut: Vec<usize> = (0..21).filter(|&i| ends[i] == StepEnd::TimedOut).collect();
-    assert_eq!(cut, [6, 13, 20]);
-    assert_eq!(
-        ends.iter().filter(|&&end| end == StepEnd::Running).count(),
-        18
-    );
+    let mut world = PacmanWorld::new(&config, 1, 6).unwrap();
+    let seen = play(&mut world, 21, &mut ChaCha8Rng::seed_from_u64(1));
+    for (t, (.., ends)) in seen.into_iter().enumerate() {
+        let end = match t % 7 {
+            6 => StepEnd::TimedOut,
+            _ => StepEnd::Running,
+        };
+        assert_eq!(ends, [end], "step {t}");
+    }
 }
 
 #[test]
@@ -327,11 +284,9 @@ fn the_lethal_ghost_changes_by_the_schedule() {
     };
     let mut world = PacmanWorld::new(&config, 1, 7).unwrap();
     for ghost in [0, 0, 2, 2, 3, 3, 0, 0] {
-        let lethal = world.lethal(0).unwrap();
-        assert_eq!(lethal, std::array::from_fn(|g| g == ghost));
+        assert_eq!(world.envs[0].lethal, std::array::from_fn(|g| g == ghost));
         assert_eq!(step(&mut world, 0).1, StepEnd::TimedOut);
     }
-    assert_eq!(world.lethal(1), None);
 }
 
 #[test]
@@ -349,11 +304,13 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
         ising: None,
         ..noisy.clone()
     };
-    let (seen, rewards, ends) = play(&mut PacmanWorld::new(&noisy, 1, 8).unwrap(), 400, 2);
-    let (bare, bare_rewards, _) = play(&mut PacmanWorld::new(&plain, 1, 8).unwrap(), 400, 2);
-    assert_eq!(rewards, bare_rewards);
-    let mut starts = vec![];
-    for (t, (a, b)) in seen.iter().zip(&bare).enumerate() {
+    let seen = |config: &PacmanConfig| {
+        let mut world = PacmanWorld::new(config, 1, 8).unwrap();
+        play(&mut world, 400, &mut ChaCha8Rng::seed_from_u64(2))
+    };
+    let (mut starts, mut is_start) = (vec![], true);
+    for ((a, rewards, ends), (b, bare_rewards, _)) in seen(&noisy).into_iter().zip(seen(&plain)) {
+        assert_eq!(rewards, bare_rewards);
         let mut fuchsia = 0;
         for (a, b) in a.chunks_exact(3).zip(b.chunks_exact(3)) {
             if b == render::WALL {
@@ -363,13 +320,14 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
                 assert_eq!(a, b);
             }
         }
-        if t == 0 || ends[t - 1] != StepEnd::Running {
+        if is_start {
             assert!(
                 (60..140).contains(&fuchsia),
                 "half of 203 walls, more or less: {fuchsia}"
             );
             starts.push(a);
         }
+        is_start = ends[0] != StepEnd::Running;
     }
     assert!(
         starts.windows(2).all(|pair| pair[0] != pair[1]),

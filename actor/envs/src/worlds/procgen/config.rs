@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options, ProcgenError};
+use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options};
 
 use super::shrink::Shrink;
 use crate::error::EnvError;
@@ -60,7 +60,7 @@ impl ProcgenConfig {
             Some(library) => Engine::other(Path::new(library)),
             None => Engine::install(progress),
         };
-        Ok(engine.map_err(ProcgenError::from)?)
+        Ok(engine?)
     }
 
     /// What makes the engine's frames smaller or grey; none where they are wanted as they are.
@@ -97,7 +97,7 @@ impl ProcgenConfig {
             center_agent: self.center_agent,
             restrict_themes: self.restrict_themes,
         };
-        options.validate().map_err(ProcgenError::from)?;
+        options.validate()?;
         Ok(options)
     }
 }

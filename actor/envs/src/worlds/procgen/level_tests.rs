@@ -45,43 +45,6 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
     }
 }
 
-/// Levels have no order: the next one is drawn.
-#[test]
-fn the_same_level_is_followed_by_different_ones() {
-    let Some(engine) = engine() else { return };
-    let config = ProcgenConfig {
-        start_level: 30,
-        num_levels: 3,
-        ..config(Game::Maze)
-    };
-    let followers = |seed: u64| {
-        let mut world = ProcgenWorld::with_engine(engine, &config, 16, seed, 0).unwrap();
-        let mut rng = ChaCha8Rng::seed_from_u64(2);
-        let mut followers = std::collections::BTreeMap::<i32, Vec<i32>>::new();
-        for _ in 0..1000 {
-            let before = world.levels().to_vec();
-            let (_, _, ends) = step(&mut world, &draw(&mut rng, 16));
-            for ((before, after), end) in before.into_iter().zip(world.levels().to_vec()).zip(ends)
-            {
-                if end == StepEnd::LevelChange {
-                    followers.entry(before).or_default().push(after);
-                }
-            }
-        }
-        followers
-    };
-    let (one, other) = (followers(3), followers(4));
-    assert_ne!(one, other);
-    let (level, after) = one.iter().max_by_key(|(_, after)| after.len()).unwrap();
-    assert!(after.len() >= 10, "{one:?}");
-    for next in 30..33 {
-        assert!(
-            after.contains(&next),
-            "{level} is never followed by {next}: {after:?}"
-        );
-    }
-}
-
 /// A redrawn environment equals a fresh one of that level, also in the steps that follow, in every game.
 #[test]
 fn a_redrawn_level_is_the_level_itself() {
@@ -143,31 +106,35 @@ fn a_redrawn_level_is_the_level_itself() {
     }
 }
 
+/// Levels have no order: whichever was played, each level of the set is as likely to be the next.
 #[test]
-fn redrawn_levels_are_uniform_over_the_set() {
+fn redrawn_levels_are_uniform_over_the_set_after_each_level() {
     let Some(engine) = engine() else { return };
     let config = ProcgenConfig {
-        num_levels: 10,
+        num_levels: 5,
         ..config(Game::Maze)
     };
     let mut world = ProcgenWorld::with_engine(engine, &config, 1, 17, 0).unwrap();
-    let mut counts = [0.0; 10];
-    for _ in 0..1000 {
+    let mut counts = [[0.0; 5]; 5];
+    for _ in 0..2500 {
+        let before = world.levels()[0] as usize;
         world
             .levels
             .as_mut()
             .unwrap()
             .redraw(&mut world.game, 0)
             .unwrap();
-        counts[world.levels()[0] as usize] += 1.0;
+        counts[before][world.levels()[0] as usize] += 1.0;
     }
-    let chi_square: f64 = counts
-        .iter()
-        .map(|count: &f64| (count - 100.0).powi(2) / 100.0)
-        .sum();
-    // The 99.9 % quantile of chi-square with 9 degrees of freedom.
+    let chi_square_of = |row: &[f64; 5]| {
+        let expected = row.iter().sum::<f64>() / 5.0;
+        let terms = row.iter().map(|count| (count - expected).powi(2));
+        terms.sum::<f64>() / expected
+    };
+    let chi_square: f64 = counts.iter().map(chi_square_of).sum();
+    // The 99.9 % quantile of chi-square with 20 degrees of freedom.
     assert!(
-        chi_square < 27.88,
+        chi_square < 45.31,
         "chi-square {chi_square}, counts {counts:?}"
     );
 }

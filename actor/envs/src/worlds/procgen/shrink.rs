@@ -45,11 +45,7 @@ impl Shrink {
 
     /// What it makes.
     pub(super) const fn shape(side: usize, grey: bool) -> FrameShape {
-        FrameShape {
-            height: side,
-            width: side,
-            channels: if grey { 1 } else { RGB },
-        }
+        FrameShape::new(side, side, if grey { 1 } else { RGB })
     }
 
     /// Writes `frames` [N, 64, 64, 3] to `out` [N, side, side, 3 or 1].

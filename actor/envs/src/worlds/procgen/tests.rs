@@ -9,9 +9,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::playing;
 
 /// The installed engine, or a line that says the test was skipped.
-pub(super) fn engine() -> Option<&'static Engine> {
+pub(crate) fn engine() -> Option<&'static Engine> {
     static ENGINE: OnceLock<Engine> = OnceLock::new();
     if std::env::var_os("DRIML_OFFLINE").is_some_and(|it| !it.is_empty() && it != "0") {
         let test = std::thread::current();
@@ -46,12 +47,8 @@ pub(super) fn draw(rng: &mut ChaCha8Rng, num_envs: usize) -> Vec<u8> {
 
 /// What a step gave: frames after it, rewards, ends.
 pub(super) fn step(world: &mut ProcgenWorld, actions: &[u8]) -> (Vec<u8>, Vec<f32>, Vec<StepEnd>) {
-    let num_envs = world.num_envs();
-    let (mut rewards, mut ends) = (vec![0.0; num_envs], vec![StepEnd::Running; num_envs]);
-    world.step(actions, &mut rewards, &mut ends).unwrap();
-    let mut frames = vec![0; num_envs * FRAME_BYTES];
-    world.observe(&mut frames);
-    (frames, rewards, ends)
+    let (rewards, ends) = playing::step(world, actions);
+    (playing::frames(world), rewards, ends)
 }
 
 /// One environment at the start of exactly this level. `last_move` is the last action below 9 other than 4 that
@@ -100,11 +97,9 @@ fn another_build_of_the_library_is_played_by_its_path() {
     });
     let mut published = ProcgenWorld::new(&config(Game::Coinrun), 2, 3, 0).unwrap();
     let mut other = ProcgenWorld::new(&other(&library), 2, 3, 0).unwrap();
-    let mut rng = ChaCha8Rng::seed_from_u64(4);
-    for _ in 0..50 {
-        let actions = draw(&mut rng, 2);
-        assert_eq!(step(&mut published, &actions), step(&mut other, &actions));
-    }
+    let played =
+        |world: &mut ProcgenWorld| playing::play(world, 50, &mut ChaCha8Rng::seed_from_u64(4));
+    assert!(played(&mut published) == played(&mut other));
 }
 
 #[test]
@@ -129,14 +124,9 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
         let actions = draw(&mut rng, 3);
         let (frames, rewards, ends) = step(&mut whole, &actions);
         for other in &mut others {
-            let (mut own_rewards, mut own_ends) = ([0.0; 3], [StepEnd::Running; 3]);
-            other
-                .step(&actions, &mut own_rewards, &mut own_ends)
-                .unwrap();
-            assert_eq!((&own_rewards[..], &own_ends[..]), (&rewards[..], &ends[..]));
+            let (seen, own_rewards, own_ends) = step(other, &actions);
+            assert_eq!((&own_rewards, &own_ends), (&rewards, &ends));
             let shape = other.frame_shape();
-            let mut seen = vec![0; 3 * shape.bytes()];
-            other.observe(&mut seen);
             let mut expected = vec![0; seen.len()];
             Shrink::new(shape.height, shape.channels == 1).apply(&frames, &mut expected);
             assert_eq!(seen, expected);
@@ -283,27 +273,6 @@ fn ends_are_told_apart() {
         .flat_map(|_| step(&mut world, &draw(&mut rng, 8)).2)
         .collect();
     assert!(ends.contains(&StepEnd::Terminal) && !ends.contains(&StepEnd::TimedOut));
-}
-
-#[test]
-fn wrong_steps_are_refused() {
-    let Some(engine) = engine() else { return };
-    let mut world = ProcgenWorld::with_engine(engine, &config(Game::Coinrun), 2, 1, 0).unwrap();
-    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
-    let error = world.step(&[0, 15], &mut rewards, &mut ends).unwrap_err();
-    assert!(
-        matches!(
-            error,
-            EnvError::ActionOutOfRange {
-                env: 1,
-                action: 15,
-                num_actions: 15
-            }
-        ),
-        "{error}"
-    );
-    let error = world.step(&[0], &mut rewards, &mut ends).unwrap_err();
-    assert!(matches!(error, EnvError::BufferLength { .. }), "{error}");
 }
 
 /// Does every action in the same saved states and compares all that follows for six steps; see `visible_actions`.

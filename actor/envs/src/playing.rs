@@ -1,0 +1,39 @@
+//! How tests play a world.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use crate::environment::{Environment, StepEnd};
+
+/// The current frames [N, H, W, C].
+pub(crate) fn frames(world: &mut dyn Environment) -> Vec<u8> {
+    let mut frames = vec![0; world.num_envs() * world.frame_shape().bytes()];
+    world.observe(&mut frames);
+    frames
+}
+
+/// The rewards [N] and ends [N] of a step.
+pub(crate) fn step(world: &mut dyn Environment, actions: &[u8]) -> (Vec<f32>, Vec<StepEnd>) {
+    let num_envs = world.num_envs();
+    let (mut rewards, mut ends) = (vec![0.0; num_envs], vec![StepEnd::Running; num_envs]);
+    world.step(actions, &mut rewards, &mut ends).unwrap();
+    (rewards, ends)
+}
+
+/// Takes so many steps of actions drawn from `rng`: of each the frames in which it was taken, its rewards and its ends.
+pub(crate) fn play(
+    world: &mut dyn Environment,
+    steps: usize,
+    rng: &mut ChaCha8Rng,
+) -> Vec<(Vec<u8>, Vec<f32>, Vec<StepEnd>)> {
+    let (num_envs, num_actions) = (world.num_envs(), world.num_actions() as u8);
+    let mut seen = Vec::new();
+    for _ in 0..steps {
+        let draw = |_| rng.random_range(0..num_actions);
+        let actions: Vec<u8> = (0..num_envs).map(draw).collect();
+        let frames = frames(world);
+        let (rewards, ends) = step(world, &actions);
+        seen.push((frames, rewards, ends));
+    }
+    seen
+}
