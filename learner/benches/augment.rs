@@ -32,7 +32,7 @@ fn augmentation(criterion: &mut Criterion) {
             saturation: jitter,
             hue: jitter,
         };
-        let mut augment = Augment::new(settings, (64, 64, 3), 3);
+        let augment = Augment::new(settings, (64, 64, 3), 3);
         group.bench_function(name, |bencher| {
             bencher.iter(|| augment.apply(black_box(&states), &mut seen, &mut rng));
         });

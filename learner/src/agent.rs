@@ -228,19 +228,10 @@ impl Agent {
     /// A batch that does not fit, or losses or gradients that are not finite: nothing has then changed. A step beyond the
     /// finite numbers, [`UpdateError::Diverged`]: the learner is then good for nothing, and can be neither published nor saved.
     pub fn update(&mut self, batch: &Batch<'_>) -> Result<UpdateReport, UpdateError> {
-        self.check(batch)?;
-        self.update_checked(batch)
-    }
-
-    /// [`Agent::update`] with a batch that passed [`Agent::check`].
-    pub(crate) fn update_checked(
-        &mut self,
-        batch: &Batch<'_>,
-    ) -> Result<UpdateReport, UpdateError> {
         fail_point::hold(self.updates());
         // On a thread of the pool: from outside, every product would wake the pool up and be woken by it.
         rayon::scope(|_| {
-            let evaluation = self.evaluate_checked(batch, &self.noise())?;
+            let evaluation = self.evaluate(batch)?;
             let grad_norm = self.apply(&evaluation.gradients)?;
             let taken = evaluation.taken_logits.unsqueeze(1)?;
             let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
@@ -283,14 +274,6 @@ impl Agent {
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
         self.check(batch)?;
-        self.evaluate_checked(batch, noise)
-    }
-
-    fn evaluate_checked(
-        &self,
-        batch: &Batch<'_>,
-        noise: &UpdateNoise,
-    ) -> Result<Evaluation, UpdateError> {
         // Neither needs the other: what one does on a single thread falls into the other's products.
         let (target, features) = rayon::join(
             || self.bellman().target(batch, noise),

@@ -88,7 +88,7 @@ struct Tap {
     far_weight: u16,
 }
 
-/// Changes states at random; its memory is used again at each call.
+/// Changes states at random.
 #[derive(Debug)]
 pub struct Augment {
     settings: AugmentSettings,
@@ -99,9 +99,6 @@ pub struct Augment {
     crop: (usize, usize),
     rows: Vec<Tap>,
     cols: Vec<Tap>,
-    views: Vec<View>,
-    /// A line of a crop for each thread.
-    lines: Vec<Vec<u16>>,
 }
 
 impl Augment {
@@ -125,8 +122,6 @@ impl Augment {
             crop,
             rows: taps(crop.0, height),
             cols: taps(crop.1, width),
-            views: Vec::new(),
-            lines: Vec::new(),
         }
     }
 
@@ -161,38 +156,29 @@ impl Augment {
     /// Writes each of `states` [n, H, W, C], each changed by a separate draw, to `seen`, which gets their length.
     ///
     /// The draws are made in order before the work is spread over the threads, so `rng` alone decides the bytes.
-    pub fn apply(&mut self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {
+    pub fn apply(&self, states: &[u8], seen: &mut Vec<u8>, rng: &mut impl Rng) {
         let (height, width, channels) = self.size;
         let state_bytes = height * width * channels;
         let count = states.len() / state_bytes;
-        let mut views = std::mem::take(&mut self.views);
-        views.clear();
-        views.extend((0..count).map(|_| self.draw(rng)));
-        let mut lines = std::mem::take(&mut self.lines);
-        let threads = rayon::current_num_threads().max(1);
-        lines.resize_with(threads, Vec::new);
-        let share = count.div_ceil(threads).max(1);
+        let views: Vec<View> = (0..count).map(|_| self.draw(rng)).collect();
         seen.resize(states.len(), 0);
-        seen.par_chunks_mut(share * state_bytes)
-            .zip(states.par_chunks(share * state_bytes))
-            .zip(views.par_chunks(share))
-            .zip(lines.par_iter_mut())
-            .for_each(|(((seen, states), views), line)| {
-                line.resize(self.crop.1 * channels, 0);
-                let pairs = seen
-                    .chunks_exact_mut(state_bytes)
-                    .zip(states.chunks_exact(state_bytes));
-                for ((seen, state), view) in pairs.zip(views) {
-                    self.change(state, view, seen, line);
-                }
-            });
-        (self.views, self.lines) = (views, lines);
+        seen.par_chunks_exact_mut(state_bytes)
+            .zip(states.par_chunks_exact(state_bytes))
+            .zip(&views)
+            .for_each_init(
+                || self.line(),
+                |line, ((seen, state), view)| self.change(state, view, seen, line),
+            );
+    }
+
+    /// Room for a line of the crop.
+    fn line(&self) -> Vec<u16> {
+        vec![0; self.crop.1 * self.size.2]
     }
 
     /// Writes one state, changed, to `seen`.
     pub fn apply_view(&self, state: &[u8], view: &View, seen: &mut [u8]) {
-        let mut line = vec![0; self.crop.1 * self.size.2];
-        self.change(state, view, seen, &mut line);
+        self.change(state, view, seen, &mut self.line());
     }
 
     fn change(&self, state: &[u8], view: &View, seen: &mut [u8], line: &mut [u16]) {

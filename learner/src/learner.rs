@@ -159,6 +159,7 @@ impl Learner {
         // Kept only if the update succeeds.
         let mut rng = self.state.rng.clone();
         let batch = self.preparation.prepare(&columns, &mut rng);
+        // Before the affinity sees its actions.
         self.state.agent.check(&batch)?;
         let mut affinity = self.state.affinity.clone();
         if let Some(affinity) = &mut affinity {
@@ -169,7 +170,7 @@ impl Learner {
             };
             affinity.observe(&pairs, &mut rng)?;
         }
-        let report = self.state.agent.update_checked(&batch)?;
+        let report = self.state.agent.update(&batch)?;
         (self.state.rng, self.state.affinity) = (rng, affinity);
         Ok(report)
     }

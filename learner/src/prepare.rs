@@ -102,7 +102,7 @@ impl Preparation {
             positive_valid: served.positive_valid(),
             importance_weight: columns.weights.as_deref(),
         };
-        if let Some(augment) = &mut self.augment {
+        if let Some(augment) = &self.augment {
             if self.positives == Positives::OtherView {
                 // Two views of the same state.
                 batch.states_k = states_t;
@@ -136,14 +136,12 @@ fn spread(states: &[u8], there: &[u8], state_bytes: usize) -> Vec<u8> {
     all
 }
 
-/// Enlarges all `states` into `larger`, a share of them on each thread.
+/// Enlarges all `states` into `larger`, spread over the threads.
 fn enlarge_all(enlarge: &Enlarge, states: &[u8], larger: &mut Vec<u8>) {
     let (from, to) = (enlarge.input_bytes(), enlarge.output_bytes());
-    let count = states.len() / from;
-    larger.resize(count * to, 0);
-    let share = count.div_ceil(rayon::current_num_threads()).max(1);
+    larger.resize(states.len() / from * to, 0);
     larger
-        .par_chunks_mut(share * to)
-        .zip(states.par_chunks(share * from))
-        .for_each(|(larger, states)| enlarge.apply(states, larger));
+        .par_chunks_exact_mut(to)
+        .zip(states.par_chunks_exact(from))
+        .for_each(|(larger, state)| enlarge.apply(state, larger));
 }

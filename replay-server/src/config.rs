@@ -8,8 +8,6 @@ use driml_protocol::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::storage::frame_store::log::OVERHEAD_BYTES_MAX;
-
 pub(crate) const SHARDS_MAX: u32 = 256;
 
 /// Smallest segment of a replay that is kept on disk.
@@ -175,7 +173,7 @@ impl Config {
                 max,
                 || "nothing is compressed; use compression = \"lz4\", or capacity_transitions",
             )?;
-            let least = compressed_bytes_least(window, spec.frame_bytes()) * u64::from(self.shards);
+            let least = window * spec.frame_bytes() as u64 * u64::from(self.shards);
             check(max >= least, key, max, || {
                 format!(
                     "one sample spans {window} transitions, which may not compress; use at least {least}"
@@ -213,13 +211,6 @@ impl Config {
         }
         Ok(())
     }
-}
-
-/// Bytes that `transitions` take if their frames do not compress at all, with what compression itself takes.
-pub(crate) const fn compressed_bytes_least(transitions: u64, frame_bytes: usize) -> u64 {
-    transitions
-        .saturating_mul(frame_bytes as u64)
-        .saturating_add(OVERHEAD_BYTES_MAX)
 }
 
 /// Least disk budget of a replay: room for the transitions before the first batch, and for the segments that come and go.

@@ -112,16 +112,11 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, CheckpointError> {
     })
 }
 
-/// Writes a file aside, flushes it to disk and gives it its name.
+/// Writes a new file and flushes it to disk.
 pub(super) fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
-    let mut aside = path.as_os_str().to_owned();
-    aside.push(".tmp");
-    let aside = PathBuf::from(aside);
-    let mut file = File::create(&aside).map_err(io_error("create", &aside))?;
-    file.write_all(bytes)
-        .and_then(|()| file.sync_all())
-        .map_err(io_error("write", &aside))?;
-    fs::rename(&aside, path).map_err(io_error("move", &aside))
+    File::create(path)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        .map_err(io_error("write", path))
 }
 
 /// Flushes a folder's own entries to disk.

@@ -32,7 +32,7 @@ pub struct Label<'a> {
 
 /// Writes `folder/checkpoint-<updates>` and removes all but the newest `keep` checkpoints.
 ///
-/// Every file is written aside, flushed to disk and renamed; so is the folder: a crash at any moment leaves the older
+/// The files are written and flushed to disk in a folder aside, which is then renamed: a crash at any moment leaves the older
 /// checkpoints whole and at most a `.tmp` folder, which the next save removes.
 ///
 /// # Errors

@@ -54,7 +54,7 @@ fn at_no_strength_every_byte_stays() {
     ] {
         let states = noise(9 * size.0 * size.1 * size.2, 2);
         let mut seen = Vec::new();
-        let mut augment = Augment::new(NOTHING, size, frame_channels);
+        let augment = Augment::new(NOTHING, size, frame_channels);
         augment.apply(&states, &mut seen, &mut rng(3));
         assert!(seen == states, "{size:?}");
     }
@@ -238,7 +238,7 @@ fn the_generator_alone_decides_and_rows_differ() {
     different.dedup();
     assert_eq!(different.len(), 33, "each row has its own draw");
     // Each call continues the generator, and reused memory leaves no trace.
-    let mut augment = Augment::new(PAPER, size, 3);
+    let augment = Augment::new(PAPER, size, 3);
     let (mut rng, mut seen) = (rng(1), vec![1; 7]);
     for rows in [20, 13] {
         augment.apply(&states[..rows * state.len()], &mut seen, &mut rng);

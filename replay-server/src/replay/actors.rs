@@ -7,7 +7,6 @@ use driml_protocol::{ActorJoin, Chunk, ChunkPoll, EndedEpisode, InsertReply, Lea
 
 use super::Replay;
 use crate::{
-    config::compressed_bytes_least,
     ledger::actors::{Difference, Verdict},
     persist::{journal::Journal, snapshot::Note},
     storage::{
@@ -161,7 +160,7 @@ impl Replay {
                 "{transitions} transitions in one chunk; the replay holds {capacity}: use 1 to that many"
             ));
         }
-        let bytes = compressed_bytes_least(transitions, frame_bytes);
+        let bytes = transitions * frame_bytes as u64;
         if let Some(max) = self.config.compressed_bytes_max.filter(|&max| max < bytes) {
             return Err(format!(
                 "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"

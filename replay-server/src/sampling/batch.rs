@@ -138,7 +138,7 @@ impl NeededFrames {
         let mut places = HashMap::new();
         for states in rows {
             for state in states.indices() {
-                for index in episodes.stack(ring, state).frames() {
+                for index in episodes.stack(ring, state) {
                     let place = match places.entry(index) {
                         Entry::Occupied(known) => *known.get(),
                         Entry::Vacant(new) => {

@@ -93,15 +93,12 @@ impl Episodes {
         self.frame_stack
     }
 
-    /// The frames that make the state at `index`.
+    /// The frames that make the state at `index`, as indices in the ring, oldest first.
     ///
     /// At the start of a level its first frame fills the slots of the frames before it. The stack must be held, which it is
     /// for every state of a window: it reaches back to the anchor's stack at most.
-    pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> Stack {
-        let mut stack = Stack {
-            length: self.frame_stack,
-            indices: [index; FRAME_STACK_MAX as usize],
-        };
+    pub(crate) fn stack(&self, ring: &Ring, mut index: u64) -> impl Iterator<Item = u64> {
+        let mut indices = [index; FRAME_STACK_MAX as usize];
         for slot in (0..self.frame_stack - 1).rev() {
             match ring.previous(index) {
                 Previous::Start => {}
@@ -110,21 +107,8 @@ impl Episodes {
                     unreachable!("the stack of {index} was checked with its anchor")
                 }
             }
-            stack.indices[slot] = index;
+            indices[slot] = index;
         }
-        stack
-    }
-}
-
-/// The frames of one state, as indices in the ring, oldest first.
-pub(crate) struct Stack {
-    length: usize,
-    indices: [u64; FRAME_STACK_MAX as usize],
-}
-
-impl Stack {
-    /// Indices of the frames, oldest first; at the start of a level the first one several times.
-    pub(crate) fn frames(&self) -> impl Iterator<Item = u64> {
-        self.indices.into_iter().take(self.length)
+        indices.into_iter().take(self.frame_stack)
     }
 }

@@ -99,10 +99,10 @@ impl PackedFrames {
             let (key, part) = frames.parts(index);
             let key_index = key.transitions.start;
             if !self.has(first_part, key_index) {
-                self.take(frames, &key, None);
+                self.take(key, None);
             }
             if let Some(part) = part {
-                self.take(frames, &part, Some(key_index));
+                self.take(part, Some(key_index));
             }
         }
         self.rows.push(PackedRow {
@@ -117,11 +117,11 @@ impl PackedFrames {
         taken.any(|part| part.transitions.contains(&index))
     }
 
-    fn take(&mut self, frames: &CompressedFrames, part: &BlockPart, key: Option<u64>) {
+    fn take(&mut self, part: BlockPart<'_>, key: Option<u64>) {
         let start = self.bytes.len();
-        frames.copy(part, &mut self.bytes);
+        self.bytes.extend_from_slice(part.bytes);
         self.parts.push(PackedPart {
-            transitions: part.transitions.clone(),
+            transitions: part.transitions,
             place: start..self.bytes.len(),
             key,
         });

@@ -148,9 +148,9 @@ fn memory_follows_what_is_held_and_the_bytes_allowed_are_kept() {
     const CAPACITY: u64 = 1000;
     let spec = sized(64, 64, 1);
     let frame_bytes = spec.frame_bytes() as u64;
-    let overhead = (3 << 20) + 16 * frame_bytes + 64 * CAPACITY;
+    let overhead = 16 * frame_bytes + 64 * CAPACITY;
     let (all, max) = (CAPACITY * frame_bytes + overhead, 8 << 20);
-    let (all_held, some_held) = (CAPACITY..CAPACITY + 1, 350..500);
+    let (all_held, some_held) = (CAPACITY..CAPACITY + 1, 650..690);
     for (allowed, most, noise_held) in [
         (None, all, all_held.clone()),
         (Some(max), max + 64 * CAPACITY, some_held),
@@ -191,7 +191,7 @@ fn memory_follows_what_is_held_and_the_bytes_allowed_are_kept() {
                 assert!(held(&replay) <= overhead, "{}", held(&replay));
             }
         }
-        let chunk = player.chunk(2, 250, Content::Constant);
+        let chunk = player.chunk(2, 350, Content::Constant);
         assert_eq!(is_refused(&replay.insert(&chunk)), allowed.is_some());
     }
 }

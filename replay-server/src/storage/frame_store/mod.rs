@@ -3,7 +3,6 @@
 
 pub(crate) mod compressed;
 mod layout;
-pub(crate) mod log;
 mod pack;
 
 use crate::config::Compression;

@@ -1,7 +1,7 @@
 //! Compresses a chunk before it is stored, so that the replay is not locked meanwhile.
 //! It stores nothing and does not judge the chunk.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, sync::Arc};
 
 use driml_protocol::{Chunk, codec};
 use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
@@ -21,31 +21,24 @@ pub struct Packer {
 pub struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
     /// With compression: of each stream.
-    packed: Vec<PackedRun>,
+    packed: Vec<Vec<Arc<Block>>>,
     /// Where chunks are kept on disk: prefix and header of the message, if the chunk makes one.
     pub(crate) sealed: Option<Vec<u8>>,
 }
 
-/// Consecutive frames of one stream as blocks, the first frame's first.
-#[derive(Default)]
-pub(crate) struct PackedRun {
-    pub(crate) blocks: Vec<PackedBlock>,
-    /// Of each block: its parts, one after the other. A part is the frames themselves if it has as many bytes.
-    pub(crate) bytes: Vec<u8>,
-}
-
-/// A block that is not stored yet.
-pub(crate) struct PackedBlock {
+/// Consecutive frames of one stream, compressed.
+pub(crate) struct Block {
     pub(crate) frames: usize,
-    /// Bytes up to the end of each part, from the start of the block.
-    pub(crate) part_ends: PartEnds,
+    part_ends: PartEnds,
+    /// Its parts, one after the other. A part is the frames themselves if it has as many bytes.
+    pub(crate) bytes: Box<[u8]>,
 }
 
 /// One stream's frames, on their way into the replay.
 #[derive(Clone, Copy)]
 pub(crate) enum Run<'a> {
     Plain(&'a [u8]),
-    Packed(&'a PackedRun),
+    Packed(&'a [Arc<Block>]),
 }
 
 impl Packer {
@@ -54,7 +47,7 @@ impl Packer {
         let packed = match self.compression {
             Compression::None => Vec::new(),
             Compression::Lz4 => runs(&chunk)
-                .map(|run| PackedRun::new(run, Layout::new(chunk.header.frame_bytes as usize)))
+                .map(|run| blocks(run, Layout::new(chunk.header.frame_bytes as usize)))
                 .collect(),
         };
         let seal = |hash| codec::seal(hash, &chunk.header, chunk.payload()).ok();
@@ -70,15 +63,15 @@ impl Packer {
 impl PackedChunk<'_> {
     /// Bytes of memory that it takes, roughly.
     pub(crate) fn bytes(&self) -> usize {
-        let packed: usize = self.packed.iter().map(|run| run.bytes.len()).sum();
-        self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed
+        let packed = self.packed.iter().flatten().map(|block| block.bytes.len());
+        self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed.sum::<usize>()
     }
 
     /// The frames of each stream.
     pub(crate) fn runs(&self) -> impl Iterator<Item = Run<'_>> {
         let plain = self.packed.is_empty();
         let plain = plain.then(|| runs(&self.chunk).map(Run::Plain));
-        let packed = self.packed.iter().map(Run::Packed);
+        let packed = self.packed.iter().map(|run| Run::Packed(run));
         plain.into_iter().flatten().chain(packed)
     }
 }
@@ -89,33 +82,46 @@ fn runs(chunk: &Chunk) -> impl Iterator<Item = &[u8]> {
     chunk.frames().chunks_exact(run_bytes.max(1))
 }
 
-impl PackedRun {
+/// A stream's frames as blocks, the first frame's first.
+fn blocks(frames: &[u8], layout: Layout) -> Vec<Arc<Block>> {
+    let blocks = frames.chunks(layout.block_frames_max() * layout.frame_bytes);
+    let packed = blocks.map(|block| Arc::new(Block::new(block, layout)));
+    packed.collect()
+}
+
+impl Block {
     fn new(frames: &[u8], layout: Layout) -> Self {
-        let mut run = Self::default();
-        let mut scratch = Vec::new();
-        for block in frames.chunks(layout.block_frames_max() * layout.frame_bytes) {
-            let frames = block.len() / layout.frame_bytes;
-            let (key, start) = (&block[..layout.frame_bytes], run.bytes.len());
-            let mut part_ends = PartEnds::default();
-            let parts = layout.parts(frames);
-            for (part, end) in part_ends.iter_mut().enumerate().take(parts) {
-                let range = layout.frames_of(part, frames);
-                let plain =
-                    &block[range.start * layout.frame_bytes..range.end * layout.frame_bytes];
-                scratch.resize(get_maximum_output_size(plain.len()), 0);
-                let packed = match part {
-                    0 => compress_into(plain, &mut scratch),
-                    _ => compress_into_with_dict(plain, &mut scratch, key),
-                };
-                run.bytes.extend_from_slice(match packed {
-                    Ok(length) if length < plain.len() => &scratch[..length],
-                    // It would not become smaller.
-                    _ => plain,
-                });
-                *end = (run.bytes.len() - start) as u32;
-            }
-            run.blocks.push(PackedBlock { frames, part_ends });
+        let key = &frames[..layout.frame_bytes];
+        let count = frames.len() / layout.frame_bytes;
+        let (mut bytes, mut scratch) = (Vec::new(), Vec::new());
+        let mut part_ends = PartEnds::default();
+        let parts = layout.parts(count);
+        for (part, end) in part_ends.iter_mut().enumerate().take(parts) {
+            let range = layout.frames_of(part, count);
+            let plain = &frames[range.start * layout.frame_bytes..range.end * layout.frame_bytes];
+            scratch.resize(get_maximum_output_size(plain.len()), 0);
+            let packed = match part {
+                0 => compress_into(plain, &mut scratch),
+                _ => compress_into_with_dict(plain, &mut scratch, key),
+            };
+            bytes.extend_from_slice(match packed {
+                Ok(length) if length < plain.len() => &scratch[..length],
+                // It would not become smaller.
+                _ => plain,
+            });
+            *end = bytes.len() as u32;
         }
-        run
+        Self {
+            frames: count,
+            part_ends,
+            // A copy, so that it takes no more memory than it has bytes.
+            bytes: bytes.as_slice().into(),
+        }
+    }
+
+    /// The bytes of one part.
+    pub(crate) fn part(&self, part: usize) -> &[u8] {
+        let end = |part: usize| self.part_ends[part] as usize;
+        &self.bytes[part.checked_sub(1).map_or(0, end)..end(part)]
     }
 }
