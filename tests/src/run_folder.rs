@@ -6,47 +6,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
+pub use driml_launch::run_folder::{Outcome, Summary};
 use safetensors::SafeTensors;
-use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::waiting::wait_for;
-
-/// The counts of `summary.json` that every run has.
-#[derive(Clone, Debug, Deserialize)]
-#[allow(
-    missing_docs,
-    reason = "the names are those of the file, which the launcher documents"
-)]
-pub struct Summary {
-    pub outcome: String,
-    pub resumed_after_updates: u64,
-    pub frames: u64,
-    pub updates: u64,
-    pub transitions_inserted: u64,
-    pub transitions_refilled: u64,
-    pub transitions_lost: u64,
-    pub transitions_duplicated: u64,
-    pub rows_sampled: u64,
-    pub rows_unlearned: u64,
-    pub replay_ratio: Option<f64>,
-    pub episodes: u64,
-    pub mean_return: Option<f64>,
-    pub mean_return_of: u64,
-    pub wall_seconds: f64,
-    pub frames_per_second: f64,
-    pub updates_per_second: f64,
-    pub mean_k: Option<f64>,
-    pub k_histogram: Vec<u64>,
-    pub weights_version: u64,
-    pub weights_sha256: String,
-    pub chunks_retried: u64,
-    #[serde(default)]
-    pub replay_servers_restarted: u32,
-    /// How often an actor that had died was started again.
-    pub actors_restarted: u32,
-    pub messages_refused: u64,
-}
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, PartialEq)]
@@ -243,25 +207,25 @@ impl RunFolder {
     /// # Panics
     /// At the first thing that does not hold.
     #[track_caller]
-    pub fn check(&self, outcome: &str) -> Summary {
+    pub fn check(&self, outcome: Outcome) -> Summary {
         let summary = self.summary();
-        let said = format!("{summary:#?}");
+        let (replay, said) = (&summary.replay, format!("{summary:#?}"));
         assert_eq!(summary.outcome, outcome, "{said}");
         assert_eq!(
-            (summary.transitions_lost, summary.transitions_duplicated),
+            (replay.transitions_lost, replay.transitions_duplicated),
             (0, 0),
             "{said}"
         );
-        assert_eq!(summary.messages_refused, 0, "{said}");
-        assert_eq!(summary.frames, summary.transitions_inserted, "{said}");
+        assert_eq!(replay.messages_refused, 0, "{said}");
+        assert_eq!(summary.frames, replay.transitions_inserted, "{said}");
         // A replay that was kept knows of the k of all the run.
         let before = match self.path.join("replay").is_dir() {
             true => 0,
             false => summary.resumed_after_updates,
         };
         let rows_before = before * self.setting("learner.batch_size") as u64;
-        let known = rows_before + summary.k_histogram.iter().sum::<u64>();
-        let served = summary.rows_sampled + summary.rows_unlearned;
+        let known = rows_before + replay.k_histogram.iter().sum::<u64>();
+        let served = replay.rows_sampled + replay.rows_unlearned;
         // A server that was killed has forgotten the k of what it served since its last snapshot.
         let may_lack = summary.resumed_after_updates > 0 || summary.replay_servers_restarted > 0;
         assert!(known == served || may_lack && known < served, "{said}");
@@ -299,7 +263,7 @@ impl RunFolder {
     /// At the first thing that does not hold.
     #[track_caller]
     pub fn check_finished(&self) -> Summary {
-        let summary = self.check("finished");
+        let summary = self.check(Outcome::Finished);
         let said = format!("{summary:#?}");
         let rows = self.setting("learner.batch_size") as u64;
         let (warmup, ratio) = (
@@ -310,7 +274,11 @@ impl RunFolder {
             summary.frames >= self.setting("replay.transitions_max") as u64,
             "{said}"
         );
-        assert_eq!(summary.rows_sampled, summary.updates * rows, "{said}");
+        assert_eq!(
+            summary.replay.rows_sampled,
+            summary.updates * rows,
+            "{said}"
+        );
         let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
         assert_eq!(summary.updates, allowed as u64, "{said}");
         let publications = summary.updates / self.setting("learner.publish_period_updates") as u64;

@@ -14,7 +14,7 @@ use std::{
     time::Duration,
 };
 
-use driml_tests::{Process, TestSystem, wait_for};
+use driml_tests::{Outcome, Process, TestSystem, wait_for};
 use nix::{
     fcntl::OFlag,
     poll::{PollFd, PollFlags, poll},
@@ -93,7 +93,7 @@ fn end(child: &mut Child) -> ExitStatus {
 fn check_saved(system: &TestSystem, ended: ExitStatus) {
     assert_eq!(ended.code(), Some(130), "{ended}");
     assert_eq!(system.survivors(), []);
-    let summary = system.run_folder("run").check("interrupted");
+    let summary = system.run_folder("run").check(Outcome::Interrupted);
     assert!(summary.updates > 100, "{summary:#?}");
 }
 
@@ -184,7 +184,7 @@ fn a_hangup_ends_a_launched_run_once() {
     process.signal(Signal::SIGHUP);
     process.wait().expect_code(130);
     assert_eq!(system.survivors(), []);
-    system.run_folder("run").check("interrupted");
+    system.run_folder("run").check(Outcome::Interrupted);
 }
 
 /// `nohup driml local ... &`, and the terminal is closed.
@@ -203,7 +203,7 @@ fn a_run_that_is_to_ignore_hangups_does() {
     }
     client.wait_for_updates(before.updates + 500);
     process.stop().expect_code(130);
-    system.run_folder("run").check("interrupted");
+    system.run_folder("run").check(Outcome::Interrupted);
 }
 
 /// Ctrl-Z, and `fg` after longer than the launcher waits for an answer.
@@ -228,5 +228,5 @@ fn a_run_that_was_stopped_for_long_resumes() {
         (updates > before.updates + 500).then_some(())
     });
     process.stop().expect_code(130);
-    system.run_folder("run").check("interrupted");
+    system.run_folder("run").check(Outcome::Interrupted);
 }

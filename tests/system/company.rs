@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use driml_actor::DeliveryLimits;
 use driml_protocol::{ChunkHeader, Keys, RunClient, Shutdown};
-use driml_tests::connect;
+use driml_tests::{Outcome, connect};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, synthetic_actor::SyntheticActor, system};
@@ -20,7 +20,7 @@ fn twenty_four_actors_wait_for_one_learner() {
         "local --agent c51 {longer} --actors 24 --set replay.replay_ratio=64 --run-dir run"
     ));
     let summary = system.run_folder("run").check_finished();
-    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
+    assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
     assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
 }
 
@@ -35,8 +35,8 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     client.wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
     drop(client);
     process.interrupt().expect_code(130);
-    let summary = system.run_folder("run").check("interrupted");
-    assert_eq!(summary.chunks_retried, 0, "{summary:#?}");
+    let summary = system.run_folder("run").check(Outcome::Interrupted);
+    assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
     assert_eq!(system.survivors(), []);
 }
 

@@ -8,7 +8,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Process, TestSystem, succeeds, wait_for};
+use driml_tests::{Outcome, Process, TestSystem, succeeds, wait_for};
 
 use crate::{LONG, SHORT, system};
 
@@ -96,7 +96,7 @@ fn a_run_continues_while_the_disk_is_full() {
     let ended = process.interrupt().expect_code(130);
     assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
     assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
-    run.check("interrupted");
+    run.check(Outcome::Interrupted);
     // No second is missing.
     let numbers = |name| -> Vec<f64> {
         let cells = run.column(name).into_iter();
@@ -164,7 +164,7 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
         saved.any(|updates: u64| updates > now).then_some(())
     });
     process.interrupt().expect_code(130);
-    system.run_folder("disk/run").check("interrupted");
+    system.run_folder("disk/run").check(Outcome::Interrupted);
     check_nothing_is_left(&system);
 }
 

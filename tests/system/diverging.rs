@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use driml_tests::RunFolder;
+use driml_tests::{Outcome, RunFolder};
 use safetensors::SafeTensors;
 
 use crate::{SHORT, system};
@@ -46,7 +46,7 @@ fn parameters_that_are_not_finite_are_neither_saved_nor_acted_with() {
             .expect_code(1);
         assert_eq!(system.survivors(), []);
         let run = system.run_folder("run");
-        assert_eq!(run.summary().outcome, "failed");
+        assert_eq!(run.summary().outcome, Outcome::Failed);
         let log = run.log("learner");
         assert!(log.contains(said), "{lr}:\n{log}");
         let log = run.log("actor-0");

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{RunFolder, Survivor, TestSystem, note, wait_for};
+use driml_tests::{Outcome, RunFolder, Survivor, TestSystem, note, wait_for};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -52,11 +52,12 @@ const fn planned(frames: u64) -> u64 {
 fn check_exactly_once(run: &RunFolder) {
     let summary = run.summary();
     let said = format!("{summary:#?}");
-    let wrong = (summary.transitions_lost, summary.transitions_duplicated);
+    let replay = &summary.replay;
+    let wrong = (replay.transitions_lost, replay.transitions_duplicated);
     assert_eq!(wrong, (0, 0), "{said}");
-    let updates = planned(summary.transitions_inserted);
+    let updates = planned(replay.transitions_inserted);
     assert_eq!(summary.updates, updates, "{said}");
-    assert_eq!(summary.rows_sampled, updates * u64::from(ROWS), "{said}");
+    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
 }
 
 #[test]
@@ -95,7 +96,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
         .wait()
         .expect_code(1)
         .expect_said("(8 of 8 times in a run)");
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
     assert!(
         !system.run_folder("run").checkpoints().is_empty(),
         "the learner saved"

@@ -3,6 +3,8 @@
 
 use std::{collections::BTreeMap, fs, path::Path};
 
+use driml_tests::Outcome;
+
 use crate::system;
 
 /// Every file of a folder but the page, which has the time it took.
@@ -147,7 +149,7 @@ fn procgen_without_the_engine() {
     }
     let summary = |name: &str| folder.join("runs").join(name).join("summary.json");
     let text = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
-    let failed = text.replace("\"finished\"", "\"failed\"");
+    let failed = text.replace(": \"finished\"", ": \"failed\"");
     fs::write(summary("chain-c51-seed2"), failed).unwrap();
     // Runs of programs that did not note their commit are adopted.
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
@@ -156,7 +158,7 @@ fn procgen_without_the_engine() {
         .expect_said("chain-c51-seed2 was not finished");
     assert!(summary("chain-c51-seed2.unfinished-1").exists());
     let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
-    assert!(again.contains("\"finished\""), "{again}");
+    assert!(again.contains(": \"finished\""), "{again}");
     let table = String::from_utf8(data(&folder)["table.csv"].clone()).unwrap();
     let line = |game: &str, agent: &str, seed: &str| {
         let of = |it: &Vec<&str>| [it[0], it[1], it[3]] == [game, agent, seed];
@@ -303,7 +305,7 @@ fn killed_and_resumed() {
         .expect_said("mspacman-c51-seed1 resumes from its checkpoint");
     let summary = run.summary();
     assert!(
-        summary.outcome == "finished" && summary.resumed_after_updates > 0,
+        summary.outcome == Outcome::Finished && summary.resumed_after_updates > 0,
         "{summary:#?}"
     );
     let page = fs::read_to_string(system.path("x/README.md")).unwrap();

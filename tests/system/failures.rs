@@ -3,7 +3,7 @@
 
 use std::{fs, process::Command};
 
-use driml_tests::{Ended, Process, TestSystem, wait_for};
+use driml_tests::{Ended, Outcome, Process, TestSystem, wait_for};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
@@ -18,7 +18,7 @@ fn an_interrupt_saves_and_ends_all_processes() {
         .expect_said("stopping: actors deliver what they have");
     assert_eq!(system.survivors(), []);
     ended.expect_printed("interrupted: ");
-    let summary = system.run_folder("run").check("interrupted");
+    let summary = system.run_folder("run").check(Outcome::Interrupted);
     assert!(summary.updates > 100, "{summary:#?}");
 }
 
@@ -34,7 +34,7 @@ fn a_second_interrupt_ends_at_once() {
         .expect_code(1)
         .expect_said("stopped at once by a second interrupt: what was not saved is lost");
     assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
 }
 
 /// Signals at nearly the same time count as one request, so this repeats it until it is noticed.
@@ -60,7 +60,10 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
         let ended = process.interrupt().expect_code(130);
         assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
         ended.expect_printed("no episode ended");
-        assert_eq!(system.run_folder("run").summary().outcome, "interrupted");
+        assert_eq!(
+            system.run_folder("run").summary().outcome,
+            Outcome::Interrupted
+        );
         assert_eq!(system.survivors(), []);
     }
 }
@@ -85,7 +88,10 @@ fn a_complete_run_is_finished_though_an_actor_stands_still() {
         .expect_code(0)
         .expect_said("did not end within 1 min 0 s and was killed")
         .expect_printed("finished: ");
-    assert_eq!(system.run_folder("run").summary().outcome, "finished");
+    assert_eq!(
+        system.run_folder("run").summary().outcome,
+        Outcome::Finished
+    );
     assert_eq!(system.survivors(), []);
 }
 
@@ -96,7 +102,10 @@ fn an_interrupt_of_a_complete_run_leaves_it_finished() {
     interrupt_until_it_ends(complete_but_for_a_frozen_actor(&system))
         .expect_code(0)
         .expect_printed("finished: ");
-    assert_eq!(system.run_folder("run").summary().outcome, "finished");
+    assert_eq!(
+        system.run_folder("run").summary().outcome,
+        Outcome::Finished
+    );
     assert_eq!(system.survivors(), []);
 }
 
@@ -127,7 +136,7 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
             ))
             .expect_said("`driml train --resume run` resumes it");
         assert_eq!(system.survivors(), []);
-        assert_eq!(system.run_folder("run").summary().outcome, "failed");
+        assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
     }
 }
 
@@ -181,7 +190,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
         .expect_said("error: actor-0 was killed by signal 9 SIGKILL (log: ")
         .expect_said("actor-0 is not started again: the ghosts of this run change");
     assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
 }
 
 /// They all notice it at once: the replay server stays until the others have delivered what they have and left.

@@ -6,7 +6,7 @@ use std::{
     net::{Ipv4Addr, TcpListener},
 };
 
-use driml_tests::{Client, Summary, wait_for};
+use driml_tests::{Client, Outcome, Summary, wait_for};
 
 use crate::{LONG, SHORT, system};
 
@@ -47,7 +47,7 @@ fn c51_leaves_a_whole_run_folder() {
     system.run_ok("local --config run/config.toml --run-dir again");
     let again = system.run_folder("again");
     assert_eq!(again.config(), run.config());
-    let counts = |it: &Summary| (it.frames, it.updates, it.rows_sampled);
+    let counts = |it: &Summary| (it.frames, it.updates, it.replay.rows_sampled);
     assert_eq!(counts(&again.check_finished()), counts(&summary));
 }
 
@@ -107,7 +107,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     outside.stop().expect_code(0).expect_said("actor 5 leaves");
     run.interrupt().expect_code(130);
     let run = system.run_folder("run");
-    run.check("interrupted");
+    run.check(Outcome::Interrupted);
     let actors: BTreeSet<_> = run.episodes().iter().map(|it| it.actor).collect();
     assert_eq!(actors, BTreeSet::from([0, 5]));
 }
@@ -143,8 +143,8 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
         let summary = run.check_finished();
         assert_eq!((summary.frames, summary.updates), (1280, 540));
         // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
-        assert_eq!(summary.k_histogram.len(), served + 1);
-        assert!(summary.k_histogram.iter().all(|&count| count > 0));
+        assert_eq!(summary.replay.k_histogram.len(), served + 1);
+        assert!(summary.replay.k_histogram.iter().all(|&count| count > 0));
         let last = run.column(loss).pop().unwrap().parse::<f64>().unwrap();
         assert!(last > 0.0, "{agent}: {last}");
         system
@@ -181,10 +181,10 @@ fn two_replay_shards_are_one_replay() {
         "local --agent driml-ada {SHORT} --actors 2 --replay-shards 2 --run-dir run"
     ));
     assert_eq!(system.survivors(), []);
-    let summary = system.run_folder("run").check("finished");
+    let summary = system.run_folder("run").check(Outcome::Finished);
     // Each of the two limiters admits chunks until it learns of the other's.
     assert!((1280..=1800).contains(&summary.frames), "{summary:#?}");
-    assert_eq!(summary.updates * 16, summary.rows_sampled);
+    assert_eq!(summary.updates * 16, summary.replay.rows_sampled);
     let owed = (summary.frames - 200) * 8 / 16;
     assert!(owed - summary.updates <= 1, "{summary:#?}");
 

@@ -33,8 +33,8 @@ fn seed_and_settings_decide_the_weights() {
             runs.map(|(name, more)| run(&system, &format!("{flags} {more}"), name));
         assert_eq!(first.weights_sha256, same.weights_sha256, "{flags} {own}");
         assert_eq!(
-            (first.k_histogram, first.episodes),
-            (same.k_histogram, same.episodes)
+            (first.replay.k_histogram, first.episodes),
+            (same.replay.k_histogram, same.episodes)
         );
         assert_ne!(first.weights_sha256, other.weights_sha256, "{flags}");
         // And so do the settings that the first run left.
@@ -50,11 +50,11 @@ fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
     let Summary {
         weights_sha256,
         mean_return,
-        k_histogram,
+        replay,
         episodes,
         ..
     } = summary;
-    (weights_sha256, mean_return, k_histogram, episodes)
+    (weights_sha256, mean_return, replay.k_histogram, episodes)
 }
 
 /// Runs it whole; finished after half of its frames and prolonged; and resumed after each signal: Ctrl-C, which saves, and death, after
@@ -160,7 +160,7 @@ fn a_compressed_replay_leads_to_the_same_weights() {
     let lz4 = format!("{flags} --set replay.compression=lz4");
     let lz4 = run(&system, &lz4, "lz4");
     assert_eq!(plain.weights_sha256, lz4.weights_sha256);
-    assert_eq!(plain.k_histogram, lz4.k_histogram);
+    assert_eq!(plain.replay.k_histogram, lz4.replay.k_histogram);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fail_point`).
 
 use driml_protocol::fail_point;
-use driml_tests::{Ended, TestSystem};
+use driml_tests::{Ended, Outcome, TestSystem};
 
 use crate::{LONG, PRIORITISED, system};
 
@@ -58,7 +58,7 @@ fn ends_the_run((process, point, flags): (&str, &str, &str)) {
     assert_eq!(ended.code, Some(1), "{point}: {ended:#?}");
     let said = format!("error: {process} was killed by signal 6 SIGABRT (log: ");
     assert!(ended.stderr.contains(&said), "{said:?} in {ended:#?}");
-    assert_eq!(system.run_folder("run").summary().outcome, "failed");
+    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
 }
 
 /// Only debug builds can be asked to panic; a line says that a test is skipped in others.

@@ -1,6 +1,7 @@
 //! Rows drawn by priority, in whole runs: of one replay server and of several, and of one that dies. Those in lockstep are in `lockstep`.
 //! The law of the draws is tested beside the code.
 
+use driml_tests::Outcome;
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, SHORT, system};
@@ -24,7 +25,7 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
             "local --agent driml-ada {SHORT} {PRIORITISED} {flags} --run-dir run"
         ));
         let run = system.run_folder("run");
-        let summary = run.check("finished");
+        let summary = run.check(Outcome::Finished);
         let processes: Vec<String> = match shards {
             1 => vec!["replay-server".into()],
             _ => (0..shards)
@@ -36,7 +37,7 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
             std::array::from_fn(|at| sums[at] + counts[at])
         });
         let [set, gone, repeated] = sums;
-        let rows = summary.rows_sampled;
+        let rows = summary.replay.rows_sampled;
         assert!(
             set + gone <= rows && set * 10 > rows * 9,
             "{sums:?} of {rows}"
@@ -64,7 +65,7 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
         .expect_code(0)
         .expect_said("is started again with what it has kept");
     let run = system.run_folder("run");
-    run.check("finished");
+    run.check(Outcome::Finished);
     let log = run.log("replay-server");
     assert!(
         log.contains("priorities are those of the last checkpoint"),

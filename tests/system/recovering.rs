@@ -277,7 +277,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let run = system.run_folder("run");
     let config = fs::read_to_string(run.path().join("config.toml")).unwrap();
     keep(&run.path().join("replay"), &config);
-    let stored = run.summary().transitions_inserted + KEPT;
+    let stored = run.summary().replay.transitions_inserted + KEPT;
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));

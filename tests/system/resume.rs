@@ -3,7 +3,7 @@
 use std::fs;
 
 use driml_settings::config::RunConfig;
-use driml_tests::{Summary, Survivor, TestSystem};
+use driml_tests::{Outcome, Summary, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 
 use crate::{PROCESSES, SHORT, launched, system};
@@ -137,12 +137,12 @@ fn a_run_cut_off_at_its_end_is_finished() {
         system.run_ok(&format!("local {run}"));
         let path = system.path(&dir).join("summary.json");
         let summary = fs::read_to_string(&path).unwrap();
-        fs::write(&path, summary.replace("\"finished\"", "\"failed\"")).unwrap();
+        fs::write(&path, summary.replace(": \"finished\"", ": \"failed\"")).unwrap();
         let run = system.run_folder(&dir);
         let before = run.summary().updates;
         system.run_ok(&format!("local --resume {dir}"));
         let summary = run.summary();
-        assert_eq!(summary.outcome, "finished");
+        assert_eq!(summary.outcome, Outcome::Finished);
         // The last chunk of 32 is stored whole, which are 16 updates.
         assert!(
             (before..before + 16).contains(&summary.updates),

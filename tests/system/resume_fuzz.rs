@@ -4,7 +4,7 @@
 
 use std::{fmt::Write as _, fs, time::Duration};
 
-use driml_tests::{RunFolder, Survivor, TestSystem};
+use driml_tests::{Outcome, RunFolder, Survivor, TestSystem};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
@@ -174,8 +174,9 @@ fn resume_once(seed: u64) {
     }
     let after = run.summary();
     let said = format!("{about}\n{before:?}\n{after:#?}");
-    assert_eq!(after.outcome, "finished", "{said}");
-    let wrong = (after.transitions_lost, after.transitions_duplicated);
+    assert_eq!(after.outcome, Outcome::Finished, "{said}");
+    let replay = &after.replay;
+    let wrong = (replay.transitions_lost, replay.transitions_duplicated);
     assert_eq!(wrong, (0, 0), "{said}");
     assert!(
         is_fresh || after.frames >= change.frames.max(before.frames),
@@ -184,17 +185,17 @@ fn resume_once(seed: u64) {
     assert_eq!(after.updates, planned(after.frames), "{said}");
     let learned = (after.updates - before.updates) * change.rows;
     let rows = before.rows * u64::from(!is_fresh) + learned;
-    assert_eq!(after.rows_sampled, rows, "{said}");
+    assert_eq!(replay.rows_sampled, rows, "{said}");
     if !is_lockstep && !is_fresh {
         let delivered = delivered(&run) - delivered_before;
-        let counted = after.frames + after.transitions_refilled;
+        let counted = after.frames + replay.transitions_refilled;
         match (is_graceful, store) {
             (true, _) | (false, "") => assert_eq!(counted, before.frames + delivered, "{said}"),
             // The log holds what came after the checkpoint, too.
             (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
         }
         assert!(
-            store.is_empty() || after.transitions_refilled == 0,
+            store.is_empty() || replay.transitions_refilled == 0,
             "{said}"
         );
     }

@@ -83,7 +83,10 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
         let all = first["histograms"][tag].as_array().unwrap();
         all.iter().map(|it| it[1].as_f64().unwrap() as u64).sum()
     };
-    assert_eq!(counted("k/served"), summary.k_histogram.iter().sum::<u64>());
+    assert_eq!(
+        counted("k/served"),
+        summary.replay.k_histogram.iter().sum::<u64>()
+    );
     assert_eq!(counted("actions/stored"), summary.frames);
     let picture = first["images"]["affinity/A"]
         .as_array()

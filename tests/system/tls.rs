@@ -12,7 +12,7 @@ use driml_protocol::{
     session::{self, Endpoints},
     tls::{Credentials, Role},
 };
-use driml_tests::{Certificates, Client, Process, TestSystem, Valid, succeeds, wait_for};
+use driml_tests::{Certificates, Client, Outcome, Process, TestSystem, Valid, succeeds, wait_for};
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
 
@@ -190,7 +190,7 @@ fn a_launched_run_with_an_actor_from_outside() {
     outside.stop().expect_code(0).expect_said("leaves: ");
     drop(observer);
     run.stop().expect_code(130);
-    tls.system.run_folder("run").check("interrupted");
+    tls.system.run_folder("run").check(Outcome::Interrupted);
 }
 
 /// Files that are wrong are named before anything is sent.

@@ -173,9 +173,9 @@ impl Watched {
         let memory = self.summary.rss_mib_max.values();
         let memory = memory.filter_map(|mib| mib.as_f64()).sum();
         columns.push(("MiB of all".to_owned(), Some(memory)));
-        let (retried, lost) = (self.summary.chunks_retried, self.summary.transitions_lost);
-        columns.push(("retried".to_owned(), Some(retried as f64)));
-        columns.push(("lost".to_owned(), Some(lost as f64)));
+        let whole = &self.summary.replay;
+        columns.push(("retried".to_owned(), Some(whole.chunks_retried as f64)));
+        columns.push(("lost".to_owned(), Some(whole.transitions_lost as f64)));
         columns
     }
 

@@ -81,8 +81,9 @@ impl Quantiles {
     }
 }
 
-/// The replay server's account of itself.
+/// The replay server's account of itself. In a run's summary, what was not recorded may be missing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct ReplayStatus {
     /// Transitions stored since the start of the run, without those in `transitions_refilled`.
     pub transitions_inserted: u64,

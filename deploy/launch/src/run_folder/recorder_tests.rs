@@ -117,10 +117,14 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
 
     let json = fs::read(run.summary()).unwrap();
     let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
-    let keys = "frames updates transitions_inserted transitions_lost transitions_duplicated rows_sampled replay_ratio episodes \
-                mean_return wall_seconds frames_per_second updates_per_second mean_k weights_version weights_sha256";
-    for key in keys.split(' ') {
-        assert!(!json[key].is_null(), "{key}");
+    let keys = "frames updates resumed_after_updates replay_ratio episodes mean_return mean_return_of wall_seconds frames_per_second \
+                updates_per_second mean_k weights_version weights_sha256 replay_servers_restarted actors_restarted";
+    let of_replay = "transitions_inserted transitions_refilled transitions_lost transitions_duplicated rows_sampled rows_unlearned \
+                     k_histogram chunks_retried messages_refused";
+    for (of, keys) in [(&json, keys), (&json["replay"], of_replay)] {
+        for key in keys.split(' ') {
+            assert!(!of[key].is_null(), "{key}");
+        }
     }
     assert_eq!(json["outcome"], "finished");
     assert_eq!(json["rss_mib_max"]["replay-server"], 12.0);

@@ -5,7 +5,7 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{Quantiles, RunSpec};
+use driml_protocol::{ReplayStatus, RunSpec};
 use serde::{Deserialize, Serialize};
 
 use super::{folder::RunFolder, table::write_whole};
@@ -86,24 +86,10 @@ pub struct Summary {
     pub frames: u64,
     /// Updates that the learner has done.
     pub updates: u64,
-    /// Transitions that the replay has stored.
-    pub transitions_inserted: u64,
-    /// Transitions that filled the replay again since the run was resumed last; they are in no other count.
-    pub transitions_refilled: u64,
-    /// Transitions that actors produced and that never arrived.
-    pub transitions_lost: u64,
-    /// Transitions stored twice.
-    pub transitions_duplicated: u64,
-    /// Rows served to the learner.
-    pub rows_sampled: u64,
     /// Rows per transition, both counted from the end of the warm-up.
     pub replay_ratio: Option<f64>,
     /// Episodes that ended, in a resumed run those too in which the replay filled again.
     pub episodes: u64,
-    /// Rows served to a learner that died before it saved what it learned from them; they do not count as served.
-    pub rows_unlearned: u64,
-    /// Updates that a learner with an older checkpoint has learned again.
-    pub updates_relearned: u64,
     /// Mean undiscounted return of the last 100 training episodes, also over a resumption.
     pub mean_return: Option<f64>,
     /// Of how many episodes that is: of fewer than 100 only if there were fewer.
@@ -116,37 +102,20 @@ pub struct Summary {
     pub updates_per_second: f64,
     /// Mean k of the rows served with a positive; of several positives the furthest counts.
     pub mean_k: Option<f64>,
-    /// How often each k was served; index 0 counts rows without a positive.
-    pub k_histogram: Vec<u64>,
-    /// How often each action was taken.
-    pub action_histogram: Vec<u64>,
     /// Version of the last weights.
     pub weights_version: u64,
     /// SHA-256 of the last weights, hexadecimal.
     pub weights_sha256: String,
-    /// Chunks recognised as a retry of a stored one.
-    pub chunks_retried: u64,
-    /// Batches that did not reach the learner and were asked for again.
-    pub batches_retried: u64,
     /// How often a replay server that had died was started again with what it had kept.
     pub replay_servers_restarted: u32,
     /// How often an actor that had died was started again; what it had not delivered is in no count.
     pub actors_restarted: u32,
-    /// Memory that the frames in the replay took at the end, MiB.
-    pub replay_frame_mib: u64,
-    /// Messages refused as malformed or foreign.
-    pub messages_refused: u64,
-    /// Milliseconds from a chunk's arrival at the replay server until it was stored, waiting at the rate limiter included; none
-    /// in lockstep.
-    pub insert_ms: Option<Quantiles>,
-    /// Seconds for which newer weights had been there when what older ones chose was stored; as above.
-    pub weights_behind_s: Option<Quantiles>,
-    /// Updates by which the weights that acted were behind then; as above.
-    pub weights_behind_updates: Option<Quantiles>,
     /// Highest resident memory of each process, MiB.
     pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
     /// What its weights earn; none where they were not played.
     pub(crate) played: Option<LastPlay>,
+    /// The replay's own account at the end; its episodes are those since the run was resumed last.
+    pub replay: ReplayStatus,
 }
 
 impl Summary {
@@ -168,13 +137,6 @@ impl Summary {
             resumed_after_updates: 0,
             frames,
             updates,
-            transitions_inserted: replay.transitions_inserted,
-            transitions_refilled: replay.transitions_refilled,
-            transitions_lost: replay.transitions_lost,
-            transitions_duplicated: replay.transitions_duplicated,
-            rows_sampled: replay.rows_sampled,
-            rows_unlearned: replay.rows_unlearned,
-            updates_relearned: replay.updates_relearned,
             replay_ratio: replay.replay_ratio(),
             episodes: episodes.count,
             mean_return: episodes.mean_return,
@@ -183,21 +145,13 @@ impl Summary {
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
             mean_k: replay.mean_k(),
-            k_histogram: replay.k_histogram.clone(),
-            action_histogram: replay.action_histogram.clone(),
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
-            chunks_retried: replay.chunks_retried,
-            batches_retried: replay.batches_retried,
             replay_servers_restarted: 0,
             actors_restarted: 0,
-            replay_frame_mib: replay.frame_bytes_held.div_ceil(1 << 20),
-            messages_refused: replay.messages_refused,
-            insert_ms: replay.insert_ms,
-            weights_behind_s: replay.weights_behind_s,
-            weights_behind_updates: replay.weights_behind_updates,
             rss_mib_max: serde_json::Map::new(),
             played: None,
+            replay: replay.clone(),
         }
     }
 

@@ -88,12 +88,12 @@ pub(super) const MEASURES: [Measure; 7] = [
     // Updates by which the weights that acted were behind, median.
     Measure {
         name: "weights_behind_updates",
-        of: |it| Some(it.ran.summary.weights_behind_updates?.p50),
+        of: |it| Some(it.ran.summary.replay.weights_behind_updates?.p50),
     },
     // Seconds for which newer weights had been there, median.
     Measure {
         name: "weights_behind_seconds",
-        of: |it| Some(it.ran.summary.weights_behind_s?.p50),
+        of: |it| Some(it.ran.summary.replay.weights_behind_s?.p50),
     },
 ];
 
