@@ -6,11 +6,11 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use driml_launch::{
     console::Screen,
-    interrupts::Interrupts,
     managed_process::{ManagedProcess, Surroundings, THREADS},
     processes::wait_until_listening,
 };
 use driml_machine::process_env;
+use driml_protocol::Shutdown;
 
 use crate::settings;
 
@@ -51,5 +51,5 @@ pub(super) fn wait_for(process: &mut ManagedProcess, endpoint: &str) -> anyhow::
         None => Ok(()),
     };
     // A benchmark does not listen for signals.
-    wait_until_listening(endpoint, &Interrupts::default(), check_alive).map(drop)
+    wait_until_listening(endpoint, &Shutdown::default(), check_alive).map(drop)
 }

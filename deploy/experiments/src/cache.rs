@@ -11,7 +11,6 @@ use anyhow::Context;
 use driml_figure::Figure;
 use driml_launch::{
     console::{self, print},
-    interrupts::Interrupts,
     run_folder::write_whole,
 };
 use driml_machine::{
@@ -19,6 +18,7 @@ use driml_machine::{
     process_env,
     resources::{self, Machine},
 };
+use driml_protocol::GracefulShutdown;
 use minijinja::Value;
 use serde::{
     Deserialize, Serialize,
@@ -106,11 +106,12 @@ impl Session {
             Err(_) if report_only => {}
             Err(_) => write_whole(&path, settings.as_bytes())?,
         }
-        let interrupts = Interrupts::listen(None).context("listening for interrupts")?;
+        let shutdown = GracefulShutdown::on_repeated_signals(None);
+        let shutdown = shutdown.context("listening for interrupts")?;
         let session = Self {
             folder,
             smoke: flags.smoke,
-            progress: Progress::new(units, interrupts),
+            progress: Progress::new(units, shutdown),
             seconds: 0.0,
             at_once: 1,
         };
@@ -334,9 +335,7 @@ mod tests {
         // Ctrl-C while it is made: first it is kept.
         let stopped = session.piece_of("", "slow", 1, |progress| {
             nix::sys::signal::raise(nix::sys::signal::Signal::SIGINT)?;
-            while progress.interrupts() == 0 {
-                std::thread::yield_now();
-            }
+            progress.shutdown().ending.wait();
             Ok(5)
         });
         assert!(stopped.unwrap_err().is::<Interrupted>());

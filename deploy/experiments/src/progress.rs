@@ -3,8 +3,9 @@
 
 use std::time::Instant;
 
-use driml_launch::{console::Screen, interrupts::Interrupts};
+use driml_launch::console::Screen;
 use driml_machine::{error::Interrupted, units::rough_duration};
+use driml_protocol::GracefulShutdown;
 
 const TEMPLATE: &str = "{bar:40} {percent:>3}%  {msg}";
 
@@ -18,12 +19,12 @@ pub(crate) struct Progress {
     started: Instant,
     what: String,
     screen: Screen,
-    interrupts: Interrupts,
+    shutdown: GracefulShutdown,
 }
 
 impl Progress {
-    /// Of `total` units; listens for interrupts from now on.
-    pub(crate) fn new(total: u64, interrupts: Interrupts) -> Self {
+    /// Of `total` units.
+    pub(crate) fn new(total: u64, shutdown: GracefulShutdown) -> Self {
         Self {
             total,
             done: 0,
@@ -31,7 +32,7 @@ impl Progress {
             started: Instant::now(),
             what: String::new(),
             screen: Screen::new(total, TEMPLATE),
-            interrupts,
+            shutdown,
         }
     }
 
@@ -66,7 +67,7 @@ impl Progress {
     pub(crate) fn advance(&mut self, units: u64) -> Result<(), Interrupted> {
         self.count(units);
         self.show();
-        if self.interrupts.count() > 0 {
+        if self.shutdown.ending.is_set() {
             self.clear();
             return Err(Interrupted);
         }
@@ -78,9 +79,9 @@ impl Progress {
         self.screen.line(line);
     }
 
-    /// How many times Ctrl-C or a signal has asked to stop.
-    pub(crate) fn interrupts(&self) -> u32 {
-        self.interrupts.count()
+    /// Whether Ctrl-C or a signal has asked to stop, once and again.
+    pub(crate) const fn shutdown(&self) -> &GracefulShutdown {
+        &self.shutdown
     }
 
     pub(crate) fn clear(&self) {
@@ -114,7 +115,7 @@ mod tests {
 
     #[test]
     fn the_time_left_follows_from_the_work_of_this_start() {
-        let mut progress = Progress::new(100, Interrupts::default());
+        let mut progress = Progress::new(100, GracefulShutdown::default());
         progress.find(40);
         assert_eq!(progress.seconds_left(5.0), None);
         progress.advance(10).unwrap();

@@ -1,5 +1,5 @@
 //! Everything that this program writes to stdout and stderr: messages, the log, progress bars, results.
-//! A closed terminal or pipe is not an error here; `driml_protocol::termination` notices it.
+//! A closed terminal or pipe is not an error here; `driml_protocol::Shutdown` notices it.
 
 use std::{
     collections::BTreeMap,

@@ -26,7 +26,6 @@ pub mod endpoint;
 pub mod evaluate;
 pub mod evaluator;
 pub mod inspect;
-pub mod interrupts;
 mod last_play;
 pub mod launcher;
 pub mod lockstep;

@@ -9,10 +9,10 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
-use driml_protocol::reach;
+use driml_protocol::{Shutdown, reach};
 use nix::sys::signal::Signal;
 
-use crate::{interrupts::Interrupts, managed_process::ManagedProcess};
+use crate::managed_process::ManagedProcess;
 
 /// How long the replay server may take to listen.
 const LISTEN_MAX: Duration = Duration::from_secs(60);
@@ -108,10 +108,10 @@ pub(crate) fn stop(
     late
 }
 
-/// Waits until something listens at `endpoint`; false after an interrupt. `check_alive` says whether it still can.
+/// Waits until something listens at `endpoint`; false once it is `interrupted`. `check_alive` says whether it still can.
 pub fn wait_until_listening(
     endpoint: &str,
-    interrupts: &Interrupts,
+    interrupted: &Shutdown,
     mut check_alive: impl FnMut() -> anyhow::Result<()>,
 ) -> anyhow::Result<bool> {
     let deadline = Instant::now() + LISTEN_MAX;
@@ -120,7 +120,7 @@ pub fn wait_until_listening(
         if Instant::now() > deadline {
             return Err(e).context("waiting for the replay server");
         }
-        if interrupts.wait_timeout(LOOK) > 0 {
+        if interrupted.wait_timeout(LOOK) {
             return Ok(false);
         }
     }

@@ -15,6 +15,8 @@ use super::{
 
 /// How often it is looked whether the flag is raised, where something else is waited for too.
 const TICK: Duration = Duration::from_millis(50);
+/// Signals closer together are one wish: tools such as `timeout` signal the process and its group.
+const ONE_WISH: Duration = Duration::from_millis(300);
 
 /// A flag that is raised once and never lowered; clones share it.
 #[derive(Clone, Debug, Default)]
@@ -119,6 +121,30 @@ impl GracefulShutdown {
         })?;
         Ok(steps)
     }
+
+    /// The first flag is raised at any reason to exit, the second when SIGINT or SIGTERM comes again later.
+    pub fn on_repeated_signals(parent: Option<u32>) -> std::io::Result<Self> {
+        let steps = Self::default();
+        let (raised, mut first) = (steps.clone(), None);
+        termination::listen("interrupts", parent, move |sign| {
+            raised.note(sign, &mut first, Instant::now());
+            ControlFlow::Continue(())
+        })?;
+        Ok(steps)
+    }
+
+    /// Takes a sign received at `now`. `first` is when the first request began.
+    fn note(&self, sign: EndSign, first: &mut Option<Instant>, now: Instant) {
+        match *first {
+            None => {
+                *first = Some(now);
+                self.ending.set();
+            }
+            // A closed terminal sends SIGHUP, and the other signs follow: no user is there who wants it faster.
+            Some(first) if sign == EndSign::Asked && now - first > ONE_WISH => self.now.set(),
+            Some(_) => {}
+        }
+    }
 }
 
 /// Waits until all of `threads` have ended, at most for `wait_max`.
@@ -163,5 +189,32 @@ mod tests {
         };
         assert_eq!(shutdown.unless_set("work", work).unwrap(), None);
         drop(until);
+    }
+
+    #[test]
+    fn a_closed_terminal_is_the_first_wish_and_never_the_second() {
+        for signs in [
+            // Seconds, what came, and whether both flags are raised then.
+            &[
+                (0.0, EndSign::Abandoned, false),
+                (5.0, EndSign::Abandoned, false),
+                (5.0, EndSign::Asked, true),
+            ][..],
+            // One wish lasts from the first signal on.
+            &[
+                (0.0, EndSign::Asked, false),
+                (0.299, EndSign::Asked, false),
+                (0.31, EndSign::Asked, true),
+            ],
+        ] {
+            let (steps, start, mut first) = (GracefulShutdown::default(), Instant::now(), None);
+            assert!(!steps.ending.is_set());
+            for &(seconds, sign, is_second) in signs {
+                let at = start + Duration::from_secs_f64(seconds);
+                steps.note(sign, &mut first, at);
+                assert!(steps.ending.is_set());
+                assert_eq!(steps.now.is_set(), is_second, "{seconds} s");
+            }
+        }
     }
 }

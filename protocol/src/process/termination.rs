@@ -21,7 +21,7 @@ const LOOK: Duration = Duration::from_millis(500);
 
 /// Why a process should end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum EndSign {
+pub(super) enum EndSign {
     /// It was requested: SIGINT (Ctrl-C) or SIGTERM.
     Asked,
     /// The terminal was closed (SIGHUP), the reader of stderr exited, or the parent died.
@@ -35,7 +35,7 @@ pub enum EndSign {
 ///
 /// # Errors
 /// The operating system gave no thread, runtime or signal handler.
-pub fn listen(
+pub(super) fn listen(
     name: &'static str,
     parent: Option<u32>,
     mut on_sign: impl FnMut(EndSign) -> ControlFlow<()> + Send + 'static,

@@ -261,7 +261,7 @@ impl<'a> Cases<'a> {
 
 #[cfg(test)]
 mod tests {
-    use driml_launch::interrupts::Interrupts;
+    use driml_protocol::GracefulShutdown;
     use rand::{Rng, SeedableRng};
 
     use super::*;
@@ -292,7 +292,7 @@ mod tests {
     #[test]
     fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
         let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
-        let progress = &mut Progress::new(1, Interrupts::default());
+        let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
         let cases = Cases::new(&settings, rng, &HALVING, progress);
         let mut rows = cases.run().unwrap();

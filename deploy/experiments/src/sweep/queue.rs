@@ -340,10 +340,9 @@ impl Queue {
         for running in &self.running {
             signal(&running.child, Signal::SIGTERM);
         }
-        let interrupts = progress.interrupts().max(1);
         let deadline = Instant::now() + DRAIN_MAX;
         while !self.running.is_empty() {
-            if progress.interrupts() > interrupts || Instant::now() > deadline {
+            if progress.shutdown().now.is_set() || Instant::now() > deadline {
                 for running in &mut self.running {
                     // It may have ended by itself in this moment.
                     let _ = running.child.kill();
@@ -386,7 +385,7 @@ fn wait_for_the_last(log: &File, plan: &PlannedRun, progress: &mut Progress) -> 
 mod tests {
     use std::path::Path;
 
-    use driml_launch::interrupts::Interrupts;
+    use driml_protocol::GracefulShutdown;
 
     use super::*;
     use crate::sweep::runs::tests::finish;
@@ -413,7 +412,7 @@ mod tests {
         let (queue, plan) = queue(root.path());
         let metrics = queue.runs.folder(&plan).metrics();
         std::fs::write(metrics, "seconds,frames,episodes\n60,9,0\n").unwrap();
-        let mut progress = Progress::new(10, Interrupts::default());
+        let mut progress = Progress::new(10, GracefulShutdown::default());
         assert_eq!(queue.find(&plan, &mut progress), 9);
         assert_eq!(progress.seconds_left(1.0), None);
     }
@@ -423,7 +422,7 @@ mod tests {
     fn a_run_that_finished_meanwhile_is_not_made_again() {
         let root = tempfile::tempdir().unwrap();
         let (mut queue, plan) = queue(root.path());
-        let mut progress = Progress::new(10, Interrupts::default());
+        let mut progress = Progress::new(10, GracefulShutdown::default());
         queue.make(&mut progress).unwrap();
         assert_eq!(queue.runs.finished(&plan).unwrap().commit, "abc");
     }

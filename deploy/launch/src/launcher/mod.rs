@@ -12,7 +12,7 @@ use std::{
 use anyhow::{Context, bail};
 use driml_machine::{error::Usage, units::duration};
 use driml_protocol::{
-    Keys, RunClient, Silence,
+    GracefulShutdown, Keys, RunClient, Silence,
     config::Settings,
     session::{self, Endpoints},
     shared_memory,
@@ -24,7 +24,6 @@ use crate::{
     console::{self, Screen, print_wrapped},
     endpoint::NAMESPACE,
     evaluator::Evaluator,
-    interrupts::Interrupts,
     last_play, open_files,
     processes::{Processes, Revived, stop, wait_until_listening},
     rendezvous::Rendezvous,
@@ -71,7 +70,8 @@ pub fn run(
     outside: Outside,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
-    let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
+    let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
+    let shutdown = shutdown.context("listening for signals")?;
     open_files::check_run(config)?;
     let servers = server_names(config.replay.shards);
     // Opening the recorder removes it.
@@ -113,7 +113,7 @@ pub fn run(
         rendezvous,
         screen,
         display,
-        interrupts,
+        shutdown,
         processes: Processes::default(),
         evaluator,
         server_restarts: 0,
@@ -131,7 +131,7 @@ pub fn run(
     // An interrupted or failed run does not wait for it.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
-        evaluator.finish(&launch.screen, &|| launch.interrupts.count() > 0);
+        evaluator.finish(&launch.screen, &|| launch.shutdown.ending.is_set());
     }
     // No process is left that could be reached by them; where these files stay behind, locks show it.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
@@ -160,7 +160,7 @@ pub fn run(
         )
     })?;
     if outcome == Outcome::Finished {
-        let is_stopped = || launch.interrupts.count() > 0;
+        let is_stopped = || launch.shutdown.ending.is_set();
         last_play::play(&mut summary, config, run_dir, &is_stopped);
     }
     resume::say_next(&summary, &config.world, run_dir)
@@ -179,7 +179,7 @@ struct Launch<'a> {
     rendezvous: Rendezvous,
     screen: Screen,
     display: Display,
-    interrupts: Interrupts,
+    shutdown: GracefulShutdown,
     processes: Processes,
     evaluator: Evaluator,
     server_restarts: u32,
@@ -218,7 +218,7 @@ impl Launch<'_> {
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
             let mut check_alive = || self.processes.check_alive(Revived::default());
-            if !wait_until_listening(endpoint, &self.interrupts, &mut check_alive)? {
+            if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
             let opened = session::open(&Endpoints::to(vec![endpoint.clone()]));
@@ -250,7 +250,7 @@ impl Launch<'_> {
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let (mut standstill, mut counts_before) = (Silence::begin(), (0, 0));
         loop {
-            if self.interrupts.wait_timeout(POLL) > 0 {
+            if self.shutdown.ending.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
@@ -315,15 +315,15 @@ impl Launch<'_> {
     ) -> anyhow::Result<Outcome> {
         let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
         // The signal that interrupted this process may have reached the others first.
-        let ran = match self.interrupts.count() {
-            0 => ran,
-            _ => ran.or(Ok(Outcome::Interrupted)),
+        let ran = match self.shutdown.ending.is_set() {
+            false => ran,
+            true => ran.or(Ok(Outcome::Interrupted)),
         };
         if matches!(ran, Ok(Outcome::Interrupted)) {
             self.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
-        let interrupts = self.interrupts.clone();
-        let abort = move || interrupts.count() > 1;
+        let now = self.shutdown.now.clone();
+        let abort = move || now.is_set();
         let finished = matches!(ran, Ok(Outcome::Finished));
         // Once a process has failed, what the actors still have will hardly be learned from.
         let actors_max = match ran {

@@ -13,13 +13,13 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_protocol::{GracefulShutdown, Shutdown};
 use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::Which,
     console::{self, Screen, print_wrapped},
     evaluator::{Due, keep},
-    interrupts::Interrupts,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
@@ -41,9 +41,10 @@ pub fn run(
     resumed: Option<ResumePoint>,
     exit_with_parent: Option<u32>,
 ) -> anyhow::Result<()> {
-    let interrupts = Interrupts::listen(exit_with_parent).context("listening for signals")?;
-    let is_stopped = || interrupts.count() > 0;
-    exit_at_a_second(interrupts.clone())?;
+    let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
+    let GracefulShutdown { ending, now } = shutdown.context("listening for signals")?;
+    let is_stopped = || ending.is_set();
+    exit_at_a_second(now)?;
     let mut due = Due::new(config, run_dir)?;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
@@ -129,9 +130,9 @@ pub fn run(
 }
 
 /// Ends this process at a second interrupt, whatever it does.
-fn exit_at_a_second(interrupts: Interrupts) -> anyhow::Result<()> {
+fn exit_at_a_second(second: Shutdown) -> anyhow::Result<()> {
     let exit = move || {
-        interrupts.wait_for_second();
+        second.wait();
         console::line("error: stopped at once by a second interrupt: what was not saved is lost");
         std::process::exit(1);
     };

@@ -7,15 +7,13 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::{LogLimiter, Silence, reach};
+use driml_protocol::{LogLimiter, Shutdown, Silence, reach};
 
 pub use self::watched::Outputs;
 use self::watched::Watched;
 use crate::{
     chosen::config_of,
-    console,
-    interrupts::Interrupts,
-    resume,
+    console, resume,
     run_folder::{Outcome, Progress, RunFolder, Summary, commands, plot, progress},
     view::{Poller, PrometheusFile, json, needed, page, recovery},
 };
@@ -39,10 +37,10 @@ pub struct Look {
 /// # Errors
 /// [`Interrupted`] if one answer was asked for and Ctrl-C came first.
 pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyhow::Result<()> {
-    let interrupts = Interrupts::listen(None)?;
+    let interrupted = Shutdown::on_signals(None)?;
     // For the speed: what happens until the next answer.
     poller.ask();
-    if interrupts.wait_timeout(POLL) > 0 {
+    if interrupted.wait_timeout(POLL) {
         return Err(Interrupted.into());
     }
     loop {
@@ -57,7 +55,7 @@ pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyh
             false if look.again => console::print_page(&page(view))?,
             false => console::print(&page(view))?,
         }
-        if !look.again || view.is_over() || interrupts.wait_timeout(PAGE_PERIOD) > 0 {
+        if !look.again || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
             return Ok(());
         }
     }
@@ -83,7 +81,7 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
 }
 
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
-fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Result<()> {
+fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
     let (mut silence, mut said) = (Silence::begin(), LogLimiter::default());
     loop {
@@ -108,7 +106,7 @@ fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Res
                 console::line("no learner has joined the run yet: waiting for it");
             }
         }
-        if interrupts.wait_timeout(POLL) > 0 {
+        if interrupted.wait_timeout(POLL) {
             return Err(Interrupted.into());
         }
     }
@@ -120,7 +118,7 @@ fn wait_until_known(poller: &mut Poller, interrupts: &Interrupts) -> anyhow::Res
 /// A folder that cannot be written to; replay servers that do not answer for as long as the run's processes wait for them, or that
 /// serve another run; [`Interrupted`].
 pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
-    let interrupts = Interrupts::listen(None).context("listening for signals")?;
+    let interrupted = Shutdown::on_signals(None).context("listening for signals")?;
     poller.ask();
     let mut file = outputs.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
@@ -131,7 +129,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         outputs.run_dir.as_ref().is_some_and(is_begun) && poller.view.after_updates.is_none();
     if is_unknown || poller.view.recovering().next().is_some() {
         // What the run has done so far is not known before.
-        wait_until_known(&mut poller, &interrupts)?;
+        wait_until_known(&mut poller, &interrupted)?;
     }
     let mut watched = Watched::new(&poller, outputs)?;
     let ended = loop {
@@ -144,7 +142,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
             true => LAST_POLL,
             false => POLL,
         };
-        if interrupts.wait_timeout(pause) > 0 {
+        if interrupted.wait_timeout(pause) {
             break Ok(Outcome::Interrupted);
         }
         poller.ask();

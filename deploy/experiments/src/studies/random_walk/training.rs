@@ -296,7 +296,7 @@ fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use driml_launch::interrupts::Interrupts;
+    use driml_protocol::GracefulShutdown;
 
     fn settings() -> Settings {
         let text = include_str!("config.toml");
@@ -332,7 +332,7 @@ mod tests {
         let chain = Chain::new(4, 0.4);
         for sampling in Sampling::ALL {
             let train = || {
-                let mut progress = Progress::new(settings.updates, Interrupts::default());
+                let mut progress = Progress::new(settings.updates, GracefulShutdown::default());
                 train(&chain, &settings, sampling, 5, &mut progress).unwrap()
             };
             let learnt = train();
