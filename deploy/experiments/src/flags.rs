@@ -163,31 +163,17 @@ impl SweepArgs {
     }
 }
 
-/// The settings of an experiment, of its full or its smoke length; both are built in.
-pub(crate) fn settings<T: DeserializeOwned>(
-    name: &str,
-    full: &str,
-    smoke: &str,
-    flags: &ExperimentFlags,
-) -> T {
-    let (file, text) = match flags.smoke {
-        true => ("smoke.toml", smoke),
-        false => ("config.toml", full),
-    };
-    toml::from_str(text).unwrap_or_else(|e| {
-        panic!("experiments/{name}/{file} is built in, and a test reads it: {e}")
-    })
-}
-
-/// The table `full` or `smoke` of a sweep's settings, which are built in.
-pub(crate) fn sweep_settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
+/// The table `full` or `smoke` of an experiment's settings, which are built in.
+pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
     let length = if smoke { "smoke" } else { "full" };
     let read = || -> Result<T, toml::de::Error> {
         let mut file: toml::Table = text.parse()?;
         let table = file.remove(length).unwrap_or(toml::Table::new().into());
         table.try_into()
     };
-    read().unwrap_or_else(|e| panic!("sweeps/{name}.toml is built in, and a test reads it: {e}"))
+    read().unwrap_or_else(|e| {
+        panic!("the settings of {name} are built in, and a test reads them: {e}")
+    })
 }
 
 /// The command that this process was called with, for a page: without where it writes, and without asking for a report alone.

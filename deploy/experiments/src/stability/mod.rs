@@ -27,16 +27,12 @@ use crate::{
 };
 
 const NAME: &str = "stability";
+const SETTINGS: &str = include_str!("config.toml");
 const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,input";
 
 /// Runs the experiment.
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(
-        NAME,
-        include_str!("config.toml"),
-        include_str!("smoke.toml"),
-        args,
-    );
+    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let table = || TABLE.into_iter().flatten();
     let units = table().count() as u64 * u64::from(settings.seeds);
@@ -149,15 +145,15 @@ mod tests {
 
     #[test]
     fn both_lengths_read() {
-        for text in [include_str!("config.toml"), include_str!("smoke.toml")] {
-            let settings: Settings = toml::from_str(text).unwrap();
+        for smoke in [false, true] {
+            let settings: Settings = flags::settings(NAME, SETTINGS, smoke);
             assert!(settings.seeds > 0 && settings.draws > 0);
         }
     }
 
     #[test]
     fn the_page_and_the_verdict_name_what_is_broken() {
-        let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
+        let settings = flags::settings(NAME, SETTINGS, true);
         let page = |rows: &[Row]| {
             let values = values(rows, &settings);
             crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1, None)

@@ -265,6 +265,10 @@ mod tests {
     use rand::{Rng, SeedableRng};
 
     use super::*;
+    use crate::{
+        flags,
+        stability::{NAME, SETTINGS},
+    };
 
     static HALVING: Property = Property {
         routine: "halving",
@@ -291,7 +295,7 @@ mod tests {
 
     #[test]
     fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
-        let settings = toml::from_str(include_str!("smoke.toml")).unwrap();
+        let settings = flags::settings(NAME, SETTINGS, true);
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
         let cases = Cases::new(&settings, rng, &HALVING, progress);

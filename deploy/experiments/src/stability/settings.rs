@@ -1,9 +1,9 @@
 //! How much the experiment tries.
-//! It holds no numbers: those are in `config.toml` and `smoke.toml`.
+//! It holds no numbers: those are in `config.toml`.
 
 use serde::{Deserialize, Serialize};
 
-/// The contents of `config.toml` or `smoke.toml` beside this file.
+/// A table of `config.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {

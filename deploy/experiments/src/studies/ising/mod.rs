@@ -19,6 +19,7 @@ use crate::{
 };
 
 const NAME: &str = "ising";
+const SETTINGS: &str = include_str!("config.toml");
 /// Updates over which the drawn loss is averaged.
 const LOSS_WINDOW: usize = 10;
 
@@ -41,12 +42,7 @@ fn task(settings: &Settings) -> anyhow::Result<Task> {
 }
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(
-        NAME,
-        include_str!("config.toml"),
-        include_str!("smoke.toml"),
-        args,
-    );
+    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let task = task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
@@ -227,13 +223,12 @@ mod tests {
     use super::*;
 
     pub(super) fn smoke() -> Settings {
-        toml::from_str(include_str!("smoke.toml")).unwrap()
+        flags::settings(NAME, SETTINGS, true)
     }
 
     #[test]
     fn both_lengths_read_and_ask_for_local_dim_alone() {
-        let full: Settings = toml::from_str(include_str!("config.toml")).unwrap();
-        for settings in [smoke(), full] {
+        for settings in [smoke(), flags::settings(NAME, SETTINGS, false)] {
             let task = task(&settings).unwrap();
             assert_eq!(
                 task.learner.lambda.wanted(),

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{progress::Progress, stats::auc, studies::dim::DimLearner};
 
-/// The contents of `config.toml` or `smoke.toml` beside this file.
+/// A table of `config.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {

@@ -22,14 +22,10 @@ use crate::{
 };
 
 const NAME: &str = "random-walk";
+const SETTINGS: &str = include_str!("config.toml");
 
 pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
-    let mut settings: Settings = flags::settings(
-        NAME,
-        include_str!("config.toml"),
-        include_str!("smoke.toml"),
-        args,
-    );
+    let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
@@ -188,8 +184,8 @@ mod tests {
 
     #[test]
     fn both_lengths_read_and_have_the_figure_s_alpha() {
-        for text in [include_str!("config.toml"), include_str!("smoke.toml")] {
-            let settings: Settings = toml::from_str(text).unwrap();
+        for smoke in [false, true] {
+            let settings: Settings = flags::settings(NAME, SETTINGS, smoke);
             assert!(settings.alphas.contains(&settings.figure_alpha));
             assert!(settings.alphas.iter().all(|a| 0.0 < *a && *a < 1.0));
             assert!(settings.states >= 2 && settings.seeds > 0 && settings.updates > 0);

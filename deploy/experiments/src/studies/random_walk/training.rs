@@ -16,7 +16,7 @@ const MEASURE_GROWTH: f64 = 1.04;
 /// Rows in the replay before the first update, where one walker fills it.
 const WARMUP_TRANSITIONS: usize = 16;
 
-/// The contents of `config.toml` or `smoke.toml` beside this file.
+/// A table of `config.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Settings {
@@ -296,11 +296,14 @@ fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{
+        flags,
+        studies::random_walk::{NAME, SETTINGS},
+    };
     use driml_protocol::GracefulShutdown;
 
     fn settings() -> Settings {
-        let text = include_str!("config.toml");
-        toml::from_str(text).unwrap()
+        flags::settings(NAME, SETTINGS, false)
     }
 
     #[test]

@@ -5,7 +5,7 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{PacmanArgs, sweep_settings},
+    flags::{self, PacmanArgs},
     sweep::plan::{Call, Planned, PlannedRun},
 };
 
@@ -145,7 +145,7 @@ impl Settings {
 /// The settings of the length asked for, with what the flags replace.
 pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
-    let mut settings: Settings = sweep_settings(NAME, text, args.flags.smoke);
+    let mut settings: Settings = flags::settings(NAME, text, args.flags.smoke);
     if !args.agents.is_empty() {
         let known = args.agents.iter().map(|name| presets::agent(name));
         let names = known.map(|agent| agent.map(|agent| agent.name.to_owned()));

@@ -7,7 +7,7 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{ProcgenArgs, sweep_settings},
+    flags::{self, ProcgenArgs},
     sweep::{
         plan::{Call, Planned, PlannedRun},
         results::Played,
@@ -64,7 +64,7 @@ impl Settings {
     /// The settings of the length asked for.
     pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
-            sweep_settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
+            flags::settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);
         if !args.games.is_empty() {
             settings.games.clone_from(&args.games);
         }
@@ -176,7 +176,7 @@ mod tests {
     use super::*;
 
     fn settings(smoke: bool) -> Settings {
-        sweep_settings(NAME, include_str!("../procgen.toml"), smoke)
+        flags::settings(NAME, include_str!("../procgen.toml"), smoke)
     }
 
     #[test]
