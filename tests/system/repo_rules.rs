@@ -9,12 +9,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_490),
-    ("actor", 13_150),
-    ("replay-server", 11_710),
-    ("learner", 26_020),
-    ("deploy", 34_700),
-    ("tests", 11_540),
+    ("protocol", 8_540),
+    ("actor", 12_440),
+    ("replay-server", 11_580),
+    ("learner", 25_350),
+    ("deploy", 33_920),
+    ("tests", 11_700),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
