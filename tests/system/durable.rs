@@ -226,9 +226,10 @@ fn a_run_whose_launcher_was_killed_continues() {
     let frames = client.replay().unwrap().transitions_inserted + 20_000;
     drop(client);
     process.kill();
+    // Which of them is the last to end depends on how busy the machine is.
     system
         .run_ok(&format!("local --resume run --frames {frames} {listen}"))
-        .expect_said("processes of the run in run still end: waiting");
+        .expect_said(": waiting");
     actor.signal(Signal::SIGKILL);
     let run = system.run_folder("run");
     run.check_finished();
