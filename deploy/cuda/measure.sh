@@ -82,8 +82,8 @@ step() {
 train() {
     local game=$1 agent=$2 folder code=0 spent=0 what
     folder=$out/runs/$game-$agent-$seed
-    # The time ends it: more frames than any GPU learns from in that time.
-    what=(--env "procgen:$game" --agent "$agent" --seed "$seed" --frames 1000000000 --run-dir "$folder")
+    # The time ends it: more frames than any GPU learns from in that time. The residual torso is slow on GPUs.
+    what=(--env "procgen:$game" --agent "$agent" --seed "$seed" --frames 1000000000 --set model.torso=nature --run-dir "$folder")
     if compgen -G "$folder/checkpoints/checkpoint-*[0-9]" >/dev/null; then
         what=(--resume "$folder")
         # The first column of its last row, in whole seconds; none if there is only the header.
