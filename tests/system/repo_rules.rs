@@ -12,9 +12,9 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_540),
     ("actor", 12_440),
     ("replay-server", 11_580),
-    ("learner", 25_350),
+    ("learner", 25_360),
     ("deploy", 33_920),
-    ("tests", 11_700),
+    ("tests", 11_710),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

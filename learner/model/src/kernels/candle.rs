@@ -139,7 +139,11 @@ fn conv2d(images: &Tensor, weight: &Tensor, bias: &Tensor, stride: usize) -> Res
     let (batch, height, width, _) = images.dims4()?;
     let (outputs, _, kernel, _) = weight.dims4()?;
     if !kernel.is_multiple_of(stride) {
+        // Backwards, candle takes both sides for reached as far as the height is.
+        let reached = |side: usize| (side - kernel) / stride * stride + kernel;
         let maps = images
+            .narrow(1, 0, reached(height))?
+            .narrow(2, 0, reached(width))?
             .permute((0, 3, 1, 2))?
             .contiguous()?
             .conv2d(weight, 0, stride, 1, 1)?

@@ -45,6 +45,11 @@ fn outputs_and_gradients(
 fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     // Strides that divide their kernels and one that does not; a stride of 1; a kernel of 1.
     let odd = small();
+    // In its second layer, rows are left over and columns are not.
+    let uneven = ModelConfig {
+        width: 48,
+        ..small()
+    };
     let even = ModelConfig {
         conv: [(5, 8, 4), (7, 4, 2), (6, 1, 1)]
             .map(|(out, kernel, stride)| ConvLayer::new(out, kernel, stride))
@@ -53,6 +58,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
     };
     for config in [
         odd,
+        uneven,
         even,
         small_with(DUELING),
         small_with(NOISY),
