@@ -82,6 +82,7 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
         ("policy", 12, 0),
         ("learner --growth --precision bf16", 26, 13),
         ("learner --kernels --precision bf16", 6, 6),
+        ("replay", 17, 0),
     ] {
         let ended = system.run_ok(&format!("bench {bench} --quick --json -"));
         let report: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();

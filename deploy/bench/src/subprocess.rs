@@ -25,15 +25,16 @@ pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     again.context("starting this program again with other threads")
 }
 
-/// Starts this program with other arguments, for driml-ada on bigfish with the settings `sets`, and its log in `folder`. It ends
-/// when the result is dropped.
+/// Starts this program with other arguments, for driml-ada on bigfish, preset `paper` and the settings `sets`, and its log in `folder`.
+/// It ends when the result is dropped.
 pub(super) fn start(
     name: &str,
     args: &[&str],
     sets: &[&str],
     folder: &Path,
 ) -> anyhow::Result<ManagedProcess> {
-    let run = ["--env", settings::WORLD, "--agent", settings::AGENT];
+    let (world, agent) = (settings::WORLD, settings::AGENT);
+    let run = ["--env", world, "--agent", agent, "--preset", "paper"];
     let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
     let args = [args, &run, &sets].concat();
     let surroundings = Surroundings {
