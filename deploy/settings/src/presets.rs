@@ -62,7 +62,7 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: TUNED,
-        about: "more exploration, fewer and smaller updates, a soft target network (the default on Procgen)",
+        about: "more exploration, fewer and smaller updates, a soft target network, on three games a residual torso (the default on Procgen)",
         layers: &[layer!("variant/tuned")],
         families: &["procgen"],
         price: None,
