@@ -68,6 +68,8 @@ fn a_run_continues_when_others_fill_it_up() {
     let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
     let client = system.connect();
     client.wait_for_updates(100);
+    // One that starts when it is full warns, too.
+    client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
     let mut filler = File::create(format!("/proc/{}/root/dev/shm/filler", process.pid())).unwrap();
     while filler.write_all(&[0; 4096]).is_ok() {}
     let then = client.learner().unwrap().updates;
