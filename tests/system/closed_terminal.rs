@@ -14,6 +14,7 @@ use std::{
     time::Duration,
 };
 
+use driml_protocol::hangup_is_ignored;
 use driml_tests::{Outcome, Process, TestSystem, wait_for};
 use nix::{
     fcntl::OFlag,
@@ -140,21 +141,17 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
 }
 
 /// Under `nohup` all processes of a test ignore hangups.
-fn hangups_are_ignored() -> bool {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
-    let mask = u64::from_str_radix(mask.unwrap().trim(), 16).unwrap();
-    let is_ignored = mask & (1 << (Signal::SIGHUP as u32 - 1)) != 0;
-    if is_ignored {
+fn skipped_under_nohup() -> bool {
+    if hangup_is_ignored() {
         driml_tests::skip("hangups are ignored here");
     }
-    is_ignored
+    hangup_is_ignored()
 }
 
 /// A closed ssh session.
 #[test]
 fn a_hangup_ends_processes_in_order() {
-    if hangups_are_ignored() {
+    if skipped_under_nohup() {
         return;
     }
     let system = system();
@@ -174,7 +171,7 @@ fn a_hangup_ends_processes_in_order() {
 
 #[test]
 fn a_hangup_ends_a_launched_run_once() {
-    if hangups_are_ignored() {
+    if skipped_under_nohup() {
         return;
     }
     let system = system();

@@ -9,4 +9,4 @@ pub mod lock_file;
 pub(crate) mod log_limiter;
 pub(crate) mod shutdown;
 pub(crate) mod silence;
-mod termination;
+pub(crate) mod termination;

@@ -98,7 +98,7 @@ async fn received(signal: &mut Option<Signal>) {
 }
 
 /// Whether SIGHUP was set to be ignored before this process started, by the kernel's own table.
-fn hangup_is_ignored() -> bool {
+pub fn hangup_is_ignored() -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     ignored_signals(&status) & (1 << (Number::SIGHUP as u32 - 1)) != 0
 }
