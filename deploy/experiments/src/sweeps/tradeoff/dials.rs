@@ -1,9 +1,15 @@
 //! The dials: what can be turned, its levels as settings, what each is expected to buy and to cost.
 //! It measures nothing; the menu itself, and what all levels share in a world, is `tradeoff.toml`.
 
+use std::collections::BTreeMap;
+
 use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
 use serde::{Deserialize, Serialize};
+
+use crate::flags;
+
+const MENU: &str = include_str!("../tradeoff.toml");
 
 /// A dial in one world: a base and the levels that are compared with it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -104,15 +110,6 @@ fn slug(name: &str) -> String {
     parts.collect::<Vec<_>>().join("-")
 }
 
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct File {
-    full: Length,
-    smoke: Length,
-    world: Vec<WorldBase>,
-    dial: Vec<Dial>,
-}
-
 /// What every world's runs have at a length.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -128,27 +125,30 @@ pub(super) struct Length {
     pub(super) sets: Vec<String>,
 }
 
-fn file() -> File {
-    toml::from_str(include_str!("../tradeoff.toml"))
-        .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"))
-}
-
 pub(super) fn length(smoke: bool) -> Length {
-    let file = file();
-    if smoke { file.smoke } else { file.full }
+    flags::settings("tradeoff", MENU, smoke)
 }
 
 /// What all runs in the worlds of one kind have, or in one game of it.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct WorldBase {
-    kind: String,
-    /// The one game that it is for; all that no other entry names if there is none.
-    game: Option<String>,
     /// Frames of a run.
     pub(super) frames: u64,
     /// In the form of `--set`.
     pub(super) sets: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct File {
+    /// By a world's name or its kind.
+    world: BTreeMap<String, WorldBase>,
+    dial: Vec<Dial>,
+}
+
+fn file() -> File {
+    toml::from_str(MENU)
+        .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"))
 }
 
 /// The levels of all dials that a world has, in the order in which they are tried. `names` are the dials that are asked for; all if it is
@@ -170,21 +170,15 @@ pub(super) fn levels(world: WorldName, names: &[String]) -> Result<Vec<LevelOf>,
     Ok(levels.collect())
 }
 
-/// What all runs in a world have.
+/// What all runs in a world have: the game's own entry comes before that of its kind.
 pub(super) fn world_base(world: WorldName) -> Result<WorldBase, Usage> {
     let mut worlds = file().world;
-    let mut kinds: Vec<_> = worlds.iter().map(|it| it.kind.clone()).collect();
-    kinds.dedup();
-    // A game's entry comes before that of all.
-    worlds.sort_by_key(|it| it.game.is_none());
-    let is_for = |it: &WorldBase| match &it.game {
-        None => it.kind == world.kind(),
-        Some(game) => format!("{}:{game}", it.kind) == world.to_string(),
-    };
-    worlds.into_iter().find(is_for).ok_or_else(|| {
+    let own = worlds.remove(&world.to_string());
+    own.or_else(|| worlds.remove(world.kind())).ok_or_else(|| {
+        let kinds = worlds.into_keys().filter(|name| !name.contains(':'));
         usage!(
             "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
-            kinds.join(", ")
+            kinds.collect::<Vec<_>>().join(", ")
         )
     })
 }

@@ -223,7 +223,7 @@ coinrun|observation|input.height=64 input.width=64";
                 "--env chain --dials learner.precison",
                 "did you mean \"learner.precision\"?",
             ),
-            ("--env ising", "it has some for mspacman, procgen, chain"),
+            ("--env ising", "it has some for chain, mspacman, procgen"),
         ] {
             let said = of(line, None).unwrap_err().to_string();
             assert!(said.contains(expected), "{said}");
