@@ -12,7 +12,7 @@ const FIELD: usize = 2;
 const MOVES: [(isize, isize); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
 /// The settings of an island, the table `[world]`.
-#[derive(Debug, Deserialize)]
+#[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct IslandConfig {
     /// Fields a side, 2 to 32.
@@ -50,10 +50,7 @@ impl WorldSettings for IslandConfig {
         self.validate()?;
         let islands = (0..num_envs).map(|env| Island::new(seed, env, self.side));
         Ok(Box::new(Islands {
-            side: self.side,
-            step_limit: self.step_limit,
-            reward: self.reward,
-            shape: self.frame_shape(),
+            config: self.clone(),
             islands: islands.collect(),
         }))
     }
@@ -96,16 +93,13 @@ impl Island {
 }
 
 struct Islands {
-    side: usize,
-    step_limit: u32,
-    reward: f32,
-    shape: FrameShape,
+    config: IslandConfig,
     islands: Vec<Island>,
 }
 
 impl Environment for Islands {
     fn frame_shape(&self) -> FrameShape {
-        self.shape
+        self.config.frame_shape()
     }
 
     fn num_actions(&self) -> usize {
@@ -118,8 +112,8 @@ impl Environment for Islands {
 
     fn observe(&mut self, frames: &mut [u8]) {
         frames.fill(0);
-        let width = self.shape.width;
-        let frames = frames.chunks_exact_mut(self.shape.bytes());
+        let shape = self.config.frame_shape();
+        let (width, frames) = (shape.width, frames.chunks_exact_mut(shape.bytes()));
         for (frame, island) in frames.zip(&self.islands) {
             for ((row, column), shade) in [(island.treasure, 128), (island.agent, 255)] {
                 for row in frame.chunks_exact_mut(width).skip(row * FIELD).take(FIELD) {
@@ -135,7 +129,8 @@ impl Environment for Islands {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
-        let last = self.side - 1;
+        let config = &self.config;
+        let last = config.side - 1;
         for (env, (island, &action)) in self.islands.iter_mut().zip(actions).enumerate() {
             let Some((down, right)) = MOVES.get(usize::from(action)) else {
                 return Err(EnvError::Step(format!(
@@ -150,14 +145,14 @@ impl Environment for Islands {
             );
             island.steps += 1;
             (rewards[env], ends[env]) = if island.agent == island.treasure {
-                (self.reward, StepEnd::Terminal)
-            } else if island.steps >= self.step_limit {
+                (config.reward, StepEnd::Terminal)
+            } else if island.steps >= config.step_limit {
                 (0.0, StepEnd::TimedOut)
             } else {
                 (0.0, StepEnd::Running)
             };
             if ends[env] != StepEnd::Running {
-                island.begin(self.side);
+                island.begin(config.side);
             }
         }
         Ok(())
