@@ -1,9 +1,9 @@
 //! `driml sweep`: a run for each combination of settings and each seed, a table and a plot of them at the end.
 //! Runs are made by `queue`; which there are follows from `axes`.
 
-use driml_envs::WorldName;
 use driml_launch::console::{aligned, print};
 use driml_machine::error::usage;
+use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -48,23 +48,20 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     let (settings, seeds) = settings(args, kept)?;
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
-    let mut points = Vec::new();
+    let mut plans = Vec::new();
     for (at, cell) in cells.iter().enumerate() {
         let config = settings.call(cell, 1).config();
         let config = config.map_err(|e| match &described(cell)[..] {
             "" => e,
             cell => usage!("{cell}: {e}"),
         })?;
-        points.push((at, folder_name(axes, cell, at), config.frames()));
+        plans.extend((1..=seeds).map(|seed| {
+            let name = format!("{}-seed{seed}", folder_name(axes, cell, at));
+            let call = settings.call(cell, seed);
+            (at, PlannedRun::new(name, call, config.frames()))
+        }));
     }
-    let mut plans = Vec::new();
-    for seed in 1..=seeds {
-        for (at, name, frames) in &points {
-            let name = format!("{name}-seed{seed}");
-            let call = settings.call(&cells[*at], seed);
-            plans.push((*at, PlannedRun::new(name, call, *frames)));
-        }
-    }
+    plans.sort_by_key(|(_, plan)| plan.call.seed);
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     queue::install(&plans, args.report)?;
     let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;
@@ -93,17 +90,15 @@ fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Setting
         frames: args.frames,
         preset: args.preset.clone(),
     };
-    Ok(match kept.filter(|_| asked.axes.is_empty()) {
-        Some(kept) => (
-            Settings {
-                axes: kept.axes,
-                frames: asked.frames.or(kept.frames),
-                preset: asked.preset.or(kept.preset),
-            },
-            args.seeds.max(SEEDS_FOUND_MAX),
-        ),
-        None => (asked, args.seeds),
-    })
+    let Some(kept) = kept.filter(|_| asked.axes.is_empty()) else {
+        return Ok((asked, args.seeds));
+    };
+    let settings = Settings {
+        axes: kept.axes,
+        frames: asked.frames.or(kept.frames),
+        preset: asked.preset.or(kept.preset),
+    };
+    Ok((settings, args.seeds.max(SEEDS_FOUND_MAX)))
 }
 
 /// Worlds and agents first, where there are several, then the settings as they were named.
@@ -149,11 +144,7 @@ impl Settings {
 }
 
 fn full_name(world: &str) -> String {
-    let game = format!("procgen:{world}");
-    match (world.parse::<WorldName>(), game.parse::<WorldName>()) {
-        (Err(_), Ok(_)) => game,
-        _ => world.to_owned(),
-    }
+    presets::world(world).map_or_else(|_| world.to_owned(), |it| it.to_string())
 }
 
 /// Such as `agent=c51, learner.batch_size=64`: the axes along which something changes.

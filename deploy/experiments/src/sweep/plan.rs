@@ -34,14 +34,10 @@ impl Call {
             ("--seed", Some(self.seed.to_string())),
             ("--frames", self.frames.map(|it| it.to_string())),
         ];
-        let named = named
-            .into_iter()
-            .filter_map(|(flag, value)| Some((flag, value?)));
-        let sets = self.sets.iter().map(|set| ("--set", set.clone()));
-        let pairs = named.chain(sets);
-        pairs
-            .flat_map(|(flag, value)| [flag.to_owned(), value])
-            .collect()
+        let sets = self.sets.iter().map(|set| ("--set", Some(set.clone())));
+        let all = named.into_iter().chain(sets);
+        let given = all.filter_map(|(flag, value)| Some([flag.to_owned(), value?]));
+        given.flatten().collect()
     }
 
     pub(crate) fn config(&self) -> Result<RunConfig, Usage> {

@@ -71,10 +71,9 @@ impl Runs {
         commit: &str,
         resumed: bool,
     ) -> anyhow::Result<()> {
-        let before = if resumed {
-            self.commit(plan)
-        } else {
-            String::new()
+        let before = match resumed {
+            true => self.commit(plan),
+            false => String::new(),
         };
         let commits = match before.split('+').any(|it| it == commit) {
             true => before,
