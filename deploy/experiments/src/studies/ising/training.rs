@@ -77,16 +77,14 @@ pub(super) struct Measured {
 
 pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::Result<Trained> {
     let settings = &task.settings;
-    let LearnerSettings {
-        lambda,
-        tanh_clip,
-        adam,
-        max_grad_norm,
-        ..
-    } = task.learner;
+    let given = &task.learner;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let dim = Dim { lambda, tanh_clip };
-    let learner = DimLearner::new(&task.model, dim, adam, max_grad_norm, &mut rng)?;
+    let dim = Dim {
+        lambda: given.lambda,
+        tanh_clip: given.tanh_clip,
+    };
+    let norm_max = given.max_grad_norm;
+    let learner = DimLearner::new(&task.model, dim, given.adam, norm_max, &mut rng)?;
     let mut scorer = Scorer { task, learner };
     let (mut episodes, mut batches_left) = (Episodes::default(), 0);
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
@@ -183,14 +181,9 @@ struct Scorer<'a> {
 
 impl Scorer<'_> {
     fn features(&self, frames: &[u8]) -> anyhow::Result<Features> {
-        let ModelConfig {
-            height,
-            width,
-            input_channels,
-            ..
-        } = self.task.model;
-        let rows = frames.len() / (height * width * input_channels);
-        let shape = (rows, height, width, input_channels);
+        let model = &self.task.model;
+        let rows = frames.len() / model.frame_len();
+        let shape = (rows, model.height, model.width, model.input_channels);
         let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
         Ok(self.learner.network.features(&frames)?)
     }
@@ -206,15 +199,9 @@ impl Scorer<'_> {
 
     /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
     fn measure(&self, episodes: usize) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
-        let Task {
-            world,
-            model,
-            settings,
-            ..
-        } = self.task;
-        let rows = settings.batch_size;
-        let t = settings.from_t as usize;
-        let view = View::of(model);
+        let (world, settings) = (&self.task.world, &self.task.settings);
+        let (rows, t) = (settings.batch_size, settings.from_t as usize);
+        let view = View::of(&self.task.model);
         let mut tally = Tally::default();
         let mut maps = Vec::new();
         for batch in 0..episodes.div_ceil(rows).max(1) {
@@ -223,17 +210,14 @@ impl Scorer<'_> {
             let (now, next) = (&played.frames[t], &played.frames[t + 1]);
             let (now, next) = (self.features(now)?, self.features(next)?);
             // [L, B, B] of every anchor with every candidate, at each location.
-            let scores = self
-                .learner
-                .scores(&now, &next, [true, false, false, false])?;
+            let local = [true, false, false, false];
+            let scores = self.learner.scores(&now, &next, local)?;
             let logs = log_softmax(&scores, rows);
             let locations = scores.len() / (rows * rows);
             for location in 0..locations {
                 let place = (location / view.columns, location % view.columns);
-                let side = world.patch_size;
-                let origins = played.origins.iter();
-                let cover = origins.map(|origin| view.cover(place, *origin, side));
-                let cover: Vec<Cover> = cover.collect();
+                let of = |origin: &(usize, usize)| view.cover(place, *origin, world.patch_size);
+                let cover: Vec<Cover> = played.origins.iter().map(of).collect();
                 tally.add(location, &cover, &scores, &logs, rows);
             }
             if batch == 0 {
@@ -268,10 +252,8 @@ fn log_softmax(scores: &[f64], rows: usize) -> Vec<f64> {
 struct Cover {
     /// Its centre is in the patch.
     centre: bool,
-    /// All of it is.
-    whole: bool,
-    /// None of it is.
-    none: bool,
+    /// All of it is, or none of it; otherwise this is none.
+    whole: Option<bool>,
 }
 
 /// What the locations of the last convolution look at.
@@ -312,10 +294,10 @@ impl View {
             ]
         };
         let (rows, columns) = (along(place.0, origin.0), along(place.1, origin.1));
+        let (inside, outside) = (rows[1] && columns[1], rows[2] || columns[2]);
         Cover {
             centre: rows[0] && columns[0],
-            whole: rows[1] && columns[1],
-            none: rows[2] || columns[2],
+            whole: (inside || outside).then_some(inside),
         }
     }
 }
@@ -337,8 +319,8 @@ impl Tally {
             let (raw, log) = (scores[at + row], logs[at + row]);
             self.inside[usize::from(here.centre)].push(log);
             self.inside_raw[usize::from(here.centre)].push(raw);
-            if here.whole || here.none {
-                self.whole[usize::from(here.whole)].push(log);
+            if let Some(whole) = here.whole {
+                self.whole[usize::from(whole)].push(log);
             }
             let other = (row + 1) % rows;
             if other != row && here.centre && cover[other].centre {
@@ -383,16 +365,12 @@ mod tests {
         let view = View::of(&model);
         assert_eq!((view.side, view.step, view.columns), (36, 8, 7));
         assert_eq!(6 * view.step + view.side, 84);
-        for (place, centre, whole, none) in [
-            ((0, 6), true, true, false),
-            ((6, 6), false, false, true),
-            ((2, 6), true, false, false),
+        for (place, centre, whole) in [
+            ((0, 6), true, Some(true)),
+            ((6, 6), false, Some(false)),
+            ((2, 6), true, None),
         ] {
-            let expected = Cover {
-                centre,
-                whole,
-                none,
-            };
+            let expected = Cover { centre, whole };
             assert_eq!(view.cover(place, (0, 42), 42), expected, "{place:?}");
         }
     }

@@ -150,17 +150,13 @@ fn values(results: &Results) -> Value {
 
 /// How long each sampling takes, by either measure: the updates at the first, the figure's and the last alpha.
 fn convergence(results: &Results) -> Vec<Value> {
-    let Settings {
-        alphas,
-        figure_alpha,
-        ..
-    } = &results.settings;
-    let ends = [alphas.first(), alphas.last()];
-    let [first, last] = ends.map(|end| end.unwrap_or(figure_alpha));
+    let settings = &results.settings;
+    let ends = [settings.alphas.first(), settings.alphas.last()];
+    let [first, last] = ends.map(|end| end.unwrap_or(&settings.figure_alpha));
     let mut rows = Vec::new();
     for (name, measure) in [("tv", TV), ("share", SHARE)] {
         for sampling in Sampling::ALL {
-            let times = [first, figure_alpha, last].map(|&alpha| {
+            let times = [first, &settings.figure_alpha, last].map(|&alpha| {
                 let times = results.of(sampling, alpha).filter_map(measure);
                 context! { alpha, updates => times.collect::<Vec<_>>() }
             });

@@ -90,15 +90,12 @@ impl Settings {
 
     pub(super) fn plans(&self, seed: u32) -> Vec<Planned<Point>> {
         let mut plans = Vec::new();
-        let Predictability {
-            agent,
-            epsilons,
-            frames,
-        } = &self.predictability;
-        for &epsilon in epsilons {
+        let of = &self.predictability;
+        for &epsilon in &of.epsilons {
             let name = format!("epsilon{epsilon}-seed{seed}");
-            let call = self.call(agent, seed, *frames, &[format!("world.epsilon={epsilon}")]);
-            let plan = PlannedRun::new(name, call, *frames);
+            let set = [format!("world.epsilon={epsilon}")];
+            let call = self.call(&of.agent, seed, of.frames, &set);
+            let plan = PlannedRun::new(name, call, of.frames);
             plans.push((Point::Epsilon(epsilon), plan));
         }
         for (part, part_name) in PART_NAMES.iter().enumerate() {

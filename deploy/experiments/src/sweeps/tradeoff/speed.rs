@@ -52,13 +52,11 @@ impl Side {
 
     /// An action for every frame of the round.
     fn act(&mut self) -> Work<'_> {
-        let Self {
-            policy,
-            frames,
-            actions,
-            ..
-        } = self;
-        Box::new(|| Ok(policy.greedy_actions(frames, actions)?))
+        Box::new(|| {
+            self.policy
+                .greedy_actions(&self.frames, &mut self.actions)?;
+            Ok(())
+        })
     }
 }
 
