@@ -13,30 +13,22 @@ use crate::plot::Curve;
 /// The paper's four panels.
 pub(super) fn fig1(results: &Results) -> Figure {
     let settings = &results.settings;
-    let alpha = settings.figure_alpha;
     let k = settings.states;
     let (truth, learnt) = (results.true_ratio(), results.learnt_ratio());
     let high = truth.iter().copied().fold(0.0, f64::max) * 1.1;
-    let heat = |title: &str, values: Vec<Option<f64>>| Heat {
-        names: (1..=k).map(|state| state.to_string()).collect(),
-        labels: ("next state".into(), "state".into()),
-        unit: "T / \u{3c1} [ratio]".into(),
-        range: Some((0.0, high)),
-        decimals: Some(1),
-        ..Heat::new(title, k, values)
+    let heat = |title: String, values: Vec<Option<f64>>| {
+        Panel::Heat(Heat {
+            names: (1..=k).map(|state| state.to_string()).collect(),
+            labels: ("next state".into(), "state".into()),
+            unit: "T / \u{3c1} [ratio]".into(),
+            range: Some((0.0, high)),
+            decimals: Some(1),
+            ..Heat::new(&title, k, values)
+        })
     };
-    let panels = vec![
-        Panel::Heat(heat(
-            &format!("(a) True ratio, \u{3b1} = {alpha}"),
-            truth.iter().map(|ratio| Some(*ratio)).collect(),
-        )),
-        Panel::Heat(heat(
-            &format!("(b) Learnt ratio, mean of {} seeds", settings.seeds),
-            learnt.iter().map(|it| Some(it.mean)).collect(),
-        )),
-        Panel::Chart(information(results)),
-        Panel::Chart(inverse_gap(results)),
-    ];
+    let of_truth = format!("(a) True ratio, \u{3b1} = {}", settings.figure_alpha);
+    let of_learnt = format!("(b) Learnt ratio, mean of {} seeds", settings.seeds);
+    let learnt = learnt.iter().map(|it| Some(it.mean));
     Figure {
         title: format!("InfoNCE on a biased random walk over {k} states"),
         notes: vec![format!(
@@ -45,82 +37,69 @@ pub(super) fn fig1(results: &Results) -> Figure {
         )],
         columns: 2,
         panel_size: (430.0, 380.0),
-        panels,
+        panels: vec![
+            heat(of_truth, truth.into_iter().map(Some).collect()),
+            heat(of_learnt, learnt.collect()),
+            information(results),
+            inverse_gap(results),
+        ],
     }
-}
-
-/// Biases for smooth curves.
-fn fine() -> impl Iterator<Item = f64> {
-    (1..=97).map(|i| 0.02 + f64::from(i - 1) * 0.01)
 }
 
 fn by_alpha() -> Axis {
     Axis::linear("\u{3b1}, probability of a step up").showing(&[0.0, 1.0])
 }
 
-fn curve(results: &Results, value: impl Fn(&Chain) -> f64) -> Vec<(f64, f64)> {
-    let at = |alpha: f64| (alpha, value(&results.chain(alpha)));
-    fine().map(at).collect()
+/// A closed form over biases so fine that its curve is smooth.
+fn closed_form(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> Series {
+    let fine = (1..=97).map(|i| 0.02 + f64::from(i - 1) * 0.01);
+    let points = fine.map(|alpha| (alpha, value(&results.chain(alpha))));
+    Series::line(name, 0, points.collect())
 }
 
-fn information(results: &Results) -> Chart {
-    let alphas = &results.settings.alphas;
-    let k = results.settings.states;
-    let numerical = alphas.iter().map(|&alpha| {
-        let t = results.chain(alpha).transitions();
-        (alpha, mutual_information_numerically(&t, k))
+/// The same by linear algebra, from the transitions at each alpha.
+fn numerical(results: &Results, value: impl Fn(&[f64], usize) -> f64) -> Series {
+    let points = results.settings.alphas.iter().map(|&alpha| {
+        let chain = results.chain(alpha);
+        (alpha, value(&chain.transitions(), chain.states))
     });
-    let learnt = alphas.iter().map(|&alpha| {
+    Series::line("numerical", 0, points.collect()).marked(Mark::Rings)
+}
+
+fn information(results: &Results) -> Panel {
+    let learnt = results.settings.alphas.iter().map(|&alpha| {
         let all = results.chain(alpha).mutual_information();
         let each = results.of(Sampling::Stationary, alpha);
         (alpha, each.map(|one| all - one.final_excess()).collect())
     });
-    Chart::new(
-        "(c) Mutual information of successive states",
-        by_alpha(),
-        Axis::linear("I(S, S') [nats]").showing(&[0.0]),
-        vec![
-            Series::line(
-                "a ring, no ends",
-                0,
-                curve(results, Chain::mutual_information_of_a_ring),
-            )
-            .coloured(GREY)
-            .marked(Mark::Dashed),
-            Series::line("closed form", 0, curve(results, Chain::mutual_information)),
-            Series::line("numerical", 0, numerical.collect()).marked(Mark::Rings),
-            Curve::of_means(learnt)
-                .series("learnt", 1)
-                .marked(Mark::Bars),
-        ],
-    )
+    let learnt = Curve::of_means(learnt).series("learnt", 1);
+    let of_a_ring = Chain::mutual_information_of_a_ring;
+    let ring = closed_form(results, "a ring, no ends", of_a_ring).coloured(GREY);
+    let series = vec![
+        ring.marked(Mark::Dashed),
+        closed_form(results, "closed form", Chain::mutual_information),
+        numerical(results, mutual_information_numerically),
+        learnt.marked(Mark::Bars),
+    ];
+    let title = "(c) Mutual information of successive states";
+    let y = Axis::linear("I(S, S') [nats]").showing(&[0.0]);
+    Panel::Chart(Chart::new(title, by_alpha(), y, series))
 }
 
-fn inverse_gap(results: &Results) -> Chart {
-    let k = results.settings.states;
-    let numerical = results.settings.alphas.iter().map(|&alpha| {
-        let t = results.chain(alpha).transitions();
-        (alpha, 1.0 / spectral_gap_numerically(&t, k))
-    });
-    Chart::new(
-        "(d) Inverse spectral gap",
-        by_alpha(),
-        Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").showing(&[0.0]),
-        vec![
-            Series::line(
-                "closed form",
-                0,
-                curve(results, |chain| 1.0 / chain.spectral_gap()),
-            ),
-            Series::line("numerical", 0, numerical.collect()).marked(Mark::Rings),
-        ],
-    )
+fn inverse_gap(results: &Results) -> Panel {
+    let series = vec![
+        closed_form(results, "closed form", |it| 1.0 / it.spectral_gap()),
+        numerical(results, |t, k| 1.0 / spectral_gap_numerically(t, k)),
+    ];
+    let y = Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").showing(&[0.0]);
+    let title = "(d) Inverse spectral gap";
+    Panel::Chart(Chart::new(title, by_alpha(), y, series))
 }
 
 /// How fast it is learnt, against the gap.
 pub(super) fn convergence(results: &Results) -> Figure {
     let settings = &results.settings;
-    let times = |title: &str, measure: Measure| {
+    let times = |title: String, measure: Measure| {
         let by_gap = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
         let series = Sampling::ALL.iter().enumerate();
         let series = series.map(|(index, &sampling)| {
@@ -130,13 +109,19 @@ pub(super) fn convergence(results: &Results) -> Figure {
             let at = |chain: &Chain| aside / chain.spectral_gap();
             over_alphas(results, sampling, index, at, value)
         });
-        Chart::new(title, by_gap, Axis::log("updates"), series.collect())
+        let y = Axis::log("updates");
+        Panel::Chart(Chart::new(&title, by_gap, y, series.collect()))
     };
     let last = Sampling::ALL.iter().enumerate().map(|(index, &sampling)| {
         let value = |one: &Trained| Some(one.final_tv());
         let aside = 0.012 * (index as f64 - 1.0);
         over_alphas(results, sampling, index, |chain| chain.alpha + aside, value)
     });
+    let of_tv = format!("Updates until the law is within {}", settings.tv_reached);
+    let share = 100.0 * (1.0 - settings.share_reached);
+    let of_share = format!("Updates until {share:.0}% of I(S, S') is learnt");
+    let of_last = format!("Error after {} updates", settings.updates);
+    let y = Axis::linear("total variation [probability]").showing(&[0.0]);
     Figure {
         title: "Does InfoNCE converge as the spectral gap says?".into(),
         notes: vec![format!(
@@ -146,24 +131,10 @@ pub(super) fn convergence(results: &Results) -> Figure {
         columns: 2,
         panel_size: (430.0, 350.0),
         panels: vec![
-            Panel::Chart(curves(results)),
-            Panel::Chart(times(
-                &format!("Updates until the law is within {}", settings.tv_reached),
-                TV,
-            )),
-            Panel::Chart(times(
-                &format!(
-                    "Updates until {:.0}% of I(S, S') is learnt",
-                    100.0 * (1.0 - settings.share_reached)
-                ),
-                SHARE,
-            )),
-            Panel::Chart(Chart::new(
-                &format!("Error after {} updates", settings.updates),
-                by_alpha(),
-                Axis::linear("total variation [probability]").showing(&[0.0]),
-                last.collect(),
-            )),
+            curves(results),
+            times(of_tv, TV),
+            times(of_share, SHARE),
+            Panel::Chart(Chart::new(&of_last, by_alpha(), y, last.collect())),
         ],
     }
 }
@@ -184,17 +155,14 @@ fn over_alphas(
     curve.marked(Mark::Bars)
 }
 
-fn curves(results: &Results) -> Chart {
+fn curves(results: &Results) -> Panel {
     let shown = results.shown().into_iter().enumerate();
     let series = shown.map(|(index, alpha)| {
         let gap = results.chain(alpha).spectral_gap();
         let name = format!("\u{3b1} = {alpha}, gap {gap:.2}");
         results.tv_curve(alpha).series(&name, index)
     });
-    Chart::new(
-        "Error on the way, stationary",
-        Axis::log("updates"),
-        Axis::log("total variation [probability]"),
-        series.collect(),
-    )
+    let title = "Error on the way, stationary";
+    let y = Axis::log("total variation [probability]");
+    Panel::Chart(Chart::new(title, Axis::log("updates"), y, series.collect()))
 }
