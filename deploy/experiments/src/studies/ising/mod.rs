@@ -118,6 +118,7 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
     };
     let range = Spread::of(first.maps.iter().flatten().copied());
     let view = View::of(&task.model);
+    let title = format!("Scores, t = {} to {early_t}", settings.from_t);
     let scores = |episode: usize| {
         let map = first.maps[episode].iter().map(|score| Some(*score));
         Panel::Heat(Heat {
@@ -129,11 +130,7 @@ fn fig2(task: &Task, first: &Trained) -> anyhow::Result<Figure> {
                 cell: view.step as f64,
             }),
             outline: Some(outline(episode)),
-            ..Heat::new(
-                &format!("Scores, t = {} to {early_t}", settings.from_t),
-                view.columns,
-                map.collect(),
-            )
+            ..Heat::new(&title, view.columns, map.collect())
         })
     };
     let panels = (0..shown)
@@ -178,6 +175,10 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
         let name = format!("seed {}", seed + 1);
         Series::line(&name, seed, smoothed(&one.loss).collect())
     });
+    let updates = || Axis::linear("updates");
+    let loss = Axis::linear("InfoNCE [nats]");
+    let area = Axis::linear("area under the ROC curve").showing(&[0.5, 1.0]);
+    let (left, right) = ("Local DIM loss (3t3), training", "What the scores tell");
     Figure {
         title: "What local DIM learns of the Ising world".into(),
         notes: vec![format!(
@@ -187,18 +188,8 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
         columns: 2,
         panel_size: (430.0, 330.0),
         panels: vec![
-            Panel::Chart(Chart::new(
-                "Local DIM loss (3t3), training",
-                Axis::linear("updates"),
-                Axis::linear("InfoNCE [nats]"),
-                losses.collect(),
-            )),
-            Panel::Chart(Chart::new(
-                "What the scores tell",
-                Axis::linear("updates"),
-                Axis::linear("area under the ROC curve").showing(&[0.5, 1.0]),
-                areas,
-            )),
+            Panel::Chart(Chart::new(left, updates(), loss, losses.collect())),
+            Panel::Chart(Chart::new(right, updates(), area, areas)),
         ],
     }
 }

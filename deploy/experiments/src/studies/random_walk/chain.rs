@@ -41,15 +41,11 @@ impl Chain {
             0 => 0.0,
             away => -(away as f64) * rate,
         };
-        let log_sum = (0..self.states)
-            .map(|away| fall(away).exp())
-            .sum::<f64>()
-            .ln();
-        let law = (0..self.states).map(|away| fall(away) - log_sum);
-        if self.alpha > 0.5 {
-            law.rev().collect()
-        } else {
-            law.collect()
+        let sum: f64 = (0..self.states).map(|away| fall(away).exp()).sum();
+        let law = (0..self.states).map(|away| fall(away) - sum.ln());
+        match self.alpha > 0.5 {
+            true => law.rev().collect(),
+            false => law.collect(),
         }
     }
 
@@ -109,10 +105,8 @@ impl Chain {
 
 /// -sum p ln p, in nats.
 fn entropy(law: &[f64]) -> f64 {
-    -law.iter()
-        .filter(|p| **p > 0.0)
-        .map(|p| p * p.ln())
-        .sum::<f64>()
+    let terms = law.iter().filter(|p| **p > 0.0).map(|p| p * p.ln());
+    -terms.sum::<f64>()
 }
 
 /// The stationary law of `t` [k, k] as the rows of T^(2^40), by squaring.
@@ -122,13 +116,11 @@ pub(super) fn stationary_numerically(t: &[f64], k: usize) -> Vec<f64> {
         let square = |i: usize, j: usize| (0..k).map(|l| power[i * k + l] * power[l * k + j]).sum();
         let next: Vec<f64> = (0..k * k).map(|at| square(at / k, at % k)).collect();
         // Rounding would let the rows' sums drift, and squaring double the drift.
-        power = next
-            .chunks(k)
-            .flat_map(|row| {
-                let sum: f64 = row.iter().sum();
-                row.iter().map(move |p| p / sum)
-            })
-            .collect();
+        let normalised = next.chunks(k).flat_map(|row| {
+            let sum: f64 = row.iter().sum();
+            row.iter().map(move |p| p / sum)
+        });
+        power = normalised.collect();
     }
     power[..k].to_vec()
 }
@@ -145,10 +137,8 @@ pub(super) fn mutual_information_numerically(t: &[f64], k: usize) -> f64 {
 
 /// 1 - lambda_2 from the eigenvalues of the symmetric matrix sqrt(T_ij T_ji), which has T's as T balances in detail.
 pub(super) fn spectral_gap_numerically(t: &[f64], k: usize) -> f64 {
-    let symmetric = (0..k * k)
-        .map(|at| (t[at] * t[at % k * k + at / k]).sqrt())
-        .collect();
-    let mut values = eigenvalues(symmetric, k);
+    let entry = |at: usize| (t[at] * t[at % k * k + at / k]).sqrt();
+    let mut values = eigenvalues((0..k * k).map(entry).collect(), k);
     values.sort_by(f64::total_cmp);
     values[k - 1] - values[k - 2]
 }
@@ -167,14 +157,11 @@ fn eigenvalues(mut a: Vec<f64>, k: usize) -> Vec<f64> {
                 let tan = theta.signum() / (theta.abs() + theta.hypot(1.0));
                 let cos = 1.0 / tan.hypot(1.0);
                 let sin = tan * cos;
-                for i in 0..k {
-                    let (x, y) = (a[i * k + p], a[i * k + q]);
-                    (a[i * k + p], a[i * k + q]) = (cos * x - sin * y, sin * x + cos * y);
-                }
-                for i in 0..k {
-                    let (x, y) = (a[p * k + i], a[q * k + i]);
-                    (a[p * k + i], a[q * k + i]) = (cos * x - sin * y, sin * x + cos * y);
-                }
+                let mut rotate = |x: usize, y: usize| {
+                    (a[x], a[y]) = (cos * a[x] - sin * a[y], sin * a[x] + cos * a[y]);
+                };
+                (0..k).for_each(|i| rotate(i * k + p, i * k + q));
+                (0..k).for_each(|i| rotate(p * k + i, q * k + i));
             }
         }
     }
