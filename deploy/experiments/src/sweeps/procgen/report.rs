@@ -85,14 +85,11 @@ pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Gam
             is_above_random: own().all(|it| it.is_above_random()),
         }
     };
+    let agents = settings.agents.iter();
     let game = |(name, runs): (&'a str, Vec<&'a Scored>)| Game {
         name,
         random: &runs[0].random,
-        agents: settings
-            .agents
-            .iter()
-            .map(|it| of(name, &runs, it))
-            .collect(),
+        agents: agents.clone().map(|it| of(name, &runs, it)).collect(),
     };
     games.into_iter().map(game).collect()
 }
@@ -104,12 +101,9 @@ pub(super) fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result
     for it in scored {
         let Made { point, plan, run } = &it.made;
         let summary = &run.summary;
-        let returns = [
-            summary.mean_return,
-            mean(&it.greedy),
-            mean(&it.random),
-            paper(&point.game, &point.agent),
-        ];
+        let paper = paper(&point.game, &point.agent);
+        let [greedy, random] = [&it.greedy, &it.random].map(|of| mean(of));
+        let returns = [summary.mean_return, greedy, random, paper];
         rows.push((
             (&point.game, &point.agent, torso(&run.folder)?),
             (plan.call.seed, summary.frames),
@@ -141,8 +135,8 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
             series.push(Series::line("random", 0, level(random)).coloured(GREY));
         }
         for (index, (agent, of)) in settings.agents.iter().zip(&game.agents).enumerate() {
-            let each = of.runs.iter();
-            let each = each.map(|it| Ok(Run::read(&it.run.folder)?.values("mean_return")?));
+            let read = |it: &&Made<Point>| Ok(Run::read(&it.run.folder)?.values("mean_return")?);
+            let each = of.runs.iter().map(read);
             let curve = over_seeds(&each.collect::<anyhow::Result<Vec<_>>>()?);
             if curve.points.is_empty() {
                 continue;
@@ -222,11 +216,8 @@ pub(super) fn values(
     count: usize,
     missing: &[String],
 ) -> Value {
-    let runs = games
-        .iter()
-        .flat_map(|it| &it.agents)
-        .flat_map(|it| &it.runs);
-    let has_seeds = runs.clone().any(|it| it.plan.call.seed > 1);
+    let agents = games.iter().flat_map(|it| &it.agents);
+    let mut runs = agents.flat_map(|it| &it.runs);
     context! {
         settings,
         agents => settings.agents,
@@ -240,7 +231,7 @@ pub(super) fn values(
         missing,
         returns_of => RETURNS_OF,
         episodes => CHECKPOINTS * settings.episodes,
-        some_seeds => has_seeds,
+        some_seeds => runs.any(|it| it.plan.call.seed > 1),
     }
 }
 
