@@ -42,13 +42,8 @@ pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
 pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<Measured> {
     let (model, update) = (&config.model, &config.learner.update);
     let compute = Compute::cpu(config.learner.precision);
-    let restored = checkpoint::load_latest(
-        &folder.checkpoints(),
-        model,
-        update,
-        &REFERENCE,
-        config.run.hash(),
-    )?;
+    let (checkpoints, hash) = (folder.checkpoints(), config.run.hash());
+    let restored = checkpoint::load_latest(&checkpoints, model, update, &REFERENCE, hash)?;
     let restored = restored.with_context(|| format!("{} has no checkpoint", folder.display()))?;
     let reference = restored.agent;
     let parameters = NetworkParameters {

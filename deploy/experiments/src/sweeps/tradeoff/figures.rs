@@ -13,7 +13,7 @@ const PANEL: (f64, f64) = (330.0, 250.0);
 struct Placed {
     speed: f64,
     value: f64,
-    ends: (f64, f64),
+    ends: [f64; 2],
 }
 
 /// Return against frames a second, a panel for each dial with its base, all over the same axes; a dashed line joins those points of
@@ -26,10 +26,7 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
     let placed: Vec<Placed> = results.points.values().filter_map(place).collect();
     let front: Vec<(f64, f64)> = front(&placed).map(|it| (it.speed, it.value)).collect();
     let speeds: Vec<f64> = placed.iter().map(|it| it.speed).collect();
-    let values: Vec<f64> = placed
-        .iter()
-        .flat_map(|it| [it.ends.0, it.ends.1])
-        .collect();
+    let values: Vec<f64> = placed.iter().flat_map(|it| it.ends).collect();
     let label = format!("{name} return");
     let panels = results.by_dial().map(|rows| {
         let line = Series::line("", 0, front.clone());
@@ -38,11 +35,9 @@ pub(super) fn pareto(results: &Results, returns: Measure, name: &str) -> Figure 
             let Some(it) = place(row.result) else {
                 continue;
             };
-            series.push(
-                Series::line(row.name, index, vec![(it.speed, it.value)])
-                    .banded(vec![(it.speed, it.ends.0, it.ends.1)])
-                    .marked(Mark::Bars),
-            );
+            let point = Series::line(row.name, index, vec![(it.speed, it.value)]);
+            let bar = vec![(it.speed, it.ends[0], it.ends[1])];
+            series.push(point.banded(bar).marked(Mark::Bars));
         }
         let (x, y) = (Axis::linear("frames/s"), Axis::linear(&label));
         let (x, y) = (x.showing(&speeds), y.showing(&values));
@@ -70,7 +65,7 @@ fn place(point: &PointResult, returns: Measure, (least, greatest): (f64, f64)) -
     Some(Placed {
         speed: point.mean(FRAMES_PER_SECOND)?.mean,
         value: value.mean,
-        ends: (low.max(least), high.min(greatest)),
+        ends: [low.max(least), high.min(greatest)],
     })
 }
 
@@ -121,7 +116,7 @@ mod tests {
         let at = |speed: f64, value: f64| Placed {
             speed,
             value,
-            ends: (value, value),
+            ends: [value; 2],
         };
         let (slow_and_good, slow_and_bad) = (at(1.0, 9.0), at(1.0, 2.0));
         let (between, beaten, fast_and_bad) = (at(3.0, 5.0), at(2.0, 4.9), at(5.0, 3.0));

@@ -244,10 +244,8 @@ fn by_chance(results: &Results) -> (usize, f64) {
     });
     let judged = each.filter(|counts| counts.iter().all(|&it| it > 1));
     let chances = judged.map(|counts| {
-        let [base, level] = counts;
-        *known
-            .entry(counts)
-            .or_insert_with(|| apart_by_chance(base, level))
+        let known = known.entry(counts);
+        *known.or_insert_with(|| apart_by_chance(counts[0], counts[1]))
     });
     chances.fold((0, 0.0), |(count, sum), chance| (count + 1, sum + chance))
 }

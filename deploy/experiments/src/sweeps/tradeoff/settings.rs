@@ -68,10 +68,9 @@ pub(super) fn of(
 impl Settings {
     /// Seeds of a point, from 1.
     pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
-        if is_base {
-            BASE_SEEDS * self.seeds
-        } else {
-            self.seeds
+        match is_base {
+            true => BASE_SEEDS * self.seeds,
+            false => self.seeds,
         }
     }
 }
@@ -82,18 +81,15 @@ impl Common {
     }
 
     pub(super) fn run(&self, point: &Point, seed: u32) -> PlannedRun {
-        PlannedRun::new(
-            format!("{}-seed{seed}", point.key),
-            Call {
-                env: Some(self.env.clone()),
-                agent: Some(point.agent.clone()),
-                preset: Some(self.preset.clone()),
-                seed,
-                frames: Some(self.frames),
-                sets: self.sets.iter().chain(&point.sets).cloned().collect(),
-            },
-            self.frames,
-        )
+        let call = Call {
+            env: Some(self.env.clone()),
+            agent: Some(point.agent.clone()),
+            preset: Some(self.preset.clone()),
+            seed,
+            frames: Some(self.frames),
+            sets: self.sets.iter().chain(&point.sets).cloned().collect(),
+        };
+        PlannedRun::new(format!("{}-seed{seed}", point.key), call, self.frames)
     }
 }
 
@@ -188,10 +184,8 @@ coinrun|observation|input.height=64 input.width=64";
             config.notes.clear();
             config
         };
-        for it in levels
-            .iter()
-            .filter(|it| it.dial.name.starts_with("preset"))
-        {
+        let is_preset = |it: &&LevelOf| it.dial.name.starts_with("preset");
+        for it in levels.iter().filter(is_preset) {
             assert_eq!(of("paper", &it.base), of(&it.dial.base, &it.base));
             let whole = of(&it.level, &it.base);
             assert_eq!(of("paper", &it.point), whole, "{}", it.point.key);

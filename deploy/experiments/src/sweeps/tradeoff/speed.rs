@@ -23,13 +23,11 @@ struct Side {
 impl Side {
     fn new(config: &RunConfig) -> anyhow::Result<Self> {
         let held = fixed_batch::play(config, None, config.learner.batch_size as usize)?;
-        let agent = Agent::new(
-            config.model.clone(),
-            config.learner.update.clone(),
-            &Compute::cpu(config.learner.precision),
-            &mut ChaCha8Rng::seed_from_u64(1),
-        )?
-        .with_deduplication(config.learner.deduplicate_states);
+        let (model, update) = (config.model.clone(), config.learner.update.clone());
+        let compute = Compute::cpu(config.learner.precision);
+        let rng = &mut ChaCha8Rng::seed_from_u64(1);
+        let agent = Agent::new(model, update, &compute, rng)?
+            .with_deduplication(config.learner.deduplicate_states);
         let weights = agent.weights_as(config.learner.publish_dtype)?;
         let policy = PolicyNetwork::new(&config.model, &weights, config.actor.precision)?;
         let envs = config.actor.envs as usize;
