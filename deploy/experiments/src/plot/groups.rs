@@ -105,10 +105,8 @@ impl Group<'_> {
                 None => values,
             })
         });
-        Ok(one_curve(
-            &each.collect::<anyhow::Result<Vec<_>>>()?,
-            args.band,
-        ))
+        let each = each.collect::<anyhow::Result<Vec<_>>>()?;
+        Ok(one_curve(&each, args.band))
     }
 }
 

@@ -76,14 +76,11 @@ fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>
     };
     // Choices by name first, as others often follow from them; then numbers; last what some do not have, and lists.
     let rank = |key: &&&String| {
-        let mut values = peers.iter().map(|peer| peer.get(**key));
-        if !values
-            .clone()
-            .all(|it| it.is_some_and(|it| !it.starts_with('[')))
-        {
-            return 2;
+        let all = |is: fn(&String) -> bool| peers.iter().all(|it| it.get(**key).is_some_and(is));
+        match all(|it| !it.starts_with('[')) {
+            true => i32::from(all(|it| it.parse::<f64>().is_ok())),
+            false => 2,
         }
-        i32::from(values.all(|it| it.is_some_and(|it| it.parse::<f64>().is_ok())))
     };
     let mut in_order: Vec<&&String> = keys.iter().collect();
     in_order.sort_by_key(rank);
@@ -119,34 +116,22 @@ mod tests {
 
     #[test]
     fn what_differs_is_told_by_its_shortest_name() {
-        let a = settings("actors = 1\n[learner.adam]\nlr = 0.1\neps = 1\n[actor]\nlr = 2\n");
-        let b = settings(
-            "actors = 1\n[learner.adam]\nlr = 0.2\neps = 1\n[actor]\nlr = 3\n[model]\nx = [1]\n",
-        );
-        let both = [a.clone(), b.clone()];
-        assert_eq!(
-            differences(&a, &both),
-            ["actor.lr=2", "adam.lr=0.1", "x=unset"]
-        );
-        assert_eq!(
-            differences(&b, &both),
-            ["actor.lr=3", "adam.lr=0.2", "x=[1]"]
-        );
-        assert_eq!(differences(&a, &[a.clone(), a.clone()]), [""; 0]);
-        let [wide, deep] = [
-            "conv = [8]\nheight = 60\ntorso = 'nature'\n",
-            "height = 64\ntorso = 'impala'\n",
-        ]
-        .map(settings);
-        assert_eq!(
-            differences(&deep, &[wide, deep.clone()]),
-            ["torso=impala", "height=64", "conv=unset"]
-        );
-        let many = settings("a = 1\nb = 1\nc = 1\nd = 1\ne = 1\n");
-        let none = BTreeMap::new();
-        assert_eq!(
-            differences(&many, &[none, many.clone()]).last().unwrap(),
-            "and 2 more settings"
-        );
+        let a = "actors = 1\n[learner.adam]\nlr = 0.1\neps = 1\n[actor]\nlr = 2\n";
+        let b =
+            "actors = 1\n[learner.adam]\nlr = 0.2\neps = 1\n[actor]\nlr = 3\n[model]\nx = [1]\n";
+        let wide = "conv = [8]\nheight = 60\ntorso = 'nature'\n";
+        let deep = "height = 64\ntorso = 'impala'\n";
+        let many = "a = 1\nb = 1\nc = 1\nd = 1\ne = 1\n";
+        for (own, other, expected) in [
+            (a, b, "actor.lr=2, adam.lr=0.1, x=unset"),
+            (b, a, "actor.lr=3, adam.lr=0.2, x=[1]"),
+            (a, a, ""),
+            (deep, wide, "torso=impala, height=64, conv=unset"),
+            (many, "", "a=1, b=1, c=1, and 2 more settings"),
+        ] {
+            let [own, other] = [own, other].map(settings);
+            let found = differences(&own, &[other, own.clone()]);
+            assert_eq!(found.join(", "), expected);
+        }
     }
 }

@@ -72,11 +72,10 @@ impl Run {
         let (settings, seed) = settings(&folder.config()).unzip();
         let run = settings.as_ref().and_then(|table| table.get("run"));
         let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
+        let what = word("world").zip(word("agent"));
         Ok(Self {
             name: folder_name(folder.path()),
-            what: word("world")
-                .zip(word("agent"))
-                .map(|(world, agent)| format!("{world} {agent}")),
+            what: what.map(|(world, agent)| format!("{world} {agent}")),
             settings,
             seed: seed.flatten(),
             folder: folder.clone(),
@@ -98,11 +97,11 @@ impl Run {
         let x = self.place(table, over.column())?;
         let place = self.place(table, column)?;
         let mut values = Vec::new();
+        let path = path.display();
         for (line, row) in (2..).zip(&table.rows) {
             let number = |text: &str| {
                 let number = text.parse::<f64>();
-                number
-                    .map_err(|_| usage!("{}, row {line}: {text:?} is not numeric", path.display()))
+                number.map_err(|_| usage!("{path}, row {line}: {text:?} is not numeric"))
             };
             // What was not known yet at a time is empty.
             if !row[place].is_empty() && !row[x].is_empty() {
@@ -175,9 +174,8 @@ pub(super) fn folder_name(folder: &Path) -> String {
 fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
     let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
     // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
-    let actors = table
-        .remove("local")
-        .and_then(|local| local.get("actors").cloned());
+    let local = table.remove("local");
+    let actors = local.and_then(|local| local.get("actors").cloned());
     table.extend(actors.map(|actors| ("actors".to_owned(), actors)));
     table.remove("transport");
     let seed = table.get_mut("run")?.as_table_mut()?.remove("seed");

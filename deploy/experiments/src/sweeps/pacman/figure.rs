@@ -21,16 +21,13 @@ pub(super) fn figure(results: &Results) -> Figure {
         for (index, &epsilon) in settings.predictability.epsilons.iter().enumerate() {
             let window = settings.predictability.frames as f64 * SMOOTH;
             let each = results.losses(column, epsilon);
-            let each = each.map(|it| smoothed(&it.points, window));
-            let curve = over_seeds(&each.collect::<Vec<_>>());
+            let each: Vec<_> = each.map(|it| smoothed(&it.points, window)).collect();
+            let curve = over_seeds(&each);
             series.push(curve.series(&format!("epsilon {epsilon}"), index));
         }
-        panels.push(Panel::Chart(Chart::new(
-            &format!("(a) DIM loss, {what} features"),
-            Axis::linear("frames"),
-            Axis::log("InfoNCE [nats]"),
-            series,
-        )));
+        let title = format!("(a) DIM loss, {what} features");
+        let (x, y) = (Axis::linear("frames"), Axis::log("InfoNCE [nats]"));
+        panels.push(Panel::Chart(Chart::new(&title, x, y, series)));
     }
     let titles = [
         "(b) One lethal ghost after another",
