@@ -27,7 +27,7 @@ use serde::{
 
 use crate::{
     flags::ExperimentFlags,
-    page::{page, summary},
+    page::{page, summary, time},
     progress::Progress,
 };
 
@@ -171,17 +171,8 @@ impl Session {
         self.at_once = at_once;
     }
 
-    /// The piece of this name, which is `units` of work: read if it is there, else made and kept.
-    pub(crate) fn piece<T: Serialize + DeserializeOwned>(
-        &mut self,
-        key: &str,
-        units: u64,
-        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
-    ) -> anyhow::Result<T> {
-        self.piece_of("", key, units, make)
-    }
-
-    /// [`Session::piece`] that was made of something which may have changed since, and then is made anew: `of` names it.
+    /// The piece of this name, which is `units` of work: read if it is there, else made and kept. `of` names what it is made of, which may
+    /// have changed since, and then it is made anew; nothing if it is made of the settings alone.
     pub(crate) fn piece_of<T: Serialize + DeserializeOwned>(
         &mut self,
         of: &str,
@@ -242,15 +233,8 @@ impl Session {
     /// Writes the page of this template with these values, says where it is, and ends.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
-        let cores = self.kept_piece(CORES);
-        let text = page(
-            template,
-            values,
-            self.smoke,
-            self.seconds,
-            self.at_once,
-            cores,
-        );
+        let time = time(self.seconds, self.at_once, self.kept_piece(CORES));
+        let text = page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
         write_whole(&path, text.as_bytes())?;
         print(&format!("{}{}\n", summary(&text), path.display()))
@@ -305,16 +289,16 @@ mod tests {
         let copied = report("wrong").unwrap();
         assert_eq!(copied.kept_piece::<u32>(CORES), None, "of another machine");
         let mut session = open("a").unwrap();
-        assert_eq!(session.piece("one", 2, |_| Ok(7)).unwrap(), 7);
-        let failed = session.piece::<u32>("two", 2, |_| anyhow::bail!("stopped"));
+        assert_eq!(session.piece_of("", "one", 2, |_| Ok(7)).unwrap(), 7);
+        let failed = session.piece_of::<u32>("", "two", 2, |_| anyhow::bail!("stopped"));
         assert!(failed.is_err());
 
-        let mut again = open("a").unwrap();
-        assert_eq!(again.piece("one", 2, |_| Ok(8)).unwrap(), 7, "it is kept");
-        assert_eq!(again.piece("two", 2, |_| Ok(8)).unwrap(), 8);
+        let made = |key: &str, made: u32| open("a").unwrap().piece_of("", key, 2, |_| Ok(made));
+        assert_eq!(made("one", 8).unwrap(), 7, "it is kept");
+        assert_eq!(made("two", 8).unwrap(), 8);
         // Cut off in the middle of a write by a crash of the machine.
         fs::write(folder.path().join("walk/pieces/one.json"), "{\"seconds\":").unwrap();
-        assert_eq!(open("a").unwrap().piece("one", 2, |_| Ok(9)).unwrap(), 9);
+        assert_eq!(made("one", 9).unwrap(), 9);
         assert!(open("b").unwrap_err().is::<Usage>());
         // What it was made of has changed.
         let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();

@@ -17,27 +17,24 @@ pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or(String::new(), |value| format!("{value:.decimals$}"))
 }
 
-/// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
-/// smoke length or not. `seconds` is the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores`
-/// where that is known.
-/// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
-pub(crate) fn page(
-    template: &str,
-    values: Value,
-    smoke: bool,
-    seconds: f64,
-    at_once: u32,
-    cores: Option<u32>,
-) -> String {
+/// What a page says of the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores` where that is
+/// known.
+pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {
     let at_once = match at_once {
         1 => String::new(),
         jobs => format!(" of runs, {jobs} at once,"),
     };
     let time = format!("{}{at_once}", rough_duration(seconds));
-    let time = match cores {
+    match cores {
         Some(cores) => format!("{time} on a machine with {cores} cores."),
         None => format!("{}.", time.trim_end_matches(',')),
-    };
+    }
+}
+
+/// The page of `template` as Markdown, with the values of the names in it. Its command is this one unless they have another; it was of the
+/// smoke length or not.
+/// The values are none of JSON's, which would make a null of NaN, and a mean would leave that out.
+pub(crate) fn page(template: &str, values: Value, smoke: bool, time: &str) -> String {
     let values = context! {
         time,
         smoke => if smoke { SMOKE } else { "" },
@@ -86,14 +83,10 @@ fn fill(template: &str, values: &Value) -> Result<String, Error> {
         of_list(&list, |all| Some(Spread::of(all.iter().copied())?.mean))
     });
     environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
-        let decimals = decimals.unwrap_or(3);
-        of_list(&list, |all| {
-            let spread = Spread::of(all.iter().copied())?;
-            Some(format!("{spread:.decimals$}"))
-        })
+        of_list(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
     });
     environment.add_filter("mean_and_sd", |list: Value, decimals: usize| {
-        of_list(&list, |all| mean_and_sd(all, decimals))
+        of_list(&list, |all| mean_and_sd(all, decimals, false))
     });
     environment.add_filter("interval", |list: Value, decimals: Option<usize>| {
         let decimals = decimals.unwrap_or(2);
@@ -136,14 +129,15 @@ fn of_list<T: Into<Value>>(list: &Value, of: impl Fn(&[f64]) -> Option<T>) -> Re
     Ok(of(&list_of(list)?).map_or_else(|| "-".into(), Into::into))
 }
 
-/// The mean, with the standard deviation of several values.
-fn mean_and_sd(values: &[f64], decimals: usize) -> Option<String> {
-    let Spread {
-        mean, sd, count, ..
-    } = Spread::of(values.iter().copied())?;
-    Some(match count {
-        1 => format!("{mean:.decimals$}"),
-        _ => format!("{mean:.decimals$} ± {sd:.decimals$}"),
+/// The mean, with the standard deviation of several values, `in_words` or behind a sign.
+fn mean_and_sd(values: &[f64], decimals: usize, in_words: bool) -> Option<String> {
+    let spread = Spread::of(values.iter().copied())?;
+    let [mean, sd] = [spread.mean, spread.sd].map(|it| format!("{it:.decimals$}"));
+    Some(match (spread.count, in_words) {
+        (1, false) => mean,
+        (1, true) => format!("{mean} (one seed)"),
+        (_, false) => format!("{mean} ± {sd}"),
+        (count, true) => format!("{mean} (standard deviation {sd} over {count} seeds)"),
     })
 }
 
@@ -162,8 +156,10 @@ mod tests {
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
         let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
-        let page =
-            |smoke, at_once, cores| page(template, values.clone(), smoke, 130.0, at_once, cores);
+        let page = |smoke, at_once, cores| {
+            let time = time(130.0, at_once, cores);
+            page(template, values.clone(), smoke, &time)
+        };
         let text = page(true, 1, Some(64));
         for part in [
             "# T\n",
@@ -188,6 +184,12 @@ mod tests {
         for (list, template, expected) in [
             (vec![1.0, 3.0], "{{ it | mean_and_sd(2) }}", "2.00 ± 1.41\n"),
             (vec![1.0], "{{ it | mean_and_sd(1) }}", "1.0\n"),
+            (vec![1.0], "{{ it | spread }}", "1.000 (one seed)\n"),
+            (
+                vec![1.0, 3.0],
+                "{{ it | spread(2) }}",
+                "2.00 (standard deviation 1.41 over 2 seeds)\n",
+            ),
             (vec![1.0], "{{ it | interval }}", "1.00 (one seed)\n"),
             (
                 vec![2.0],

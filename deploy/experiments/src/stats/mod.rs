@@ -38,21 +38,6 @@ impl Spread {
     }
 }
 
-impl fmt::Display for Spread {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let decimals = f.precision().unwrap_or(3);
-        let mean = self.mean;
-        match self.count {
-            1 => write!(f, "{mean:.decimals$} (one seed)"),
-            count => write!(
-                f,
-                "{mean:.decimals$} (standard deviation {:.decimals$} over {count} seeds)",
-                self.sd
-            ),
-        }
-    }
-}
-
 /// A mean and the interval in which it lies with 95% confidence if values are normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Interval {
@@ -102,10 +87,8 @@ pub(crate) fn difference(from: &[f64], to: &[f64]) -> Option<Difference> {
 }
 
 fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
-    let (from, to) = (
-        Spread::of(from.iter().copied())?,
-        Spread::of(to.iter().copied())?,
-    );
+    let [from, to] = [from, to].map(|it| Spread::of(it.iter().copied()));
+    let (from, to) = from.zip(to)?;
     let mean = to.mean - from.mean;
     if from.count < 2 || to.count < 2 {
         return Some(Interval { mean, ends: None });
@@ -160,11 +143,8 @@ fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
     }
     let total: f64 = all.iter().sum();
     let apart = |dealt: u32| {
-        let chosen = all
-            .iter()
-            .enumerate()
-            .filter(|(at, _)| dealt >> at & 1 == 1);
-        let sum: f64 = chosen.map(|(_, value)| value).sum();
+        let chosen = (0..all.len()).filter(|at| dealt >> at & 1 == 1);
+        let sum: f64 = chosen.map(|at| all[at]).sum();
         (sum / to.len() as f64 - (total - sum) / from.len() as f64).abs()
     };
     let seen = apart(((1 << to.len()) - 1) << from.len());

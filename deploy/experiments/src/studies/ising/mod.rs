@@ -50,7 +50,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let key = format!("seed{seed}");
-        trained.push(session.piece(&key, settings.updates, |progress| {
+        trained.push(session.piece_of("", &key, settings.updates, |progress| {
             train(&task, seed.into(), progress)
         })?);
     }

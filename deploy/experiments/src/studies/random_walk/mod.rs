@@ -39,7 +39,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     for (sampling, alpha, seed) in grid {
         let chain = Chain::new(settings.states, alpha);
         let key = format!("{}-alpha{alpha}-seed{seed}", sampling.name());
-        let learnt = session.piece(&key, settings.updates, |progress| {
+        let learnt = session.piece_of("", &key, settings.updates, |progress| {
             train(&chain, &settings, sampling, seed.into(), progress)
         })?;
         let share = settings.share_reached * chain.mutual_information();
