@@ -93,20 +93,13 @@ fn folders(args: &PlotArgs) -> anyhow::Result<Vec<RunFolder>> {
     let (runs, others): (Vec<_>, Vec<_>) = folders.partition(|it| it.metrics().is_file());
     if runs.is_empty() {
         let named: Vec<String> = others.iter().map(|it| it.display().to_string()).collect();
-        let metrics = others[0].metrics();
-        let file = metrics.file_name().unwrap_or_default();
-        return Err(usage!(
-            "{} is not the folder of a run: there is no {} in it",
-            named.join(", "),
-            file.display()
-        )
-        .into());
+        let (named, metrics) = (named.join(", "), others[0].metrics());
+        let file = metrics.file_name().unwrap_or_default().display();
+        return Err(usage!("{named} is not the folder of a run: there is no {file} in it").into());
     }
     for other in others {
-        console::line(&format!(
-            "left out {}: it is not the folder of a run",
-            other.display()
-        ));
+        let other = other.display();
+        console::line(&format!("left out {other}: it is not the folder of a run"));
     }
     Ok(runs)
 }
@@ -123,13 +116,12 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         columns => columns.iter().map(named).collect(),
     };
     let groups = groups::of(&runs, !args.separate);
+    let is_return = |column: &String| column == RETURN || column == EVALUATED;
+    if args.random.is_some() && !columns.iter().any(is_return) {
+        return Err(usage!("--random is a line over {RETURN:?}, which is not drawn").into());
+    }
     let random = match args.random {
-        Some(episodes) if columns.iter().any(|it| it == RETURN || it == EVALUATED) => {
-            at_random(&runs, episodes as usize)?
-        }
-        Some(_) => {
-            return Err(usage!("--random is a line over {RETURN:?}, which is not drawn").into());
-        }
+        Some(episodes) => at_random(&runs, episodes as usize)?,
         None => Vec::new(),
     };
     let mut panels = Vec::new();
@@ -140,7 +132,6 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         }
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);
-        let is_return = column == RETURN || column == EVALUATED;
         let mut series = Vec::new();
         for (index, group) in groups.iter().enumerate() {
             // Agents differ in their losses: what another one reports is not drawn for this one.
@@ -156,7 +147,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         if column == RETURN || !(args.column.is_empty() || is_loss) {
             absent(column, &runs).for_each(|line| console::line(&line));
         }
-        if is_return {
+        if is_return(column) {
             series.extend(lines(&random, &series, groups.len()));
         }
         let (title, y) = match is_loss {
