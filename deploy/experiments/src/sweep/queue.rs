@@ -68,19 +68,16 @@ pub(crate) fn make<P>(
         queue.stop(progress);
         return Err(e);
     }
-    let mut swept = Swept {
-        made: Vec::new(),
-        missing: Vec::new(),
-    };
+    let (mut made, mut missing) = (Vec::new(), Vec::new());
     for (point, plan) in plans {
         match queue.runs.finished(&plan) {
-            Some(run) => swept.made.push(Made { point, plan, run }),
-            None => swept.missing.push(plan.name),
+            Some(run) => made.push(Made { point, plan, run }),
+            None => missing.push(plan.name),
         }
     }
-    let seconds = swept.made.iter().map(|it| it.run.summary.wall_seconds);
+    let seconds = made.iter().map(|it| it.run.summary.wall_seconds);
     session.spend(seconds.sum(), jobs);
-    Ok(swept)
+    Ok(Swept { made, missing })
 }
 
 /// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
@@ -94,9 +91,8 @@ pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<(
             ..plan.call.clone()
         };
         if !known.contains(&call) {
-            let config = call
-                .config()
-                .map_err(|e| usage!("the run {}: {e}", plan.name))?;
+            let config = call.config();
+            let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
             config.world.install(&mut console::line)?;
             known.push(call);
         }
@@ -106,9 +102,8 @@ pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<(
 
 /// The commit that this program was built from, as its `--version` says in brackets.
 fn commit() -> anyhow::Result<String> {
-    let output = Command::new(process_env::program())
-        .arg("--version")
-        .output();
+    let mut command = Command::new(process_env::program());
+    let output = command.arg("--version").output();
     let output = output.context("asking this program for its version")?;
     let text = String::from_utf8_lossy(&output.stdout);
     let text = text.trim().strip_suffix(')');
@@ -248,11 +243,8 @@ impl Queue {
     ) -> anyhow::Result<Option<Running>> {
         let path = self.runs.log(&plan);
         let doing = || format!("making {}", path.display());
-        let log = File::options()
-            .create(true)
-            .append(true)
-            .open(&path)
-            .with_context(doing)?;
+        let log = File::options().create(true).append(true).open(&path);
+        let log = log.with_context(doing)?;
         wait_for_the_last(&log, &plan, progress)?;
         if self.runs.finished(&plan).is_some() {
             progress.find(plan.units);

@@ -2,8 +2,7 @@
 //! It starts none.
 
 use std::{
-    fs::{self, File},
-    io::{Read, Seek, SeekFrom},
+    fs,
     path::{Path, PathBuf},
 };
 
@@ -16,7 +15,7 @@ use crate::cache::RUNS;
 /// Seeds up to which finished runs are looked for.
 pub(crate) const SEEDS_FOUND_MAX: u32 = 64;
 /// Bytes at the end of a run's output that are shown if it fails.
-const LAST_WORDS_BYTES: u64 = 1200;
+const LAST_WORDS_BYTES: usize = 1200;
 
 /// The folder of a sweep's runs.
 pub(crate) struct Runs {
@@ -87,7 +86,9 @@ impl Runs {
 
     /// The end of what the run's process printed.
     pub(super) fn last_words(&self, plan: &PlannedRun) -> String {
-        tail(&self.log(plan), LAST_WORDS_BYTES).unwrap_or_default()
+        let text = fs::read(self.log(plan)).unwrap_or_default();
+        let start = text.len().saturating_sub(LAST_WORDS_BYTES);
+        String::from_utf8_lossy(&text[start..]).into_owned()
     }
 
     pub(super) fn folder(&self, plan: &PlannedRun) -> RunFolder {
@@ -118,16 +119,6 @@ pub(super) fn move_aside(folder: &Path) -> anyhow::Result<Option<PathBuf>> {
     let aside = free.expect("there are more numbers than folders");
     fs::rename(folder, &aside).with_context(|| format!("moving {} aside", folder.display()))?;
     Ok(Some(aside))
-}
-
-fn tail(path: &Path, bytes: u64) -> Option<String> {
-    let mut file = File::open(path).ok()?;
-    let length = file.metadata().ok()?.len();
-    file.seek(SeekFrom::Start(length.saturating_sub(bytes)))
-        .ok()?;
-    let mut end = Vec::new();
-    file.read_to_end(&mut end).ok()?;
-    Some(String::from_utf8_lossy(&end).into_owned())
 }
 
 #[cfg(test)]

@@ -278,8 +278,8 @@ impl Tradeoff<'_> {
         // A random policy plays once.
         self.session.work().1.again(work + units);
         let common = self.settings.common.clone();
-        let Swept { made, missing } =
-            queue::make(&mut self.session, wanted, common.jobs, report_only)?;
+        let session = &mut self.session;
+        let Swept { made, missing } = queue::make(session, wanted, common.jobs, report_only)?;
         let play = Played {
             levels: Levels::Train,
             checkpoints: 1,
@@ -295,14 +295,14 @@ impl Tradeoff<'_> {
             if random.is_empty() {
                 random = play.random(&mut self.session, "random", &run)?;
             }
+            let result = points.entry(point.key.clone()).or_default();
             // One run is enough: seeds differ in what they learned, not in how exactly it is computed.
-            if !points.contains_key(&point.key) {
-                let mut measured = self.exactness(&point, &run)?;
-                measured.extend(self.speeds.get(&point.key).cloned().unwrap_or_default());
-                let seeds = Vec::new();
-                points.insert(point.key.clone(), PointResult { measured, seeds });
+            if result.seeds.is_empty() {
+                result.measured = self.exactness(&point, &run)?;
+                let speed = self.speeds.get(&point.key).cloned();
+                result.measured.extend(speed.unwrap_or_default());
             }
-            points.entry(point.key).or_default().seeds.push(SeedResult {
+            result.seeds.push(SeedResult {
                 seed: plan.call.seed,
                 ran: run,
                 greedy: greedy.unwrap_or_default(),
