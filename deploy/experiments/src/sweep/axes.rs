@@ -31,9 +31,8 @@ impl Axis {
     pub(crate) fn parse(text: &str) -> Result<Self, Usage> {
         let form =
             "--set takes table.key=value,value,.., such as learner.update.adam.lr=1e-4,2.5e-4";
-        let (name, values) = text
-            .split_once('=')
-            .ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
+        let parts = text.split_once('=');
+        let (name, values) = parts.ok_or_else(|| usage!("--set {text:?} has no '='; {form}"))?;
         let values = split(values).into_iter();
         let axis = Self {
             name: name.trim().into(),

@@ -154,14 +154,11 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let predictability = &mut settings.predictability;
     predictability.frames = args.frames.unwrap_or(predictability.frames);
     for continual in [&mut settings.continual, &mut settings.noise] {
-        let episodes = args
-            .episodes_per_task
-            .unwrap_or(continual.episodes_per_task);
-        if !episodes.is_multiple_of(continual.envs) {
+        let (given, envs) = (args.episodes_per_task, continual.envs);
+        let episodes = given.unwrap_or(continual.episodes_per_task);
+        if !episodes.is_multiple_of(envs) {
             return Err(usage!(
-                "--episodes-per-task {episodes} is not a multiple of the {} environments, each of which changes its ghost \
-                 by itself",
-                continual.envs
+                "--episodes-per-task {episodes} is not a multiple of the {envs} environments, each of which changes its ghost by itself"
             ));
         }
         continual.episodes_per_task = episodes;

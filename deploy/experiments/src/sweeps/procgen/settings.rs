@@ -1,5 +1,7 @@
 //! What table 1 can be told, what the command line replaces of it, and the runs that follow.
 
+use std::collections::BTreeSet;
+
 use driml_envs::WorldName;
 use driml_launch::evaluate::Levels;
 use driml_machine::error::{Usage, usage};
@@ -20,15 +22,7 @@ pub(super) const CHECKPOINTS: u32 = 3;
 /// Playing a run as a part of making it; only the estimate of the time left depends on it.
 const PLAY_SHARE: u64 = 10;
 /// The paper's agents, in the order of its table 1.
-const AGENTS: [&str; 7] = [
-    "c51",
-    "cpc",
-    "curl",
-    "driml-noact",
-    "driml-randk",
-    "driml-fix",
-    "driml-ada",
-];
+const AGENTS: &str = "c51 cpc curl driml-noact driml-randk driml-fix driml-ada";
 /// Agents that look a fixed k ahead, so that another k can be asked for.
 const OF_FIXED_K: [&str; 2] = ["driml-fix", "driml-noact"];
 
@@ -121,17 +115,15 @@ impl Settings {
 
 /// Worlds by their names or their games', each once; `all` is every game.
 fn worlds(names: &[String]) -> Result<Vec<String>, Usage> {
-    once(names, |name| {
-        Ok(match name {
-            "all" => {
-                let games = WorldName::all().filter(|it| it.kind() == "procgen");
-                games.map(|world| world.to_string()).collect()
-            }
-            name => {
-                let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
-                vec![world.to_string()]
-            }
-        })
+    once(names, |name| match name {
+        "all" => {
+            let games = WorldName::all().filter(|it| it.kind() == "procgen");
+            Ok(games.map(|world| world.to_string()).collect())
+        }
+        name => {
+            let world = presets::world(name).map_err(|e| usage!("--games: {e}"))?;
+            Ok(vec![world.to_string()])
+        }
     })
 }
 
@@ -148,7 +140,7 @@ fn with_k(name: &str) -> (&str, Option<u32>) {
 fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
     once(names, |name| {
         Ok(match (name, with_k(name)) {
-            ("all", _) => AGENTS.map(String::from).into(),
+            ("all", _) => AGENTS.split(' ').map(String::from).collect(),
             (_, (agent, None)) => vec![presets::agent(agent)?.name.to_owned()],
             (_, (agent, Some(k))) => vec![format!("{}-k{k}", presets::agent(agent)?.name)],
         })
@@ -160,15 +152,11 @@ fn once(
     names: &[String],
     of: impl Fn(&str) -> Result<Vec<String>, Usage>,
 ) -> Result<Vec<String>, Usage> {
-    let mut kept: Vec<String> = Vec::new();
-    for name in names {
-        for found in of(name)? {
-            if !kept.contains(&found) {
-                kept.push(found);
-            }
-        }
-    }
-    Ok(kept)
+    let all = names.iter().map(|name| of(name));
+    let all = all.collect::<Result<Vec<_>, _>>()?.concat();
+    let mut seen = BTreeSet::new();
+    let new = |name: &String| seen.insert(name.clone());
+    Ok(all.into_iter().filter(new).collect())
 }
 
 #[cfg(test)]
