@@ -54,47 +54,36 @@ pub(super) struct Measure {
     pub(super) of: fn(&SeedResult) -> Option<f64>,
 }
 
+const fn measure(name: &'static str, of: fn(&SeedResult) -> Option<f64>) -> Measure {
+    Measure { name, of }
+}
+
 /// Mean of the greedily played episodes.
-pub(super) const GREEDY: Measure = Measure {
-    name: "greedy_return",
-    of: |it| mean(&it.greedy),
-};
+pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
 /// Mean of the last 100 training episodes.
-pub(super) const TRAINING: Measure = Measure {
-    name: "training_return",
-    of: |it| it.ran.summary.mean_return,
-};
-pub(super) const FRAMES_PER_SECOND: Measure = Measure {
-    name: "frames_per_second",
-    of: |it| Some(it.ran.summary.frames_per_second),
-};
+pub(super) const TRAINING: Measure = measure("training_return", |it| it.ran.summary.mean_return);
+pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| {
+    Some(it.ran.summary.frames_per_second)
+});
 /// All measures, in the order of the data.
 pub(super) const MEASURES: [Measure; 7] = [
     GREEDY,
     TRAINING,
     FRAMES_PER_SECOND,
-    Measure {
-        name: "wall_seconds",
-        of: |it| Some(it.ran.summary.wall_seconds),
-    },
+    measure("wall_seconds", |it| Some(it.ran.summary.wall_seconds)),
     // Highest resident memory of all processes.
-    Measure {
-        name: "rss_mib",
-        of: |it| {
-            let each = it.ran.summary.rss_mib_max.values();
-            Some(each.filter_map(Value::as_f64).sum())
-        },
-    },
+    measure("rss_mib", |it| {
+        let each = it.ran.summary.rss_mib_max.values();
+        Some(each.filter_map(Value::as_f64).sum())
+    }),
     // Updates by which the weights that acted were behind, median.
-    Measure {
-        name: "weights_behind_updates",
-        of: |it| Some(it.ran.summary.replay.weights_behind_updates?.p50),
-    },
+    measure("weights_behind_updates", |it| {
+        Some(it.ran.summary.replay.weights_behind_updates?.p50)
+    }),
     // Seconds for which newer weights had been there, median.
-    Measure {
-        name: "weights_behind_seconds",
-        of: |it| Some(it.ran.summary.replay.weights_behind_s?.p50),
-    },
+    measure("weights_behind_seconds", |it| {
+        Some(it.ran.summary.replay.weights_behind_s?.p50)
+    }),
 ];
 
 impl PointResult {
