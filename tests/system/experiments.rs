@@ -111,6 +111,8 @@ fn stability() {
 fn procgen_without_the_engine() {
     let system = system();
     let call = "experiment procgen --smoke";
+    // What is rejected leaves the folder to the corrected call.
+    system.refuses(&format!("{call} --set learner.batchsize=1"), "no setting");
     system.run_ok(call);
     let folder = system.path("experiments/procgen");
     let files = "curves.png curves.svg table.csv";

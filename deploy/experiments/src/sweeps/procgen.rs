@@ -52,27 +52,3 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     session.finish(include_str!("procgen.md.j2"), values)?;
     plan::check_made(&missing, report)
 }
-
-#[cfg(test)]
-mod tests {
-    use clap::Parser;
-    use driml_machine::error::Usage;
-
-    use super::*;
-
-    #[derive(Parser)]
-    struct CommandLine {
-        #[command(flatten)]
-        args: ProcgenArgs,
-    }
-
-    #[test]
-    fn a_setting_that_is_rejected_leaves_the_folder_to_the_corrected_call() {
-        let root = tempfile::tempdir().unwrap();
-        let out = format!("--out={}", root.path().join("x").display());
-        let words = ["procgen", "--smoke", "--set=learner.batchsize=64", &out];
-        let rejected = run(&CommandLine::parse_from(words).args).unwrap_err();
-        assert!(rejected.is::<Usage>(), "{rejected}");
-        assert!(!root.path().join("x").exists());
-    }
-}
