@@ -102,10 +102,8 @@ fn welch(from: &[f64], to: &[f64]) -> Option<Interval> {
             student_quantile((sum * sum / each) as usize) * sum.sqrt()
         }
     };
-    Some(Interval {
-        mean,
-        ends: Some((mean - by, mean + by)),
-    })
+    let ends = Some((mean - by, mean + by));
+    Some(Interval { mean, ends })
 }
 
 /// Samples of [`apart_by_chance`].
@@ -151,12 +149,8 @@ fn chance_of_difference(from: &[f64], to: &[f64]) -> Option<f64> {
     // Sums in another order may differ in their last places.
     let least = seen - 1e-9 * (1.0 + seen);
     let deals = (0..1u32 << all.len()).filter(|it| it.count_ones() as usize == to.len());
-    let (mut far, mut count) = (0u32, 0u32);
-    for deal in deals {
-        count += 1;
-        far += u32::from(apart(deal) >= least);
-    }
-    Some(f64::from(far) / f64::from(count))
+    let (far, near): (Vec<_>, Vec<_>) = deals.partition(|&deal| apart(deal) >= least);
+    Some(far.len() as f64 / (far.len() + near.len()) as f64)
 }
 
 impl fmt::Display for Interval {

@@ -2,7 +2,7 @@
 //! 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Their bootstrap intervals are for more seeds than
 //! runs of days allow; these are Student's. It normalises nothing.
 
-use crate::stats::{Interval, interval};
+use crate::stats::{Interval, auc, interval};
 
 /// Scores by game and seed: `scores[game][seed]`. Nothing follows from no game, or from one without a score.
 pub(crate) type Scores = Vec<Vec<f64>>;
@@ -19,7 +19,7 @@ pub(crate) fn improvement(x: &Scores, y: &Scores) -> Option<Interval> {
     assert_eq!(x.len(), y.len(), "the same games");
     let found = estimate(&[x, y], |it| {
         let games = it[0].iter().zip(&it[1]);
-        games.map(|(x, y)| better(x, y)).sum::<f64>() / it[0].len() as f64
+        games.filter_map(|(x, y)| auc(x, y)).sum::<f64>() / it[0].len() as f64
     })?;
     let ends = found.ends.map(|(low, high)| (low.max(0.0), high.min(1.0)));
     Some(Interval { ends, ..found })
@@ -32,17 +32,6 @@ fn interquartile_mean<'a>(scores: impl Iterator<Item = &'a f64>) -> f64 {
     let cut = all.len() / 4;
     let middle = &all[cut..all.len() - cut];
     middle.iter().sum::<f64>() / middle.len() as f64
-}
-
-/// Share of the pairs in which x is larger; equal ones count half.
-fn better(x: &[f64], y: &[f64]) -> f64 {
-    let pairs = x.iter().flat_map(|x| y.iter().map(move |y| (x, y)));
-    let wins = pairs.map(|(x, y)| match x.total_cmp(y) {
-        std::cmp::Ordering::Greater => 1.0,
-        std::cmp::Ordering::Equal => 0.5,
-        std::cmp::Ordering::Less => 0.0,
-    });
-    wins.sum::<f64>() / (x.len() * y.len()) as f64
 }
 
 /// `of` the groups, and its interval over seeds by the jackknife: Student's interval of the pseudo-values
