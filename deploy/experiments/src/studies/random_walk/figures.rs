@@ -67,11 +67,8 @@ fn numerical(results: &Results, value: impl Fn(&[f64], usize) -> f64) -> Series 
 }
 
 fn information(results: &Results) -> Panel {
-    let learnt = results.settings.alphas.iter().map(|&alpha| {
-        let all = results.chain(alpha).mutual_information();
-        let each = results.of(Sampling::Stationary, alpha);
-        (alpha, each.map(|one| all - one.final_excess()).collect())
-    });
+    let alphas = results.settings.alphas.iter();
+    let learnt = alphas.map(|&alpha| (alpha, results.learnt_information(alpha)));
     let learnt = Curve::of_means(learnt).series("learnt", 1);
     let of_a_ring = Chain::mutual_information_of_a_ring;
     let ring = closed_form(results, "a ring, no ends", of_a_ring).coloured(GREY);
@@ -100,23 +97,13 @@ fn inverse_gap(results: &Results) -> Panel {
 pub(super) fn convergence(results: &Results) -> Figure {
     let settings = &results.settings;
     let times = |title: String, measure: Measure| {
-        let by_gap = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
-        let series = Sampling::ALL.iter().enumerate();
-        let series = series.map(|(index, &sampling)| {
-            let value = |one: &Trained| measure(one).map(|time| time as f64);
-            // Moved by a few percent, so that no point hides another.
-            let aside = 1.0 + 0.035 * (index as f64 - 1.0);
-            let at = |chain: &Chain| aside / chain.spectral_gap();
-            over_alphas(results, sampling, index, at, value)
-        });
-        let y = Axis::log("updates");
-        Panel::Chart(Chart::new(&title, by_gap, y, series.collect()))
+        let at = |chain: &Chain, aside: f64| (1.0 + 0.035 * aside) / chain.spectral_gap();
+        let series = by_sampling(results, at, |one| measure(one).map(|time| time as f64));
+        let x = Axis::log("1 / (1 - \u{3bb}\u{2082}) [steps]");
+        Panel::Chart(Chart::new(&title, x, Axis::log("updates"), series))
     };
-    let last = Sampling::ALL.iter().enumerate().map(|(index, &sampling)| {
-        let value = |one: &Trained| Some(one.final_tv());
-        let aside = 0.012 * (index as f64 - 1.0);
-        over_alphas(results, sampling, index, |chain| chain.alpha + aside, value)
-    });
+    let at = |chain: &Chain, aside: f64| chain.alpha + 0.012 * aside;
+    let last = by_sampling(results, at, |one| Some(one.final_tv()));
     let of_tv = format!("Updates until the law is within {}", settings.tv_reached);
     let share = 100.0 * (1.0 - settings.share_reached);
     let of_share = format!("Updates until {share:.0}% of I(S, S') is learnt");
@@ -134,25 +121,27 @@ pub(super) fn convergence(results: &Results) -> Figure {
             curves(results),
             times(of_tv, TV),
             times(of_share, SHARE),
-            Panel::Chart(Chart::new(&of_last, by_alpha(), y, last.collect())),
+            Panel::Chart(Chart::new(&of_last, by_alpha(), y, last)),
         ],
     }
 }
 
-/// Mean and range over seeds at each alpha.
-fn over_alphas(
+/// Of each sampling the mean and range over seeds at each alpha, moved aside by up to -1 or 1, so that no point hides another.
+fn by_sampling(
     results: &Results,
-    sampling: Sampling,
-    index: usize,
-    x: impl Fn(&Chain) -> f64,
+    x: impl Fn(&Chain, f64) -> f64,
     value: impl Fn(&Trained) -> Option<f64>,
-) -> Series {
-    let means = results.settings.alphas.iter().map(|&alpha| {
-        let values = results.of(sampling, alpha).filter_map(&value);
-        (x(&results.chain(alpha)), values.collect())
-    });
-    let curve = Curve::of_means(means).series(sampling.name(), index);
-    curve.marked(Mark::Bars)
+) -> Vec<Series> {
+    let of = |(index, &sampling): (usize, &Sampling)| {
+        let means = results.settings.alphas.iter().map(|&alpha| {
+            let values = results.of(sampling, alpha).filter_map(&value);
+            let x = x(&results.chain(alpha), index as f64 - 1.0);
+            (x, values.collect())
+        });
+        let curve = Curve::of_means(means).series(sampling.name(), index);
+        curve.marked(Mark::Bars)
+    };
+    Sampling::ALL.iter().enumerate().map(of).collect()
 }
 
 fn curves(results: &Results) -> Panel {

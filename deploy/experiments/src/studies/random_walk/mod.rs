@@ -64,10 +64,11 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let laws = results.settings.alphas.iter().map(|&alpha| {
         let chain = results.chain(alpha);
         let t = chain.transitions();
+        let learnt = Spread::of(results.learnt_information(alpha));
         let of_chain = [
             chain.mutual_information(),
             chain::mutual_information_numerically(&t, k),
-            results.learnt_information(alpha).mean,
+            learnt.expect("each bias has a seed").mean,
             chain.mutual_information_of_a_ring(),
             chain.mutual_information_as_printed(),
             chain.spectral_gap(),
