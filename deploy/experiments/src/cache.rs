@@ -155,7 +155,6 @@ impl Session {
         self.folder.join(PIECES).join(format!("{key}.json"))
     }
 
-    /// Where everything goes.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
@@ -225,7 +224,6 @@ impl Session {
         file.flush().with_context(doing)
     }
 
-    /// Writes a figure as SVG and PNG.
     pub(crate) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
         Ok(figure.save_both(&self.folder, stem)?)
     }

@@ -23,7 +23,6 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    /// Of `total` units.
     pub(crate) fn new(total: u64, shutdown: GracefulShutdown) -> Self {
         Self {
             total,
@@ -51,7 +50,6 @@ impl Progress {
         debug_assert!(self.done <= self.total, "more work than was announced");
     }
 
-    /// Units that are done.
     pub(crate) const fn done(&self) -> u64 {
         self.done
     }
@@ -74,7 +72,6 @@ impl Progress {
         Ok(())
     }
 
-    /// Writes a line above the bar.
     pub(crate) fn line(&self, line: &str) {
         self.screen.line(line);
     }

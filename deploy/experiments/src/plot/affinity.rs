@@ -9,7 +9,6 @@ use driml_machine::error::usage;
 
 use super::runs::folder_name;
 
-/// One heat map a run.
 pub(crate) fn figure(folders: &[RunFolder]) -> anyhow::Result<Figure> {
     let panels = folders.iter().map(|it| heat(it).map(Panel::Heat));
     let panels = panels.collect::<anyhow::Result<Vec<_>>>()?;

@@ -31,7 +31,6 @@ use self::{
 };
 use crate::plot::flags::PlotArgs;
 
-/// Width and height of a chart.
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column over which a random policy is a line.
 const RETURN: &str = "mean_return";

@@ -24,7 +24,6 @@ pub(crate) struct Run {
     pub(super) name: String,
     /// World and agent, if the settings say.
     pub(super) what: Option<String>,
-    /// The seed, if the settings say.
     pub(super) seed: Option<i64>,
     /// The settings without seed and without what the machine decides; none if there are none.
     pub(super) settings: Option<toml::Table>,
@@ -162,7 +161,6 @@ impl Run {
     }
 }
 
-/// The last part of a folder's path.
 pub(super) fn folder_name(folder: &Path) -> String {
     let whole = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     let name = whole.file_name().unwrap_or(folder.as_os_str());

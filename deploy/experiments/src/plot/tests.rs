@@ -37,7 +37,6 @@ impl Runs {
     }
 }
 
-/// The picture that a call draws.
 fn drawn(args: &PlotArgs) -> String {
     run(args).unwrap();
     std::fs::read_to_string(&args.out).unwrap()

@@ -21,7 +21,6 @@ pub(crate) struct Spread {
 }
 
 impl Spread {
-    /// Of these values; none of no value.
     pub(crate) fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let values: Vec<f64> = values.into_iter().collect();
         if values.is_empty() {

@@ -25,7 +25,6 @@ pub(crate) struct Call {
 }
 
 impl Call {
-    /// As words of a command line.
     pub(crate) fn args(&self) -> Vec<String> {
         let named = [
             ("--env", self.env.clone()),
@@ -63,7 +62,6 @@ pub(crate) struct PlannedRun {
     /// Its folder's name.
     pub(crate) name: String,
     pub(crate) call: Call,
-    /// Its length in frames.
     pub(crate) frames: u64,
     /// Episodes after which it is long enough, if that comes first.
     pub(crate) episodes: Option<u64>,
@@ -105,7 +103,6 @@ pub(crate) struct Made<P> {
 pub(crate) struct Swept<P> {
     /// The finished runs, in the order of their plans.
     pub(crate) made: Vec<Made<P>>,
-    /// The names of those that are missing.
     pub(crate) missing: Vec<String>,
 }
 

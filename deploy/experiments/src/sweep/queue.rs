@@ -113,7 +113,6 @@ fn commit() -> anyhow::Result<String> {
 
 struct Queue {
     runs: Runs,
-    /// Runs at once.
     jobs: u32,
     /// Of this program.
     commit: String,
@@ -122,7 +121,6 @@ struct Queue {
     running: Vec<Running>,
 }
 
-/// A child and how far it is.
 struct Running {
     plan: PlannedRun,
     /// Which try this is, from 1.

@@ -17,7 +17,6 @@ pub(crate) const SEEDS_FOUND_MAX: u32 = 64;
 /// Bytes at the end of a run's output that are shown if it fails.
 const LAST_WORDS_BYTES: usize = 1200;
 
-/// The folder of a sweep's runs.
 pub(crate) struct Runs {
     root: PathBuf,
 }

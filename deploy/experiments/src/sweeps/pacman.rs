@@ -19,9 +19,7 @@ use crate::{
     sweep::{plan, queue},
 };
 
-/// Names of ghosts 0 to 3.
 const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
-/// How the page names (b) and (c).
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {

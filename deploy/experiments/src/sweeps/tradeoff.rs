@@ -49,7 +49,6 @@ const OVERHEAD: f64 = 1.3;
 /// Seconds that processes take to start, and to save and end.
 const START_SECONDS: f64 = 4.0;
 
-/// A call under way.
 struct Tradeoff<'a> {
     args: &'a TradeoffArgs,
     settings: Settings,
@@ -124,7 +123,6 @@ fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow:
     Ok(())
 }
 
-/// Seconds of a run, about.
 fn estimate(config: &RunConfig, speed: &Measured) -> f64 {
     let updates = config.updates() as f64 * speed["update_seconds"];
     let actions = config.frames() as f64 * speed["act_seconds"];
@@ -132,7 +130,6 @@ fn estimate(config: &RunConfig, speed: &Measured) -> f64 {
 }
 
 impl Tradeoff<'_> {
-    /// Work of a piece of measuring.
     fn piece_units(&self) -> u64 {
         self.settings.common.frames / PIECE_SHARE
     }

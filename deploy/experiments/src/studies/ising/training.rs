@@ -263,7 +263,6 @@ pub(super) struct View {
     pub(super) side: usize,
     /// Pixels from one location's field to the next one's.
     pub(super) step: usize,
-    /// Locations in a row.
     pub(super) columns: usize,
 }
 

@@ -31,7 +31,6 @@ pub(super) struct Settings {
     pub(super) updates: u64,
     /// Pairs in a batch, each with all others as negatives.
     pub(super) batch_size: usize,
-    /// Width of the heads.
     pub(super) embedding_dim: usize,
     /// Rows sampled per transition of a single walker.
     pub(super) replay_ratio: f64,
@@ -281,7 +280,6 @@ impl Source {
     }
 }
 
-/// An index drawn by its probability.
 fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
     let mut left: f64 = rng.random();
     for (index, p) in law.iter().enumerate() {

@@ -50,7 +50,6 @@ pub(super) struct Trace {
 }
 
 impl Results {
-    /// Reads the metrics of the finished runs.
     pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
         let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
         for Made { point, plan, run } in swept.made {

@@ -26,10 +26,8 @@ pub(super) struct Settings {
     /// Seeds 1 to this.
     #[serde(skip_serializing)]
     pub(super) seeds: u32,
-    /// Runs at once.
     #[serde(skip_serializing)]
     pub(super) jobs: u32,
-    /// As `--preset` takes it.
     pub(super) preset: String,
     /// What differs from the preset in every run, in the form of `--set`.
     pub(super) sets: Vec<String>,
@@ -73,7 +71,6 @@ pub(super) const PARTS: usize = 2;
 /// As files name them.
 pub(super) const PART_NAMES: [&str; PARTS] = ["ghosts", "noise"];
 
-/// What a run is for.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Point {
     /// (a): ghosts that move at random with this probability.
@@ -83,7 +80,6 @@ pub(super) enum Point {
 }
 
 impl Settings {
-    /// Those of (b) or (c).
     pub(super) const fn tasks(&self, part: usize) -> &Continual {
         [&self.continual, &self.noise][part]
     }

@@ -27,7 +27,6 @@ const PAPER_FRAMES: f64 = 50e6;
 /// Seeds of each game and agent from which on scores over all games are made.
 const SEEDS_MIN: usize = 3;
 
-/// A run and how it plays.
 pub(super) struct Scored {
     pub(super) made: Made<Point>,
     /// Returns of its agent, played greedily.
@@ -94,7 +93,6 @@ pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Gam
     games.into_iter().map(game).collect()
 }
 
-/// A line a run.
 pub(super) fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
     let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     let mut rows = Vec::new();

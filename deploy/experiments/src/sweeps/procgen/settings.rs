@@ -46,7 +46,6 @@ pub(super) struct Settings {
     pub(super) episodes: u32,
 }
 
-/// Where in the sweep a run is.
 #[derive(Debug)]
 pub(super) struct Point {
     /// The world's name as files have it.
@@ -55,7 +54,6 @@ pub(super) struct Point {
 }
 
 impl Settings {
-    /// The settings of the length asked for.
     pub(super) fn of(args: &ProcgenArgs) -> Result<Self, Usage> {
         let mut settings: Self =
             flags::settings(NAME, include_str!("../procgen.toml"), args.flags.smoke);

@@ -18,9 +18,7 @@ pub(super) struct Dial {
     pub(super) name: String,
     /// The name of the level that the settings of the world have.
     pub(super) base: String,
-    /// What the other levels are expected to buy.
     buys: String,
-    /// Why they are expected to cost accuracy.
     costs: String,
     /// The agent of its base; C51 if it names none.
     #[serde(default = "c51")]
@@ -68,14 +66,12 @@ pub(super) struct LevelOf {
 }
 
 impl LevelOf {
-    /// As the page has it.
     pub(super) fn name(&self) -> String {
         format!("{} = {}", self.dial.name, self.level)
     }
 }
 
 impl Dial {
-    /// Its levels, and what each is made with.
     fn levels(&self, is_asked: bool) -> impl Iterator<Item = LevelOf> {
         let base = Point {
             key: self.agent.clone(),
@@ -133,7 +129,6 @@ pub(super) fn length(smoke: bool) -> Length {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct WorldBase {
-    /// Frames of a run.
     pub(super) frames: u64,
     /// In the form of `--set`.
     pub(super) sets: Vec<String>,

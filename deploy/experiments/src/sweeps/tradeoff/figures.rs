@@ -6,7 +6,6 @@ use super::results::{FRAMES_PER_SECOND, Measure, PointResult, Results};
 use crate::{plot::over_seeds, stats::Spread};
 
 const COLUMNS: usize = 3;
-/// Width and height of a panel.
 const PANEL: (f64, f64) = (330.0, 250.0);
 
 #[derive(Clone, Copy, Debug, PartialEq)]

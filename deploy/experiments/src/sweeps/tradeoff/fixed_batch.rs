@@ -11,7 +11,6 @@ use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Environments that are played.
 const ENVS: usize = 16;
 /// Steps over which the rows of an environment are spread evenly.
 const SPAN: usize = 512;

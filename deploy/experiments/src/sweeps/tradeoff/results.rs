@@ -37,11 +37,9 @@ pub(super) struct Results {
     pub(super) levels: Vec<LevelOf>,
     /// By the point's key.
     pub(super) points: BTreeMap<String, PointResult>,
-    /// Returns of the random policy.
     pub(super) random: Vec<f64>,
     /// Levels that have no run.
     pub(super) left_out: Vec<String>,
-    /// Runs that failed.
     pub(super) missing: Vec<String>,
     /// The calls that made it.
     pub(super) commands: Vec<String>,
@@ -87,12 +85,10 @@ pub(super) const MEASURES: [Measure; 7] = [
 ];
 
 impl PointResult {
-    /// What each run gave, by its seed.
     pub(super) fn values(&self, measure: Measure) -> Vec<f64> {
         self.seeds.iter().filter_map(measure.of).collect()
     }
 
-    /// The mean over seeds, with its interval.
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
         interval(&self.values(measure))
     }

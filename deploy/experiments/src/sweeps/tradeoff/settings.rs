@@ -66,7 +66,6 @@ pub(super) fn of(
 }
 
 impl Settings {
-    /// Seeds of a point, from 1.
     pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
         match is_base {
             true => BASE_SEEDS * self.seeds,

@@ -10,7 +10,6 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{fixed_batch, results::Measured};
 
-/// What is timed.
 struct Side {
     agent: Agent,
     held: OwnedBatch,
