@@ -105,7 +105,10 @@ fn settings(args: &SweepArgs, kept: Option<Settings>) -> anyhow::Result<(Setting
 fn axes_of(args: &SweepArgs) -> anyhow::Result<Vec<Axis>> {
     let mut axes = Vec::new();
     for (name, values) in [("env", &args.env), ("agent", &args.agent)] {
-        let axis = Axis::of_flag(name, values);
+        let axis = Axis {
+            name: name.into(),
+            values: values.clone(),
+        };
         axis.check(&format!("--{name} takes a list, such as --{name} A,B"))?;
         axes.extend((!values.is_empty()).then_some(axis));
     }
@@ -224,11 +227,12 @@ mod tests {
     #[test]
     fn folders_are_named_for_what_changes() {
         let axes = [
-            Axis::of_flag("env", &["procgen:maze".into()]),
-            Axis::of_flag("agent", &["c51".into(), "curl".into()]),
-            Axis::parse("learner.update.adam.lr=1e-4,2.5e-4").unwrap(),
-            Axis::parse("run.horizon=[1, 2],x y").unwrap(),
-        ];
+            "env=procgen:maze",
+            "agent=c51,curl",
+            "learner.update.adam.lr=1e-4,2.5e-4",
+            "run.horizon=[1, 2],x y",
+        ]
+        .map(|it| Axis::parse(it).unwrap());
         let cells = cells(&axes, 1).unwrap();
         let name = |at: usize| folder_name(&axes, &cells[at], at);
         assert_eq!(name(0), "1-c51-lr=1e-4-horizon=-1--2-");

@@ -131,22 +131,6 @@ pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Resul
 mod tests {
     use super::*;
 
-    /// The form that runs of earlier programs were made with, which are adopted.
-    #[test]
-    fn a_call_is_written_in_one_order() {
-        let call = Call {
-            env: Some("procgen:maze".into()),
-            agent: Some("c51".into()),
-            preset: Some("tuned".into()),
-            seed: 2,
-            frames: Some(1000),
-            sets: vec!["learner.batch_size=64".into()],
-        };
-        let words = "--env procgen:maze --agent c51 --preset tuned --seed 2 --frames 1000 --set learner.batch_size=64";
-        assert_eq!(call.args().join(" "), words);
-        assert_eq!(Call::default().args(), ["--seed", "0"]);
-    }
-
     #[test]
     fn runs_that_failed_are_no_fault_of_the_call() {
         let nothing = Swept::<u32> {
