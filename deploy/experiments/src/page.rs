@@ -61,14 +61,7 @@ fn fill(template: &str, values: &Value) -> Result<String, Error> {
     environment.set_trim_blocks(true);
     environment.set_lstrip_blocks(true);
     environment.add_function("figure", figure);
-    environment.add_filter(
-        "fixed",
-        |value: Value, decimals: usize, unit: Option<f64>| {
-            written(&value, |it| {
-                format!("{:.decimals$}", it * unit.unwrap_or(1.0))
-            })
-        },
-    );
+    environment.add_filter("fixed", fixed);
     environment.add_filter("percent", |value: Value| {
         written(&value, |it| format!("{:.1}%", 100.0 * it))
     });
@@ -105,6 +98,12 @@ fn fill(template: &str, values: &Value) -> Result<String, Error> {
     let blocks = text.split("\n\n").map(str::trim);
     let blocks: Vec<_> = blocks.filter(|block| !block.is_empty()).collect();
     Ok(blocks.join("\n\n") + "\n")
+}
+
+/// A number times `unit`, which is 1 where it is not given.
+fn fixed(value: Value, decimals: usize, unit: Option<f64>) -> Result<String, Error> {
+    let unit = unit.unwrap_or(1.0);
+    written(&value, |it| format!("{:.decimals$}", it * unit))
 }
 
 /// A number as a template has it, a dash if it is none. One that its experiment does not give is a mistake.

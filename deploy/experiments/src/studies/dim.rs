@@ -59,17 +59,13 @@ impl DimLearner {
         Ok(self.adam.step(&self.parameters, &gradients, factor)?)
     }
 
-    /// Clipped scores [L, B, B] of every anchor with every candidate at each location, of the one pair that is wanted.
-    pub(super) fn scores(
-        &self,
-        now: &Features,
-        next: &Features,
-        wanted: [bool; 4],
-    ) -> anyhow::Result<Vec<f64>> {
+    /// Clipped scores [L, B, B] of every anchor with every candidate at each location, of the one pair that has a weight.
+    pub(super) fn scores(&self, now: &Features, next: &Features) -> anyhow::Result<Vec<f64>> {
         let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
+        let wanted = self.dim.lambda.wanted();
         let found = dots(&self.network, now, next, &action, wanted)?;
         let found = found.into_iter().flatten().next();
-        let found = found.expect("a pair is wanted");
+        let found = found.expect("a pair has a weight");
         let scores = self.dim.scores(found.width);
         let values = found.dots.flatten_all()?.to_vec1::<f32>()?;
         Ok(values.iter().map(|&dot| scores.score(dot)).collect())

@@ -210,8 +210,7 @@ impl Scorer<'_> {
             let (now, next) = (&played.frames[t], &played.frames[t + 1]);
             let (now, next) = (self.features(now)?, self.features(next)?);
             // [L, B, B] of every anchor with every candidate, at each location.
-            let local = [true, false, false, false];
-            let scores = self.learner.scores(&now, &next, local)?;
+            let scores = self.learner.scores(&now, &next)?;
             let logs = log_softmax(&scores, rows);
             let locations = scores.len() / (rows * rows);
             for location in 0..locations {

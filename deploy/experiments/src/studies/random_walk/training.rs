@@ -221,7 +221,7 @@ impl Heads {
     /// Scores [K, K] of each state with each.
     fn scores(&self) -> anyhow::Result<Vec<f64>> {
         let all = self.features(0..self.states)?;
-        self.learner.scores(&all, &all, [false, false, false, true])
+        self.learner.scores(&all, &all)
     }
 }
 
