@@ -26,7 +26,10 @@ pub(super) struct Dial {
     /// Kinds of worlds that have it; all if it names none.
     #[serde(default)]
     worlds: Vec<String>,
-    #[serde(skip_serializing)]
+    /// Levels that set what the dial is named for.
+    #[serde(default, skip_serializing)]
+    values: Vec<String>,
+    #[serde(default, skip_serializing)]
     levels: Vec<Level>,
 }
 
@@ -78,20 +81,26 @@ impl Dial {
             agent: self.agent.clone(),
             sets: Vec::new(),
         };
-        self.levels.iter().map(move |level| {
-            let agent = level.agent.as_ref().unwrap_or(&self.agent).clone();
+        let values = self.values.iter().map(move |value| Level {
+            name: value.clone(),
+            sets: vec![format!("{}={value}", self.name)],
+            agent: None,
+        });
+        let levels = values.chain(self.levels.iter().cloned());
+        levels.map(move |level| {
+            let agent = level.agent.unwrap_or_else(|| self.agent.clone());
             let key = match level.sets.is_empty() {
                 true => agent.clone(),
                 false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
             };
             LevelOf {
                 dial: self.clone(),
-                level: level.name.clone(),
+                level: level.name,
                 base: base.clone(),
                 point: Point {
                     key,
                     agent,
-                    sets: level.sets.clone(),
+                    sets: level.sets,
                 },
                 is_asked,
             }
