@@ -1,6 +1,7 @@
 //! A network with the auxiliary loss DIM alone and its optimiser, which are the learner's: what both studies train.
 //! It has neither returns nor actions nor a replay.
 
+use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
 use driml_learner::{
     AdamSettings,
@@ -40,23 +41,18 @@ impl DimLearner {
         })
     }
 
-    /// InfoNCE of the pairs 3t3, 3t4, 4t3 and 4t4 that have a weight, with its graph.
-    pub(super) fn losses(
-        &self,
-        now: &Features,
-        next: &Features,
-    ) -> anyhow::Result<[Option<Tensor>; 4]> {
+    /// An update by InfoNCE of the one pair of 3t3, 3t4, 4t3 and 4t4 that has a weight; gives its loss before that.
+    pub(super) fn learn(&mut self, now: &Features, next: &Features) -> anyhow::Result<f32> {
         let rows = now.f4.dim(0)?;
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
-        let valid = vec![1; rows];
-        let network = &self.network;
-        Ok(self.dim.pair_losses(network, now, next, &action, &valid)?)
-    }
-
-    pub(super) fn step(&mut self, loss: &Tensor) -> anyhow::Result<()> {
-        let gradients = Gradients::of(&self.parameters, loss)?;
+        let (network, valid) = (&self.network, vec![1; rows]);
+        let losses = self.dim.pair_losses(network, now, next, &action, &valid)?;
+        let loss = losses.into_iter().flatten().next();
+        let loss = loss.context("no pair of DIM has a weight")?;
+        let gradients = Gradients::of(&self.parameters, &loss)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
-        Ok(self.adam.step(&self.parameters, &gradients, factor)?)
+        self.adam.step(&self.parameters, &gradients, factor)?;
+        Ok(loss.to_scalar()?)
     }
 
     /// Clipped scores [L, B, B] of every anchor with every candidate at each location, of the one pair that has a weight.

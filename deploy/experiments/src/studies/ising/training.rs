@@ -1,7 +1,6 @@
 //! Local DIM on the Ising world: training on pairs of successive frames, and measuring what the scores tell.
 //! Network, loss and optimiser are the learner's own; there is no C51 part, as nothing is earned in this world.
 
-use anyhow::Context;
 use candle_core::{Device, Tensor};
 use driml_envs::{Environment, IsingConfig, IsingWorld, StepEnd};
 use driml_learner::{LearnerSettings, auxiliary::dim::Dim};
@@ -191,10 +190,7 @@ impl Scorer<'_> {
     /// An update on pairs (s_t, s_{t+1}); gives InfoNCE's loss before it.
     fn learn(&mut self, now: &[u8], next: &[u8]) -> anyhow::Result<f32> {
         let (now, next) = (self.features(now)?, self.features(next)?);
-        let [local, ..] = self.learner.losses(&now, &next)?;
-        let local = local.context("lambda.3t3 is 0, so there is no local DIM to learn")?;
-        self.learner.step(&local)?;
-        Ok(local.to_scalar()?)
+        self.learner.learn(&now, &next)
     }
 
     /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.

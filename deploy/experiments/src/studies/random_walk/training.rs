@@ -212,9 +212,7 @@ impl Heads {
     fn learn(&mut self, pairs: &[(usize, usize)]) -> anyhow::Result<()> {
         let now = self.features(pairs.iter().map(|pair| pair.0))?;
         let next = self.features(pairs.iter().map(|pair| pair.1))?;
-        for loss in self.learner.losses(&now, &next)?.iter().flatten() {
-            self.learner.step(loss)?;
-        }
+        self.learner.learn(&now, &next)?;
         Ok(())
     }
 
