@@ -300,10 +300,8 @@ mod tests {
         assert!(open("b").unwrap_err().is::<Usage>());
         // What it was made of has changed.
         let mut of = |of: &str, made: u32| session.piece_of(of, "played", 1, |_| Ok(made)).unwrap();
-        assert_eq!(
-            (of("x", 1), of("x", 2), of("y", 3), of("y", 4)),
-            (1, 1, 3, 3)
-        );
+        let all = [of("x", 1), of("x", 2), of("y", 3), of("y", 4)];
+        assert_eq!(all, [1, 1, 3, 3]);
         // Read whatever it was made of.
         assert_eq!(session.made_of("played").unwrap(), "y");
         assert_eq!(session.kept_piece::<u32>("played"), Some(3));

@@ -194,11 +194,8 @@ mod tests {
     #[test]
     fn between_points_lies_the_line() {
         let points = [(0.0, 1.0), (10.0, 3.0), (10.0, 5.0), (20.0, 6.0)];
-        let at = |x| between(&points, x);
-        assert_eq!(
-            [at(-1.0), at(0.0), at(5.0), at(15.0), at(99.0)],
-            [1.0, 1.0, 2.0, 5.5, 6.0]
-        );
+        let found = [-1.0, 0.0, 5.0, 15.0, 99.0].map(|x| between(&points, x));
+        assert_eq!(found, [1.0, 1.0, 2.0, 5.5, 6.0]);
     }
 
     #[test]

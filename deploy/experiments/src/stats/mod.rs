@@ -227,10 +227,8 @@ mod tests {
         let found = interval(&[1.0, 2.0, 3.0]).unwrap();
         let one = interval(&[3.0]).unwrap();
         assert_eq!(one.ends, None);
-        assert_eq!(
-            format!("{one} {found:.1}"),
-            "3.00 (one seed) 2.0 [-0.5, 4.5]"
-        );
+        let printed = format!("{one} {found:.1}");
+        assert_eq!(printed, "3.00 (one seed) 2.0 [-0.5, 4.5]");
         assert_eq!(interval(&[]), None);
     }
 

@@ -221,11 +221,9 @@ mod tests {
     fn both_lengths_read_and_ask_for_local_dim_alone() {
         for settings in [smoke(), flags::settings(NAME, SETTINGS, false)] {
             let task = task(&settings).unwrap();
-            assert_eq!(
-                task.learner.lambda.wanted(),
-                [true, false, false, false],
-                "the paper's table of parameters"
-            );
+            // The paper's table of parameters.
+            let local = [true, false, false, false];
+            assert_eq!(task.learner.lambda.wanted(), local);
             assert_eq!((task.world.lattice_size, task.world.patch_size), (84, 42));
             assert!(!task.model.dim.action);
         }

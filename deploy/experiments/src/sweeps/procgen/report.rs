@@ -262,9 +262,7 @@ mod tests {
 
     #[test]
     fn small_shares_keep_two_digits() {
-        assert_eq!(
-            [0.002, 0.000012, 0.5, 1.0].map(percent),
-            ["0.20", "0.0012", "50", "100"]
-        );
+        let texts = [0.002, 0.000012, 0.5, 1.0].map(percent);
+        assert_eq!(texts, ["0.20", "0.0012", "50", "100"]);
     }
 }

@@ -185,10 +185,8 @@ mod tests {
         assert_eq!(found(both, agents).unwrap(), both);
         assert_eq!(found("all", agents).unwrap().split(' ').count(), 7);
         let worlds = |names| found(names, worlds);
-        assert_eq!(
-            worlds("chain bigfish chain").unwrap(),
-            "chain procgen:bigfish"
-        );
+        let both = worlds("chain bigfish chain").unwrap();
+        assert_eq!(both, "chain procgen:bigfish");
         let said = worlds("bigfihs").unwrap_err().to_string();
         assert!(said.contains("did you mean"), "{said}");
         for wrong in ["driml-ada-k5", "driml-noact-kx"] {
