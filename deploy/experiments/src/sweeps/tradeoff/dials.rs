@@ -7,9 +7,8 @@ use driml_envs::WorldName;
 use driml_machine::error::{Usage, nearest, usage};
 use serde::{Deserialize, Serialize};
 
-use crate::flags;
-
-const MENU: &str = include_str!("../tradeoff.toml");
+/// The file with all of it.
+pub(super) const MENU: &str = include_str!("../tradeoff.toml");
 
 /// A dial in one world: a base and the levels that are compared with it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -113,25 +112,6 @@ fn slug(name: &str) -> String {
     let parts = name.split(|c: char| !c.is_ascii_alphanumeric() && c != '.');
     let parts = parts.filter(|part| !part.is_empty());
     parts.collect::<Vec<_>>().join("-")
-}
-
-/// What every world's runs have at a length.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Length {
-    pub(super) preset: String,
-    /// Of each level.
-    pub(super) seeds: u32,
-    /// Played with each run's weights.
-    pub(super) episodes: u32,
-    /// Of a run; as its world says if this says nothing.
-    pub(super) frames: Option<u64>,
-    /// After those of the world, in the form of `--set`.
-    pub(super) sets: Vec<String>,
-}
-
-pub(super) fn length(smoke: bool) -> Length {
-    flags::settings("tradeoff", MENU, smoke)
 }
 
 /// What all runs in the worlds of one kind have, or in one game of it.

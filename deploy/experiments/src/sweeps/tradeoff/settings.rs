@@ -5,14 +5,29 @@ use driml_machine::error::Usage;
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-use super::dials::{self, LevelOf, Point};
+use super::dials::{self, LevelOf, MENU, Point};
 use crate::{
-    flags::TradeoffArgs,
+    flags::{self, TradeoffArgs},
     sweep::plan::{Call, PlannedRun},
 };
 
 /// Seeds of a base for each of a level's: all levels are compared with it, so that its luck is in all of their differences.
 const BASE_SEEDS: u32 = 2;
+
+/// What every world's runs have at a length.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Length {
+    preset: String,
+    /// Of each level.
+    seeds: u32,
+    /// Played with each run's weights.
+    episodes: u32,
+    /// Of a run; as its world says if this says nothing.
+    frames: Option<u64>,
+    /// After those of the world, in the form of `--set`.
+    sets: Vec<String>,
+}
 
 /// What all runs of a folder have in common. Dials, levels and seeds can be added.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -46,7 +61,7 @@ pub(super) fn of(
     found: Option<Common>,
 ) -> Result<Settings, Usage> {
     let base = dials::world_base(world)?;
-    let length = dials::length(args.flags.smoke);
+    let length: Length = flags::settings("tradeoff", MENU, args.flags.smoke);
     let asked = [length.sets, args.queue.sets.clone()];
     let (found_frames, found_jobs) = found.map(|it| (it.frames, it.jobs)).unzip();
     let frames = args.frames.or(found_frames);
