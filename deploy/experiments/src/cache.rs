@@ -54,6 +54,7 @@ struct Kept<T> {
 pub(crate) struct Session {
     folder: PathBuf,
     smoke: bool,
+    report_only: bool,
     progress: Progress,
     seconds: f64,
     /// Of how many pieces at once this is the sum.
@@ -111,6 +112,7 @@ impl Session {
         let session = Self {
             folder,
             smoke: flags.smoke,
+            report_only,
             progress: Progress::new(units, shutdown),
             seconds: 0.0,
             at_once: 1,
@@ -124,11 +126,6 @@ impl Session {
     /// The piece of this name if it is there and can be read, whatever it was made of.
     pub(crate) fn kept_piece<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         self.read(key).map(|kept| kept.result)
-    }
-
-    /// Of what the piece of this name was made, if it is there.
-    pub(crate) fn made_of(&self, key: &str) -> Option<String> {
-        self.read::<IgnoredAny>(key).map(|kept| kept.of)
     }
 
     /// Keeps a piece that took no time.
@@ -205,6 +202,22 @@ impl Session {
         let counted = self.progress.advance(rest).map_err(anyhow::Error::from);
         counted.inspect_err(stopped)?;
         Ok(kept.result)
+    }
+
+    /// [`Session::piece_of`] what this program makes of `what`: another program's is made anew, but for a report.
+    pub(crate) fn computed<T: Serialize + DeserializeOwned>(
+        &mut self,
+        what: &str,
+        key: &str,
+        units: u64,
+        make: impl FnOnce(&mut Progress) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        let kept = self.read::<IgnoredAny>(key).map(|kept| kept.of);
+        let of = match kept.filter(|of| self.report_only && of.starts_with(what)) {
+            Some(of) => of,
+            None => format!("{what}, {}", program()?),
+        };
+        self.piece_of(&of, key, units, make)
     }
 
     /// Writes rows as `name.csv`, below the names of their columns, parted by commas.
@@ -303,14 +316,23 @@ mod tests {
         let all = [of("x", 1), of("x", 2), of("y", 3), of("y", 4)];
         assert_eq!(all, [1, 1, 3, 3]);
         // Read whatever it was made of.
-        assert_eq!(session.made_of("played").unwrap(), "y");
         assert_eq!(session.kept_piece::<u32>("played"), Some(3));
         assert_eq!(session.kept_piece::<u32>("never"), None);
         session.keep("calls", ["driml tradeoff"]).unwrap();
         let calls: Option<Vec<String>> = session.kept_piece("calls");
         assert_eq!(calls.unwrap(), ["driml tradeoff"]);
-        let cores = report("a").unwrap().kept_piece(CORES);
+        let mut reported = report("a").unwrap();
+        let cores = reported.kept_piece(CORES);
         assert_eq!(cores, Some(Machine::this().cores));
+        let made = session.piece_of("w, an old program", "errors", 1, |_| Ok(1));
+        assert_eq!(made.unwrap(), 1);
+        let computed = |session: &mut Session, what: &str, made: u32| {
+            let found = session.computed(what, "errors", 1, |_| Ok(made));
+            found.unwrap()
+        };
+        assert_eq!(computed(&mut reported, "w", 2), 1);
+        assert_eq!(computed(&mut session, "w", 3), 3);
+        assert_eq!(computed(&mut reported, "v", 4), 4);
         assert!(report("b").unwrap_err().is::<Usage>());
         // Ctrl-C while it is made: first it is kept.
         let stopped = session.piece_of("", "slow", 1, |progress| {

@@ -330,12 +330,11 @@ impl Tradeoff<'_> {
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.work().1.again(units);
         let key = format!("exactness-{}", point.key);
-        let kept = self.session.made_of(&key);
-        let kept = kept.filter(|_| self.args.queue.report);
+        let (rows, states) = exactness::sizes(&config);
         let weights = &run.summary.weights_sha256;
-        let of = exactness::made_of(weights, &config, &cache::program()?, kept);
+        let what = format!("{weights}, {rows} rows, {states} states");
         let measure = |_: &mut _| exactness::measure(&config, &run.folder);
-        self.session.piece_of(&of, &key, units, measure)
+        self.session.computed(&what, &key, units, measure)
     }
 
     /// The calls that made the folder's runs, this one last unless it makes none.

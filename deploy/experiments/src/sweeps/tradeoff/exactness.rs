@@ -18,20 +18,6 @@ const ROWS_MAX: usize = 64;
 /// States whose values and greedy actions are compared, for each of these rows.
 const STATES_A_ROW: usize = 16;
 
-/// Of what the errors of a run of `config` with these weights are made, for [`Session::piece_of`](crate::cache::Session::piece_of): the
-/// `program` does the arithmetic. A report takes the `kept` errors of any.
-pub(super) fn made_of(
-    weights: &str,
-    config: &RunConfig,
-    program: &str,
-    kept: Option<String>,
-) -> String {
-    let (rows, states) = sizes(config);
-    let of = format!("{weights}, {rows} rows, {states} states");
-    let kept = kept.filter(|kept| kept.starts_with(&of));
-    kept.unwrap_or_else(|| format!("{of}, {program}"))
-}
-
 /// Rows whose loss and gradient are compared, and states whose values and greedy actions are.
 pub(super) fn sizes(config: &RunConfig) -> (usize, usize) {
     let rows = ROWS_MAX.min(config.learner.batch_size as usize);
@@ -80,24 +66,4 @@ pub(super) fn measure(config: &RunConfig, folder: &RunFolder) -> anyhow::Result<
         ("actor_q_rms_error", acting.rms),
     ];
     Ok(errors.map(|(name, it)| (name.to_owned(), it)).into())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::sweep::plan::Call;
-
-    #[test]
-    fn errors_are_of_the_program_that_computes_them() {
-        let call = Call {
-            env: Some("chain".into()),
-            ..Call::default()
-        };
-        let config = call.config().unwrap();
-        let of = |weights, program, kept| made_of(weights, &config, program, kept);
-        let old = of("w", "old", None);
-        assert_ne!(of("w", "new", None), old);
-        assert_eq!(of("w", "new", Some(old.clone())), old, "for a report");
-        assert_eq!(of("v", "new", Some(old)), of("v", "new", None));
-    }
 }
