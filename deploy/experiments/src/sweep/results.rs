@@ -55,18 +55,15 @@ impl Played {
         folder: &RunFolder,
         progress: &mut Progress,
     ) -> anyhow::Result<Option<Vec<f64>>> {
-        let mut all = Vec::new();
         let players = players(folder, self.checkpoints)?;
         let each = self.episodes.div_ceil(players.len().max(1) as u32);
-        for which in players {
+        let returns = players.into_iter().map(|which| {
             progress.advance(0)?;
             let player = Player::load_at(folder, which, Weights::default())?;
-            match player.returns(Who::Agent, self.levels, each, SEED)? {
-                Some(returns) => all.extend(returns),
-                None => return Ok(None),
-            }
-        }
-        Ok(Some(all))
+            player.returns(Who::Agent, self.levels, each, SEED)
+        });
+        let all = returns.collect::<anyhow::Result<Option<Vec<_>>>>()?;
+        Ok(all.map(|all| all.concat()))
     }
 }
 

@@ -127,11 +127,10 @@ fn values(results: &Results) -> Value {
         Some(context! { what, rank, runs })
     });
     let differences = (0..PARTS).flat_map(|part| differences(part, results));
-    let short = ghosts.episodes_per_task.min(noise.episodes_per_task) < 2 * RETURNS_OF as u64;
+    let task_min = ghosts.episodes_per_task.min(noise.episodes_per_task);
     let mut sets = ghosts.sets.iter();
     let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));
     let order = results.order_of_epsilon(LOSSES[1].0);
-    let is_out_of_order = order.is_some_and(|(rank, _)| rank <= 0.0);
     context! {
         settings,
         agents => settings.agents,
@@ -142,9 +141,9 @@ fn values(results: &Results) -> Value {
         ghosts => tasks(0, results),
         noise => tasks(1, results),
         missing => results.missing,
-        out_of_order => is_out_of_order,
+        out_of_order => order.is_some_and(|(rank, _)| rank <= 0.0),
         capacity,
-        short_tasks => short,
+        short_tasks => task_min < 2 * RETURNS_OF as u64,
         returns_of => RETURNS_OF,
         episode_frames_max => EPISODE_FRAMES_MAX,
     }

@@ -198,10 +198,8 @@ impl Heads {
 
     fn features(&self, states: impl ExactSizeIterator<Item = usize>) -> anyhow::Result<Features> {
         let rows = states.len();
-        let mut one_hot = vec![0f32; rows * self.states];
-        for (row, state) in states.enumerate() {
-            one_hot[row * self.states + state] = 1.0;
-        }
+        let row = |state: usize| (0..self.states).map(move |it| f32::from(it == state));
+        let one_hot: Vec<f32> = states.flat_map(row).collect();
         Ok(Features {
             f3: None,
             f4: Tensor::from_vec(one_hot, (rows, self.states), &Device::Cpu)?,
