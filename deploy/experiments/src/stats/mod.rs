@@ -272,16 +272,13 @@ mod tests {
 
     #[test]
     fn rank_correlation_knows_order_and_ties() {
+        // By hand: ranks of x 1, 2.5, 2.5, 4 and of y 1, 3, 2, 4.
+        let by_hand = Some(4.5 / (4.5f64 * 5.0).sqrt());
         for (x, y, expected) in [
             ([1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 50.0, 90.0], Some(1.0)),
             ([1.0, 2.0, 3.0, 4.0], [0.0, -1.0, -2.0, -5.0], Some(-1.0)),
             ([1.0; 4], [1.0; 4], None),
-            // By hand: ranks of x 1, 2.5, 2.5, 4 and of y 1, 3, 2, 4 give 4.5 / sqrt(4.5 * 5).
-            (
-                [1.0, 2.0, 2.0, 3.0],
-                [1.0, 3.0, 2.0, 4.0],
-                Some(4.5 / (4.5f64 * 5.0).sqrt()),
-            ),
+            ([1.0, 2.0, 2.0, 3.0], [1.0, 3.0, 2.0, 4.0], by_hand),
         ] {
             let pairs: Vec<_> = x.into_iter().zip(y).collect();
             let found = rank_correlation(&pairs);

@@ -87,13 +87,7 @@ mod tests {
 
     #[test]
     fn a_small_budget_makes_shorter_runs() {
-        for (budget, expected) in [
-            (400.0, 40_000),
-            (200.0, 20_000),
-            (80.0, 10_000),
-            (1.0, 10_000),
-        ] {
-            assert_eq!(frames(40_000, 300.0, budget), expected);
-        }
+        let found = [400.0, 200.0, 80.0, 1.0].map(|budget| frames(40_000, 300.0, budget));
+        assert_eq!(found, [40_000, 20_000, 10_000, 10_000]);
     }
 }

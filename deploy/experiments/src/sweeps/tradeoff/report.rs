@@ -243,8 +243,7 @@ mod tests {
     #[test]
     fn a_curve_is_read_at_a_time() {
         let curve = [(1.0, 0.5), (2.0, 0.6), (4.0, 0.9)];
-        for (seconds, expected) in [(3.0, Some(0.6)), (0.5, None), (9.0, Some(0.9))] {
-            assert_eq!(at(&curve, seconds), expected);
-        }
+        let found = [3.0, 0.5, 9.0].map(|seconds| at(&curve, seconds));
+        assert_eq!(found, [Some(0.6), None, Some(0.9)]);
     }
 }
