@@ -93,7 +93,7 @@ pub(super) fn train(
 ) -> anyhow::Result<Learnt> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut heads = Heads::new(chain.states, settings, &mut rng)?;
-    let mut source = Source::new(chain, settings, sampling, &mut rng);
+    let mut source = source(chain, settings, sampling, &mut rng);
     let (mut learnt, mut measure_next) = (Learnt::default(), 0);
     for update in 0..=settings.updates {
         if update >= measure_next || update == settings.updates {
@@ -101,8 +101,7 @@ pub(super) fn train(
             measure_next = ((update as f64 * MEASURE_GROWTH).ceil() as u64).max(update + 1);
         }
         if update < settings.updates {
-            let pairs = source.batch(chain, &mut rng);
-            heads.learn(&pairs)?;
+            heads.learn(&source(&mut rng))?;
             progress.advance(1)?;
         }
     }
@@ -221,59 +220,47 @@ impl Heads {
     }
 }
 
-/// Draws batches of pairs.
-struct Source {
+/// Draws a batch of pairs.
+type Source<'a> = Box<dyn FnMut(&mut ChaCha8Rng) -> Vec<(usize, usize)> + 'a>;
+
+fn source<'a>(
+    chain: &'a Chain,
+    settings: &Settings,
     sampling: Sampling,
-    rows: usize,
-    steps_per_update: usize,
-    stationary: Vec<f64>,
-    walkers: Vec<usize>,
-    replay: Vec<(usize, usize)>,
+    rng: &mut ChaCha8Rng,
+) -> Source<'a> {
+    let rows = settings.batch_size;
+    match sampling {
+        Sampling::Stationary => {
+            let law = chain.stationary();
+            let pair = move |rng: &mut ChaCha8Rng| walk(chain, &mut draw(&law, rng), rng);
+            Box::new(move |rng| (0..rows).map(|_| pair(rng)).collect())
+        }
+        Sampling::FromOneEnd => {
+            let mut walkers = vec![0; rows];
+            Box::new(move |rng| {
+                let each = walkers.iter_mut();
+                each.map(|walker| walk(chain, walker, rng)).collect()
+            })
+        }
+        Sampling::OneWalker => {
+            let steps = ((rows as f64 / settings.replay_ratio).round() as usize).max(1);
+            let (mut walker, mut replay) = (0, Vec::new());
+            replay.extend((0..WARMUP_TRANSITIONS).map(|_| walk(chain, &mut walker, rng)));
+            Box::new(move |rng| {
+                replay.extend((0..steps).map(|_| walk(chain, &mut walker, rng)));
+                let row = |_| replay[rng.random_range(0..replay.len())];
+                (0..rows).map(row).collect()
+            })
+        }
+    }
 }
 
-impl Source {
-    fn new(chain: &Chain, settings: &Settings, sampling: Sampling, rng: &mut ChaCha8Rng) -> Self {
-        let rows = settings.batch_size;
-        let mut this = Self {
-            sampling,
-            rows,
-            steps_per_update: ((rows as f64 / settings.replay_ratio).round() as usize).max(1),
-            stationary: chain.stationary(),
-            walkers: vec![0; rows],
-            replay: Vec::new(),
-        };
-        if sampling == Sampling::OneWalker {
-            this.walk(chain, WARMUP_TRANSITIONS, rng);
-        }
-        this
-    }
-
-    fn walk(&mut self, chain: &Chain, steps: usize, rng: &mut ChaCha8Rng) {
-        for _ in 0..steps {
-            let state = self.walkers[0];
-            self.walkers[0] = chain.step(state, rng);
-            self.replay.push((state, self.walkers[0]));
-        }
-    }
-
-    fn batch(&mut self, chain: &Chain, rng: &mut ChaCha8Rng) -> Vec<(usize, usize)> {
-        if self.sampling == Sampling::OneWalker {
-            self.walk(chain, self.steps_per_update, rng);
-        }
-        let mut pair = |row: usize| match self.sampling {
-            Sampling::Stationary => {
-                let state = draw(&self.stationary, rng);
-                (state, chain.step(state, rng))
-            }
-            Sampling::FromOneEnd => {
-                let state = self.walkers[row];
-                self.walkers[row] = chain.step(state, rng);
-                (state, self.walkers[row])
-            }
-            Sampling::OneWalker => self.replay[rng.random_range(0..self.replay.len())],
-        };
-        (0..self.rows).map(&mut pair).collect()
-    }
+/// A step from a state: the pair of both, of which the second takes its place.
+fn walk(chain: &Chain, state: &mut usize, rng: &mut ChaCha8Rng) -> (usize, usize) {
+    let before = *state;
+    *state = chain.step(before, rng);
+    (before, *state)
 }
 
 fn draw(law: &[f64], rng: &mut ChaCha8Rng) -> usize {
