@@ -156,7 +156,7 @@ mod tests {
         let settings = flags::settings(NAME, SETTINGS, true);
         let page = |rows: &[Row]| {
             let values = values(rows, &settings);
-            crate::page::page(include_str!("page.md.j2"), values, true, 1.0, 1, None)
+            crate::page::page(include_str!("page.md.j2"), values, true, "1 s.")
         };
         let mut row = Row {
             routine: "halving".into(),
