@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use toml::Value;
+use toml::{Table, Value};
 
 use super::runs::Run;
 
@@ -18,9 +18,10 @@ pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
         };
         let peers = groups.iter().map(|other| other[0]);
         let peers = peers.filter(|other| other.what.as_ref() == Some(what));
-        let peers: Vec<_> = peers.map(settings).collect();
+        let peers: Vec<_> = peers.map(|run| settings(run.settings.as_ref())).collect();
         let mut parts = vec![what.clone()];
-        parts.extend(differences(&settings(runs[0]), &peers));
+        let own = settings(runs[0].settings.as_ref());
+        parts.extend(differences(&own, &peers));
         parts.push(seeds(runs));
         parts.join(", ")
     };
@@ -46,9 +47,9 @@ fn seeds(runs: &[&Run]) -> String {
 }
 
 /// Every setting with its whole name.
-fn settings(run: &Run) -> BTreeMap<String, String> {
+fn settings(table: Option<&Table>) -> BTreeMap<String, String> {
     let mut all = BTreeMap::new();
-    for (key, value) in run.settings.iter().flatten() {
+    for (key, value) in table.into_iter().flatten() {
         flatten(key, value, &mut all);
     }
     all
@@ -106,14 +107,6 @@ fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
 mod tests {
     use super::*;
 
-    fn settings(text: &str) -> BTreeMap<String, String> {
-        let mut all = BTreeMap::new();
-        for (key, value) in &text.parse::<toml::Table>().unwrap() {
-            flatten(key, value, &mut all);
-        }
-        all
-    }
-
     #[test]
     fn what_differs_is_told_by_its_shortest_name() {
         let a = "actors = 1\n[learner.adam]\nlr = 0.1\neps = 1\n[actor]\nlr = 2\n";
@@ -129,7 +122,7 @@ mod tests {
             (deep, wide, "torso=impala, height=64, conv=unset"),
             (many, "", "a=1, b=1, c=1, and 2 more settings"),
         ] {
-            let [own, other] = [own, other].map(settings);
+            let [own, other] = [own, other].map(|text| settings(text.parse().ok().as_ref()));
             let found = differences(&own, &[other, own.clone()]);
             assert_eq!(found.join(", "), expected);
         }
