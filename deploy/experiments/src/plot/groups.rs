@@ -55,25 +55,19 @@ impl Curve {
 ///
 /// Settings that only the machine decides (threads, sizes, the replay's capacity) do not part them; the number of actors does.
 pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
-    let mut groups: Vec<Group<'_>> = Vec::new();
+    let mut groups: Vec<Vec<&Run>> = Vec::new();
     for run in runs {
-        let same = |group: &&mut Group<'_>| {
-            together && run.settings.is_some() && group.runs[0].settings == run.settings
+        let same = |group: &&mut Vec<&Run>| {
+            together && run.settings.is_some() && group[0].settings == run.settings
         };
         match groups.iter_mut().find(same) {
-            Some(group) => group.runs.push(run),
-            None => groups.push(Group {
-                name: String::new(),
-                runs: vec![run],
-            }),
+            Some(group) => group.push(run),
+            None => groups.push(vec![run]),
         }
     }
-    let runs: Vec<_> = groups.iter().map(|group| &group.runs[..]).collect();
-    let names = names::of(&runs);
-    for (group, name) in groups.iter_mut().zip(names) {
-        group.name = name;
-    }
-    groups
+    let all: Vec<_> = groups.iter().map(|group| &group[..]).collect();
+    let named = names::of(&all).into_iter().zip(groups);
+    named.map(|(name, runs)| Group { name, runs }).collect()
 }
 
 impl Group<'_> {
