@@ -149,13 +149,11 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         if is_return(column) {
             series.extend(lines(&random, &series, groups.len()));
         }
-        let (title, y) = match is_loss {
-            true => (
-                format!("{} loss", loss_title(column)),
-                "auxiliary loss [nats]".into(),
-            ),
-            false => words(column),
-        };
+        let (mut title, mut y) = words(column);
+        if is_loss {
+            title = format!("{} loss", loss_title(column));
+            y = "auxiliary loss [nats]".into();
+        }
         let (x, y) = (Axis::linear(args.x.column()), Axis::linear(&y));
         panels.push(Panel::Chart(Chart::new(&title, x, y, series)));
     }

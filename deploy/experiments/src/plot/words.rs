@@ -49,14 +49,11 @@ pub(super) fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -
             }
         ));
     }
-    let spread = groups.iter().flat_map(|group| &group.runs);
-    if columns.iter().any(|column| column == "mean_k")
-        && spread.clone().any(|run| run.has_values(runs::SPREAD_OF_K))
-    {
-        notes.push(
-            "The band around k is one standard deviation of k itself to each side, cut at 1."
-                .into(),
-        );
+    let mut all = groups.iter().flat_map(|group| &group.runs);
+    let has_spread = all.any(|run| run.has_values(runs::SPREAD_OF_K));
+    if has_spread && columns.iter().any(|column| column == "mean_k") {
+        let it = "The band around k is one standard deviation of k itself to each side, cut at 1.";
+        notes.push(it.into());
     }
     match args.smooth {
         Some(width) => notes.push(format!(
