@@ -6,7 +6,6 @@ pub mod flags;
 mod groups;
 mod names;
 mod runs;
-mod words;
 
 use std::{collections::BTreeSet, path::PathBuf};
 
@@ -15,25 +14,28 @@ use driml_launch::{
     chosen::config_of,
     console::{self, print},
     evaluate::random_returns,
+    metrics,
     run_folder::RunFolder,
     stats::mean_and_deviation,
     view::loss_title,
 };
 use driml_machine::error::usage;
 
+use self::{
+    flags::{Band, PlotArgs},
+    groups::Group,
+    runs::{C51_LOSS, SPREAD_OF_K},
+};
 pub(crate) use self::{
     groups::{Curve, over_seeds, smoothed},
     runs::{Over, Run},
 };
-use self::{
-    runs::C51_LOSS,
-    words::{EVALUATED, notes, title, words},
-};
-use crate::plot::flags::PlotArgs;
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
 /// The column over which a random policy is a line.
 const RETURN: &str = "mean_return";
+/// The column of what checkpoints earned when they were played.
+const EVALUATED: &str = "evaluated_return";
 /// Words for columns, as `--column` takes them too.
 const WORDS: [(&str, &str); 4] = [
     ("return", RETURN),
@@ -163,12 +165,64 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
         _ => (2, CHART_SIZE),
     };
     Ok(Figure {
-        title: title(&groups),
+        title: match &groups[..] {
+            [only] => only.name.clone(),
+            _ => format!("{} configurations compared", groups.len()),
+        },
         notes: notes(args, &groups, &columns),
         columns: grid,
         panel_size,
         panels,
     })
+}
+
+/// Title and label of a column's chart, with its unit.
+fn words(column: &str) -> (String, String) {
+    if column == EVALUATED {
+        return (
+            "Return of checkpoints, played greedily".into(),
+            "mean over episodes".into(),
+        );
+    }
+    let named = column.replace('_', " ");
+    match metrics::column(column) {
+        Some(it) if it.name == column => (it.plot_label.into(), it.unit.into()),
+        // One of several things.
+        Some(it) => (named, it.unit.into()),
+        None => (named.clone(), named),
+    }
+}
+
+/// What was done to the numbers.
+fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<String> {
+    let mut notes = Vec::new();
+    if groups.iter().any(|group| group.runs.len() > 1) {
+        notes.push(format!(
+            "Runs that differ in their seed alone are one line, their mean; the band is {}.",
+            match args.band {
+                Band::Range => "their smallest and largest value",
+                Band::Sd => "one standard deviation to each side",
+                Band::Ci => "the 95% interval of that mean (Student's t)",
+            }
+        ));
+    }
+    let mut all = groups.iter().flat_map(|group| &group.runs);
+    let has_spread = all.any(|run| run.has_values(SPREAD_OF_K));
+    if has_spread && columns.iter().any(|column| column == "mean_k") {
+        let it = "The band around k is one standard deviation of k itself to each side, cut at 1.";
+        notes.push(it.into());
+    }
+    match args.smooth {
+        Some(width) => notes.push(format!(
+            "Smoothed: each point is the mean over the {width} {} before it.",
+            args.x.column()
+        )),
+        None => notes.push("Not smoothed.".into()),
+    }
+    if let Some(episodes) = args.random {
+        notes.push(format!("Random policy: mean of {episodes} whole episodes."));
+    }
+    notes
 }
 
 /// A line about each run that has no value of a column which is drawn.
