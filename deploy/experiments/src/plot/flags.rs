@@ -5,8 +5,6 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use driml_machine::whole_number;
 
-pub use super::runs::Over;
-
 /// What `driml plot` takes.
 #[derive(Debug, Default, Args)]
 pub struct PlotArgs {
@@ -42,6 +40,29 @@ pub struct PlotArgs {
     /// File to write, .svg, .pdf or .png
     #[arg(long, value_name = "FILE", default_value = "plot.svg")]
     pub(crate) out: PathBuf,
+}
+
+/// What a curve is drawn over: columns that only grow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Over {
+    /// Environment steps, over all actors
+    #[default]
+    Frames,
+    /// Updates of the learner
+    Updates,
+    /// Seconds since the run began
+    Seconds,
+}
+
+impl Over {
+    /// The column of `metrics.csv`, which is the axis' label too.
+    pub(super) const fn column(self) -> &'static str {
+        match self {
+            Self::Frames => "frames",
+            Self::Updates => "updates",
+            Self::Seconds => "seconds",
+        }
+    }
 }
 
 /// What the band over several seeds shows.

@@ -28,7 +28,7 @@ use self::{
 };
 pub(crate) use self::{
     groups::{Curve, over_seeds, smoothed},
-    runs::{Over, Run},
+    runs::Run,
 };
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);
@@ -129,7 +129,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     for column in &columns {
         // A name that no run knows is an error.
         if !runs.iter().any(|run| run.has_values(column)) {
-            runs[0].values_over(args.x, column)?;
+            runs[0].values_over(args.x.column(), column)?;
         }
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);

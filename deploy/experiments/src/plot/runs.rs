@@ -4,7 +4,6 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::ValueEnum;
 use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, nearest, usage};
 
@@ -30,29 +29,6 @@ pub(crate) struct Run {
     columns: Table,
     /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
     evaluations: Table,
-}
-
-/// What a curve is drawn over: columns that only grow.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum Over {
-    /// Environment steps, over all actors
-    #[default]
-    Frames,
-    /// Updates of the learner
-    Updates,
-    /// Seconds since the run began
-    Seconds,
-}
-
-impl Over {
-    /// The column of `metrics.csv`, which is the axis' label too.
-    pub(super) const fn column(self) -> &'static str {
-        match self {
-            Self::Frames => "frames",
-            Self::Updates => "updates",
-            Self::Seconds => "seconds",
-        }
-    }
 }
 
 impl Run {
@@ -85,15 +61,15 @@ impl Run {
 
     /// The values of a column over frames; rows without a value are left out.
     pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        self.values_over(Over::Frames, column)
+        self.values_over("frames", column)
     }
 
-    /// The values of a column over frames, updates or seconds, in their order; rows without a value are left out.
+    /// The values of a column over another one which only grows, in their order; rows without a value are left out.
     ///
     /// Rows at the same place are one point, their mean: a row is written each second, in which there may be no new frame.
-    pub(crate) fn values_over(&self, over: Over, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+    pub(crate) fn values_over(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let (table, path) = self.table(column);
-        let x = self.place(table, over.column())?;
+        let x = self.place(table, x)?;
         let place = self.place(table, column)?;
         let mut values = Vec::new();
         let path = path.display();

@@ -149,9 +149,9 @@ fn rows_at_the_same_place_are_one_point_whatever_their_order() {
     let metrics = "seconds,frames,updates,loss\n1,10,0,1\n2,10,1,3\n3,30,2,5\n4,20,2,7\n";
     let run = read(&Runs::new().run("a", "c51", 1, metrics));
     let over = |x| run.values_over(x, "loss").unwrap();
-    assert_eq!(over(Over::Frames), [(10.0, 2.0), (20.0, 7.0), (30.0, 5.0)]);
-    assert_eq!(over(Over::Updates), [(0.0, 1.0), (1.0, 3.0), (2.0, 6.0)]);
-    assert_eq!(over(Over::Seconds).len(), 4);
+    assert_eq!(over("frames"), [(10.0, 2.0), (20.0, 7.0), (30.0, 5.0)]);
+    assert_eq!(over("updates"), [(0.0, 1.0), (1.0, 3.0), (2.0, 6.0)]);
+    assert_eq!(over("seconds").len(), 4);
 }
 
 #[test]

@@ -116,12 +116,7 @@ fn mean_from(points: &Points, frames: f64) -> Option<f64> {
 
 /// Mean return of the last 100 episodes over episodes, up to the end of the last task.
 fn trace(run: &Run, continual: &Continual) -> anyhow::Result<Points> {
-    let (returns, episodes) = (run.values("mean_return")?, run.values("episodes")?);
-    // Once known, the return is in every row: the last rows of both belong together.
-    let rows = returns.iter().rev().zip(episodes.iter().rev());
-    let mut points: Vec<_> = rows.map(|(mean, episodes)| (episodes.1, mean.1)).collect();
-    points.reverse();
-    points.dedup_by_key(|point| point.0);
+    let mut points = run.values_over("episodes", "mean_return")?;
     points.retain(|point| point.0 <= continual.episodes() as f64);
     Ok(points)
 }

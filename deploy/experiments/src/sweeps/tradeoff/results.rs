@@ -9,7 +9,7 @@ use super::{
     settings::Common,
 };
 use crate::{
-    plot::{Over, Run},
+    plot::Run,
     stats::{Difference, Interval, Spread, difference, interval},
     sweep::{plan::FinishedRun, results::mean},
 };
@@ -95,9 +95,8 @@ impl PointResult {
 
     /// Training return over seconds, of each run.
     pub(super) fn training_curves(&self) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
-        let read = |it: &SeedResult| {
-            Ok(Run::read(&it.ran.folder)?.values_over(Over::Seconds, "mean_return")?)
-        };
+        let read =
+            |it: &SeedResult| Ok(Run::read(&it.ran.folder)?.values_over("seconds", "mean_return")?);
         self.seeds.iter().map(read).collect()
     }
 }
