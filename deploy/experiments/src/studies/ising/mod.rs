@@ -195,7 +195,8 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
 }
 
 fn values(task: &Task, trained: &[Trained]) -> Value {
-    let last: Vec<_> = trained.iter().map(|one| one.last).collect();
+    let last = trained.iter().map(|one| one.checks.last());
+    let last: Vec<_> = last.flatten().map(|check| check.1).collect();
     let untrained: Vec<_> = trained.iter().map(|one| one.checks[0].1.auc).collect();
     context! {
         task,

@@ -51,10 +51,8 @@ const MEASURED_SEED: u64 = 1 << 40;
 pub(super) struct Trained {
     /// InfoNCE's loss at each update, in nats.
     pub(super) loss: Vec<f32>,
-    /// Measurements on the way: after how many updates, and what.
+    /// Measurements on the way: after how many updates, and what; the last one is at the end, on more episodes.
     pub(super) checks: Vec<(u64, Measured)>,
-    /// The measurement at the end, on more episodes.
-    pub(super) last: Measured,
     /// Scores at each location of the first episodes of the last measurement, in nats: log-softmax of the true pair plus ln B.
     pub(super) maps: Vec<Vec<f64>>,
 }
@@ -106,12 +104,7 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
     }
     let (last, maps) = scorer.measure(settings.episodes)?;
     checks.push((settings.updates, last));
-    Ok(Trained {
-        loss,
-        checks,
-        last,
-        maps,
-    })
+    Ok(Trained { loss, checks, maps })
 }
 
 /// Frames [T, N, H * W] of whole episodes of N environments, and the patches' first rows and columns.
