@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use driml_launch::{
     console::Screen,
     managed_process::{ManagedProcess, Surroundings, THREADS},
@@ -47,10 +47,6 @@ pub(super) fn start(
 
 /// Waits until a process listens at `endpoint`.
 pub(super) fn wait_for(process: &mut ManagedProcess, endpoint: &str) -> anyhow::Result<()> {
-    let check_alive = || match process.end() {
-        Some(_) => bail!("{}", process.exit_report()),
-        None => Ok(()),
-    };
     // A benchmark does not listen for signals.
-    wait_until_listening(endpoint, &Shutdown::default(), check_alive).map(drop)
+    wait_until_listening(endpoint, &Shutdown::default(), || process.check_alive()).map(drop)
 }

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use driml_machine::{process_env::program, units::kib};
 use nix::{
     sys::signal::{Signal, kill},
@@ -114,14 +114,20 @@ impl ManagedProcess {
         self.child.id()
     }
 
-    /// Whether it has ended in a way that a restart may mend: it was killed, or it had run for a while. A broken
-    /// invariant of our own aborts it. After an orderly end it may if it `is_needed`.
-    pub(crate) fn may_be_started_again(&mut self, is_needed: bool) -> bool {
+    /// Whether it has ended in a way that a restart may mend: in order, killed, or after it had run for a while. A broken
+    /// invariant of our own aborts it.
+    pub(crate) fn may_be_started_again(&mut self) -> bool {
         let killed = |signal| signal != Signal::SIGABRT as i32;
-        self.end().is_some_and(|status| match status.success() {
-            true => is_needed,
-            false => status.signal().is_some_and(killed) || self.started.elapsed() > AT_ONCE,
+        let had_run = self.started.elapsed() > AT_ONCE;
+        self.end().is_some_and(|status| {
+            status.success() || status.signal().is_some_and(killed) || had_run
         })
+    }
+
+    /// Checks that it has not ended.
+    pub fn check_alive(&mut self) -> anyhow::Result<()> {
+        ensure!(self.end().is_none(), "{}", self.exit_report());
+        Ok(())
     }
 
     /// How it ended, if it has.

@@ -3,11 +3,10 @@
 
 use std::{
     os::unix::process::ExitStatusExt,
-    process::ExitStatus,
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use driml_machine::units::duration;
 use driml_protocol::{Shutdown, reach};
 use nix::sys::signal::Signal;
@@ -43,35 +42,6 @@ impl Processes {
         let missing = |it: &mut ManagedProcess| it.missing_log_lines();
         self.all().filter_map(missing).collect()
     }
-
-    /// Checks that all are as they should be: running, about to be started again, or actors that are not needed any more.
-    pub(crate) fn check_alive(&mut self, revived: Revived) -> anyhow::Result<()> {
-        let servers = self.replay_servers.iter_mut().filter(|_| !revived.servers);
-        for process in servers.chain(&mut self.learner) {
-            if process.end().is_some() {
-                bail!("{}", process.exit_report());
-            }
-        }
-        for actor in &mut self.actors {
-            let is_needed = revived.actors_are_needed;
-            let comes_back = revived.actors && actor.may_be_started_again(is_needed);
-            let is_missed = |status: ExitStatus| is_needed || !status.success();
-            if actor.end().is_some_and(is_missed) && !comes_back {
-                bail!("{}", actor.exit_report());
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Which processes of a run are restarted when they have died: their end does not end the run, however soon it comes.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Revived {
-    pub(crate) servers: bool,
-    /// Actors that had lived for a while.
-    pub(crate) actors: bool,
-    /// An actor that has exited was asked to by someone else, as frames are missing.
-    pub(crate) actors_are_needed: bool,
 }
 
 /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
@@ -130,26 +100,6 @@ pub fn wait_until_listening(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn an_actor_that_exits_before_the_run_is_over_is_missed() {
-        let logs = tempfile::tempdir().unwrap();
-        let mut actor = ManagedProcess::of_script("exit 0", logs.path());
-        actor.wait_until(Instant::now() + Duration::from_secs(60), || false);
-        let mut processes = Processes {
-            actors: vec![actor],
-            ..Processes::default()
-        };
-        for actors_are_needed in [false, true] {
-            let revived = Revived {
-                actors_are_needed,
-                ..Revived::default()
-            };
-            let said = processes.check_alive(revived).map_err(|e| e.to_string());
-            let is_missed = said.is_err_and(|it| it.starts_with("script exited with code 0"));
-            assert_eq!(is_missed, actors_are_needed);
-        }
-    }
 
     #[test]
     fn a_process_that_dies_of_the_request_to_stop_has_stopped() {

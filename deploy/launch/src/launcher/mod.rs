@@ -24,8 +24,10 @@ use crate::{
     console::{self, Screen, print_wrapped},
     endpoint::NAMESPACE,
     evaluator::Evaluator,
-    last_play, open_files,
-    processes::{Processes, Revived, stop, wait_until_listening},
+    last_play,
+    managed_process::ManagedProcess,
+    open_files,
+    processes::{Processes, stop, wait_until_listening},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
@@ -47,6 +49,7 @@ const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 const DRAIN_POLL: Duration = Duration::from_millis(100);
+
 /// Where the replay server is reached from outside the run.
 #[derive(Clone, Debug, Default)]
 pub struct Outside {
@@ -118,7 +121,6 @@ pub fn run(
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
-        actors_are_needed: false,
         poller: None,
     };
 
@@ -184,8 +186,6 @@ struct Launch<'a> {
     evaluator: Evaluator,
     server_restarts: u32,
     actor_restarts: u32,
-    /// An actor that has exited is to come back.
-    actors_are_needed: bool,
     poller: Option<Poller>,
 }
 
@@ -217,7 +217,8 @@ impl Launch<'_> {
         let hash = self.config.run.hash();
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
-            let mut check_alive = || self.processes.check_alive(Revived::default());
+            let servers = &mut self.processes.replay_servers;
+            let mut check_alive = || servers.iter_mut().try_for_each(ManagedProcess::check_alive);
             if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
@@ -254,9 +255,7 @@ impl Launch<'_> {
                 return Ok(Outcome::Interrupted);
             }
             self.run_dir.check_whole()?;
-            self.actors_are_needed = self.is_actor_missed();
             self.revive()?;
-            self.processes.check_alive(self.revived())?;
             let poller = self.poller.as_mut();
             let poller = poller.expect("it was set before the run is watched");
             poller.ask();

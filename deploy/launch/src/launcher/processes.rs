@@ -1,16 +1,16 @@
 //! The launcher's processes: the words that start each, and those that are started again when they have died.
 //! When the first are started, and how all end, is in `mod`.
 
-use std::ffi::{OsStr, OsString};
+use std::{
+    ffi::{OsStr, OsString},
+    process::ExitStatus,
+};
 
 use anyhow::bail;
 use driml_protocol::session;
 
 use super::{Launch, Outside};
-use crate::{
-    managed_process::{ManagedProcess, Surroundings},
-    processes::Revived,
-};
+use crate::managed_process::{ManagedProcess, Surroundings};
 
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
 const RESTARTS_MAX: u32 = 8;
@@ -98,7 +98,7 @@ impl Launch<'_> {
     }
 
     /// Whether an actor has exited though frames are missing, by an answer that is newer than its end.
-    pub(super) fn is_actor_missed(&mut self) -> bool {
+    fn is_actor_missed(&mut self) -> bool {
         let Some(poller) = &mut self.poller else {
             return false;
         };
@@ -109,37 +109,40 @@ impl Launch<'_> {
         poller.ask_replay().is_ok() && !poller.view.replay.finished
     }
 
-    pub(super) fn revived(&self) -> Revived {
-        Revived {
-            servers: self.config.local.durable && self.server_restarts < RESTARTS_MAX,
-            actors: self.actor_restarts < ACTOR_RESTARTS_MAX,
-            actors_are_needed: self.actors_are_needed,
-        }
-    }
-
     /// Restarts processes that have died: replay servers that keep their replay on disk, and actors. What an actor had not delivered is
     /// lost; the run continues.
+    ///
+    /// # Errors
+    /// One that has died is not restarted.
     pub(super) fn revive(&mut self) -> anyhow::Result<()> {
+        let actors_are_needed = self.is_actor_missed();
         for shard in 0..self.processes.replay_servers.len() {
             let server = &mut self.processes.replay_servers[shard];
-            if server.end().is_none() || !self.revived().servers {
-                continue;
+            if !self.config.local.durable || self.server_restarts >= RESTARTS_MAX {
+                server.check_alive()?;
+            } else if server.end().is_some() {
+                let report = server.exit_report();
+                self.server_restarts += 1;
+                let how = format!(
+                    "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
+                    self.servers[shard], self.server_restarts
+                );
+                self.note_restart(&report, &how);
+                self.processes.replay_servers[shard] = self.start_server(shard)?;
             }
-            let report = self.processes.replay_servers[shard].exit_report();
-            self.server_restarts += 1;
-            let how = format!(
-                "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
-                self.servers[shard], self.server_restarts
-            );
-            self.note_restart(&report, &how);
-            self.processes.replay_servers[shard] = self.start_server(shard)?;
         }
+        let mut learner = self.processes.learner.iter_mut();
+        learner.try_for_each(ManagedProcess::check_alive)?;
         for id in 0..self.processes.actors.len() {
             let actor = &mut self.processes.actors[id];
-            if !actor.may_be_started_again(self.actors_are_needed) || !self.revived().actors {
+            let is_over = |status: ExitStatus| status.success() && !actors_are_needed;
+            if actor.end().is_none_or(is_over) {
                 continue;
             }
-            let report = self.processes.actors[id].exit_report();
+            let report = actor.exit_report();
+            if !actor.may_be_started_again() || self.actor_restarts >= ACTOR_RESTARTS_MAX {
+                bail!("{report}");
+            }
             if !self.config.world.is_resumable() {
                 bail!(
                     "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
