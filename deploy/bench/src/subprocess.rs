@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::Context;
 use driml_launch::{
     console::Screen,
-    managed_process::{ManagedProcess, Surroundings, THREADS},
+    managed_process::{ManagedProcess, THREADS},
     processes::wait_until_listening,
 };
 use driml_machine::process_env;
@@ -37,12 +37,7 @@ pub(super) fn start(
     let run = ["--env", world, "--agent", agent, "--preset", "paper"];
     let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
     let args = [args, &run, &sets].concat();
-    let surroundings = Surroundings {
-        logs: folder,
-        screen: &Screen::plain(),
-        rendezvous: None,
-    };
-    ManagedProcess::start(name, &args, 1, surroundings)
+    ManagedProcess::start(name, &args, 1, folder, &Screen::plain(), None)
 }
 
 /// Waits until a process listens at `endpoint`.

@@ -17,7 +17,7 @@ use crate::{
     chosen::{Weights, Which, checkpoint_at, config_of},
     console::Screen,
     evaluate::{Levels, Player, Who, levels},
-    managed_process::{ManagedProcess, Surroundings},
+    managed_process::ManagedProcess,
     run_folder::{Candidate, Evaluated, RunFolder},
     stats::mean_and_deviation,
 };
@@ -198,12 +198,7 @@ impl Evaluator {
             OsStr::new("--episodes"),
             OsStr::new(&episodes),
         ];
-        let surroundings = Surroundings {
-            logs: &self.run_dir.logs(),
-            screen,
-            rendezvous: None,
-        };
-        ManagedProcess::start("evaluation", &args, 1, surroundings)
+        ManagedProcess::start("evaluation", &args, 1, &self.run_dir.logs(), screen, None)
     }
 
     /// Takes note of an evaluation that has ended. One that failed costs the run nothing but a line.

@@ -33,17 +33,6 @@ pub struct ManagedProcess {
     log: ProcessLog,
 }
 
-/// What all processes of a run have in common when they start.
-#[derive(Clone, Copy, Debug)]
-pub struct Surroundings<'a> {
-    /// The folder of their logs.
-    pub logs: &'a Path,
-    /// Where their warnings are shown.
-    pub screen: &'a Screen,
-    /// Where they meet, if it is to stay there as long as any of them lives.
-    pub rendezvous: Option<&'a Rendezvous>,
-}
-
 /// The variable that says how many threads a process has for arithmetic.
 pub const THREADS: &str = "RAYON_NUM_THREADS";
 
@@ -55,15 +44,18 @@ pub fn exit_with_this_process() -> [String; 2] {
 
 impl ManagedProcess {
     /// Starts this program with other arguments, in its own process group so that Ctrl-C does not reach it. It ends when
-    /// this process does.
+    /// this process does. Its log is in the folder `logs`, its warnings are shown on `screen`; where the processes of a run meet
+    /// stays there as long as it lives.
     pub fn start(
         name: &str,
         args: &[impl AsRef<OsStr>],
         threads: u32,
-        surroundings: Surroundings<'_>,
+        logs: &Path,
+        screen: &Screen,
+        rendezvous: Option<&Rendezvous>,
     ) -> anyhow::Result<Self> {
-        let log = ProcessLog::open(name, surroundings.logs)?;
-        let held = surroundings.rendezvous.map(Rendezvous::hold).transpose();
+        let log = ProcessLog::open(name, logs)?;
+        let held = rendezvous.map(Rendezvous::hold).transpose();
         let held = held.with_context(|| format!("starting {name}"))?;
         let stdin = held.map_or_else(Stdio::null, Stdio::from);
         let mut command = Command::new(program());
@@ -73,7 +65,7 @@ impl ManagedProcess {
             .args(args)
             .args(exit_with_this_process())
             .stdin(stdin);
-        Self::spawn(name, command, log, surroundings.screen)
+        Self::spawn(name, command, log, screen)
     }
 
     fn spawn(

@@ -10,7 +10,7 @@ use anyhow::bail;
 use driml_protocol::session;
 
 use super::{Launch, Outside};
-use crate::managed_process::{ManagedProcess, Surroundings};
+use crate::managed_process::ManagedProcess;
 
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
 const RESTARTS_MAX: u32 = 8;
@@ -47,12 +47,8 @@ impl Outside {
 
 impl Launch<'_> {
     fn start(&self, name: &str, args: &[OsString], threads: u32) -> anyhow::Result<ManagedProcess> {
-        let surroundings = Surroundings {
-            logs: &self.run_dir.logs(),
-            screen: &self.screen,
-            rendezvous: Some(&self.rendezvous),
-        };
-        ManagedProcess::start(name, args, threads, surroundings)
+        let (logs, screen, rendezvous) = (self.run_dir.logs(), &self.screen, &self.rendezvous);
+        ManagedProcess::start(name, args, threads, &logs, screen, Some(rendezvous))
     }
 
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
