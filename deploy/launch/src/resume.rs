@@ -38,23 +38,9 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
     let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
     folder.config().exists()
         && saved.last().is_some_and(|(_, newest)| {
-            let lockstep = lockstep_of(newest).unwrap_or_default();
-            lockstep.map_or_else(|| world.is_resumable(), |it| it.is_whole)
+            let companion = checkpoint::companion(newest).unwrap_or_default();
+            companion.map_or_else(|| world.is_resumable(), |it| !it.is_empty())
         })
-}
-
-/// A run in lockstep.
-struct InLockstep {
-    /// A checkpoint holds all its components.
-    is_whole: bool,
-}
-
-/// Whether a checkpoint is of a run in lockstep; none if it is not.
-fn lockstep_of(checkpoint: &Path) -> Result<Option<InLockstep>, CheckpointError> {
-    let companion = checkpoint::companion(checkpoint)?;
-    Ok(companion.map(|it| InLockstep {
-        is_whole: !it.is_empty(),
-    }))
 }
 
 /// Prints how to resume a run that was interrupted or failed, if it can be.
@@ -171,15 +157,16 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         usage!("there is no checkpoint in {checkpoints}: start the run again, in another folder")
     })?;
     let (updates, progress) = checkpoint::progress(newest)?;
-    let found = lockstep_of(newest)?;
-    if found.as_ref().is_some_and(|it| !it.is_whole) {
+    // A run in lockstep has one, which is empty where its world cannot be saved.
+    let companion = checkpoint::companion(newest)?;
+    if companion.as_ref().is_some_and(Vec::is_empty) {
         return Err(usage!(
             "the run in {} cannot be resumed, because the state of its world cannot be saved: start it again",
             folder.display()
         )
         .into());
     }
-    let lockstep = found.is_some();
+    let lockstep = companion.is_some();
     if !lockstep && !config.world.is_resumable() {
         return Err(usage!(
             "the run in {} cannot be resumed, because a checkpoint does not save its position in world.lethal_schedule: start it again",
