@@ -9,16 +9,12 @@ use std::{
 use anyhow::{bail, ensure};
 use driml_launch::{
     console::{self, aligned},
-    endpoint::NAMESPACE,
     managed_process::ManagedProcess,
     run_folder::{RunFolder, Summary},
     view::{Poller, Reached},
 };
 use driml_machine::units::number;
-use driml_protocol::{
-    Keys, LearnerStatus, ReplayStatus, RunClient,
-    session::{self, Endpoints},
-};
+use driml_protocol::{LearnerStatus, ReplayStatus};
 use tempfile::TempDir;
 
 use crate::{
@@ -218,15 +214,8 @@ impl Run {
         ];
         let args = [&listen[..], flags].concat();
         let mut launcher = start("launcher", &args, sets, folder.path())?;
-        let endpoints = Endpoints::to(vec![endpoint.clone()]);
         wait_for(&mut launcher, &endpoint)?;
-        let session = session::open(&endpoints)?;
-        let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
-        let reached = Reached {
-            name: "replay-server".into(),
-            endpoint,
-            client: RunClient::new(session, keys, config.run.hash()),
-        };
+        let reached = Reached::open("replay-server", &endpoint, config.run.hash())?;
         Ok(Self {
             poller: Poller::new(&config, vec![reached]),
             launcher,

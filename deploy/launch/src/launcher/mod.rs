@@ -10,19 +10,13 @@ use std::{
 };
 
 use anyhow::{Context, bail};
-use driml_machine::{error::Usage, units::duration};
-use driml_protocol::{
-    GracefulShutdown, Keys, RunClient, Silence,
-    config::Settings,
-    session::{self, Endpoints},
-    shared_memory,
-};
+use driml_machine::units::duration;
+use driml_protocol::{GracefulShutdown, Silence, config::Settings, session, shared_memory};
 use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
     console::{self, Screen, print_wrapped},
-    endpoint::NAMESPACE,
     evaluator::Evaluator,
     last_play,
     managed_process::ManagedProcess,
@@ -213,7 +207,6 @@ impl Launch<'_> {
             let server = self.start_server(shard)?;
             self.processes.replay_servers.push(server);
         }
-        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
         let hash = self.config.run.hash();
         let mut reached = Vec::new();
         for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
@@ -222,17 +215,12 @@ impl Launch<'_> {
             if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
             }
-            let opened = session::open(&Endpoints::to(vec![endpoint.clone()]));
+            let opened = Reached::open(name, endpoint, hash);
             if opened.is_err() {
                 // One that died while this process connected says more than the connection.
                 check_alive()?;
             }
-            let session = opened?;
-            reached.push(Reached {
-                name: name.clone(),
-                endpoint: endpoint.clone(),
-                client: RunClient::new(session, keys.clone(), hash),
-            });
+            reached.push(opened?);
         }
         let mut poller = Poller::new(self.config, reached);
         let point = &self.resume_point;

@@ -4,17 +4,20 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use driml_machine::error::usage;
+use driml_machine::error::{Usage, usage};
 use driml_protocol::{
-    CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, Recovering,
-    ReplayStatus, RunClient, RunInfo, join, reach,
+    CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, ReplayStatus,
+    RunClient, RunInfo, join, reach,
     session::{self, Endpoints, SMALL_MESSAGE_BYTES_MAX, SessionError},
     tls::Credentials,
 };
 use driml_settings::config::RunConfig;
 use zenoh::{Session, Wait};
 
-use crate::run_view::{Plan, RunView, ServerAnswer};
+use crate::{
+    endpoint::NAMESPACE,
+    run_view::{Plan, RunView, ServerAnswer},
+};
 
 /// How long an answer may take; a process that is busy answers the next time.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
@@ -23,11 +26,10 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub struct Reached {
     /// What it is called in messages.
-    pub name: String,
-    /// Where it listens.
-    pub endpoint: String,
+    name: String,
+    endpoint: String,
     /// Asks it, through a session that the poller closes.
-    pub client: RunClient,
+    client: RunClient,
 }
 
 /// Asks a run's processes.
@@ -58,17 +60,17 @@ impl Poller {
         namespace: &str,
         credentials: Option<&Credentials>,
     ) -> anyhow::Result<Self> {
-        let keys = Keys::new(namespace).map_err(driml_machine::error::Usage)?;
+        let keys = Keys::new(namespace).map_err(Usage)?;
         let mut servers = Vec::new();
-        let mut first: Option<Greeting> = None;
+        let mut config: Option<RunConfig> = None;
         for endpoint in endpoints {
             let reached = Endpoints::to(vec![endpoint.clone()]);
             // An observer does not wait for a server that is still to come.
             reach::look(endpoint)?;
             let session = session::open_as(&reached, &keys, credentials, SMALL_MESSAGE_BYTES_MAX)?;
-            let run_info = run_info(&session, &keys, endpoint, namespace)?;
-            let hash = run_info.config.run.hash();
-            if first.get_or_insert(run_info).config.run.hash() != hash {
+            let served = settings(&session, &keys, endpoint, namespace)?;
+            let hash = served.run.hash();
+            if config.get_or_insert(served).run.hash() != hash {
                 return Err(usage!(
                     "{} and {endpoint} are of different runs: name the replay shards of one",
                     endpoints[0]
@@ -81,10 +83,8 @@ impl Poller {
                 client: RunClient::new(session, keys.clone(), hash),
             });
         }
-        let first = first.context("no endpoint to ask")?;
-        let mut this = Self::new(&first.config, servers);
-        this.view.after_updates = first.after_updates;
-        Ok(this)
+        let config = config.context("no endpoint to ask")?;
+        Ok(Self::new(&config, servers))
     }
 
     /// Asks all processes. Those that do not answer are named in the view.
@@ -154,6 +154,17 @@ impl Poller {
 }
 
 impl Reached {
+    /// Connects to a server of the run with this hash that `driml train` has started at `endpoint`.
+    pub fn open(name: &str, endpoint: &str, spec_hash: u64) -> anyhow::Result<Self> {
+        let session = session::open(&Endpoints::to(vec![endpoint.to_owned()]))?;
+        let keys = Keys::new(NAMESPACE).map_err(Usage)?;
+        Ok(Self {
+            name: name.to_owned(),
+            endpoint: endpoint.to_owned(),
+            client: RunClient::new(session, keys, spec_hash),
+        })
+    }
+
     fn ask(&self) -> ServerAnswer {
         let replay = self.client.fetch::<ReplayStatus>(ANSWER_MAX);
         let answers =
@@ -181,24 +192,16 @@ impl Reached {
     }
 }
 
-struct Greeting {
-    config: RunConfig,
-    /// Updates after which the run was resumed; none before its learner has joined.
-    after_updates: Option<u64>,
-}
-
-fn run_info(
+/// The settings that a replay server hands out, also while it reads its replay back.
+fn settings(
     session: &Session,
     keys: &Keys,
     endpoint: &str,
     namespace: &str,
-) -> anyhow::Result<Greeting> {
-    let (config_toml, after_updates) = match join::run_info_within(session, keys, ANSWER_MAX) {
-        Ok(run_info) => {
-            let after_updates = run_info.has_learner.then_some(run_info.after_updates);
-            (run_info.config_toml, after_updates)
-        }
-        Err(SessionError::Recovering(Recovering { config_toml, .. })) => (config_toml, None),
+) -> anyhow::Result<RunConfig> {
+    let config_toml = match join::run_info_within(session, keys, ANSWER_MAX) {
+        Ok(run_info) => run_info.config_toml,
+        Err(SessionError::Recovering(recovering)) => recovering.config_toml,
         Err(SessionError::Unreadable { why, .. }) => {
             let what = format!("the run info of the replay server on {endpoint}");
             return Err(why).context(what);
@@ -214,8 +217,8 @@ fn run_info(
             return Err(anyhow::Error::new(other).context(what));
         }
     };
-    Ok(Greeting {
-        config: RunConfig::parse("the replay server's settings", &config_toml)?,
-        after_updates,
-    })
+    Ok(RunConfig::parse(
+        "the replay server's settings",
+        &config_toml,
+    )?)
 }
