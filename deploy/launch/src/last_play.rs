@@ -93,8 +93,8 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
 mod tests {
     use super::*;
     use crate::{
-        run_folder::Outcome,
-        run_view::{Episodes, Plan, RunView},
+        run_folder::{Outcome, ResumePoint},
+        run_view::{Plan, RunView},
         testing::config,
     };
 
@@ -104,8 +104,7 @@ mod tests {
         assert!(!config.local.play, "a test run is not played");
         config.local.play = true;
         let view = RunView::new(Plan::of(&config));
-        let (none, outcome) = (Episodes::default(), Outcome::Finished);
-        let mut summary = Summary::of(outcome, &config.run, &view, none, 2.0);
+        let mut summary = Summary::of(Outcome::Finished, &view, 2.0, ResumePoint::default());
         let before = summary.clone();
         let folder = RunFolder::new("no-such-run");
         play(&mut summary, &config, &folder, &|| false);

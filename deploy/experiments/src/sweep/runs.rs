@@ -140,7 +140,7 @@ pub(super) mod tests {
         let mut view = RunView::new(Plan::of(&config));
         let mut recorder = RunRecorder::create(folder, &config, Vec::new()).unwrap();
         recorder.record(&mut view, &[]);
-        let summary = recorder.summarise(Outcome::Finished, &config.run, &view);
+        let summary = recorder.summarise(Outcome::Finished, &mut view);
         summary.write(folder).unwrap();
     }
 

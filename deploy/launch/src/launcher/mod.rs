@@ -400,7 +400,8 @@ impl Launch<'_> {
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
-        let nothing = &mut RunView::new(Plan::default());
+        let updates = self.resume_point.updates;
+        let nothing = &mut RunView::beginning(Plan::of(self.config), 0, updates);
         let view = match &mut self.poller {
             None => nothing,
             Some(poller) => {
@@ -411,7 +412,7 @@ impl Launch<'_> {
         let logs = self.processes.missing_log_lines();
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
-        let mut summary = recorder.summarise(outcome, &self.config.run, view);
+        let mut summary = recorder.summarise(outcome, view);
         summary.replay_servers_restarted = servers_before + self.server_restarts;
         summary.actors_restarted = actors_before + self.actor_restarts;
         let written = summary.write(self.run_dir);

@@ -123,7 +123,7 @@ pub fn run(
     let missing = console::join_losses(recorder.missing());
     missing.iter().for_each(|line| console::line(line));
     run_dir.check_whole()?;
-    let summary = recorder.summarise(outcome, &config.run, &view);
+    let summary = recorder.summarise(outcome, &mut view);
     print_wrapped(&summary.describe(run_dir), 2)?;
     summary.write(run_dir)?;
     resume::say_next(&summary, &config.world, run_dir)

@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_protocol::{EpisodesReply, ReplayStatus, RunSpec};
+use driml_protocol::{EpisodesReply, ReplayStatus};
 use driml_settings::config::RunConfig;
 
 use super::{
@@ -225,23 +225,13 @@ impl RunRecorder {
     }
 
     /// What there is to say of the run, which ended so.
-    pub fn summarise(&self, outcome: Outcome, run: &RunSpec, view: &RunView) -> Summary {
-        let (wall_seconds, episodes) = (self.seconds(), self.episodes(&view.replay));
-        let of_view = Summary::of(outcome, run, view, episodes, wall_seconds);
-        // A resumed run that did not get anywhere still has what was done before.
-        let frames = of_view.frames.max(self.resume_point.frames);
-        let updates = of_view.updates.max(self.resume_point.updates);
+    pub fn summarise(&self, outcome: Outcome, view: &mut RunView) -> Summary {
+        self.complete(view);
         let rss = self.rss_mib.iter().zip(&self.rss_max);
         let rss = rss.map(|((name, _), mib)| (name.clone(), mib.map(f64::round).into()));
         Summary {
-            resumed_after_updates: self.resume_point.updates,
-            frames,
-            updates,
-            frames_per_second: frames as f64 / wall_seconds,
-            updates_per_second: updates as f64 / wall_seconds,
-            mean_k: self.k(&view.replay).map(|it| it.mean),
             rss_mib_max: rss.collect(),
-            ..of_view
+            ..Summary::of(outcome, view, self.seconds(), self.resume_point)
         }
     }
 }

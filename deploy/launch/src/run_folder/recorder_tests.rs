@@ -102,7 +102,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let said = recorder.record(&mut all, &[Some(12.34), None]);
     assert!(said.is_empty(), "{said:?}");
     assert!(recorder.missing().is_empty());
-    let summary = recorder.summarise(Outcome::Finished, &settings().run, &all);
+    let summary = recorder.summarise(Outcome::Finished, &mut all);
     summary.write(&run).unwrap();
     assert!(Summary::is_finished(&run));
     let counts = (summary.frames, summary.replay_ratio, summary.mean_k);
@@ -145,11 +145,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     }
     let said = go_on(&run, &processes).unwrap_err();
     assert!(said.to_string().contains("is still running"), "{said}");
-    let summary = recorder.summarise(
-        Outcome::Interrupted,
-        &settings().run,
-        &view(&replay, &learner),
-    );
+    let summary = recorder.summarise(Outcome::Interrupted, &mut view(&replay, &learner));
     summary.write(&run).unwrap();
     drop(recorder);
     // A launcher that was killed while it wrote.
@@ -169,7 +165,9 @@ fn a_resumed_run_continues_in_its_metrics() {
     replay.rows_sampled = 62 * 16;
     learner.updates = 62;
     recorder.record(&mut view(&replay, &learner), &[]);
-    let summary = recorder.summarise(Outcome::Finished, &settings().run, &view(&replay, &learner));
+    let mut resumed = view(&replay, &learner);
+    resumed.after_updates = Some(31);
+    let summary = recorder.summarise(Outcome::Finished, &mut resumed);
     let counts = (summary.frames, summary.updates, summary.episodes);
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
@@ -222,8 +220,8 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         assert_eq!(rows_of_metrics, (kept, kept / 2), "{what}");
         let nothing = ReplayStatus::default();
         assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
-        let view = view(&nothing, &LearnerStatus::default());
-        let summary = recorder.summarise(Outcome::Finished, &settings().run, &view);
+        let mut view = view(&nothing, &LearnerStatus::default());
+        let summary = recorder.summarise(Outcome::Finished, &mut view);
         let took = summary.wall_seconds;
         assert!(took >= seconds, "{what}: {took}");
         assert_eq!(summary.frames, 2_000, "{what}");
@@ -265,13 +263,7 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
 
 fn summary(replay: &ReplayStatus) -> Summary {
     let view = view(replay, &LearnerStatus::default());
-    Summary::of(
-        Outcome::Finished,
-        &settings().run,
-        &view,
-        Episodes::default(),
-        2.0,
-    )
+    Summary::of(Outcome::Finished, &view, 2.0, ResumePoint::default())
 }
 
 #[test]

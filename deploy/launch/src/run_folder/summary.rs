@@ -5,13 +5,13 @@ use std::{fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
-use driml_protocol::{ReplayStatus, RunSpec};
+use driml_protocol::ReplayStatus;
 use serde::{Deserialize, Serialize};
 
-use super::{folder::RunFolder, table::write_whole};
+use super::{folder::RunFolder, metrics::ResumePoint, table::write_whole};
 use crate::{
     console::aligned,
-    run_view::{Episodes, RunView},
+    run_view::RunView,
     stats::{interval, mean_and_deviation},
 };
 
@@ -119,22 +119,23 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// What replay and learner counted in a run that took so many seconds and was never resumed.
+    /// Of a run that took so many seconds. One that was resumed and did not get anywhere still has what was done `before`.
     pub(crate) fn of(
         outcome: Outcome,
-        run: &RunSpec,
         view: &RunView,
-        episodes: Episodes,
         wall_seconds: f64,
+        before: ResumePoint,
     ) -> Self {
-        let (replay, learner) = (&view.replay, &view.learner);
-        let (frames, updates) = (replay.transitions_inserted, learner.updates);
+        let (plan, replay, learner) = (&view.plan, &view.replay, &view.learner);
+        let frames = replay.transitions_inserted.max(before.frames);
+        let updates = learner.updates.max(before.updates);
+        let episodes = view.episodes();
         Self {
             outcome,
-            world: run.world.clone(),
-            agent: run.agent.clone(),
-            seed: run.seed,
-            resumed_after_updates: 0,
+            world: plan.world.clone(),
+            agent: plan.agent.clone(),
+            seed: plan.seed,
+            resumed_after_updates: view.after_updates.unwrap_or(0),
             frames,
             updates,
             replay_ratio: replay.replay_ratio(),
@@ -144,7 +145,7 @@ impl Summary {
             wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: replay.mean_k(),
+            mean_k: view.k().map(|it| it.mean),
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
             replay_servers_restarted: 0,

@@ -151,7 +151,8 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         }
     };
     poller.close();
-    let summary = watched.conclude(&poller, *ended.as_ref().unwrap_or(&Outcome::Failed));
+    let outcome = *ended.as_ref().unwrap_or(&Outcome::Failed);
+    let summary = watched.conclude(&mut poller.view, outcome);
     if ended? == Outcome::Interrupted {
         console::line("the run continues without being watched");
         return Err(Interrupted.into());

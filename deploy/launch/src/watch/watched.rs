@@ -138,24 +138,15 @@ impl Watched {
     }
 
     /// Takes the live lines away, says what could not be recorded, and gives the summary of a run that ended so.
-    pub(super) fn conclude(&mut self, poller: &Poller, outcome: Outcome) -> Summary {
+    pub(super) fn conclude(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
         self.screen.clear();
-        let (run, view) = (&poller.config.run, &poller.view);
-        let summary = match &self.recorder {
-            Some(recorder) => {
-                let missing = recorder.missing();
-                missing.iter().for_each(|line| console::line(line));
-                recorder.summarise(outcome, run, view)
-            }
-            None => {
-                let (episodes, seconds) = (view.episodes(), self.began.elapsed());
-                Summary::of(outcome, run, view, episodes, seconds.as_secs_f64())
-            }
+        let Some(recorder) = &self.recorder else {
+            let seconds = self.began.elapsed().as_secs_f64();
+            return Summary::of(outcome, view, seconds, ResumePoint::default());
         };
-        Summary {
-            resumed_after_updates: view.after_updates.unwrap_or(0),
-            ..summary
-        }
+        let missing = recorder.missing();
+        missing.iter().for_each(|line| console::line(line));
+        recorder.summarise(outcome, view)
     }
 }
 
