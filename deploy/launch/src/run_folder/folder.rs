@@ -16,8 +16,44 @@ use super::table::{Table, write_whole};
 
 /// What the names of TensorBoard's files begin with.
 pub(super) const EVENTS: &str = "events.out.tfevents.";
-/// The file whose lock keeps other launchers out.
-const LOCK: &str = ".lock";
+
+/// Makes a method for each file and folder of a run's, which gives its path.
+macro_rules! paths {
+    ($($(#[$doc:meta])+ $vis:vis $method:ident: $name:expr;)+) => {
+        impl RunFolder {
+            $($(#[$doc])+ $vis fn $method(&self) -> PathBuf {
+                self.path.join($name)
+            })+
+        }
+    };
+}
+
+paths! {
+    /// The resolved settings, TOML.
+    pub config: "config.toml";
+    /// A row a second: frames, updates, losses, speed, memory.
+    pub metrics: "metrics.csv";
+    /// A row for each training episode: when it ended, who played it, its return and length.
+    pub episodes: "episodes.csv";
+    /// How the run ended and what it counted, JSON; it is there once the run has ended.
+    pub summary: "summary.json";
+    /// The endpoints of the replay servers, a line each, while `driml train` runs here.
+    pub endpoints: "endpoints";
+    /// The folder in which the processes of `driml train` meet, while it runs here.
+    pub(crate) rendezvous: "rendezvous";
+    /// What checkpoints earned when they were played.
+    pub evaluations: "evaluations.csv";
+    /// A folder with the checkpoint that earned most.
+    pub best: "best";
+    /// A folder for each checkpoint.
+    pub checkpoints: driml_learner::checkpoint::FOLDER;
+    /// The replay, where it is kept on disk.
+    pub replay: "replay";
+    /// A file for each process.
+    pub logs: "logs";
+    /// The file whose lock keeps other launchers out.
+    lock_file: ".lock";
+}
 
 /// The folder of a run, which need not be there yet.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -39,61 +75,6 @@ impl RunFolder {
     /// Its path for a message.
     pub fn display(&self) -> std::path::Display<'_> {
         self.path.display()
-    }
-
-    /// The resolved settings, TOML.
-    pub fn config(&self) -> PathBuf {
-        self.path.join("config.toml")
-    }
-
-    /// A row a second: frames, updates, losses, speed, memory.
-    pub fn metrics(&self) -> PathBuf {
-        self.path.join("metrics.csv")
-    }
-
-    /// A row for each training episode: when it ended, who played it, its return and length.
-    pub fn episodes(&self) -> PathBuf {
-        self.path.join("episodes.csv")
-    }
-
-    /// How the run ended and what it counted, JSON; it is there once the run has ended.
-    pub fn summary(&self) -> PathBuf {
-        self.path.join("summary.json")
-    }
-
-    /// The endpoints of the replay servers, a line each, while `driml train` runs here.
-    pub fn endpoints(&self) -> PathBuf {
-        self.path.join("endpoints")
-    }
-
-    /// The folder in which the processes of `driml train` meet, while it runs here.
-    pub(crate) fn rendezvous(&self) -> PathBuf {
-        self.path.join("rendezvous")
-    }
-
-    /// What checkpoints earned when they were played.
-    pub fn evaluations(&self) -> PathBuf {
-        self.path.join("evaluations.csv")
-    }
-
-    /// A folder with the checkpoint that earned most.
-    pub fn best(&self) -> PathBuf {
-        self.path.join("best")
-    }
-
-    /// A folder for each checkpoint.
-    pub fn checkpoints(&self) -> PathBuf {
-        self.path.join(driml_learner::checkpoint::FOLDER)
-    }
-
-    /// The replay, where it is kept on disk.
-    pub fn replay(&self) -> PathBuf {
-        self.path.join("replay")
-    }
-
-    /// A file for each process.
-    pub fn logs(&self) -> PathBuf {
-        self.path.join("logs")
     }
 
     /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
@@ -121,7 +102,7 @@ impl RunFolder {
             self.endpoints(),
             self.rendezvous(),
             self.logs(),
-            self.path.join(LOCK),
+            self.lock_file(),
         ];
         let has_frames = |path: &PathBuf| {
             let text = fs::read(path).unwrap_or_default();
@@ -166,7 +147,7 @@ impl RunFolder {
     /// # Errors
     /// Another launcher holds it, or a file system that refuses.
     pub fn lock(&self) -> anyhow::Result<File> {
-        let path = self.path.join(LOCK);
+        let path = self.lock_file();
         let doing = || format!("locking {}", path.display());
         let lock = lock_file::create(&path, "start no other run there").with_context(doing)?;
         let folder = self.display();
