@@ -31,47 +31,32 @@ pub(super) struct At {
 }
 
 pub(super) fn version(at: At) -> Vec<u8> {
-    let mut event = event(at);
-    bytes(&mut event, 3, FILE_VERSION.as_bytes());
-    record(&event)
+    record(at, 3, FILE_VERSION.as_bytes())
 }
 
 /// A record that says that what was written before for this step or later does not count any more.
 pub(super) fn begin_anew(at: At) -> Vec<u8> {
     const START: u64 = 1;
-    let mut session = Vec::new();
-    number(&mut session, 1, START);
-    let mut event = event(at);
-    bytes(&mut event, 7, &session);
-    record(&event)
+    record(at, 7, &number(1, START))
 }
 
 pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
-    let mut all = Vec::new();
-    for (name, value) in values {
-        let mut one = Vec::new();
-        bytes(&mut one, 1, name.as_bytes());
-        match value {
-            Value::Scalar(value) => {
-                key(&mut one, 2, FIXED32);
-                one.extend(value.to_le_bytes());
-            }
-            Value::Counts(counts) => bytes(&mut one, 5, &histogram(counts)),
+    let field = |(name, value): &(String, Value<'_>)| {
+        let value = match value {
+            Value::Scalar(value) => fixed(2, FIXED32, &value.to_le_bytes()),
+            Value::Counts(counts) => bytes(5, &histogram(counts)),
             Value::Image { width, height, png } => {
                 const RGB: u64 = 3;
-                let mut image = Vec::new();
-                for (field, value) in [(1, *height as u64), (2, *width as u64), (3, RGB)] {
-                    number(&mut image, field, value);
-                }
-                bytes(&mut image, 4, png);
-                bytes(&mut one, 4, &image);
+                let [height, width] =
+                    [(1, height), (2, width)].map(|(n, it)| number(n, *it as u64));
+                let image = [height, width, number(3, RGB), bytes(4, png)];
+                bytes(4, &image.concat())
             }
-        }
-        bytes(&mut all, 1, &one);
-    }
-    let mut event = event(at);
-    bytes(&mut event, 5, &all);
-    record(&event)
+        };
+        bytes(1, &[bytes(1, name.as_bytes()), value].concat())
+    };
+    let fields: Vec<_> = values.iter().flat_map(field).collect();
+    record(at, 5, &fields)
 }
 
 /// A `HistogramProto` in which each number has its own bucket, from half below it to half above. Its least and largest value are
@@ -88,71 +73,59 @@ fn histogram(counts: &[u64]) -> Vec<u8> {
     let most = counts.iter().enumerate().rfind(counted);
     let [least, most] = [(least, -0.5), (most, 0.5)]
         .map(|(found, half)| found.map_or(0.0, |(value, _)| value as f64 + half));
-    let mut histogram = Vec::new();
-    for (field, value) in [(1, least), (2, most), (3, total), (4, sum), (5, squares)] {
-        key(&mut histogram, field, FIXED64);
-        histogram.extend(f64::to_le_bytes(value));
-    }
+    let facts = [(1, least), (2, most), (3, total), (4, sum), (5, squares)];
+    let facts = facts.map(|(field, value)| fixed(field, FIXED64, &f64::to_le_bytes(value)));
     // A first, empty bucket ends where that of 0 begins.
     let limits = (0..=counts.len()).map(|value| value as f64 - 0.5);
     let numbers = std::iter::once(0.0).chain(counts.iter().map(|&n| n as f64));
-    bytes(&mut histogram, 6, &packed(limits));
-    bytes(&mut histogram, 7, &packed(numbers));
-    histogram
+    let buckets = [bytes(6, &packed(limits)), bytes(7, &packed(numbers))];
+    [facts.concat(), buckets.concat()].concat()
 }
 
 fn packed(values: impl Iterator<Item = f64>) -> Vec<u8> {
     values.flat_map(f64::to_le_bytes).collect()
 }
 
-fn event(At { seconds, step }: At) -> Vec<u8> {
-    let mut event = Vec::new();
-    key(&mut event, 1, FIXED64);
-    event.extend(seconds.to_le_bytes());
-    number(&mut event, 2, step);
-    event
+fn fixed(field: u8, kind: u8, value: &[u8]) -> Vec<u8> {
+    [&[field << 3 | kind][..], value].concat()
 }
 
-fn key(out: &mut Vec<u8>, field: u8, kind: u8) {
-    out.push(field << 3 | kind);
+fn number(field: u8, value: u64) -> Vec<u8> {
+    fixed(field, VARINT, &varint(value))
 }
 
-fn number(out: &mut Vec<u8>, field: u8, value: u64) {
-    key(out, field, VARINT);
-    varint(out, value);
-}
-
-fn bytes(out: &mut Vec<u8>, field: u8, value: &[u8]) {
-    key(out, field, BYTES);
-    varint(out, value.len() as u64);
-    out.extend(value);
+fn bytes(field: u8, value: &[u8]) -> Vec<u8> {
+    let length = varint(value.len() as u64);
+    fixed(field, BYTES, &[&length[..], value].concat())
 }
 
 /// Seven bits a byte, the lowest first; all but the last byte have the eighth.
-fn varint(out: &mut Vec<u8>, mut value: u64) {
+fn varint(mut value: u64) -> Vec<u8> {
+    let mut bytes = Vec::new();
     while value > 0x7f {
-        out.push(value as u8 | 0x80);
+        bytes.push(value as u8 | 0x80);
         value >>= 7;
     }
-    out.push(value as u8);
+    bytes.push(value as u8);
+    bytes
 }
 
-fn record(data: &[u8]) -> Vec<u8> {
-    let length = (data.len() as u64).to_le_bytes();
-    let mut record = length.to_vec();
-    record.extend(masked(crc32c(&length)).to_le_bytes());
-    record.extend(data);
-    record.extend(masked(crc32c(data)).to_le_bytes());
-    record
+/// The record of an event with one field beside its time and step.
+fn record(At { seconds, step }: At, field: u8, value: &[u8]) -> Vec<u8> {
+    let seconds = fixed(1, FIXED64, &seconds.to_le_bytes());
+    let event = [seconds, number(2, step), bytes(field, value)].concat();
+    let length = (event.len() as u64).to_le_bytes();
+    let [of_length, of_event] = [&length[..], &event].map(|it| masked(crc32c(it)).to_le_bytes());
+    [&length[..], &of_length, &event, &of_event].concat()
 }
 
 /// A checksum of data that may hold checksums.
-pub(super) const fn masked(crc: u32) -> u32 {
+const fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
 /// CRC-32C (Castagnoli), bit by bit: records are a kilobyte a second.
-pub(super) fn crc32c(data: &[u8]) -> u32 {
+fn crc32c(data: &[u8]) -> u32 {
     const POLYNOMIAL: u32 = 0x82f6_3b78;
     let mut crc = u32::MAX;
     for &byte in data {
