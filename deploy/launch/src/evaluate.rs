@@ -122,8 +122,8 @@ impl Player {
         let Ok(world) = levels(&self.config.world, which) else {
             return Ok(None);
         };
-        let (count, watch) = (episodes as usize, &mut play_on);
-        let played = self.play_watched(who, &world, count, seed, watch);
+        let watch = &mut until(|| false);
+        let played = self.play_watched(who, &world, episodes as usize, seed, watch);
         played.map(Some)
     }
 
@@ -182,14 +182,18 @@ impl Player {
 /// Returns of whole episodes of a random policy in a run's world, on the levels trained on. It needs no checkpoint.
 pub fn random_returns(config: &RunConfig, episodes: usize, seed: u64) -> anyhow::Result<Vec<f64>> {
     let world = levels(&config.world, Levels::Train)?;
-    let mut policy = random_policy(config)?;
-    let (policy, watch) = (&mut policy, &mut play_on);
+    let (policy, watch) = (&mut random_policy(config)?, &mut until(|| false));
     play_with(config, policy, &world, episodes, EPSILON, seed, watch)
 }
 
-/// Watches without ending anything.
-fn play_on(_: &Step<'_>, _: &[f64]) -> ControlFlow<()> {
-    ControlFlow::Continue(())
+/// Watches, and ends it once it `is_over`.
+pub(crate) fn until(
+    is_over: impl Fn() -> bool,
+) -> impl FnMut(&Step<'_>, &[f64]) -> ControlFlow<()> {
+    move |_: &Step<'_>, _: &[f64]| match is_over() {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    }
 }
 
 fn random_policy(config: &RunConfig) -> anyhow::Result<RandomPolicy> {

@@ -3,12 +3,10 @@
 
 use std::{
     ffi::OsStr,
-    ops::ControlFlow,
     path::Path,
     time::{Duration, Instant},
 };
 
-use driml_actor::Step;
 use driml_learner::checkpoint;
 use driml_machine::error::Interrupted;
 use driml_settings::config::{EvaluationConfig, RunConfig};
@@ -16,7 +14,7 @@ use driml_settings::config::{EvaluationConfig, RunConfig};
 use crate::{
     chosen::{Weights, Which, checkpoint_at, config_of},
     console::Screen,
-    evaluate::{Levels, Player, Who, levels},
+    evaluate::{Levels, Player, Who, levels, until},
     managed_process::ManagedProcess,
     run_folder::{Candidate, Evaluated, RunFolder},
     stats::mean_and_deviation,
@@ -56,10 +54,7 @@ pub fn keep(
         let player = Player::read(config_of(folder)?, path, Weights::default())?;
         let world = levels(&player.config.world, Levels::Train)?;
         let count = episodes as usize;
-        let watch = &mut |_: &Step<'_>, _: &[f64]| match is_stopped() {
-            true => ControlFlow::Break(()),
-            false => ControlFlow::Continue(()),
-        };
+        let watch = &mut until(is_stopped);
         let returns = player.play_watched(Who::Agent, &world, count, SELECTION_SEED, watch)?;
         if returns.len() < count {
             return Err(Interrupted.into());

@@ -1,19 +1,15 @@
 //! What a finished run's weights earn, played greedily beside a random policy: the number that the run was for.
 //! It fails no run: what goes wrong is a line on stderr.
 
-use std::{
-    ops::ControlFlow,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::ensure;
-use driml_actor::Step;
 use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::{Weights, Which},
     console,
-    evaluate::{Levels, Player, Who, levels},
+    evaluate::{Levels, Player, Who, levels, until},
     run_folder::{Earned, LastPlay, RunFolder, Summary},
 };
 
@@ -56,11 +52,7 @@ fn played(folder: &RunFolder, is_stopped: &dyn Fn() -> bool) -> anyhow::Result<O
     let started = Instant::now();
     let player = Player::load_at(folder, Which::default(), Weights::default())?;
     let world = levels(&player.config.world, Levels::Train)?;
-    let watch =
-        &mut |_: &Step<'_>, _: &[f64]| match is_stopped() || started.elapsed() > FIRST_BATCH_MAX {
-            true => ControlFlow::Break(()),
-            false => ControlFlow::Continue(()),
-        };
+    let watch = &mut until(|| is_stopped() || started.elapsed() > FIRST_BATCH_MAX);
     let (mut agent, mut random) = (Vec::new(), Vec::new());
     for batch in 0..BATCHES_MAX {
         // It takes about as long as each before it.
