@@ -214,6 +214,16 @@ impl Ended {
         self
     }
 
+    /// Standard output, as JSON.
+    ///
+    /// # Panics
+    /// If it is not.
+    #[track_caller]
+    pub fn json(&self) -> serde_json::Value {
+        let said = serde_json::from_str(&self.stdout);
+        said.unwrap_or_else(|e| panic!("{e}: {}", self.stdout))
+    }
+
     /// Checks that standard error holds `words`.
     ///
     /// # Panics

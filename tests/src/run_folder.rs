@@ -6,11 +6,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
-pub use driml_launch::run_folder::{Outcome, Summary};
+pub use driml_launch::run_folder::{Outcome, Summary, Table};
 use safetensors::SafeTensors;
 use sha2::{Digest, Sha256};
 
-use crate::waiting::wait_for;
+use crate::{client::check_nothing_lost, waiting::wait_for};
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, PartialEq)]
@@ -75,21 +75,14 @@ impl RunFolder {
         serde_json::from_str(&self.text("summary.json")).unwrap()
     }
 
-    /// `metrics.csv`: its header and its rows.
-    pub fn metrics(&self) -> (Vec<String>, Vec<Vec<String>>) {
-        let text = self.text("metrics.csv");
-        let mut rows = text
-            .lines()
-            .map(|line| line.split(',').map(str::to_owned).collect());
-        let header = rows.next().unwrap();
-        (header, rows.collect())
+    /// The whole rows of a table so far; none before it is there.
+    pub fn table(&self, name: &str) -> Table {
+        Table::read(&self.path.join(name)).unwrap()
     }
 
-    /// Updates in the last whole row of the metrics so far; none before the first row.
+    /// Updates in the last row of the metrics so far; none before the first row.
     pub fn updates_recorded(&self) -> Option<u64> {
-        let text = fs::read_to_string(self.path.join("metrics.csv")).ok()?;
-        let row = text.get(..text.rfind('\n')?)?.lines().skip(1).last()?;
-        row.split(',').nth(2)?.parse().ok()
+        self.table("metrics.csv").last("updates")
     }
 
     /// Waits until the metrics have a row with more than so many updates.
@@ -102,34 +95,35 @@ impl RunFolder {
     /// The cells of one column of `metrics.csv`.
     #[track_caller]
     pub fn column(&self, name: &str) -> Vec<String> {
-        let (header, rows) = self.metrics();
-        let at = header.iter().position(|it| it == name);
-        let at = at.unwrap_or_else(|| panic!("{name} is not in {header:?}"));
-        rows.into_iter()
-            .map(|mut row| row.swap_remove(at))
-            .collect()
+        let table = self.table("metrics.csv");
+        let at = table.place(name);
+        let at = at.unwrap_or_else(|| panic!("{name} is not in {:?}", table.header));
+        table.rows.iter().map(|row| row[at].to_owned()).collect()
     }
 
-    /// The rows of `episodes.csv`.
+    /// One column of `metrics.csv` that has no empty cell.
+    #[track_caller]
+    pub fn numbers(&self, name: &str) -> Vec<f64> {
+        let cells = self.column(name);
+        cells.iter().map(|it| it.parse().unwrap()).collect()
+    }
+
+    /// The rows of `episodes.csv` so far.
     pub fn episodes(&self) -> Vec<EpisodeRow> {
-        let text = self.text("episodes.csv");
-        let row = |line: &str| {
-            let cells: Vec<_> = line.split(',').collect();
-            let [seconds, frames, episode, actor, env, value, length] = cells[..] else {
-                panic!("{line:?} is not a row of episodes");
-            };
-            let count = |cell: &str| cell.parse().unwrap();
+        let table = self.table("episodes.csv");
+        let rows = table.rows.iter().map(|row| {
+            let count = |name| table.value(row, name).unwrap();
             EpisodeRow {
-                seconds: seconds.parse().ok(),
-                frames: count(frames),
-                episode: count(episode),
-                actor: count(actor),
-                env: count(env),
-                episode_return: (!value.is_empty()).then(|| value.parse().unwrap()),
-                length: (!length.is_empty()).then(|| count(length)),
+                seconds: table.value(row, "seconds"),
+                frames: count("frames"),
+                episode: count("episode"),
+                actor: count("actor"),
+                env: count("env"),
+                episode_return: table.value(row, "return"),
+                length: table.value(row, "length"),
             }
-        };
-        text.lines().skip(1).map(row).collect()
+        });
+        rows.collect()
     }
 
     /// Checks that every episode has a row, and that the mean return is of the last 100 episodes, or of all if there were fewer.
@@ -211,11 +205,7 @@ impl RunFolder {
         let summary = self.summary();
         let (replay, said) = (&summary.replay, format!("{summary:#?}"));
         assert_eq!(summary.outcome, outcome, "{said}");
-        assert_eq!(
-            (replay.transitions_lost, replay.transitions_duplicated),
-            (0, 0),
-            "{said}"
-        );
+        check_nothing_lost(replay);
         assert_eq!(replay.messages_refused, 0, "{said}");
         assert_eq!(summary.frames, replay.transitions_inserted, "{said}");
         // A replay that was kept knows of the k of all the run.
@@ -236,9 +226,6 @@ impl RunFolder {
 
         self.check_episodes(&summary);
 
-        let (header, rows) = self.metrics();
-        let is_whole = rows.iter().all(|row| row.len() == header.len());
-        assert!(is_whole, "{header:?}\n{rows:?}");
         for (column, count) in [("frames", summary.frames), ("updates", summary.updates)] {
             let last = self.column(column).pop().expect("there is a row");
             assert_eq!(last, count.to_string(), "{column}");

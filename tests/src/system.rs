@@ -83,6 +83,12 @@ impl TestSystem {
         self.folder.path().join(name)
     }
 
+    /// The text of a file in the system's folder.
+    #[track_caller]
+    pub fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
+    }
+
     /// The names of what lies in a folder of the system's.
     pub fn names(&self, folder: &str) -> Vec<String> {
         let entries = fs::read_dir(self.path(folder)).unwrap();

@@ -28,3 +28,11 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         thread::sleep(LOOK_AGAIN);
     }
 }
+
+/// Waits until something holds.
+///
+/// # Panics
+/// As [`wait_for`].
+pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
+    wait_for(what, || holds().then_some(()));
+}

@@ -84,8 +84,9 @@ fn benches_give_figures_and_name_the_peer_that_is_missing() {
         ("learner --kernels --precision bf16", 6, 6),
         ("replay", 17, 0),
     ] {
-        let ended = system.run_ok(&format!("bench {bench} --quick --json -"));
-        let report: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+        let report = system
+            .run_ok(&format!("bench {bench} --quick --json -"))
+            .json();
         let figures = report["figures"].as_array().unwrap();
         assert!(bench.starts_with(report["bench"].as_str().unwrap()));
         assert!(figures.iter().all(|it| it["value"].as_f64().unwrap() > 0.0));

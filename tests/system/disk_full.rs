@@ -98,11 +98,7 @@ fn a_run_continues_while_the_disk_is_full() {
     assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
     run.check(Outcome::Interrupted);
     // No second is missing.
-    let numbers = |name| -> Vec<f64> {
-        let cells = run.column(name).into_iter();
-        cells.map(|it| it.parse().unwrap()).collect()
-    };
-    let (seconds, frames) = (numbers("seconds"), numbers("frames"));
+    let [seconds, frames] = ["seconds", "frames"].map(|name| run.numbers(name));
     assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
     assert!(frames.is_sorted(), "{frames:?}");
     check_nothing_is_left(&system);

@@ -34,7 +34,8 @@ fn the_doctor_names_what_the_machine_has_and_ends_as_it_says() {
 #[test]
 fn the_facts_are_there_as_json_too() {
     let ended = system().run("doctor --json");
-    let facts: Vec<serde_json::Value> = serde_json::from_str(&ended.stdout).unwrap();
+    let facts = ended.json();
+    let facts = facts.as_array().unwrap();
     assert!(facts.len() >= 8, "{}", ended.stdout);
     assert_eq!(facts[0]["what"], "cores");
     assert!(facts.iter().all(|fact| fact["state"].is_string()));

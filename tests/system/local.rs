@@ -6,7 +6,7 @@ use std::{
     net::{Ipv4Addr, TcpListener},
 };
 
-use driml_tests::{Client, Outcome, Summary, wait_for};
+use driml_tests::{Client, Outcome, Summary, wait_until};
 
 use crate::{LONG, SHORT, system};
 
@@ -82,8 +82,8 @@ fn driml_ada_with_two_actors_over_tcp() {
         );
     }
     // The replay server says whose affinity it used; the learner sends one after each update.
-    let affinity = run.column("affinity_version").pop().unwrap();
-    assert_ne!(affinity, "0", "it reached the replay server");
+    let affinity = run.table("metrics.csv").last::<u64>("affinity_version");
+    assert!(affinity > Some(0), "it reached the replay server");
 }
 
 /// `driml local --listen` lets actors of other machines play, in the same run folder.
@@ -98,18 +98,13 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     system.find_process("learner");
     let mut outside = system.start_process(&format!("actor --connect {endpoint} --id 5"));
     outside.wait_for_stderr("actor 5 steps 4 environments");
-    wait_for("an episode that it played", || {
-        let rows = std::fs::read_to_string(system.path("run/episodes.csv")).ok()?;
-        let mut rows = rows.lines();
-        rows.any(|row| row.split(',').nth(3) == Some("5"))
-            .then_some(())
-    });
+    let folder = system.run_folder("run");
+    let actors = || -> BTreeSet<_> { folder.episodes().iter().map(|it| it.actor).collect() };
+    wait_until("an episode that it played", || actors().contains(&5));
     outside.stop().expect_code(0).expect_said("actor 5 leaves");
     run.interrupt().expect_code(130);
-    let run = system.run_folder("run");
-    run.check(Outcome::Interrupted);
-    let actors: BTreeSet<_> = run.episodes().iter().map(|it| it.actor).collect();
-    assert_eq!(actors, BTreeSet::from([0, 5]));
+    folder.check(Outcome::Interrupted);
+    assert_eq!(actors(), BTreeSet::from([0, 5]));
 }
 
 /// An unused endpoint, at a loopback address of this process so that no other takes it meanwhile.
@@ -145,7 +140,7 @@ fn cpc_and_curl_get_what_they_need_and_no_more() {
         // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
         assert_eq!(summary.replay.k_histogram.len(), served + 1);
         assert!(summary.replay.k_histogram.iter().all(|&count| count > 0));
-        let last = run.column(loss).pop().unwrap().parse::<f64>().unwrap();
+        let last = run.table("metrics.csv").last::<f64>(loss).unwrap();
         assert!(last > 0.0, "{agent}: {last}");
         system
             .run_ok(&format!("evaluate --run {agent} --episodes 3"))
@@ -168,7 +163,7 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
         ));
         let run = system.run_folder("run");
         assert_eq!(run.check_finished().updates, 540);
-        let last: f64 = run.column(loss).pop().unwrap().parse().unwrap();
+        let last: f64 = run.table("metrics.csv").last(loss).unwrap();
         assert!(last > 0.0 && last < 0.75 * 64f64.ln(), "{agent}: {last}");
     }
 }

@@ -191,8 +191,9 @@ fn c51_learns_the_chain_and_evaluation_shows_it() {
         "the last 100 episodes, with exploration: {while_training} of {wanted}"
     );
 
-    let ended = system.run_ok("evaluate --run run --episodes 40 --json");
-    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    let told = system
+        .run_ok("evaluate --run run --episodes 40 --json")
+        .json();
     let mean = |policy: &str| told["policies"][policy]["mean_return"].as_f64().unwrap();
     let (learned, random) = (mean("c51"), mean("random"));
     assert!(learned >= wanted, "greedy: {learned} of {wanted}");

@@ -31,8 +31,7 @@ fn resumes(system: &TestSystem) -> Summary {
     assert!(summary.episodes > 0);
 
     for name in ["seconds", "frames", "updates", "episodes"] {
-        let numbers = run.column(name).into_iter().map(|it| it.parse().unwrap());
-        let numbers: Vec<f64> = numbers.collect();
+        let numbers = run.numbers(name);
         assert!(numbers.is_sorted(), "{name}: {numbers:?}");
     }
     let log = run.log("learner");

@@ -65,7 +65,7 @@ fn missing_processes_are_named_with_what_to_do() {
     );
 
     let ended = system.run(&format!("status --connect {endpoint} --json"));
-    let answer: serde_json::Value = serde_json::from_str(&ended.expect_code(0).stdout).unwrap();
+    let answer = ended.expect_code(0).json();
     let processes = &answer["servers"][0]["processes"]["processes"];
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);

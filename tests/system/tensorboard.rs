@@ -28,11 +28,11 @@ print(json.dumps({
 
 /// The columns of `metrics.csv`, empty cells left out: frames and value.
 fn columns(system: &TestSystem) -> BTreeMap<String, Vec<(u64, f64)>> {
-    let (header, rows) = system.run_folder("run").metrics();
+    let metrics = system.run_folder("run").table("metrics.csv");
     let mut columns = BTreeMap::<_, Vec<_>>::new();
-    for row in rows {
-        let frames: u64 = row[1].parse().unwrap();
-        for (name, cell) in header.iter().zip(&row) {
+    for row in &metrics.rows {
+        let frames: u64 = metrics.value(row, "frames").unwrap();
+        for (name, cell) in metrics.header.iter().zip(row) {
             if let Ok(value) = cell.parse() {
                 let column = columns.entry(name.clone()).or_default();
                 column.push((frames, value));

@@ -12,7 +12,9 @@ use driml_protocol::{
     session::{self, Endpoints},
     tls::{Credentials, Role},
 };
-use driml_tests::{Certificates, Client, Outcome, Process, TestSystem, Valid, succeeds, wait_for};
+use driml_tests::{
+    Certificates, Client, Outcome, Process, TestSystem, Valid, succeeds, wait_until,
+};
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
 
@@ -178,11 +180,11 @@ fn a_launched_run_with_an_actor_from_outside() {
         "watch --connect {} --tls-dir tls --run-dir seen",
         tls.endpoint
     ));
-    let rows = || std::fs::read_to_string(tls.system.path("seen/episodes.csv")).ok();
-    wait_for("episodes of both actors", || {
-        let rows = rows()?;
-        let is_there = |actor: &str| rows.lines().any(|row| row.split(',').nth(3) == Some(actor));
-        (is_there("0") && is_there("2")).then_some(())
+    let seen = tls.system.run_folder("seen");
+    wait_until("episodes of both actors", || {
+        let episodes = seen.episodes();
+        let is_there = |&actor: &u64| episodes.iter().any(|it| it.actor == actor);
+        [0, 2].iter().all(is_there)
     });
     watched.signal(Signal::SIGINT);
     watched.wait_for_stderr("the run continues without being watched");

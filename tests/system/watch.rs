@@ -1,19 +1,15 @@
 //! `driml watch`: what is shown and recorded of runs that others have started, without disturbing them.
 //! What `driml status` says of a run is in `status`.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    fs,
-};
+use std::collections::{BTreeMap, BTreeSet};
 
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
     Process, TestSystem,
     python::{python_with, run},
-    wait_for,
+    wait_for, wait_until,
 };
 use nix::sys::signal::Signal;
-use serde_json::Value;
 
 use crate::{LONG, SHORT, launched, system};
 
@@ -32,9 +28,7 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     ));
     let client = system.connect();
     let watch = watch(&system, "--run-dir run --tensorboard");
-    wait_for("the folder", || {
-        system.path("run/metrics.csv").exists().then_some(())
-    });
+    wait_until("the folder", || system.path("run/metrics.csv").exists());
     // They begin together, with the first weights: one that came late would play hardly an episode.
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
@@ -62,8 +56,9 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
 
     // The columns are those of a launched run with these settings.
     system.run_ok(&format!("local {flags} {SHORT} --run-dir launched"));
-    let header = watched.metrics().0;
-    assert_eq!(header, system.run_folder("launched").metrics().0);
+    let header = watched.table("metrics.csv").header;
+    let launched = system.run_folder("launched").table("metrics.csv");
+    assert_eq!(header, launched.header);
     assert_eq!(watched.column("rss_mib_learner").pop().unwrap(), "");
     system.run_ok("plot run launched --out plot.svg");
     let names = system.names("run");
@@ -75,9 +70,9 @@ fn a_launched_run_is_watched_and_continues_without() {
     let system = system();
     let launcher = launched(&system, 1);
     let mut watched = system.start("watch --run run --run-dir seen");
-    let rows =
-        || fs::read_to_string(system.path("seen/metrics.csv")).map_or(0, |it| it.lines().count());
-    wait_for("two rows", || (rows() > 2).then_some(()));
+    let seen = system.run_folder("seen");
+    let rows = || seen.table("metrics.csv").rows.len();
+    wait_until("two rows", || rows() >= 2);
     watched.signal(Signal::SIGINT);
     watched.wait_for_stderr("the run continues without being watched");
     watched.wait().expect_code(130);
@@ -97,15 +92,11 @@ fn a_launched_run_is_watched_and_continues_without() {
     );
 
     let watched = system.start("watch --run run --run-dir seen");
-    wait_for("further rows", || (rows() > before + 1).then_some(()));
+    wait_until("further rows", || rows() > before + 1);
     launcher.interrupt().expect_code(130);
     watched.interrupt().expect_code(130);
-    let text = fs::read_to_string(system.path("seen/metrics.csv")).unwrap();
-    let frames = text.lines().skip(1).map(|row| {
-        let frames = row.split(',').nth(1).unwrap();
-        frames.parse::<u64>().unwrap()
-    });
-    assert!(frames.is_sorted(), "{text}");
+    let frames = seen.numbers("frames");
+    assert!(frames.is_sorted(), "{frames:?}");
 }
 
 #[test]
@@ -128,13 +119,9 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     server.kill();
     watched.wait_for_stderr("replay server: no answer for ");
     let _server = system.start_replay_server(&flags);
-    let frames = || {
-        let text = fs::read_to_string(system.path("seen/metrics.csv")).ok()?;
-        let row = text.get(..text.rfind('\n')?)?.lines().last()?;
-        row.split(',').nth(1)?.parse::<u64>().ok()
-    };
-    wait_for("rows after the restart", || {
-        (frames()? > before).then_some(())
+    let metrics = || system.run_folder("seen").table("metrics.csv");
+    wait_until("rows after the restart", || {
+        metrics().last::<u64>("frames") > Some(before)
     });
     watched.interrupt().expect_code(130);
 }
@@ -173,7 +160,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     client.wait_for_learner("the end", |it| it.finished);
 
     let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
-    let said: Value = serde_json::from_str(&ended.stdout).unwrap();
+    let said = ended.json();
     let names: BTreeSet<_> = said
         .as_object()
         .unwrap()
@@ -199,8 +186,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
         "{page}"
     );
 
-    let text = fs::read_to_string(system.path("run.prom")).unwrap();
-    let samples = parse_prometheus(&text);
+    let samples = parse_prometheus(&system.read("run.prom"));
     let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
     let (_, labels, frames) = of("driml_frames_total");
     assert_eq!(*frames, 1280.0);
@@ -291,7 +277,7 @@ print(next(it for it in parse(open(sys.argv[1]).read()) if it.name == 'driml_upd
         })
     };
     let first = wait_for("the file", updates);
-    wait_for("more updates", || (updates()? > first).then_some(()));
+    wait_until("more updates", || updates() > Some(first));
     watched.interrupt().expect_code(130);
     launcher.interrupt().expect_code(130);
 }
