@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{TestSystem, updates_of, wait_for};
+use driml_tests::{TestSystem, updates_of, wait_until};
 
 use crate::{SHORT, system};
 
@@ -21,10 +21,11 @@ fn with_run_of(flags: &str) -> TestSystem {
 }
 
 #[test]
-fn it_prints_the_agent_beside_a_random_policy() {
+fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
     let system = with_run();
-    let ended = system.run_ok("evaluate --run run --episodes 7 --seed 2");
-    let lines: Vec<_> = ended.stdout.lines().collect();
+    let flags = "evaluate run --episodes 7 --seed 2";
+    let said = system.run_ok(flags).stdout;
+    let lines: Vec<_> = said.lines().collect();
     assert_eq!(lines.len(), 3, "{lines:?}");
     assert_eq!(
         lines[0],
@@ -36,32 +37,23 @@ fn it_prints_the_agent_beside_a_random_policy() {
             "{line}"
         );
     }
-    let again = system.run_ok("evaluate --run run --episodes 7 --seed 2");
-    assert_eq!(
-        ended.stdout, again.stdout,
-        "the same seed plays the same episodes"
-    );
     // The chain has no levels to hold back.
     system.refuses("evaluate --run run --levels unseen", "use --levels train");
-}
 
-#[test]
-fn it_tells_programs_what_it_tells_people() {
-    let system = with_run();
-    let flags = "evaluate run --episodes 7 --seed 2";
-    let lines = system.run_ok(flags).stdout;
-    let ended = system.run_ok(&format!("{flags} --json --returns returns.csv"));
-    let told: serde_json::Value = serde_json::from_str(&ended.stdout).unwrap();
+    // The same seed plays the same episodes.
+    let told = system
+        .run_ok(&format!("{flags} --json --returns returns.csv"))
+        .json();
     assert_eq!(
         (&told["world"], &told["updates"]),
         (&"chain".into(), &540.into())
     );
-    let table = fs::read_to_string(system.path("returns.csv")).unwrap();
+    let table = system.read("returns.csv");
     for policy in ["driml-fix", "random"] {
         let mean = told["policies"][policy]["mean_return"].as_f64().unwrap();
         assert!(
-            lines.contains(&format!("{policy:12} mean return {mean:8.3}")),
-            "{lines}"
+            said.contains(&format!("{policy:12} mean return {mean:8.3}")),
+            "{said}"
         );
         let rows = table
             .lines()
@@ -77,17 +69,14 @@ fn it_tells_programs_what_it_tells_people() {
         .run("evaluate run --returns none/returns.csv")
         .expect_code(1)
         .expect_said("--returns none/returns.csv");
-}
 
-#[test]
-fn it_plays_any_checkpoint_that_is_there() {
-    let system = with_run();
+    // Any checkpoint that is there is played.
     let kept = system.run_folder("run").checkpoints();
     let oldest = updates_of(&kept[0]);
     assert!(oldest < 540);
-    let ended = system.run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"));
-    let said = format!("weights after {oldest} updates");
-    ended.expect_printed(&said);
+    system
+        .run_ok(&format!("evaluate run --episodes 2 --checkpoint {oldest}"))
+        .expect_printed(&format!("weights after {oldest} updates"));
     system.refuses(
         "evaluate run --checkpoint 7",
         "no checkpoint after 7 updates; it has those after",
@@ -110,11 +99,10 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
         ("--weights average", "averaged"),
         ("--weights online", "online"),
     ] {
-        let said = system.run_ok(&format!("evaluate run --episodes 2 {flags}"));
-        said.expect_printed(&format!("{weights} f32 weights after 540 updates"));
-        let json = system.run_ok(&format!("evaluate run --episodes 2 --json {flags}"));
-        let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
-        assert_eq!(told["averaged"], weights == "averaged");
+        let told = system
+            .run_ok(&format!("evaluate run --episodes 2 --json {flags}"))
+            .json();
+        assert_eq!(told["averaged"], weights == "averaged", "{flags}");
     }
     system.refuses("evaluate run --checkpoint average", "leave it out");
 }
@@ -159,7 +147,7 @@ fn a_finished_run_says_what_its_weights_earn() {
         ));
         let line = "Greedy return (online weights): ";
         assert_eq!(ended.stdout.contains(line), is_played, "{}", ended.stdout);
-        let text = fs::read_to_string(system.path(name).join("summary.json")).unwrap();
+        let text = system.read(&format!("{name}/summary.json"));
         let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
         let played = &summary["played"];
         assert_eq!(played.is_object(), is_played);
@@ -183,35 +171,37 @@ fn it_plays_checkpoints_while_the_run_continues() {
         ));
         assert!(ended.stderr.contains("evaluated after"), "{}", ended.stderr);
         let folder = system.run_folder(name);
-        let table = fs::read_to_string(folder.path().join("evaluations.csv")).unwrap();
-        let mut lines = table.lines();
+        let table = folder.table("evaluations.csv");
         assert_eq!(
-            lines.next(),
-            Some("seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd")
+            table.header.join(","),
+            "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd"
         );
-        let rows: Vec<Vec<f64>> = lines
-            .map(|row| {
-                let cells = row.split(',');
-                // Before the first row of metrics the run's seconds and frames are not known.
-                let cells = cells.map(|it| if it.is_empty() { "0" } else { it });
-                cells.map(|it| it.parse().unwrap()).collect()
-            })
-            .collect();
-        assert!(rows.len() >= rows_min, "{table}");
+        let rows = table.rows.iter().map(|row| {
+            let number = |name| table.value::<f64>(row, name);
+            // Before the first row of metrics the run's frames are not known.
+            let frames = number("frames").unwrap_or_default();
+            [
+                number("updates").unwrap(),
+                frames,
+                number("evaluated_return").unwrap(),
+            ]
+        });
+        let rows: Vec<_> = rows.collect();
+        assert!(rows.len() >= rows_min, "{table:?}");
         let last = rows.last().unwrap();
-        assert_eq!(last[2], 540.0, "the last checkpoint is played: {table}");
+        assert_eq!(last[0], 540.0, "the last checkpoint is played: {table:?}");
         assert!(
-            rows.is_sorted_by(|a, b| a[2] < b[2] && a[1] <= b[1]),
-            "{table}"
+            rows.is_sorted_by(|a, b| a[0] < b[0] && a[1] <= b[1]),
+            "{table:?}"
         );
-        let most = rows.iter().map(|row| row[4]).fold(f64::MIN, f64::max);
-        let best = rows.iter().find(|row| row[4] == most).unwrap();
+        let most = rows.iter().map(|row| row[2]).fold(f64::MIN, f64::max);
+        let best = rows.iter().find(|row| row[2] == most).unwrap();
         // Played again with the same seed, the best earns the same.
         let again = system.run_ok(&format!(
             "evaluate {name} --checkpoint best --episodes 4 --seed {SELECTION_SEED}"
         ));
         again
-            .expect_printed(&format!("weights after {} updates", best[2]))
+            .expect_printed(&format!("weights after {} updates", best[0]))
             .expect_printed(&format!("mean return {most:8.3}"));
         system.run_ok(&format!(
             "plot {name} --column evaluated_return --out {name}.svg"
@@ -224,10 +214,10 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     let system = system();
     let flags = "--agent c51 --eval-interval 100 --eval-episodes 1000000";
     let process = system.start(&format!("local --lockstep {SHORT} {flags} --run-dir run"));
-    wait_for("a checkpoint", || {
-        let saved = fs::read_dir(system.path("run/checkpoints")).ok()?;
-        let is_checkpoint = |it: fs::DirEntry| !it.path().ends_with(".lock");
-        saved.flatten().any(is_checkpoint).then_some(())
+    wait_until("a checkpoint", || {
+        let saved = fs::read_dir(system.path("run/checkpoints")).into_iter();
+        let mut saved = saved.flatten().flatten();
+        saved.any(|it| !it.path().ends_with(".lock"))
     });
     process
         .interrupt()
@@ -240,20 +230,37 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
     system.run_folder("run").check_finished();
 }
 
+/// A checkpoint is compared with the best over as many episodes as that was played for, or more.
 #[test]
-fn an_evaluation_can_be_kept_by_hand() {
+fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it() {
     let system = with_run();
     system.refuses(
         "evaluate run --checkpoint best",
         "run has no best checkpoint",
     );
-    let keep = "evaluate run --keep --episodes 3";
-    system
-        .run_ok(keep)
-        .expect_printed("over 3 episodes, the most so far\n");
+    let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
+    keep("--episodes 3").expect_printed("over 3 episodes, the most so far\n");
     system.run_ok("evaluate run --checkpoint best --episodes 1");
+    let oldest = system.run_folder("run").checkpoints().remove(0);
+    let updates = updates_of(&oldest);
+    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_printed(
+        "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
+    );
+    // Over more episodes the best is played again, as it was played for fewer.
+    keep(&format!("--episodes 5 --checkpoint {updates}"));
+    let table = system.run_folder("run").table("evaluations.csv");
+    let count = |row, name| table.value::<u64>(row, name).unwrap();
+    let rows = table.rows.iter();
+    let rows: Vec<_> = rows
+        .map(|row| (count(row, "updates"), count(row, "episodes")))
+        .collect();
+    assert_eq!(rows, [(540, 3), (updates, 1), (540, 5), (updates, 5)]);
+
     // The episodes that choose are never those of a report.
-    system.refuses(&format!("{keep} --seed 0"), "'--keep' cannot be used with");
+    system.refuses(
+        "evaluate run --keep --seed 0",
+        "'--keep' cannot be used with",
+    );
     system.refuses(
         "evaluate run --checkpoint bset",
         "the updates of a checkpoint",
@@ -264,36 +271,6 @@ fn an_evaluation_can_be_kept_by_hand() {
     );
 }
 
-/// A checkpoint is compared with the best over as many episodes as that was played for, or more.
-#[test]
-fn fewer_episodes_do_not_displace_the_best() {
-    let system = with_run();
-    let oldest = system.run_folder("run").checkpoints().remove(0);
-    let updates = &updates_of(&oldest).to_string();
-    let keep = |flags: &str| system.run_ok(&format!("evaluate run --keep {flags}"));
-    let rows = || {
-        let text = fs::read_to_string(system.path("run/evaluations.csv")).unwrap();
-        let column = |row: &str, at: usize| row.split(',').nth(at).unwrap().to_owned();
-        let rows = text.lines().skip(1);
-        rows.map(|row| (column(row, 2), column(row, 3)))
-            .collect::<Vec<_>>()
-    };
-    keep("--episodes 3");
-    keep(&format!("--episodes 1 --checkpoint {updates}")).expect_printed(
-        "; the best stays: it was played for 3 episodes, and fewer do not compare\n",
-    );
-    // Over more episodes the best is played again, as it was played for fewer.
-    keep(&format!("--episodes 5 --checkpoint {updates}"));
-    let row = |updates: &str, episodes: &str| (updates.to_owned(), episodes.to_owned());
-    let expected = [
-        row("540", "3"),
-        row(updates, "1"),
-        row("540", "5"),
-        row(updates, "5"),
-    ];
-    assert_eq!(rows(), expected);
-}
-
 /// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
 #[test]
 fn it_plays_in_the_precision_of_the_run() {
@@ -302,15 +279,12 @@ fn it_plays_in_the_precision_of_the_run() {
         .run_ok(&format!(
             "local --lockstep --agent c51 {SHORT} --set learner.publish_dtype=bf16 --set actor.precision=bf16 --run-dir run"
         ));
-    for (flags, words) in [
-        ("", "bf16 weights after 540 updates played in bf16"),
-        ("--exact", "f32 weights after 540 updates played in f32"),
-    ] {
-        let said = system.run_ok(&format!("evaluate run --episodes 2 {flags}"));
-        said.expect_printed(words);
+    for (flags, precision) in [("", "bf16"), ("--exact", "f32")] {
+        let call = format!("evaluate run --episodes 2 {flags}");
+        let words = format!("{precision} weights after 540 updates played in {precision}");
+        system.run_ok(&call).expect_printed(&words);
     }
-    let json = system.run_ok("evaluate run --episodes 2 --json");
-    let told: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
+    let told = system.run_ok("evaluate run --episodes 2 --json").json();
     assert_eq!(
         (&told["weights"], &told["arithmetic"]),
         (&"bf16".into(), &"bf16".into())
@@ -331,57 +305,34 @@ fn a_folder_that_is_no_run_s() {
     system.refuses("evaluate --run empty", "config.toml that driml wrote");
 }
 
+/// That every file's damage is found is the learner's own test.
 #[test]
-fn a_damaged_checkpoint_is_named_and_not_used() {
+fn a_damaged_checkpoint_and_one_of_another_run_are_named_and_not_used() {
     let system = with_run();
     let newest = system.run_folder("run").newest_checkpoint();
     let name = newest.file_name().unwrap().to_str().unwrap();
-    for file in [
-        "online.safetensors",
-        "target.safetensors",
-        "optimizer.safetensors",
-        "state.json",
-    ] {
-        let path = newest.join(file);
-        let whole = fs::read(&path).unwrap();
-        for broken in [&whole[..whole.len() / 2], &whole[..0], &flipped(&whole)] {
-            fs::write(&path, broken).unwrap();
-            system
-                .run("evaluate --run run --episodes 1")
-                .expect_code(1)
-                .expect_said(&format!(
-                    "error: run/checkpoints/{name}/{file} is damaged: "
-                ))
-                .expect_said("remove the folder it is in");
-        }
-        fs::remove_file(&path).unwrap();
-        system
-            .run("evaluate --run run --episodes 1")
-            .expect_code(1)
-            .expect_said(&format!("{file} is damaged: it is missing"));
-        fs::write(&path, &whole).unwrap();
-    }
-    system.run_ok("evaluate --run run --episodes 1");
-}
-
-fn flipped(bytes: &[u8]) -> Vec<u8> {
-    let mut bytes = bytes.to_vec();
-    let at = bytes.len() * 3 / 4;
-    bytes[at] ^= 1;
-    bytes
-}
-
-#[test]
-fn weights_of_another_run_are_refused() {
-    let system = with_run();
-    let config = system.path("run/config.toml");
-    let text = fs::read_to_string(&config).unwrap();
-    fs::write(&config, text.replace("seed = 1", "seed = 2")).unwrap();
+    let path = newest.join("online.safetensors");
+    let whole = fs::read(&path).unwrap();
+    fs::write(&path, &whole[..whole.len() / 2]).unwrap();
+    let call = "evaluate --run run --episodes 1";
     system
-        .run("evaluate --run run")
+        .run(call)
+        .expect_code(1)
+        .expect_said(&format!(
+            "error: run/checkpoints/{name}/online.safetensors is damaged: "
+        ))
+        .expect_said("remove the folder it is in");
+    fs::write(&path, &whole).unwrap();
+    system.run_ok(call);
+
+    let text = system.read("run/config.toml");
+    let other = text.replace("seed = 1", "seed = 2");
+    fs::write(system.path("run/config.toml"), other).unwrap();
+    system
+        .run(call)
         .expect_code(1)
         .expect_said("belongs to a run with specification")
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
-    system.refuses("evaluate --run run", "has no checkpoint yet");
+    system.refuses(call, "has no checkpoint yet");
 }
