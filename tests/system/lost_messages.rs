@@ -1,0 +1,429 @@
+//! Chunks, batches and answers that get lost between a replay server and its actors and learner, which send and ask again: each
+//! transition is stored once, and no batch counts twice.
+//! The replay server is played by the test, around the real replay; the side of actors and learner is the real one.
+
+use std::{
+    collections::BTreeMap,
+    ops::Range,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU32, Ordering},
+    },
+    time::Duration,
+};
+
+use driml_actor::DeliveryLimits;
+use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
+use driml_protocol::{
+    Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
+    Keyed, Keys, Leave, ReplayStatus, RunClient, RunSpec, Shutdown, codec, session,
+};
+use driml_replay_server::{Config, Replay};
+use driml_tests::{check_nothing_lost, connect, listen};
+use zenoh::{
+    Session, Wait,
+    query::{Query, Queryable},
+};
+
+use crate::{synthetic_actor::SyntheticActor, tiny_replay};
+
+/// Actors, and chunks of each.
+const ACTORS: u32 = 3;
+const CHUNKS: u64 = 32;
+/// Transitions of one chunk.
+const STEPS: u32 = 4;
+const TRANSITIONS: u64 = ACTORS as u64 * CHUNKS * STEPS as u64;
+/// How often each transition is sampled, on average: that one is never drawn has a probability of exp(-64).
+const SAMPLED: u64 = 64;
+const ROWS: u32 = 16;
+/// Of each so many batches and parts of batches, one is lost.
+const LOSES: u32 = 4;
+
+/// Of the tests that lose chunks.
+fn spec() -> RunSpec {
+    tiny_replay::spec("c51", Horizon::None {})
+}
+
+/// Of those that lose batches, whose rows have positives.
+fn batches_spec() -> RunSpec {
+    tiny_replay::spec("driml-randk", Horizon::Uniform { k_max: 2 })
+}
+
+/// The place of a replay server, in which a test answers.
+struct Endpoint {
+    session: Session,
+    answered: Vec<Queryable<()>>,
+    name: String,
+    _folder: tempfile::TempDir,
+}
+
+impl Endpoint {
+    fn open() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let name = format!("unixsock-stream/{}/server.sock", folder.path().display());
+        Self {
+            session: listen(&name),
+            answered: Vec::new(),
+            name,
+            _folder: folder,
+        }
+    }
+
+    fn keys() -> Keys {
+        Keys::new("lossy").unwrap()
+    }
+
+    /// Answers messages of type `M`.
+    fn answer<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
+        let queryable = self.session.declare_queryable(Self::keys().of::<M>());
+        let queryable = queryable.callback(answer).wait();
+        self.answered.push(queryable.unwrap());
+    }
+
+    /// A process of a run that asks here.
+    fn client(&self, spec: &RunSpec) -> RunClient {
+        RunClient::new(connect(&self.name), Self::keys(), spec.hash())
+    }
+}
+
+/// What the network does to messages about chunks.
+#[derive(Clone, Copy)]
+enum Loses {
+    /// Of each five, one does not arrive, and the answer to another one does not.
+    TwoOfFive,
+    /// The first few do not arrive, the others do.
+    First(u32),
+}
+
+/// A replay server behind a network that loses messages.
+struct Server {
+    replay: Mutex<Replay>,
+    loses: Loses,
+    messages: AtomicU32,
+    /// How often each actor sent `Leave`.
+    leaves: Mutex<BTreeMap<u32, u32>>,
+    /// What is never answered; a query that is dropped would tell the actor so at once.
+    lost: Mutex<Vec<Query>>,
+}
+
+impl Server {
+    fn new(loses: Loses) -> Arc<Self> {
+        let config = Config {
+            replay_ratio: SAMPLED as f64,
+            ..tiny_replay::config(2 * TRANSITIONS)
+        };
+        let mut replay = Replay::new(&spec(), &config, ROWS).unwrap();
+        for actor in 0..ACTORS {
+            tiny_replay::join(&mut replay, actor);
+        }
+        Arc::new(Self {
+            replay: Mutex::new(replay),
+            loses,
+            messages: AtomicU32::new(0),
+            leaves: Mutex::default(),
+            lost: Mutex::default(),
+        })
+    }
+
+    /// Answers about chunks and leaves as a replay server does, but for what is lost.
+    fn serve(self: &Arc<Self>, endpoint: &mut Endpoint) {
+        self.answer::<ChunkHeader>(endpoint, |server, payload| {
+            let chunk = Chunk::decode(payload, spec().hash()).unwrap();
+            server.lossy(|replay| replay.insert(&chunk))
+        });
+        self.answer::<ChunkPoll>(endpoint, |server, payload| {
+            let poll = codec::decode::<ChunkPoll>(payload, Some(spec().hash()));
+            let poll = poll.unwrap().0;
+            server.lossy(|replay| replay.poll(&poll).expect("nothing is parked here"))
+        });
+        self.answer::<Leave>(endpoint, |server, payload| {
+            let hash = spec().hash();
+            let leave = codec::decode::<Leave>(payload, Some(hash)).unwrap().0;
+            let tries = server.count_leave(leave.actor);
+            // The first does not arrive, and the answer to the second does not.
+            if tries > 1 {
+                let refused = server.replay.lock().unwrap().leave(&leave);
+                assert_eq!(refused, None);
+            }
+            (tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
+        });
+    }
+
+    fn answer<M: Keyed>(
+        self: &Arc<Self>,
+        endpoint: &mut Endpoint,
+        answer: fn(&Self, &[u8]) -> Option<Vec<u8>>,
+    ) {
+        let server = self.clone();
+        endpoint.answer::<M>(move |query| {
+            let payload = query.payload().unwrap().to_bytes();
+            match answer(&server, &payload) {
+                Some(reply) => session::answer(&query, reply.into()),
+                None => server.lost.lock().unwrap().push(query),
+            }
+        });
+    }
+
+    /// Counts a `Leave` of this actor; gives how often it has said it.
+    fn count_leave(&self, actor: u32) -> u32 {
+        let mut leaves = self.leaves.lock().unwrap();
+        let tries = leaves.entry(actor).or_default();
+        *tries += 1;
+        *tries
+    }
+
+    fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {
+        let message = self.messages.fetch_add(1, Ordering::Relaxed);
+        let (arrives, is_answered) = match self.loses {
+            Loses::TwoOfFive => (message % 5 != 1, message % 5 != 3),
+            Loses::First(count) => (message >= count, true),
+        };
+        let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
+        is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
+    }
+
+    /// Checks that each actor sent `Leave` until it was answered.
+    fn check_leaves(&self) {
+        let leaves = self.leaves.lock().unwrap();
+        assert_eq!(leaves.len(), ACTORS as usize, "{leaves:?}");
+        assert!(leaves.values().all(|&tries| tries >= 3), "{leaves:?}");
+    }
+
+    /// Checks that the replay holds the numbers 0 to `TRANSITIONS`, each once.
+    fn check_numbers(&self) {
+        let mut replay = self.replay.lock().unwrap();
+        replay.check_valid();
+        let status = replay.status();
+        assert_eq!(status.transitions_inserted, TRANSITIONS, "{status:#?}");
+        check_nothing_lost(&status);
+        let batches = TRANSITIONS * SAMPLED / u64::from(ROWS);
+        let numbers = tiny_replay::numbers(&mut replay, batches, ROWS);
+        // As many are stored as there are numbers: if each number is there, none is there twice.
+        assert_eq!(numbers, (0..TRANSITIONS).collect());
+    }
+}
+
+/// Delivers the chunks of `ACTORS` actors to `server`, which are about to leave or not.
+fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
+    let mut endpoint = Endpoint::open();
+    server.serve(&mut endpoint);
+    let limits = DeliveryLimits {
+        chunks_in_flight_max: CHUNKS as usize,
+        ack_timeout,
+        unreachable_max: Duration::from_secs(60),
+    };
+    std::thread::scope(|scope| {
+        for actor in 0..ACTORS {
+            let run = endpoint.client(&spec());
+            scope.spawn(move || {
+                let stop = Shutdown::default();
+                let first = tiny_replay::chunk(&spec(), actor, 0, STEPS).header;
+                let mut synthetic = SyntheticActor::start(run, first, limits, &stop);
+                if leaving {
+                    stop.set();
+                }
+                let number = u64::from(actor) * CHUNKS * u64::from(STEPS);
+                (0..CHUNKS).for_each(|_| synthetic.send(number));
+                synthetic.finish();
+            });
+        }
+    });
+}
+
+#[test]
+fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
+    let server = Server::new(Loses::TwoOfFive);
+    deliver_all(&server, Duration::from_millis(100), false);
+    server.check_numbers();
+    server.check_leaves();
+    let retried = server.replay.lock().unwrap().status().chunks_retried;
+    // Some answers were lost; how many chunks came again for it, and were not just asked about, is the machine's.
+    assert!(retried > 0, "answers were to get lost");
+}
+
+/// The time in which an actor that leaves must deliver is not spent on one message that was lost.
+#[test]
+fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
+    let server = Server::new(Loses::First(3 * ACTORS));
+    deliver_all(&server, Duration::from_secs(15), true);
+    server.check_numbers();
+    server.check_leaves();
+}
+
+fn config(shards: u32) -> Config {
+    Config {
+        shards,
+        transitions_max: Some(TRANSITIONS),
+        ..tiny_replay::config(1_000)
+    }
+}
+
+/// A shard that holds its share of the run.
+fn full(shard: u32, shards: u32) -> Replay {
+    let mut replay = Replay::shard(&batches_spec(), &config(shards), ROWS, shard).unwrap();
+    tiny_replay::join(&mut replay, 0);
+    fill(&mut replay, 0..TRANSITIONS / 8 / u64::from(shards));
+    replay
+}
+
+/// Stores chunks of 8 transitions with these numbers.
+fn fill(replay: &mut Replay, sequences: Range<u64>) {
+    for sequence in sequences {
+        let stored = replay.insert(&tiny_replay::chunk(&batches_spec(), 0, sequence, 8));
+        assert!(matches!(stored, InsertReply::Stored { .. }), "{stored:?}");
+    }
+}
+
+/// Answers as a replay server does, but for some batches, which it draws and does not send.
+fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
+    let hash = batches_spec().hash();
+    let payload = query.payload().unwrap().to_bytes();
+    let (request, _): (BatchRequest, _) = codec::decode(&payload, Some(hash)).unwrap();
+    let mut replay = replay.lock().unwrap();
+    if let Some(other_shards) = request.other_shards {
+        replay.set_other_shards(other_shards).unwrap();
+    }
+    let message = match replay.draw_for(request.id, request.rows, Buffer::zeroed) {
+        Ok(_) if drawn.fetch_add(1, Ordering::Relaxed).is_multiple_of(LOSES) => return,
+        Ok(draft) => {
+            let (header, payload) = draft.unpack().into_payload();
+            codec::encode(hash, &BatchReply::Batch(header), &payload).unwrap()
+        }
+        Err(not_ready) => codec::encode(hash, &BatchReply::NotReady(not_ready), &[]).unwrap(),
+    };
+    session::answer(query, message.into());
+}
+
+/// Replay servers of these shards, of which some batches get lost, and a learner's end of them.
+struct Shards {
+    replays: Vec<Arc<Mutex<Replay>>>,
+    drawn: Arc<AtomicU32>,
+    source: BatchSource,
+    _endpoints: Vec<Endpoint>,
+}
+
+fn serve(shards: Vec<Replay>) -> Shards {
+    let drawn = Arc::<AtomicU32>::default();
+    let (mut replays, mut endpoints, mut clients) = (vec![], vec![], vec![]);
+    for replay in shards {
+        let mut endpoint = Endpoint::open();
+        let replay = Arc::new(Mutex::new(replay));
+        let (asked, count) = (replay.clone(), drawn.clone());
+        endpoint.answer::<BatchRequest>(move |query| answer(&query, &asked, &count));
+        let asked = replay.clone();
+        endpoint.answer::<ReplayStatus>(move |query| {
+            let status = asked.lock().unwrap().status();
+            let bytes = codec::encode(batches_spec().hash(), &status, &[]).unwrap();
+            session::answer(&query, bytes.into());
+        });
+        clients.push(endpoint.client(&batches_spec()));
+        replays.push(replay);
+        endpoints.push(endpoint);
+    }
+    let requests = Requests {
+        learner: 1,
+        rows: ROWS,
+        in_flight: 2,
+        shared_memory: false,
+        unreachable_max: Duration::from_secs(60),
+    };
+    let stop = Shutdown::default();
+    let counters = Counters::at_start(clients.len());
+    let source = BatchSource::start(&clients, requests, &counters, &stop).unwrap();
+    Shards {
+        replays,
+        drawn,
+        source,
+        _endpoints: endpoints,
+    }
+}
+
+impl Shards {
+    /// The next batch; none at the end of the run.
+    fn next(&mut self) -> Option<Served> {
+        match self.source.next(Duration::from_secs(60)).unwrap() {
+            Next::Batch(served) => Some(*served),
+            Next::Finished => None,
+            Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
+        }
+    }
+}
+
+/// Fetches all batches of a run from `shards` shards, of which some get lost.
+fn every_batch_comes_once(shards: u32) {
+    let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
+    let mut batches = 0;
+    while let Some(Served { batch, parts }) = served.next() {
+        assert_eq!(batch.rows(), ROWS as usize);
+        assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
+        batches += 1;
+    }
+    let Shards {
+        replays,
+        drawn,
+        source,
+        ..
+    } = served;
+    assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
+    let statuses: Vec<_> = replays
+        .iter()
+        .map(|replay| {
+            let replay = replay.lock().unwrap();
+            replay.check_valid();
+            replay.status()
+        })
+        .collect();
+    let sampled: u64 = statuses.iter().map(|status| status.rows_sampled).sum();
+    let retried: u64 = statuses.iter().map(|status| status.batches_retried).sum();
+    assert_eq!(sampled, TRANSITIONS);
+    let lost = drawn.load(Ordering::Relaxed).div_ceil(LOSES);
+    assert!(
+        lost >= 5,
+        "of so many batches as there are, some were to get lost: {lost}"
+    );
+    assert_eq!(retried, u64::from(lost));
+    source.end();
+}
+
+#[test]
+fn lost_batches_do_not_count() {
+    every_batch_comes_once(1);
+}
+
+#[test]
+fn lost_parts_of_batches_do_not_count() {
+    every_batch_comes_once(3);
+}
+
+/// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others
+/// never make the learner wait.
+#[test]
+fn a_shard_that_fills_late_is_asked() {
+    let config = Config {
+        transitions_max: None,
+        ..config(2)
+    };
+    let mut shards: Vec<_> = (0..2)
+        .map(|shard| Replay::shard(&batches_spec(), &config, ROWS, shard).unwrap())
+        .collect();
+    shards
+        .iter_mut()
+        .for_each(|replay| tiny_replay::join(replay, 0));
+    fill(&mut shards[0], 0..8);
+    let mut served = serve(shards);
+    for batches in 0..1_000 {
+        let parts = served.next().unwrap().parts;
+        if parts.iter().any(|part| part.shard == 1) {
+            assert!(batches > 3, "it held nothing");
+            served.source.end();
+            return;
+        }
+        let replays: Vec<_> = served.replays.iter().map(|it| it.lock().unwrap()).collect();
+        let [mut first, mut second] = <[_; 2]>::try_from(replays).ok().unwrap();
+        fill(&mut first, 8 + 2 * batches..10 + 2 * batches);
+        if batches == 3 {
+            fill(&mut second, 0..8);
+        }
+    }
+    panic!("a shard that holds something is never drawn from");
+}
