@@ -14,28 +14,36 @@ use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
 
-/// Transitions in the log, one record each.
-const KEPT: u64 = 1_000_000;
-/// Updates of a run that continues with them: one of 16 rows for 1,024 transitions after the warm-up.
-const UPDATES: u64 = 991;
+/// Transitions in a log, one record each: in one that is read for longer than the limit for an absent server, and in the others.
+const LONG: u64 = 1_000_000;
+const SHORTER: u64 = 400_000;
 const WARMUP: u64 = 192;
-const FRAMES: u64 = WARMUP + 1024 * UPDATES;
 /// How long the processes of these runs would wait for an unresponsive server, seconds.
 const UNREACHABLE_MAX_S: f64 = 5.0;
 /// What a waiting process logs.
 const WAITING: &str =
     "waiting for as long as it takes: the replay server reads its replay back from disk, ";
 
-fn flags() -> String {
+/// Updates of a run that continues with so many transitions: one of 16 rows for 1,024 of them after the warm-up.
+const fn updates(kept: u64) -> u64 {
+    kept / 1024 + 15
+}
+
+const fn frames(kept: u64) -> u64 {
+    WARMUP + 1024 * updates(kept)
+}
+
+fn flags(kept: u64) -> String {
+    let (frames, capacity) = (frames(kept), kept + 100_000);
     format!(
-        "--agent c51 --env chain --preset smoke --frames {FRAMES} --set replay.replay_ratio=0.015625 \
-         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions=1100000 --set replay.slack_transitions=2048 \
+        "--agent c51 --env chain --preset smoke --frames {frames} --set replay.replay_ratio=0.015625 \
+         --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions={capacity} --set replay.slack_transitions=2048 \
          --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
     )
 }
 
-/// Puts transitions of another actor into the log in `folder`, whose run has these settings.
-fn keep(folder: &Path, config_toml: &str) -> RunSpec {
+/// Puts so many transitions of another actor into the log in `folder`, whose run has these settings.
+fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     let settings = Settings::parse(config_toml).unwrap();
     let spec: RunSpec = settings.table("run").unwrap();
     let mut config: Config = settings.table("replay").unwrap();
@@ -54,7 +62,7 @@ fn keep(folder: &Path, config_toml: &str) -> RunSpec {
     };
     replay.join_actor(join).unwrap();
     let mut header = header_of(9, spec.frame_bytes());
-    for sequence in 0..KEPT {
+    for sequence in 0..kept {
         (header.sequence, header.first_transition) = (sequence, sequence);
         let mut chunk = Chunk::zeroed(header);
         chunk.set(0, 0, 0.0, End::Running);
@@ -77,14 +85,15 @@ fn header_of(actor: u32, frame_bytes: usize) -> ChunkHeader {
     }
 }
 
-/// A folder with the log of a run with these settings.
-fn keep_for(system: &TestSystem, folder: &str) -> RunSpec {
-    let server = system.start_replay_server(&flags());
+/// Makes a log of so many transitions in the folder `replay`; gives its run, and what a replay server is called with to read it.
+fn keep_for(system: &TestSystem, kept: u64) -> (RunSpec, String) {
+    let flags = flags(kept);
+    let server = system.start_replay_server(&flags);
     let client = system.connect();
-    let spec = keep(&system.path(folder), &client.config_toml);
+    let spec = keep(kept, &system.path("replay"), &client.config_toml);
     drop(client);
     server.stop().expect_code(0);
-    spec
+    (spec, format!("{flags} --replay-dir replay"))
 }
 
 /// Makes a server's machine a slow one, and waits until it has begun to read.
@@ -168,8 +177,7 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
 #[test]
 fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let system = system();
-    let spec = keep_for(&system, "replay");
-    let serve = format!("{} --replay-dir replay", flags());
+    let (spec, serve) = keep_for(&system, LONG);
     let server = system.start_replay_server(&serve);
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
@@ -220,12 +228,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let replay = client.check_nothing_lost();
     assert_eq!(
         (status.updates, replay.rows_sampled),
-        (UPDATES, 16 * UPDATES)
+        (updates(LONG), 16 * updates(LONG))
     );
-    assert_eq!(replay.transitions_inserted, FRAMES);
+    assert_eq!(replay.transitions_inserted, frames(LONG));
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait().expect_code(0);
-    assert_eq!(system.run_folder("seen").summary().updates, UPDATES);
+    let seen = system.run_folder("seen").summary();
+    assert_eq!(seen.updates, updates(LONG));
     learner.stop().expect_code(0);
     drop(client);
     server
@@ -238,8 +247,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
 #[test]
 fn a_server_that_reads_is_stopped_and_started_again() {
     let system = system();
-    keep_for(&system, "replay");
-    let serve = format!("{} --replay-dir replay", flags());
+    let (_, serve) = keep_for(&system, SHORTER);
     let mut server = start_stopped(&system, &serve);
     let slow = slow_down(&mut server);
     let mut actor = system.start_actor(0);
@@ -252,7 +260,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     actor.stop().expect_code(0);
     let server = system.start_replay_server(&serve);
     let replay = system.connect().replay().unwrap();
-    assert_eq!(replay.transitions_inserted, KEPT);
+    assert_eq!(replay.transitions_inserted, SHORTER);
     server.stop().expect_code(0);
 
     // An unreadable log ends it with an error, and no process waits for it any more.
@@ -269,15 +277,15 @@ fn a_server_that_reads_is_stopped_and_started_again() {
 #[test]
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
-    let mut process = system.start(&system.local(&format!("--durable {}", flags())));
+    let mut process = system.start(&system.local(&format!("--durable {}", flags(SHORTER))));
     let client = system.connect();
     client.wait_for_updates(10);
     drop(client);
     process.stop().expect_code(130);
     let run = system.run_folder("run");
-    let config = fs::read_to_string(run.path().join("config.toml")).unwrap();
-    keep(&run.path().join("replay"), &config);
-    let stored = run.summary().replay.transitions_inserted + KEPT;
+    let config = system.read("run/config.toml");
+    keep(SHORTER, &run.path().join("replay"), &config);
+    let stored = run.summary().replay.transitions_inserted + SHORTER;
     let frames = WARMUP + (stored + 2_000).next_multiple_of(1024);
 
     process = system.start(&format!("local --resume run --frames {frames}"));
@@ -295,8 +303,8 @@ fn a_resumed_run_shows_how_far_its_server_is() {
 #[test]
 fn roles_are_told_too() {
     let Some(tls) = TlsSystem::new() else { return };
-    keep_for(&tls.system, "replay");
-    let mut server = tls.start_server(&format!("{} --replay-dir replay", flags()));
+    let (_, serve) = keep_for(&tls.system, SHORTER);
+    let mut server = tls.start_server(&serve);
     let slow = slow_down(&mut server);
     let mut processes = [
         tls.start("actor --id 0", "tls"),
