@@ -38,6 +38,16 @@ fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
     ended
 }
 
+/// Does this for all these commands at the same time, as most of it is waiting.
+fn at_once(commands: &[&str], check: impl Fn(&str) + Sync) {
+    let check = &check;
+    thread::scope(|scope| {
+        for &command in commands {
+            scope.spawn(move || check(command));
+        }
+    });
+}
+
 /// An endpoint and what listens there.
 fn listener() -> (String, TcpListener) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -49,14 +59,18 @@ fn a_closed_port_differs_from_an_unknown_host() {
     let system = system();
     let (endpoint, listener) = listener();
     drop(listener);
-    for command in COMMANDS {
+    let unknown = "tcp/no-such-host.invalid:7447";
+    for (endpoint, said) in [
         // Processes give the replay server some seconds to start, `driml status` does not.
-        refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&format!(
-            "nothing listens on {endpoint}: start the replay server first"
-        ));
-        let unknown = "tcp/no-such-host.invalid:7447";
-        refused(&system, &format!("{command} {unknown}"), 10)
-            .expect_said(&format!("the host of {unknown} is unknown: "));
+        (
+            &*endpoint,
+            format!("nothing listens on {endpoint}: start the replay server first"),
+        ),
+        (unknown, format!("the host of {unknown} is unknown: ")),
+    ] {
+        at_once(&COMMANDS, |command| {
+            refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&said);
+        });
     }
     let started = Instant::now();
     refused(&system, &format!("status --connect {endpoint}"), 0);
@@ -84,13 +98,13 @@ fn a_web_server_is_no_replay_server() {
             });
         }
     });
-    for command in COMMANDS {
+    at_once(&COMMANDS, |command| {
         refused(&system, &format!("{command} {endpoint}"), 5)
             .expect_said(&format!(
                 "something listens on {endpoint} that is not driml"
             ))
             .expect_said("it says \"HTTP/1.0 404 Not Found\"");
-    }
+    });
 }
 
 #[test]
@@ -99,25 +113,25 @@ fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let (endpoint, listener) = listener();
     drop(listener);
     let _router = driml_tests::listen(&endpoint);
-    let words = "a process listens there, but does not answer at driml/run-info";
-    for command in [COMMANDS[0], COMMANDS[1]] {
+    at_once(&COMMANDS[..2], |command| {
         let started = Instant::now();
         let mut process = system.start_process(&format!("{command} {endpoint}"));
+        let words = "a process listens there, but does not answer at driml/run-info";
         process.wait_for_stderr(words);
         assert!(started.elapsed() < Duration::from_secs(30));
-    }
-    for command in [COMMANDS[2], COMMANDS[3]] {
+    });
+    at_once(&COMMANDS[2..], |command| {
         system
             .refuses(&format!("{command} {endpoint}"), "a program listens on")
             .expect_said("but it is not a replay server with the namespace \"driml\"");
-    }
+    });
 }
 
 /// Soon, and as one that plays or learns: with exit code 0.
 #[test]
 fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
     let system = system();
-    for command in [COMMANDS[0], COMMANDS[1]] {
+    at_once(&COMMANDS[..2], |command| {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
@@ -132,7 +146,7 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
             process.wait().expect_code(0);
             drop(connection);
         }
-    }
+    });
 }
 
 #[test]
