@@ -205,6 +205,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         rows,
         frames,
         replay_is_kept: replay_is_kept && (lockstep || updates > 0),
+        frames_max: config.frames(),
     };
     Ok(Found::Resumed(Box::new(Resumed {
         config,

@@ -138,7 +138,7 @@ pub(super) mod tests {
         };
         let config = call.config().unwrap();
         let mut view = RunView::new(Plan::of(&config));
-        let mut recorder = RunRecorder::create(folder, &config, Vec::new()).unwrap();
+        let mut recorder = RunRecorder::open(folder, &config, Vec::new(), None, false).unwrap();
         recorder.record(&mut view, &[]);
         let summary = recorder.summarise(Outcome::Finished, &mut view);
         summary.write(folder).unwrap();

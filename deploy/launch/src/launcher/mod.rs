@@ -77,7 +77,8 @@ pub fn run(
         [it.replay_servers_restarted, it.actors_restarted]
     });
     let evaluator = Evaluator::new(config, run_dir)?;
-    let mut recorder = RunRecorder::open(run_dir, config, process_names(config), resumed)?;
+    let (names, events) = (process_names(config), config.local.tensorboard);
+    let mut recorder = RunRecorder::open(run_dir, config, names, resumed, events)?;
     let resume_point = resumed.unwrap_or_default();
     let rendezvous = Rendezvous::create()?;
     let mut endpoints: Vec<_> = servers

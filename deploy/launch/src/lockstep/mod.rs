@@ -46,7 +46,8 @@ pub fn run(
     let is_stopped = || ending.is_set();
     exit_at_a_second(now)?;
     let mut due = Due::new(config, run_dir)?;
-    let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed)?;
+    let events = config.local.tensorboard;
+    let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed, events)?;
     let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,

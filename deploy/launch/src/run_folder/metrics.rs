@@ -22,18 +22,19 @@ pub struct ResumePoint {
     pub(crate) frames: u64,
     /// The replay was kept, and counts all of the run.
     pub(crate) replay_is_kept: bool,
+    /// Frames with which the run ends now.
+    pub(crate) frames_max: u64,
 }
 
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 1 << 16;
 
-/// The rows of an interrupted run up to `resume_point`, of no more than `frames_max` frames, under this header; none where there is no
-/// such file. The others, which contradict what the run will do, are set aside.
+/// The rows of an interrupted run up to `resume_point`, under this header; none where there is no such file. The others, which
+/// contradict what the run will do, are set aside.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
     resume_point: ResumePoint,
-    frames_max: u64,
 ) -> anyhow::Result<Table> {
     let mut found = Table::read(path)?;
     found.keep(path, |found, row| {
@@ -44,7 +45,8 @@ pub(super) fn rows_up_to(
         // Actors run ahead: without the second condition a run that now ends sooner would end before its rows. A replay that is filled
         // anew counts from the checkpoint's frames.
         let is_counted = resume_point.replay_is_kept || frames <= resume_point.frames;
-        Ok(updates <= resume_point.updates && frames <= frames_max && is_counted)
+        let is_before = updates <= resume_point.updates && frames <= resume_point.frames_max;
+        Ok(is_before && is_counted)
     })?;
     let places: Vec<_> = header.iter().map(|name| found.place(name)).collect();
     let rows = found.rows.iter().map(|row| {

@@ -47,81 +47,52 @@ pub struct RunRecorder {
 }
 
 impl RunRecorder {
-    /// Records a run with these settings and processes in `folder`: one that begins, or that is `resumed` from there.
-    pub(crate) fn open(
+    /// Records a run with these settings in `folder`, the memory of `processes` and, on request, `events` of TensorBoard: one that
+    /// begins, whose folder is made, or one that is `resumed` there and keeps its rows up to that point. The clock starts.
+    pub fn open(
         folder: &RunFolder,
         config: &RunConfig,
         processes: Vec<String>,
         resumed: Option<ResumePoint>,
+        events: bool,
     ) -> anyhow::Result<Self> {
-        let mut this = match resumed {
-            Some(point) => Self::go_on(folder, config, processes, point, config.frames())?,
-            None => Self::create(folder, config, processes)?,
-        };
-        if config.local.tensorboard {
-            this.write_events(folder)?;
+        if resumed.is_none() {
+            folder.check_free()?;
+            fs::create_dir_all(folder.path())
+                .with_context(|| format!("making the run folder {}", folder.display()))?;
         }
-        Ok(this)
-    }
-
-    /// Makes the folder and writes the settings; the clock starts. The memory of `processes` is recorded.
-    pub fn create(
-        folder: &RunFolder,
-        config: &RunConfig,
-        processes: Vec<String>,
-    ) -> anyhow::Result<Self> {
-        folder.check_free()?;
-        fs::create_dir_all(folder.path())
-            .with_context(|| format!("making the run folder {}", folder.display()))?;
         let lock = folder.lock()?;
-        folder.write_config(config)?;
-        let (header, rows) = (header(config, &processes), Vec::new());
-        let rows = Table { header, rows };
-        let (episodes, point) = (TrainingEpisodes::create(folder)?, ResumePoint::default());
-        Self::begin(folder, processes, lock, rows, episodes, point)
-    }
-
-    /// Continues from `resume_point` to `frames_max` frames in the folder of an interrupted run: the rows of metrics up
-    /// to there stay.
-    pub(crate) fn go_on(
-        folder: &RunFolder,
-        config: &RunConfig,
-        processes: Vec<String>,
-        resume_point: ResumePoint,
-        frames_max: u64,
-    ) -> anyhow::Result<Self> {
-        let lock = folder.lock()?;
-        let (seconds, header) = (seconds_of(folder), header(config, &processes));
-        let rows = rows_up_to(&folder.metrics(), header, resume_point, frames_max)?;
-        let is_known = resume_point.replay_is_kept;
-        let episodes = TrainingEpisodes::go_on(folder, resume_point.frames, is_known)?;
+        let header = header(config, &processes);
+        let (rows, episodes, seconds) = match resumed {
+            None => {
+                let rows = Vec::new();
+                let episodes = TrainingEpisodes::create(folder)?;
+                (Table { header, rows }, episodes, 0.0)
+            }
+            Some(point) => {
+                let seconds = seconds_of(folder);
+                let rows = rows_up_to(&folder.metrics(), header, point)?;
+                let is_known = point.replay_is_kept;
+                let episodes = TrainingEpisodes::go_on(folder, point.frames, is_known)?;
+                (rows, episodes, seconds)
+            }
+        };
         Summary::remove(folder)?;
         folder.write_config(config)?;
-        let mut this = Self::begin(folder, processes, lock, rows, episodes, resume_point)?;
-        this.count_seconds(seconds);
-        Ok(this)
-    }
-
-    fn begin(
-        folder: &RunFolder,
-        processes: Vec<String>,
-        lock: File,
-        rows: Table,
-        episodes: TrainingEpisodes,
-        resume_point: ResumePoint,
-    ) -> anyhow::Result<Self> {
+        let resume_point = resumed.unwrap_or_default();
         // A replay that was kept knows of all the run's episodes and k.
         let is_kept = resume_point.replay_is_kept;
         let before = |column| rows.last(column).filter(|_| !is_kept);
         let rows_of_episodes = rows.last("episodes").unwrap_or(0).max(episodes.episode);
+        let events = events.then(|| Events::create(folder, resume_point.frames));
         Ok(Self {
             _lock: lock,
             resume_point,
-            seconds_before: rows.last("seconds").unwrap_or(0.0),
+            seconds_before: seconds.max(rows.last("seconds").unwrap_or(0.0)),
             episodes_before: if is_kept { 0 } else { rows_of_episodes },
             k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
-            events: None,
+            events: events.transpose()?,
             episodes,
             is_late: false,
             rss_max: vec![None; processes.len()],
@@ -130,18 +101,9 @@ impl RunRecorder {
         })
     }
 
-    pub(crate) fn write_events(&mut self, folder: &RunFolder) -> anyhow::Result<()> {
-        self.events = Some(Events::create(folder, self.resume_point.frames)?);
-        Ok(())
-    }
-
     /// The run has taken at least so many seconds before this recorder started.
     pub(crate) fn count_seconds_from(&mut self, seconds: f64) {
         self.is_late = true;
-        self.count_seconds(seconds);
-    }
-
-    fn count_seconds(&mut self, seconds: f64) {
         self.seconds_before = self.seconds_before.max(seconds);
     }
 

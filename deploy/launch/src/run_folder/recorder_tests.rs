@@ -16,12 +16,12 @@ fn settings() -> RunConfig {
     config("smoke", "chain", "driml-ada", &[])
 }
 
-fn create(folder: &RunFolder, processes: &[&str]) -> RunRecorder {
-    RunRecorder::create(folder, &settings(), names(processes)).unwrap()
-}
-
-fn go_on(folder: &RunFolder, processes: &[&str]) -> anyhow::Result<RunRecorder> {
-    RunRecorder::go_on(folder, &settings(), names(processes), point(31), 9_999)
+fn open(
+    folder: &RunFolder,
+    processes: &[&str],
+    resumed: Option<ResumePoint>,
+) -> anyhow::Result<RunRecorder> {
+    RunRecorder::open(folder, &settings(), names(processes), resumed, false)
 }
 
 fn names(processes: &[&str]) -> Vec<String> {
@@ -34,7 +34,10 @@ fn header_of(processes: &[&str]) -> Vec<String> {
 
 /// Where a run is resumed, with 16 rows an update.
 fn point(updates: u64) -> ResumePoint {
-    with(|it: &mut ResumePoint| (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000))
+    with(|it: &mut ResumePoint| {
+        (it.updates, it.rows, it.frames) = (updates, 31 * 16, 2_000);
+        it.frames_max = 9_999;
+    })
 }
 
 fn statuses() -> (ReplayStatus, LearnerStatus) {
@@ -77,7 +80,7 @@ fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
 fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
-    let mut recorder = create(&run, &["replay-server", "actor-0"]);
+    let mut recorder = open(&run, &["replay-server", "actor-0"], None).unwrap();
     let (replay, learner) = statuses();
     let mut all = view(&replay, &learner);
     let mut nothing = view(&ReplayStatus::default(), &LearnerStatus::default());
@@ -135,7 +138,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server"];
-    let mut recorder = create(&run, &processes);
+    let mut recorder = open(&run, &processes, None).unwrap();
     let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
@@ -143,7 +146,7 @@ fn a_resumed_run_continues_in_its_metrics() {
         learner.updates = updates;
         recorder.record(&mut view(&replay, &learner), &[]);
     }
-    let said = go_on(&run, &processes).unwrap_err();
+    let said = open(&run, &processes, Some(point(31))).unwrap_err();
     assert!(said.to_string().contains("is still running"), "{said}");
     let summary = recorder.summarise(Outcome::Interrupted, &mut view(&replay, &learner));
     summary.write(&run).unwrap();
@@ -153,7 +156,7 @@ fn a_resumed_run_continues_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
-    let mut recorder = go_on(&run, &processes).unwrap();
+    let mut recorder = open(&run, &processes, Some(point(31))).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
     (replay.transitions_inserted, replay.episodes) = (2_000, 1);
@@ -173,11 +176,14 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
     let header = header_of(&processes);
-    let all = ResumePoint {
-        replay_is_kept: true,
-        ..point(99)
+    let read = |frames_max| {
+        let all = ResumePoint {
+            replay_is_kept: true,
+            frames_max,
+            ..point(99)
+        };
+        rows_up_to(&path, header.clone(), all).unwrap()
     };
-    let read = |frames_max| rows_up_to(&path, header.clone(), all, frames_max).unwrap();
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
     let column = |name| -> Vec<f64> {
@@ -209,7 +215,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         if let Some(text) = metrics {
             fs::write(run.metrics(), text).unwrap();
         }
-        let recorder = go_on(&run, &["actor-0"]).unwrap();
+        let recorder = open(&run, &["actor-0"], Some(point(31))).unwrap();
         let rows = |name: &str| {
             let text = fs::read(run.path().join(name)).unwrap_or_default();
             Table::parse(&text).unwrap().rows.len()
@@ -229,7 +235,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
 
         // A run resumed twice from there sets aside beside what was set aside before.
         fs::write(run.episodes(), episodes).unwrap();
-        go_on(&run, &["actor-0"]).unwrap();
+        open(&run, &["actor-0"], Some(point(31))).unwrap();
         assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
     }
 }
@@ -249,8 +255,7 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
             format!("seconds,frames,updates,episodes\n{metrics}"),
         )
         .unwrap();
-        let processes = Vec::new();
-        let recorder = RunRecorder::go_on(&run, &settings(), processes, point, 9_999).unwrap();
+        let recorder = open(&run, &[], Some(point)).unwrap();
         assert_eq!(
             Table::read(&run.metrics()).unwrap().rows.len(),
             kept,

@@ -49,13 +49,9 @@ impl Watched {
     /// A run that has been asked once.
     pub(super) fn new(poller: &Poller, outputs: &Outputs) -> anyhow::Result<Self> {
         let (config, view) = (&poller.config, &poller.view);
-        let mut recorder = None;
-        if let Some(folder) = &outputs.run_dir {
-            let recorder = recorder.insert(record(folder, config, view)?);
-            if outputs.tensorboard {
-                recorder.write_events(folder)?;
-            }
-        }
+        let folder = outputs.run_dir.as_ref();
+        let recorder = folder.map(|it| record(it, config, view, outputs.tensorboard));
+        let recorder = recorder.transpose()?;
         let screen = Screen::new(config.frames(), TEMPLATE);
         let up_s = view.up_s().unwrap_or(0.0).min(UP_MAX);
         let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
@@ -151,33 +147,28 @@ impl Watched {
 }
 
 /// Begins to record the run in `folder`, or continues.
-fn record(folder: &RunFolder, config: &RunConfig, view: &RunView) -> anyhow::Result<RunRecorder> {
-    let processes = process_names(config);
+fn record(
+    folder: &RunFolder,
+    config: &RunConfig,
+    view: &RunView,
+    events: bool,
+) -> anyhow::Result<RunRecorder> {
+    let mut resumed = None;
     // A learner may have just begun there.
-    let is_run_s = folder.config().exists() || folder.checkpoints().is_dir();
-    let mut recorder = match is_run_s {
-        false => RunRecorder::create(folder, config, processes)?,
-        true => {
-            check_same(folder, config)?;
-            let point = resume_point(folder, view)?;
-            let recorder = RunRecorder::go_on(folder, config, processes, point, u64::MAX);
-            recorder.map_err(|e| in_use(folder, e))?
-        }
-    };
+    if folder.config().exists() || folder.checkpoints().is_dir() {
+        check_same(folder, config)?;
+        resumed = Some(resume_point(folder, view)?);
+        folder.lock().map_err(|_| {
+            usage!(
+                "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
+                folder.display()
+            )
+        })?;
+    }
+    let processes = process_names(config);
+    let mut recorder = RunRecorder::open(folder, config, processes, resumed, events)?;
     recorder.count_seconds_from(view.up_s().unwrap_or(0.0));
     Ok(recorder)
-}
-
-/// Says so if another command writes there.
-fn in_use(folder: &RunFolder, e: anyhow::Error) -> anyhow::Error {
-    match folder.lock() {
-        Ok(_) => e,
-        Err(_) => usage!(
-            "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
-            folder.display()
-        )
-        .into(),
-    }
 }
 
 /// Refuses the folder of a run with other settings.
@@ -224,5 +215,6 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
         rows: view.replay.rows_sampled,
         frames: now,
         replay_is_kept: after_updates == 0,
+        frames_max: u64::MAX,
     })
 }
