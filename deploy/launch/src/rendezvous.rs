@@ -119,7 +119,6 @@ pub(crate) fn is_used(path: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::endpoint::check_endpoints;
 
     fn folders(place: &Path) -> usize {
         fs::read_dir(place).unwrap().count()
@@ -155,15 +154,5 @@ mod tests {
         assert!(!is_used(&path), "it is gone");
         assert!(!path.exists());
         assert_eq!(folders(place.path()), 2);
-    }
-
-    #[test]
-    fn a_folder_whose_sockets_would_have_too_long_a_name_is_elsewhere() {
-        let name_of = |bytes: usize| PathBuf::from(format!("/{}", "x".repeat(bytes - 1)));
-        assert_eq!(place_under(name_of(67)), name_of(67));
-        assert_eq!(place_under(name_of(68)), Path::new("/tmp"));
-        let rendezvous = Rendezvous::create_in(&place_under(name_of(95))).unwrap();
-        let endpoint = rendezvous.endpoint("replay-server-255");
-        assert!(check_endpoints(&[endpoint], false).is_ok());
     }
 }

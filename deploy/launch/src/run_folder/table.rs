@@ -227,10 +227,6 @@ mod tests {
         assert_eq!(beside, b"a,b\n3,\"4, of five\"\n");
     }
 
-    fn full(name: &str, unit: &'static str, waiting_max: usize) -> AppendLog {
-        AppendLog::open(Path::new("/dev/full"), name.into(), unit, waiting_max).unwrap()
-    }
-
     #[test]
     fn what_is_appended_waits_until_it_can_be_written() {
         let folder = tempfile::tempdir().unwrap();
@@ -239,7 +235,8 @@ mod tests {
             ("metrics.csv", "rows", WAITING_MAX, 0),
             ("the log of actor-0", "lines", 2, 1),
         ] {
-            let mut log = full(name, unit, waiting_max);
+            let full = Path::new("/dev/full");
+            let mut log = AppendLog::open(full, name.into(), unit, waiting_max).unwrap();
             let said = log.add(row(1).into_bytes()).unwrap();
             let why = format!("{name} cannot be written: No space left");
             let wait = format!("; its {unit} wait in memory until it can be");
@@ -265,14 +262,5 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let table = AppendLog::create(&folder.path().join("x.csv"), b"a\n").unwrap();
         assert_eq!((table.name.as_str(), table.unit), ("x.csv", "rows"));
-    }
-
-    #[test]
-    fn the_oldest_of_too_many_rows_are_lost() {
-        let mut table = full("x.csv", "rows", WAITING_MAX);
-        table.waiting = vec![Vec::new(); WAITING_MAX - 1].into();
-        table.add(b"1".to_vec());
-        table.add(b"2".to_vec());
-        assert_eq!((table.lost, table.waiting.len()), (1, WAITING_MAX));
     }
 }
