@@ -192,13 +192,7 @@ impl ManagedProcess {
             }
             Some((None, None)) => "exited".into(),
         };
-        let last = match (self.log.error(), self.log.tail()) {
-            // It says all.
-            (Some(error), _) => format!(": {error}"),
-            (None, tail) if tail.is_empty() => String::new(),
-            (None, tail) => format!("; its last lines:\n  {}", tail.join("\n  ")),
-        };
-        let (name, log) = (&self.name, self.log.path().display());
+        let (name, log, last) = (&self.name, self.log.path().display(), self.log.last_words());
         format!("{name} {how} (log: {log}){last}")
     }
 }

@@ -82,20 +82,19 @@ impl ProcessLog {
         &self.path
     }
 
-    pub(crate) fn tail(&self) -> Vec<String> {
-        lock(&self.kept).tail.iter().cloned().collect()
-    }
-
-    /// The error with which the process ended, if it said one.
-    pub(crate) fn error(&self) -> Option<String> {
+    /// The error with which the process ended, if it said one, or else its last lines.
+    pub(crate) fn last_words(&self) -> String {
         let kept = lock(&self.kept);
-        let (mut error, followed) = kept.error.clone()?;
-        let before = kept.tail.len().saturating_sub(followed);
-        for line in kept.tail.iter().skip(before) {
-            error.push_str("\n  ");
-            error.push_str(line);
+        let last = |count: usize| -> String {
+            let lines = kept.tail.iter().skip(kept.tail.len().saturating_sub(count));
+            lines.map(|line| format!("\n  {line}")).collect()
+        };
+        match &kept.error {
+            // It says all.
+            Some((error, followed)) => format!(": {error}{}", last(*followed)),
+            None if kept.tail.is_empty() => String::new(),
+            None => format!("; its last lines:{}", last(TAIL_LINES_MAX)),
         }
-        Some(error)
     }
 
     /// How many lines could not be written, and why; none if all were.
@@ -167,13 +166,13 @@ mod tests {
             .unwrap();
         log.finish();
         assert_eq!(std::fs::read_to_string(log.path()).unwrap(), lines);
-        assert_eq!((log.tail().len(), log.tail()[7].as_str()), (8, "line 9"));
+        let said = log.last_words();
+        assert!(said.starts_with("; its last lines:\n  line 2\n") && said.ends_with("line 9"));
         assert_eq!(log.missing(), None);
-        assert_eq!(log.error(), None);
         for line in ["error: it failed. Its last words:", "no", "more"] {
             lock(&log.kept).add(line.into());
         }
-        let said = "it failed. Its last words:\n  no\n  more";
-        assert_eq!(log.error().as_deref(), Some(said));
+        let said = ": it failed. Its last words:\n  no\n  more";
+        assert_eq!(log.last_words(), said);
     }
 }
