@@ -198,20 +198,14 @@ fn silent_for(process: &ProcessStatus) -> Option<f64> {
 
 /// Actors that are gone or unresponsive, a few words each; the first of them.
 fn unresponsive_actors(view: &RunView) -> Vec<String> {
-    let words = |process: &ProcessStatus| match silent_for(process) {
-        _ if process.who == ProcessName::Learner => None,
-        _ if !process.connected && view.replay.finished => None,
-        _ if !process.connected => Some(format!(
-            "{}: gone for {}",
-            process.who,
-            seconds(process.since_s)
-        )),
-        Some(silent) => Some(format!(
-            "{}: no answer for {}",
-            process.who,
-            seconds(silent)
-        )),
-        None => None,
+    let words = |process: &ProcessStatus| {
+        let (how, since_s) = match process.connected {
+            _ if process.who == ProcessName::Learner => return None,
+            true => ("no answer", silent_for(process)?),
+            false if view.replay.finished => return None,
+            false => ("gone", process.since_s),
+        };
+        Some(format!("{}: {how} for {}", process.who, seconds(since_s)))
     };
     let mut words: Vec<_> = processes(view).filter_map(|it| words(it.1)).collect();
     let more = words.len().saturating_sub(NAMED_MAX);
