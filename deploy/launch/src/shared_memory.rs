@@ -11,16 +11,7 @@ const EXTENSION: &str = ".zenoh";
 
 /// Removes the segments of shared memory that this process alone has in its memory. It must not use them any more.
 pub fn remove_own() {
-    for path in own() {
-        let removed = fs::remove_file(&path);
-        tracing::debug!("removing {}: {removed:?}", path.display());
-    }
-}
-
-/// The segments that no other process has in its memory.
-fn own() -> BTreeSet<PathBuf> {
-    let mut own = segments("self");
-    let this = std::process::id();
+    let (mut own, this) = (segments("self"), std::process::id());
     for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
         let pid = entry.file_name().to_string_lossy().into_owned();
         if pid.parse::<u32>().is_ok_and(|it| it != this) {
@@ -28,7 +19,10 @@ fn own() -> BTreeSet<PathBuf> {
             own.retain(|it| !theirs.contains(it));
         }
     }
-    own
+    for path in own {
+        let removed = fs::remove_file(&path);
+        tracing::debug!("removing {}: {removed:?}", path.display());
+    }
 }
 
 /// The segments that a process has in its memory.
@@ -39,21 +33,4 @@ fn segments(pid: &str) -> BTreeSet<PathBuf> {
         .filter_map(|line| line.split_whitespace().nth(5));
     let segments = paths.filter(|it| it.starts_with(FOLDER) && it.ends_with(EXTENSION));
     segments.map(PathBuf::from).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use zenoh::{Wait, shm::ShmProviderBuilder};
-
-    use super::*;
-
-    #[test]
-    fn a_segment_that_this_process_alone_has_is_its_own() {
-        let before = own();
-        let pool = ShmProviderBuilder::default_backend(1 << 12).wait().unwrap();
-        let found = own();
-        assert!(found.difference(&before).next().is_some(), "{found:?}");
-        assert!(found.is_subset(&segments(&std::process::id().to_string())));
-        drop(pool);
-    }
 }
