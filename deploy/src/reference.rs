@@ -1,5 +1,5 @@
 //! The reference pages of `deploy/docs` that are generated: the commands from clap, the settings from the commented presets.
-//! A test fails when they are stale; `UPDATE_DOCS=1` rewrites them. It also holds every `driml` command of the pages to clap.
+//! A test fails when they are stale; `UPDATE_EXPECT=1` rewrites them. It also holds every `driml` command of the pages to clap.
 
 use std::{
     collections::BTreeMap,
@@ -9,11 +9,12 @@ use std::{
 };
 
 use clap::{Arg, Command, CommandFactory, Parser};
+use expect_test::expect_file;
 
 use crate::cli::Cli;
 
 const GENERATED: &str =
-    "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml --lib reference` rewrites this page. -->";
+    "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml --lib reference` rewrites this page. -->";
 
 /// A flag or argument as its command's list shows it.
 fn entry(arg: &Arg) -> String {
@@ -147,15 +148,7 @@ fn settings() -> String {
 fn the_generated_pages_are_up_to_date() {
     let folder = root().join("deploy/docs/src/reference");
     for (name, page) in [("commands.md", commands()), ("settings.md", settings())] {
-        let path = folder.join(name);
-        if std::env::var_os("UPDATE_DOCS").is_some() {
-            fs::write(&path, &page).unwrap();
-        }
-        let there = fs::read_to_string(&path).unwrap_or_default();
-        assert!(
-            there == page,
-            "{name} is stale: UPDATE_DOCS=1 cargo test -p driml --lib reference"
-        );
+        expect_file![folder.join(name)].assert_eq(&page);
     }
 }
 

@@ -271,6 +271,7 @@ pub fn rounded(value: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use driml_protocol::ReplayStatus;
+    use expect_test::expect_file;
 
     use super::*;
     use crate::{
@@ -385,22 +386,14 @@ mod tests {
         table
     }
 
-    /// `UPDATE_DOCS=1` writes the page anew.
+    /// `UPDATE_EXPECT=1` writes the page anew.
     #[test]
     fn the_page_has_every_metric() {
-        let path = concat!(
-            env!("CARGO_MANIFEST_DIR"),
-            "/../docs/src/reference/metrics.md"
-        );
         let page = format!(
-            "<!-- Generated: `UPDATE_DOCS=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
+            "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
              names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n{}",
             markdown()
         );
-        if std::env::var_os("UPDATE_DOCS").is_some() {
-            std::fs::write(path, &page).unwrap();
-        }
-        let found = std::fs::read_to_string(path).unwrap_or_default();
-        assert_eq!(found, page, "run this test with UPDATE_DOCS=1");
+        expect_file!["../../docs/src/reference/metrics.md"].assert_eq(&page);
     }
 }
