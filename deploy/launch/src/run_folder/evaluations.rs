@@ -202,15 +202,18 @@ impl Candidate {
 
 #[cfg(test)]
 mod tests {
-    use std::path::PathBuf;
-
     use super::*;
 
-    fn checkpoint(folder: &RunFolder, updates: u64) -> PathBuf {
+    /// A checkpoint of so many updates, which the learner clears away while it is played.
+    fn judge(folder: &RunFolder, updates: u64, mean: f64, episodes: u32) -> anyhow::Result<bool> {
         let path = folder.checkpoints().join(format!("checkpoint-{updates}"));
         fs::create_dir_all(&path).unwrap();
         fs::write(path.join("weights"), updates.to_string()).unwrap();
-        path
+        let candidate = Candidate::read(&path).unwrap();
+        fs::remove_dir_all(path).unwrap();
+        let earned = Evaluated::at(folder, updates, episodes, (mean, 0.5));
+        let best = Evaluated::best(folder).unwrap();
+        candidate.judge(folder, &earned, best.as_ref())
     }
 
     #[test]
@@ -223,15 +226,7 @@ mod tests {
         )
         .unwrap();
         assert_eq!(Evaluated::all(&folder).unwrap(), []);
-        let judge = |updates, mean, episodes| {
-            let path = checkpoint(&folder, updates);
-            let candidate = Candidate::read(&path).unwrap();
-            // The learner clears it away while it is played.
-            fs::remove_dir_all(path).unwrap();
-            let earned = Evaluated::at(&folder, updates, episodes, (mean, 0.5));
-            let best = Evaluated::best(&folder).unwrap();
-            candidate.judge(&folder, &earned, best.as_ref()).unwrap()
-        };
+        let judge = |updates, mean, episodes| judge(&folder, updates, mean, episodes).unwrap();
         assert!(judge(10, -1.0, 4));
         assert!(judge(20, 3.0, 4));
         assert!(!judge(30, 3.0, 4), "the first of equals stays");
@@ -259,19 +254,13 @@ mod tests {
     fn the_best_stays_until_another_has_its_place() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
-        let judge = |updates, mean| {
-            let candidate = Candidate::read(&checkpoint(&folder, updates)).unwrap();
-            let earned = Evaluated::at(&folder, updates, 4, (mean, 0.5));
-            let best = Evaluated::best(&folder).unwrap();
-            candidate.judge(&folder, &earned, best.as_ref())
-        };
-        assert!(judge(20, 3.0).unwrap());
+        assert!(judge(&folder, 20, 3.0, 4).unwrap());
         let taken = folder.best().join("checkpoint-50");
         fs::write(&taken, "").unwrap();
-        judge(50, 9.0).unwrap_err();
+        judge(&folder, 50, 9.0, 4).unwrap_err();
         fs::remove_file(taken).unwrap();
         assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 20);
-        assert!(judge(50, 9.0).unwrap());
+        assert!(judge(&folder, 50, 9.0, 4).unwrap());
         assert_eq!(Evaluated::best(&folder).unwrap().unwrap().updates, 50);
     }
 
