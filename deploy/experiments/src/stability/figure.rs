@@ -69,14 +69,11 @@ mod tests {
     fn inputs_have_their_side_and_a_promise_that_was_not_tried_is_not_kept() {
         let row = Row {
             routine: "halving".into(),
-            range: "any".into(),
             extreme: "0, 1, and drawn".into(),
-            is_drawn: false,
-            promise: "error of |x|".into(),
             bound: 0.5,
             cases: 1,
             worst: 0.25,
-            input: "3".into(),
+            ..Row::default()
         };
         let drawn = Row {
             extreme: "one is infinite".into(),

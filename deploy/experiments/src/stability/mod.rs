@@ -16,11 +16,7 @@ use minijinja::{Value, context};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use self::{
-    checks::TABLE,
-    property::{Cases, Row},
-    settings::Settings,
-};
+use self::{checks::TABLE, property::Row, settings::Settings};
 use crate::{
     cache::{self, Session},
     flags::{self, ExperimentFlags},
@@ -50,12 +46,11 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
             let found = session.piece_of(&program, &key, 1, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
-                Cases::new(&settings, rng, property, progress).run()
+                property.rows(&settings, rng, progress)
             })?;
             property::merge(&mut of_property, found);
         }
-        of_property.extend(property.untried(&of_property));
-        rows.extend(of_property);
+        rows.extend(property::tried(of_property));
     }
     session.csv("promises", COLUMNS, table_of(&rows))?;
     session.figure(
@@ -160,14 +155,12 @@ mod tests {
         };
         let mut row = Row {
             routine: "halving".into(),
-            range: "any".into(),
             extreme: "big".into(),
-            is_drawn: false,
             promise: "error of |x|".into(),
             bound: 0.5,
             cases: 1,
             worst: 0.25,
-            input: "3".into(),
+            ..Row::default()
         };
         assert_eq!(
             verdict(&[row.clone()]),

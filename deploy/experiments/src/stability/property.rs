@@ -36,34 +36,48 @@ pub(super) enum Inputs {
 pub(super) type Check = fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
-    /// A promise at one kind of extreme, before the first case.
-    fn row(&self, promise: usize, extreme: &str, is_drawn: bool) -> Row {
-        let (words, bound) = self.promises[promise];
-        Row {
-            routine: self.routine.to_owned(),
-            range: self.range.to_owned(),
-            extreme: extreme.to_owned(),
-            is_drawn,
-            promise: words.to_owned(),
-            bound,
-            cases: 0,
-            worst: 0.0,
-            input: String::new(),
+    /// Runs all checks; what they saw of each promise at each kind of extreme.
+    pub(super) fn rows(
+        &self,
+        settings: &Settings,
+        rng: ChaCha8Rng,
+        progress: &mut Progress,
+    ) -> anyhow::Result<Vec<Row>> {
+        let mut cases = Cases {
+            settings,
+            rng,
+            progress,
+            taken: None,
+            lists: 0,
+            rows: Vec::new(),
+        };
+        let mut all = Vec::new();
+        for &(extreme, inputs, check) in self.extremes {
+            let steps = settings.adam_steps.to_string();
+            let updates = settings.affinity_updates.to_string();
+            let extreme = extreme
+                .replace("{adam_steps}", &steps)
+                .replace("{affinity_updates}", &updates);
+            let rows = self.promises.iter().map(|&(promise, bound)| Row {
+                routine: self.routine.to_owned(),
+                range: self.range.to_owned(),
+                extreme: extreme.clone(),
+                is_drawn: matches!(inputs, Drawn(_)),
+                promise: promise.to_owned(),
+                bound,
+                ..Row::default()
+            });
+            cases.rows = rows.collect();
+            cases.run(inputs, check)?;
+            all.append(&mut cases.rows);
         }
-    }
-
-    /// Rows without a case, which are not kept, of the promises that these rows say nothing of.
-    pub(super) fn untried(&self, rows: &[Row]) -> Vec<Row> {
-        let promises = self.promises.iter().enumerate();
-        let untried = promises.filter(|(_, it)| rows.iter().all(|row| row.promise != it.0));
-        untried
-            .map(|(promise, _)| self.row(promise, "none was tried", false))
-            .collect()
+        cases.progress.advance(1)?;
+        Ok(all)
     }
 }
 
 /// One promise at one kind of extreme.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Row {
     pub(super) routine: String,
     pub(super) range: String,
@@ -84,19 +98,23 @@ impl Row {
         self.cases > 0 && self.worst <= self.bound
     }
 
-    fn is_beside(&self, promise: &str, extreme: &str) -> bool {
-        self.extreme == extreme && self.promise == promise
+    fn see(&mut self, input: Arguments<'_>, error: f64) {
+        self.cases += 1;
+        // The least of a number and NaN is the number.
+        let error = error.abs().min(f64::MAX);
+        if error > self.worst {
+            (self.worst, self.input) = (error, input.to_string());
+        }
     }
 }
 
 /// Adds what another seed saw of the same property.
 pub(super) fn merge(rows: &mut Vec<Row>, others: Vec<Row>) {
-    for other in others {
-        let same = |row: &&mut Row| row.is_beside(&other.promise, &other.extreme);
-        let Some(row) = rows.iter_mut().find(same) else {
-            rows.push(other);
-            continue;
-        };
+    if rows.is_empty() {
+        *rows = others;
+        return;
+    }
+    for (row, other) in rows.iter_mut().zip(others) {
         row.cases += other.cases;
         if other.worst > row.worst {
             (row.worst, row.input) = (other.worst, other.input);
@@ -104,70 +122,54 @@ pub(super) fn merge(rows: &mut Vec<Row>, others: Vec<Row>) {
     }
 }
 
+/// Of a property's rows those with a case, and one, which is not kept, of each promise that has none at any extreme.
+pub(super) fn tried(rows: Vec<Row>) -> Vec<Row> {
+    let (mut tried, untried): (Vec<_>, Vec<_>) = rows.into_iter().partition(|row| row.cases > 0);
+    for mut row in untried {
+        if tried.iter().all(|it| it.promise != row.promise) {
+            (row.extreme, row.is_drawn) = ("none was tried".into(), false);
+            tried.push(row);
+        }
+    }
+    tried
+}
+
 /// What a check takes the inputs of a case from, and reports its errors to.
 pub(super) struct Cases<'a> {
     pub(super) settings: &'a Settings,
     /// The generator of inputs, and of nothing else.
     pub(super) rng: ChaCha8Rng,
-    property: &'static Property,
     progress: &'a mut Progress,
-    extreme: String,
     /// Which item of each list the case takes, and of how many; none where they are drawn.
     taken: Option<Vec<(usize, usize)>>,
     /// The lists that the case has taken an item of.
     lists: usize,
+    /// One for each promise, at the extreme that is tried.
     rows: Vec<Row>,
 }
 
-impl<'a> Cases<'a> {
-    pub(super) fn new(
-        settings: &'a Settings,
-        rng: ChaCha8Rng,
-        property: &'static Property,
-        progress: &'a mut Progress,
-    ) -> Self {
-        Self {
-            settings,
-            rng,
-            property,
-            progress,
-            extreme: String::new(),
-            taken: None,
-            lists: 0,
-            rows: Vec::new(),
-        }
-    }
-
+impl Cases<'_> {
     /// How many cases this share of the draws is.
     pub(super) fn draws(&self, share: f64) -> u64 {
         (self.settings.draws as f64 * share).ceil().max(8.0) as u64
     }
 
-    /// The rows of all cases.
-    pub(super) fn run(mut self) -> anyhow::Result<Vec<Row>> {
-        for &(extreme, inputs, check) in self.property.extremes {
-            let steps = self.settings.adam_steps.to_string();
-            let updates = self.settings.affinity_updates.to_string();
-            self.extreme = extreme
-                .replace("{adam_steps}", &steps)
-                .replace("{affinity_updates}", &updates);
-            match inputs {
-                Listed => {
-                    self.taken = Some(Vec::new());
-                    while self.taken.is_some() {
-                        self.attempt(check)?;
-                        self.combine_anew();
-                    }
+    fn run(&mut self, inputs: Inputs, check: Check) -> anyhow::Result<()> {
+        match inputs {
+            Listed => {
+                self.taken = Some(Vec::new());
+                while self.taken.is_some() {
+                    self.attempt(check)?;
+                    self.combine_anew();
                 }
-                Drawn(share) => {
-                    for _ in 0..self.draws(share) {
-                        self.attempt(check)?;
-                    }
+            }
+            Drawn(share) => {
+                for _ in 0..self.draws(share) {
+                    self.attempt(check)?;
                 }
             }
         }
-        self.progress.advance(1)?;
-        Ok(self.rows)
+        Ok(())
     }
 
     /// Runs a case; one that fails breaks the first promise, and the error stands for its input.
@@ -219,38 +221,22 @@ impl<'a> Cases<'a> {
         errors: [E; N],
     ) -> anyhow::Result<()> {
         for (promise, error) in errors.into_iter().enumerate() {
-            let Some(error) = error.into() else { continue };
-            let words = self.property.promises[promise].0;
-            let mut rows = self.rows.iter();
-            let found = rows.position(|it| it.is_beside(words, &self.extreme));
-            let at = found.unwrap_or_else(|| {
-                let row = self
-                    .property
-                    .row(promise, &self.extreme, self.taken.is_none());
-                self.rows.push(row);
-                self.rows.len() - 1
-            });
-            let row = &mut self.rows[at];
-            row.cases += 1;
-            // The least of a number and NaN is the number.
-            let error = error.abs().min(f64::MAX);
-            if error > row.worst {
-                (row.worst, row.input) = (error, input.to_string());
+            if let Some(error) = error.into() {
+                self.rows[promise].see(input, error);
             }
         }
         self.pause()
     }
 
-    /// Counts whether this case keeps a promise, one of the first three, that allows no error.
+    /// Counts whether this case keeps a promise that allows no error.
     pub(super) fn keeps(
         &mut self,
         promise: usize,
         input: Arguments<'_>,
         is_kept: bool,
     ) -> anyhow::Result<()> {
-        let mut errors = [None; 3];
-        errors[promise] = Some(if is_kept { 0.0 } else { 1.0 });
-        self.see(input, errors)
+        self.rows[promise].see(input, if is_kept { 0.0 } else { 1.0 });
+        self.pause()
     }
 
     /// Where an interrupt ends a case that has long to go until it sees an error.
@@ -298,9 +284,7 @@ mod tests {
         let settings = flags::settings(NAME, SETTINGS, true);
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
-        let cases = Cases::new(&settings, rng, &HALVING, progress);
-        let mut rows = cases.run().unwrap();
-        rows.extend(HALVING.untried(&rows));
+        let rows = tried(HALVING.rows(&settings, rng, progress).unwrap());
         let seen = |row: &Row| (row.cases, row.worst, row.input.clone(), row.is_kept());
         assert_eq!(
             rows.iter().filter(|it| it.is_drawn).count(),
