@@ -5,7 +5,6 @@ mod checks;
 mod edges;
 mod figure;
 mod property;
-mod settings;
 mod small;
 
 use anyhow::ensure;
@@ -16,7 +15,10 @@ use minijinja::{Value, context};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use self::{checks::TABLE, property::Row, settings::Settings};
+use self::{
+    checks::TABLE,
+    property::{Row, Settings},
+};
 use crate::{
     cache::{self, Session},
     flags::{self, ExperimentFlags},

@@ -5,11 +5,36 @@
 use std::fmt::Arguments;
 
 use driml_machine::error::Interrupted;
-use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{edges::one_of, settings::Settings};
 use crate::progress::Progress;
+
+// What a check is written in.
+pub(super) use super::edges::*;
+pub(super) use Inputs::{Drawn, Listed};
+pub(super) use rand::Rng;
+pub(super) use rand_chacha::ChaCha8Rng;
+
+/// How much is tried: a table of `config.toml`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Settings {
+    /// Seeds 1 to this. No piece depends on it, so that more can be added later.
+    #[serde(skip_serializing)]
+    pub(super) seeds: u32,
+    /// Random inputs of a quick routine; slower ones take a share of it.
+    pub(super) draws: u64,
+    /// Steps of the longest run of Adam.
+    pub(super) adam_steps: u64,
+    /// Most moves of a target network towards one that stands still; a tau that needs more is left out.
+    pub(super) follow_moves: u64,
+    /// Updates of the learned affinity.
+    pub(super) affinity_updates: u64,
+    /// Draws from each law that is tested.
+    pub(super) law_draws: u64,
+    /// Random probabilities for which every value that can be drawn is drawn.
+    pub(super) whole_draws: u64,
+}
 
 /// A row of the table of properties.
 pub(super) struct Property {
@@ -21,8 +46,6 @@ pub(super) struct Property {
     /// Kinds of extremes in words, how many cases of each, and what runs the routine beside its reference in one case.
     pub(super) extremes: &'static [(&'static str, Inputs, Check)],
 }
-
-pub(super) use Inputs::{Drawn, Listed};
 
 /// Where the inputs of a check come from.
 #[derive(Clone, Copy)]
@@ -248,7 +271,7 @@ impl Cases<'_> {
 #[cfg(test)]
 mod tests {
     use driml_protocol::GracefulShutdown;
-    use rand::{Rng, SeedableRng};
+    use rand::SeedableRng;
 
     use super::*;
     use crate::{

@@ -4,12 +4,8 @@ use driml_learner::{
     AdamSettings,
     optimiser::adam::{Rule, STEP_ERROR, moment_error, step_floor},
 };
-use rand::Rng;
 
-use crate::stability::{
-    edges::{F32_STEP, Shown, clamped, one_of},
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 /// As `driml-ada` on Procgen has them, but for the eps, which here is the one that rounds worst.
 const PRESET: AdamSettings = AdamSettings {

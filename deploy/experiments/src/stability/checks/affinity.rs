@@ -4,13 +4,8 @@ use driml_learner::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings, LearnedAffinity, LearnedSettings,
     affinity::exact::ENTRY_ERROR,
 };
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::stability::{
-    edges::{exact_sum, off, worst},
-    property::{Cases, Listed, Property},
-};
+use crate::stability::property::*;
 
 /// Half of the last place of an f32 near 1, of which the sum of a row of an affinity may be off by four.
 const ROW_SUM_ERROR: f64 = 2.5e-7;

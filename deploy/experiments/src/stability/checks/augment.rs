@@ -1,12 +1,8 @@
 //! States cropped and recoloured, as an auxiliary loss sees them, against bytes that are rounded once.
 
 use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR, View};
-use rand::Rng;
 
-use crate::stability::{
-    edges::{one_of, worst},
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 const STATES: &str = "states of 1 to 13 pixels a side, 1 to 4 frames in colour or grey; crops resized to the whole; the same states recoloured, factors and turns at the ends of their ranges and between, drawn";
 

@@ -6,16 +6,8 @@ use driml_learner::losses::{
     c51::{self, ENTRY_ERROR, KL_ERROR, SLOPE_ERROR},
     projection::{MASS_ERROR, entry_error, project},
 };
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::stability::{
-    edges::{
-        LEAST, SUPPORTS, Shown, exact_sum, finite, finites, law, not_finite, off, one_of,
-        probability, shares, support, widened, worst,
-    },
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 const STEPS: &str = "rewards 0, 1e-45, 1, 1e30, 3.4e38, infinite; discounts 0, 1e-45, 1 - 6e-8, 1; 2, 51, 1,001 atoms; supports 1 ulp to 1e30 wide";
 const LOGITS: &str =

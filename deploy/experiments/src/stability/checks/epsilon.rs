@@ -1,10 +1,8 @@
 //! The schedule of epsilon.
 
 use driml_actor::Schedule;
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::stability::property::{Cases, Drawn, Listed, Property};
+use crate::stability::property::*;
 
 const FRAMES: &str = "decay over 0, 1, 1e5, 1e10, 2^32, 2^53, 2^64 - 1 frames, from before the first to after the last";
 

@@ -4,12 +4,8 @@ use driml_learner::losses::{
     info_nce::{LOSS_ERROR, info_nce, slope_error},
     scores::{self, CLIP_ERROR, Scores},
 };
-use rand::Rng;
 
-use crate::stability::{
-    edges::{Shown, exact_sum, finite, finites, not_finite, one_of, shares, worst},
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 const RANGE: &str = "dot products finite; bounds 1e-30 to 1e30";
 const DOTS: &str =

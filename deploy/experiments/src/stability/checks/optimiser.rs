@@ -9,13 +9,8 @@ use driml_learner::{
     },
 };
 use driml_model::{ModelConfig, Parameters};
-use rand::Rng;
 
-use crate::stability::{
-    edges::{LEAST, Shown, clamped, exact_sum, finites, not_finite, worst},
-    property::{Cases, Drawn, Listed, Property},
-    small,
-};
+use crate::stability::{property::*, small};
 
 const NORMS: &str =
     "all 0, 1e-45, 1e-38, 1e20, 3.4e38; one of 3.4e38 among 1e-45; 10 and 131,000 of them";

@@ -3,13 +3,8 @@
 
 use candle_core::{DType, Device, Tensor, Var};
 use driml_model::{Precision, conv2d_relu, linear, relu};
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::stability::{
-    edges::{Shown, clamped, finite, not_finite, worst},
-    property::{Cases, Check, Drawn, Inputs, Listed, Property},
-};
+use crate::stability::property::*;
 
 const PRODUCT: &str = "a sum of products, as a share of the precision's `product_error` and floor";
 const PROMISES: &[(&str, f64)] = &[

@@ -4,12 +4,8 @@ use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
 };
 use driml_replay_server::{Config, RETURN_ERROR, Replay, return_sum_error};
-use rand::Rng;
 
-use crate::stability::{
-    edges::{LEAST, clamped, exact_sum, finite, one_of},
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 const REWARDS: &str = "rewards 0, 1e-45, +-1e30 that cancel, 3.4e38 / n; n 1, 7, 1,000; gamma 0, 1e-320, 0.5, 0.99, 1 - 1e-12, 1";
 

@@ -12,13 +12,10 @@ use driml_replay_server::{
         nhg::{GO_ON_ERROR, draw_k},
     },
 };
-use rand::{Rng, RngCore};
+use rand::RngCore;
 
 use super::replay::{chunk, config, number, replay, spec};
-use crate::stability::{
-    edges::{LEAST, Shown, exact_sum, finite, finites, off, probability},
-    property::{Cases, Drawn, Listed, Property},
-};
+use crate::stability::property::*;
 
 /// Deviations of a chi-square that one right law in two million passes.
 const DEVIATIONS: f64 = 5.0;

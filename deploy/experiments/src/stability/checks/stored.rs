@@ -2,13 +2,8 @@
 
 use candle_core::Device;
 use driml_model::{Parameters, StoredAs};
-use rand::Rng;
 
-use crate::stability::{
-    edges::clamped,
-    property::{Cases, Drawn, Listed, Property},
-    small,
-};
+use crate::stability::{property::*, small};
 
 const NEAREST: &str = "weights not read as the nearest, ties to even, with their sign";
 const OF_WEIGHT: &str = "a weight, as a share of it";

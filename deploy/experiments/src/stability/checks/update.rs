@@ -9,14 +9,8 @@ use driml_machine::resources::Machine;
 use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use driml_settings::flags::of_names;
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::stability::{
-    edges::{one_of, worst},
-    property::{Cases, Listed, Property},
-    small,
-};
+use crate::stability::{property::*, small};
 
 /// How far two ways of computing may be apart, each of which is right to half of it.
 const UPDATES_APART: f64 = 2e-4;

@@ -6,14 +6,9 @@ use driml_model::{
     EXPECTED_RETURN_ERROR, ModelConfig, ModelError, Network, Parameters, PolicyNetwork, Precision,
     StoredAs,
 };
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::SeedableRng;
 
-use crate::stability::{
-    edges::{F32_STEP, LEAST, SUPPORTS, Shown, exact_sum, finites, shares, support, widened},
-    property::{Cases, Drawn, Listed, Property},
-    small,
-};
+use crate::stability::{property::*, small};
 
 const LOGITS: &str = "2, 51, 1,001 atoms; supports from 0, far from 0 ([1e6, 1e6 + 1], [1000, 1001]), 1 ulp and 2e30 wide; logits equal, +-1e38, one -inf";
 const TOO_LARGE: &str = "weights that take a value beyond 3.4e38 in some rows of a batch";
