@@ -59,14 +59,13 @@ const fn precision<const BF16: bool>() -> Precision {
     }
 }
 
-/// From the maps to the hidden layer, from there to the atoms of 15 actions, and each place of a map to a score of DIM.
-const DENSE: [Layer; 3] = [
+/// Of Procgen's network and DIM's heads.
+const LAYERS: [Layer; 6] = [
+    // From the maps to the hidden layer, from there to the atoms of 15 actions, and each place of a map to a score of DIM.
     Layer::of([256, 1024, 512], [0; 3]),
     Layer::of([256, 512, 765], [0; 3]),
     Layer::of([4096, 64, 512], [0; 3]),
-];
-/// The three of Procgen's network, the border that the first would not read left out.
-const CONVOLUTIONS: [Layer; 3] = [
+    // Convolutions, the border that the first would not read left out.
     Layer::of([32, 3, 32], [60, 8, 4]),
     Layer::of([32, 32, 64], [14, 4, 2]),
     Layer::of([32, 64, 64], [6, 3, 1]),
@@ -120,34 +119,19 @@ impl Layer {
     }
 
     fn operands(&self, draw: Draw<'_>, rng: &mut ChaCha8Rng) -> anyhow::Result<Operands> {
-        let Self {
-            rows,
-            inputs,
-            outputs,
-            side,
-            kernel,
-            stride,
-        } = *self;
-        let [x, w, g] = match self.is_convolution() {
-            false => [
-                vec![rows, inputs],
-                vec![outputs, inputs],
-                vec![rows, outputs],
-            ],
-            true => {
-                let places = (side - kernel) / stride + 1;
-                [
-                    vec![rows, side, side, inputs],
-                    vec![outputs, inputs, kernel, kernel],
-                    vec![rows, places, places, outputs],
-                ]
-            }
-        };
+        let square = |side| vec![side; if self.is_convolution() { 2 } else { 0 }];
+        let places = (self.side - self.kernel).checked_div(self.stride);
+        let places = places.map_or(0, |steps| steps + 1);
         let mut tensor = |shape: Vec<usize>| {
             let values = draw(shape.iter().product(), rng);
             Tensor::from_vec(values, shape, &Device::Cpu)
         };
-        Ok([tensor(x)?, tensor(w)?, tensor(vec![outputs])?, tensor(g)?])
+        Ok([
+            tensor([vec![self.rows], square(self.side), vec![self.inputs]].concat())?,
+            tensor([vec![self.outputs, self.inputs], square(self.kernel)].concat())?,
+            tensor(vec![self.outputs])?,
+            tensor([vec![self.rows], square(places), vec![self.outputs]].concat())?,
+        ])
     }
 
     /// In float64 by candle's own operations, and before ReLU.
@@ -169,14 +153,17 @@ impl Layer {
             false => linear(x, w, b, precision),
             true => conv2d_relu(x, w, b, self.stride, precision),
         })?;
-        let in_f64 = |tensor: &Tensor| tensor.to_dtype(DType::F64);
-        let [x, w, b, g] = operands;
-        let with_bytes = x.dtype() == DType::U8;
-        let scale = if with_bytes { 1.0 / 255.0 } else { 1.0 };
-        let mut exact = [(in_f64(x)? * scale)?, in_f64(w)?, in_f64(b)?, in_f64(g)?];
+        let with_bytes = operands[0].dtype() == DType::U8;
+        let mut exact = operands.clone();
+        for tensor in &mut exact {
+            *tensor = tensor.to_dtype(DType::F64)?;
+        }
+        if with_bytes {
+            exact[0] = (&exact[0] * (1.0 / 255.0))?;
+        }
         if self.is_convolution() {
             // Where a result is 0 its gradient is.
-            let y = Tensor::from_slice(&found[0], g.shape(), &Device::Cpu)?;
+            let y = Tensor::from_slice(&found[0], exact[3].shape(), &Device::Cpu)?;
             exact[3] = (&exact[3] * y.gt(0.0)?.to_dtype(DType::F64)?)?;
         }
         let traced = |operands: &Operands| traced(operands, |vars| self.exact(vars));
@@ -184,14 +171,14 @@ impl Layer {
         for (at, tensor) in exact.iter().enumerate() {
             (sizes[at], ones[at]) = (tensor.abs()?, tensor.ones_like()?);
         }
-        ones[2] = b.zeros_like()?.to_dtype(DType::F64)?;
+        ones[2] = exact[2].zeros_like()?;
         // Both operands' sizes and 1, each summed over the terms of a sum.
-        let beside_ones = [0, 1, 3].map(|at| {
+        let mut beside_ones = Vec::new();
+        for at in [0, 1, 3] {
             let mut operands = ones.clone();
             operands[at] = sizes[at].clone();
-            traced(&operands)
-        });
-        let beside_ones: Vec<_> = beside_ones.into_iter().collect::<anyhow::Result<_>>()?;
+            beside_ones.push(traced(&operands)?);
+        }
         let [exact, sizes, terms] = [traced(&exact)?, traced(&sizes)?, traced(&ones)?];
         let mut errors = Vec::new();
         for of in 0..4 {
@@ -220,27 +207,21 @@ impl Layer {
         Ok(worst(errors))
     }
 
-    fn see<const BF16: bool>(
-        &self,
-        cases: &mut Cases<'_>,
-        operands: &Operands,
-    ) -> anyhow::Result<()> {
-        let error = self.error(operands, precision::<BF16>())?;
-        let w = operands[1].flatten_all()?.to_vec1()?;
-        let input = format_args!("{self:?}, {:?}, w {}", operands[0].dtype(), Shown(&w));
-        cases.see(input, [error])
-    }
-
-    /// The same with inputs that are bytes.
-    fn see_bytes<const BF16: bool>(
-        &self,
-        cases: &mut Cases<'_>,
-        mut operands: Operands,
-    ) -> anyhow::Result<()> {
-        let bytes = (0..operands[0].elem_count()).map(|_| cases.rng.random());
-        let bytes: Vec<u8> = bytes.collect();
-        operands[0] = Tensor::from_vec(bytes, operands[0].shape(), &Device::Cpu)?;
-        self.see::<BF16>(cases, &operands)
+    /// Sees the errors on operands that are drawn; those of a convolution on bytes too.
+    fn see<const BF16: bool>(&self, cases: &mut Cases<'_>, draw: Draw<'_>) -> anyhow::Result<()> {
+        let mut operands = self.operands(draw, &mut cases.rng)?;
+        loop {
+            let error = self.error(&operands, precision::<BF16>())?;
+            let [x, w, ..] = &operands;
+            let w = w.flatten_all()?.to_vec1()?;
+            let input = format_args!("{self:?}, {:?}, w {}", x.dtype(), Shown(&w));
+            cases.see(input, [error])?;
+            if !self.is_convolution() || x.dtype() == DType::U8 {
+                return Ok(());
+            }
+            let bytes: Vec<u8> = (0..x.elem_count()).map(|_| cases.rng.random()).collect();
+            operands[0] = Tensor::from_vec(bytes, x.shape(), &Device::Cpu)?;
+        }
     }
 }
 
@@ -283,8 +264,7 @@ fn dense_of_sizes<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()>
         let size = sizes.next().unwrap_or(size);
         usual(count, rng).into_iter().map(|x| x * size).collect()
     };
-    let operands = layer.operands(&mut draw, &mut cases.rng)?;
-    layer.see::<BF16>(cases, &operands)
+    layer.see::<BF16>(cases, &mut draw)
 }
 
 fn dense<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -294,26 +274,18 @@ fn dense<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         true => moderate(count, rng),
         false => clamped(count, most, rng),
     };
-    let operands = layer.operands(&mut draw, &mut cases.rng)?;
-    layer.see::<BF16>(cases, &operands)
+    layer.see::<BF16>(cases, &mut draw)
 }
 
 fn convolution<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let layer = Layer::drawn_convolution(&mut cases.rng);
-    let operands = layer.operands(&mut { moderate }, &mut cases.rng)?;
-    layer.see::<BF16>(cases, &operands)?;
-    layer.see_bytes::<BF16>(cases, operands)
+    layer.see::<BF16>(cases, &mut { moderate })
 }
 
 fn layers_of_procgen<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let layer = cases.each(&[DENSE, CONVOLUTIONS].concat());
+    let layer = cases.each(&LAYERS);
     let mut draw = cases.each(&[usual as fn(_, &mut _) -> _, moderate]);
-    let operands = layer.operands(&mut draw, &mut cases.rng)?;
-    layer.see::<BF16>(cases, &operands)?;
-    if layer.is_convolution() {
-        layer.see_bytes::<BF16>(cases, operands)?;
-    }
-    Ok(())
+    layer.see::<BF16>(cases, &mut draw)
 }
 
 fn infinite<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
