@@ -1,5 +1,7 @@
 //! Adam: steps of any gradients, ten million of them, and the bias correction of any step number.
 
+use std::slice;
+
 use driml_learner::{
     AdamSettings,
     optimiser::adam::{Rule, STEP_ERROR, moment_error, step_floor},
@@ -61,83 +63,70 @@ pub(super) const PROPERTIES: &[Property] = &[
     },
 ];
 
-/// One parameter and its moments in float64.
+/// A parameter that starts at 0 and its moments, as the rule steps them in f32, and in float64.
 #[derive(Clone, Copy, Default)]
-struct Exact {
+struct Stepped {
+    /// The parameter and its moments in f32.
+    found: [f32; 3],
     p: f64,
     m: f64,
     v: f64,
     /// How far the parameter went, back and forth.
     way: f64,
-    /// What f32 may add: [`step_floor`] of each step.
+    /// What f32 may add: [`step_floor`] of each step; NaN after one that is not finite.
     floor: f64,
     /// Decayed mean of the gradients' sizes.
     size: f64,
 }
 
-/// `N` parameters that start at 0, as the rule steps them in f32, and in float64.
-struct Run<const N: usize> {
-    settings: AdamSettings,
-    p: [f32; N],
-    m: [f32; N],
-    v: [f32; N],
-    exact: [Exact; N],
-    is_finite: bool,
+impl Stepped {
+    /// The error of the parameter as a share of its way, [`step_floor`] apart.
+    fn error(&self) -> f64 {
+        match (f64::from(self.found[0]) - self.p).abs() - self.floor {
+            error if error <= 0.0 => 0.0,
+            error => error / self.way,
+        }
+    }
 }
 
-impl<const N: usize> Run<N> {
-    fn new(settings: AdamSettings) -> Self {
-        Self {
-            settings,
-            p: [0.0; N],
-            m: [0.0; N],
-            v: [0.0; N],
-            exact: [Exact::default(); N],
-            is_finite: true,
-        }
-    }
-
-    fn step(&mut self, t: u64, g: [f32; N]) {
-        let rule = Rule::new(self.settings, t, 1.0);
-        self.is_finite &= rule.apply(&mut self.p, &g, &mut self.m, &mut self.v);
-        let AdamSettings {
-            lr,
-            beta1,
-            beta2,
-            eps,
-        } = self.settings;
-        // 1 - beta^t, which keeps its digits near beta = 1 and near t = 0.
-        let [first, second] = [beta1, beta2].map(|beta| match beta {
-            0.0 => 1.0,
-            _ => -(t as f64 * beta.ln()).exp_m1(),
-        });
-        for (it, g) in self.exact.iter_mut().zip(g.map(f64::from)) {
-            it.m = beta1 * it.m + (1.0 - beta1) * g;
-            it.v = beta2 * it.v + (1.0 - beta2) * g * g;
-            it.size = beta1 * it.size + (1.0 - beta1) * g.abs();
-            let step = lr * (it.m / first) / ((it.v / second).sqrt() + eps);
-            it.p -= step;
-            it.way += step.abs();
-            it.floor += step_floor(it.p.abs().max(step.abs()), eps);
-        }
-    }
-
-    /// The error of a parameter as a share of its way, [`step_floor`] apart.
-    fn error(&self, at: usize) -> f64 {
-        let it = self.exact[at];
-        match (f64::from(self.p[at]) - it.p).abs() - it.floor {
-            _ if !self.is_finite => f64::NAN,
-            error if error <= 0.0 => 0.0,
-            error => error / it.way,
-        }
+/// Takes step number `t` of each with its gradient.
+fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) {
+    let rule = Rule::new(settings, t, 1.0);
+    let AdamSettings {
+        lr,
+        beta1,
+        beta2,
+        eps,
+    } = settings;
+    // 1 - beta^t, which keeps its digits near beta = 1 and near t = 0.
+    let [first, second] = [beta1, beta2].map(|beta| match beta {
+        0.0 => 1.0,
+        _ => -(t as f64 * beta.ln()).exp_m1(),
+    });
+    for (it, &g) in all.iter_mut().zip(gradients) {
+        let [p, m, v] = it.found.each_mut().map(slice::from_mut);
+        let is_finite = rule.apply(p, &[g], m, v);
+        let g = f64::from(g);
+        it.m = beta1 * it.m + (1.0 - beta1) * g;
+        it.v = beta2 * it.v + (1.0 - beta2) * g * g;
+        it.size = beta1 * it.size + (1.0 - beta1) * g.abs();
+        let step = lr * (it.m / first) / ((it.v / second).sqrt() + eps);
+        it.p -= step;
+        it.way += step.abs();
+        it.floor += match is_finite {
+            true => step_floor(it.p.abs().max(step.abs()), eps),
+            false => f64::NAN,
+        };
     }
 }
 
 /// The error of one parameter after these gradients.
 fn error_after(settings: AdamSettings, gradients: &[f32]) -> f64 {
-    let mut run = Run::<1>::new(settings);
-    (1..).zip(gradients).for_each(|(t, &g)| run.step(t, [g]));
-    run.error(0)
+    let mut one = [Stepped::default()];
+    (1..)
+        .zip(gradients)
+        .for_each(|(t, &g)| step(settings, t, &mut one, &[g]));
+    one[0].error()
 }
 
 fn equal_gradients(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -204,18 +193,19 @@ const fn turn(t: u64) -> f32 {
 
 fn long_run(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let steps = cases.settings.adam_steps;
-    let mut run = Run::<8>::new(PRESET);
+    let mut all = [Stepped::default(); PATTERNS.len()];
     let mut next_look = 10;
     for t in 1..=steps {
         let noise = cases.rng.random_range(-1.0f32..1.0);
-        run.step(t, PATTERNS.map(|(_, gradient)| gradient(t, noise)));
+        let gradients = PATTERNS.map(|(_, gradient)| gradient(t, noise));
+        step(PRESET, t, &mut all, &gradients);
         if t == next_look || t == steps {
             next_look *= 10;
-            for (at, it) in run.exact.iter().enumerate() {
-                let [p, m, v] = [run.p[at], run.m[at], run.v[at]].map(f64::from);
+            for (at, it) in all.iter().enumerate() {
+                let [p, m, v] = it.found.map(f64::from);
                 let is_fine = it.floor <= STEP_ERROR * it.way;
                 let errors = [
-                    Some(run.error(at)),
+                    Some(it.error()),
                     is_fine.then_some((p - it.p) / it.way),
                     (at < 3).then_some((m - it.m) / it.size),
                     (at < 3).then_some((v - it.v) / it.v),
@@ -235,11 +225,14 @@ fn long_run(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 fn step_number(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let powers = [24, 31, 32, 33, 53].map(|power| 1 << power);
     let number = cases.each(&[&[1, 2, 1000, u64::MAX][..], &powers].concat());
-    let step = cases.each(&[(number - 1).max(1), number]);
+    let t = cases.each(&[(number - 1).max(1), number]);
     let beta2 = cases.each(&[0.9, 0.999, 0.99999]);
-    let mut run = Run::<1>::new(AdamSettings { beta2, ..PRESET });
-    (run.m, run.v) = ([0.25], [0.5]);
-    (run.exact[0].m, run.exact[0].v) = (0.25, 0.5);
-    run.step(step, [0.125]);
-    cases.see(format_args!("step {step}, beta2 {beta2}"), [run.error(0)])
+    let mut one = [Stepped {
+        found: [0.0, 0.25, 0.5],
+        m: 0.25,
+        v: 0.5,
+        ..Stepped::default()
+    }];
+    step(AdamSettings { beta2, ..PRESET }, t, &mut one, &[0.125]);
+    cases.see(format_args!("step {t}, beta2 {beta2}"), [one[0].error()])
 }
