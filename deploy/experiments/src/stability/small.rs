@@ -32,7 +32,7 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
     }
 }
 
-/// The network of least parameters: eight in all, but for the biases.
+/// The network of least parameters: eight in all.
 pub(super) fn least() -> ModelConfig {
     config(2, 1, (-1.0, 1.0))
 }
