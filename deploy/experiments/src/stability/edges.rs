@@ -71,6 +71,12 @@ pub(super) fn clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
     values.map(|x| x.clamp(-most, most)).collect()
 }
 
+/// Numbers from -scale / 2 to scale / 2, of which neighbours are far apart.
+pub(super) fn ramp(count: usize, scale: f32) -> Vec<f32> {
+    let place = |i: usize| (i * 37 % count) as f32 / count as f32;
+    (0..count).map(|i| place(i) * scale - scale / 2.0).collect()
+}
+
 /// Weights of `count` atoms that sum to 1, some of them 0 or tiny.
 pub(super) fn law(count: usize, rng: &mut impl Rng) -> Vec<f32> {
     let mut weights: Vec<f64> = (0..count)

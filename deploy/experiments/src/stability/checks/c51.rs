@@ -87,11 +87,8 @@ fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
 
     // Each atom lands as the height of the hats of the atoms beside it: 1 at an atom, 0 at its neighbours.
-    let (last, width) = (
-        (atoms - 1) as f64,
-        f64::from(support.1) - f64::from(support.0),
-    );
-    let (low, high) = (f64::from(support.0), f64::from(support.1));
+    let [low, high] = [support.0, support.1].map(f64::from);
+    let (last, width) = ((atoms - 1) as f64, high - low);
     let mut hats = vec![0.0; atoms];
     for (i, &p) in probs.iter().enumerate() {
         let moved = f64::from(reward) + f64::from(discount) * (low + width * (i as f64 / last));
@@ -147,15 +144,12 @@ fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
 
 /// Rows of logits at which a softmax may go wrong.
 static LISTED_LOGITS: LazyLock<Vec<Vec<f32>>> = LazyLock::new(|| {
-    let ramp = |scale: f32| -> Vec<f32> {
-        let place = |i: u16| f32::from(i * 37 % 51) / 51.0;
-        (0..51).map(|i| place(i) * scale - scale / 2.0).collect()
-    };
     let equal = [0.0, 1e-45, 1e4, -1e4, 1e12, 1e38, -1e38, f32::MAX, f32::MIN];
     let equal = equal
         .iter()
         .flat_map(|&x| [51, 2, 1001].map(|atoms| vec![x; atoms]));
-    let ramps = [1e-40f32, 1.0, 80.0, 104.0, 200.0, 1e4, 1e20, f32::MAX].map(ramp);
+    let ramps = [1e-40, 1.0, 80.0, 104.0, 200.0, 1e4, 1e20, f32::MAX];
+    let ramps = ramps.map(|scale| ramp(51, scale));
     let mut apart = vec![f32::MIN; 51];
     apart[17] = f32::MAX;
     equal.chain(ramps).chain([apart]).collect()
@@ -209,10 +203,7 @@ impl Batch {
         for row in 0..rows {
             let weight = self.weights.as_ref().map_or(1.0, |it| f64::from(it[row]));
             let row = row * self.atoms..(row + 1) * self.atoms;
-            let (x, t) = (
-                widened(&self.logits[row.clone()]),
-                widened(&self.target[row.clone()]),
-            );
+            let [x, t] = [&self.logits, &self.target].map(|all| widened(&all[row.clone()]));
             let (probs, max, sum) = shares(&x);
             let mass = exact_sum(t.iter().copied());
             let there = || x.iter().zip(&t).filter(|(_, t)| **t > 0.0);
