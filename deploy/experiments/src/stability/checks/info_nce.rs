@@ -166,20 +166,17 @@ fn loss_of_not_finite(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             *dot = not_finite(rng);
         }
     }
-    let is_kept = batch.bits() == before;
-    keeps(cases, &batch, is_kept)?;
+    keeps(cases, &batch, batch.bits() == before)?;
     let (there, rng) = (batch.there(), &mut cases.rng);
     let at = one_of(&there, rng) * count + one_of(&there, rng);
     for end in [f32::MAX, f32::MIN] {
         batch.dots[at] = end;
         let at_the_bound = batch.bits();
         batch.dots[at] = end * 2.0;
-        let is_kept = batch.bits() == at_the_bound;
-        keeps(cases, &batch, is_kept)?;
+        keeps(cases, &batch, batch.bits() == at_the_bound)?;
     }
     batch.dots[at] = f32::NAN;
-    let is_kept = !batch.loss().0.is_finite();
-    keeps(cases, &batch, is_kept)
+    keeps(cases, &batch, !batch.loss().0.is_finite())
 }
 
 /// Notes whether what is promised of dot products that are not finite holds for this batch.

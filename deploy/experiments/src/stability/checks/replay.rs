@@ -59,15 +59,11 @@ pub(super) fn replay(spec: &RunSpec, rows: u32, config: &Config) -> anyhow::Resu
 /// The first steps of a stream as a chunk.
 pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
-        actor: 0,
         incarnation: 1,
-        sequence: 0,
-        first_transition: 0,
-        weights_version: 0,
-        leaving: false,
         streams: 1,
         steps: steps.len() as u32,
         frame_bytes: 4,
+        ..ChunkHeader::default()
     });
     for (row, (reward, end)) in steps.iter().enumerate() {
         chunk
