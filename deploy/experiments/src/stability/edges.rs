@@ -184,6 +184,11 @@ pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
         .fold(0.0, |a, b| if a.is_nan() { a } else { larger(a, b) })
 }
 
+/// An error where this holds; else NaN, the largest.
+pub(super) const fn only_if(holds: bool, error: f64) -> f64 {
+    if holds { error } else { f64::NAN }
+}
+
 /// One of the numbers that are not finite.
 pub(super) fn not_finite(rng: &mut impl Rng) -> f32 {
     one_of(&[f32::INFINITY, f32::NEG_INFINITY, f32::NAN], rng)

@@ -7,6 +7,8 @@ mod figure;
 mod property;
 mod small;
 
+use std::collections::HashSet;
+
 use anyhow::ensure;
 use driml_machine::resources;
 use driml_model::{Precision, describe_kernels};
@@ -115,13 +117,9 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
     let share = |row: &Row| 100.0 * row.worst / row.bound;
     let mut close: Vec<&Row> = rows.iter().filter(|row| row.bound > 0.0).collect();
     close.sort_by(|a, b| share(b).total_cmp(&share(a)));
-    let mut nearest: Vec<&Row> = Vec::new();
-    for row in close {
-        if nearest.iter().all(|it| it.routine != row.routine) {
-            nearest.push(row);
-        }
-    }
-    let nearest = nearest.iter().take(5);
+    let mut named = HashSet::new();
+    close.retain(|row| named.insert(&row.routine));
+    let nearest = close.iter().take(5);
     let nearest: Vec<_> = nearest
         .map(|row| format!("{} ({:.0}%)", row.routine, share(row)))
         .collect();

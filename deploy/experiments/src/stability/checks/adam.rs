@@ -113,10 +113,8 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
         let step = lr * (it.m / first) / ((it.v / second).sqrt() + eps);
         it.p -= step;
         it.way += step.abs();
-        it.floor += match is_finite {
-            true => step_floor(it.p.abs().max(step.abs()), eps),
-            false => f64::NAN,
-        };
+        let floor = step_floor(it.p.abs().max(step.abs()), eps);
+        it.floor += only_if(is_finite, floor);
     }
 }
 

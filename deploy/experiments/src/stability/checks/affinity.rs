@@ -74,10 +74,8 @@ fn any_pair(actions: u8, rng: &mut ChaCha8Rng) -> (u8, u8) {
 /// The largest distance of a row's sum from 1; NaN where an entry is not a probability.
 fn row_sum_error(matrix: &[f32], actions: usize) -> f64 {
     worst(matrix.chunks_exact(actions).map(|row| {
-        match row.iter().all(|a| (0.0..=1.0 + 1e-6).contains(a)) {
-            true => (exact_sum(row.iter().map(|&a| a.into())) - 1.0).abs(),
-            false => f64::NAN,
-        }
+        let are_chances = row.iter().all(|a| (0.0..=1.0 + 1e-6).contains(a));
+        only_if(are_chances, (exact_sum(widened(row)) - 1.0).abs())
     }))
 }
 

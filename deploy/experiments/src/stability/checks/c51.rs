@@ -100,14 +100,12 @@ fn projection(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     }
     let out = projected(&probs, &[reward], &[discount], support);
     let allowed = entry_error(atoms, support.0, support.1);
-    let errors = out.iter().zip(hats).map(|(&p, expected)| match p {
-        0.0..=f32::MAX => (f64::from(p) - expected).abs() / allowed,
-        _ => f64::NAN,
+    let errors = out.iter().zip(hats).map(|(&p, expected)| {
+        let error = (f64::from(p) - expected).abs() / allowed;
+        only_if((0.0..=f32::MAX).contains(&p), error)
     });
-    let errors = [
-        worst(errors),
-        exact_sum(widened(&out)) - exact_sum(widened(&probs)),
-    ];
+    let [before, after] = [&probs, &out].map(|law| exact_sum(widened(law)));
+    let errors = [worst(errors), after - before];
     let input = format_args!(
         "reward {reward:e}, discount {discount:e}, {atoms} atoms on [{low:e}, {high:e}]"
     );

@@ -47,10 +47,8 @@ fn epsilon(cases: &mut Cases<'_>) -> anyhow::Result<()> {
             true => 1.0,
             false => ((u128::from(frames) << 64) / u128::from(decay_frames)) as f64 / 2f64.powi(64),
         };
-        let error = match (before.min(end)..=before.max(end)).contains(&found) {
-            true => found - (start + (end - start) * share),
-            false => f64::NAN,
-        };
+        let is_between = (before.min(end)..=before.max(end)).contains(&found);
+        let error = only_if(is_between, found - (start + (end - start) * share));
         let input = format_args!("{start} to {end} over {decay_frames}, after {frames}: {found}");
         cases.see(input, [error])?;
         before = found;

@@ -121,11 +121,8 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     if norm <= 8e37 * limit {
         // As the step uses it.
         let factor = f64::from(clip_factor(norm, limit) as f32);
-        let is_whole = norm + 1e-6 <= limit;
-        let error = match factor {
-            0.0..=1.0 if factor == 1.0 || !is_whole => (factor * norm / limit - 1.0).max(0.0),
-            _ => f64::NAN,
-        };
+        let is_right = factor == 1.0 || (norm + 1e-6 > limit && (0.0..1.0).contains(&factor));
+        let error = only_if(is_right, (factor * norm / limit - 1.0).max(0.0));
         cases.see(format_args!("norm {norm:e}, limit {limit:e}"), [error])?;
     }
     Ok(())

@@ -107,10 +107,8 @@ fn probability_of_a_step(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = further.count() as f64 / f64::from(draws);
     // Certain is certain, and impossible impossible.
     let is_certain = a == 0.0 || a == 1.0;
-    let error = match found - f64::from(a) {
-        error if is_certain && error != 0.0 => f64::NAN,
-        error => error,
-    };
+    let error = found - f64::from(a);
+    let error = only_if(!is_certain || error == 0.0, error);
     cases.see(format_args!("A = {a:e}: {found}"), [error])
 }
 
@@ -268,10 +266,7 @@ fn weights(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = importance_weights(&chances, beta);
     for (&found, &chance) in found.iter().zip(&chances) {
         let expected = (beta * (f64::from(least).ln() - f64::from(chance).ln())).exp();
-        let error = match chance == least && found != 1.0 {
-            true => f64::NAN,
-            false => off(found, expected),
-        };
+        let error = only_if(chance != least || found == 1.0, off(found, expected));
         let input = format_args!("beta {beta}, chances {}", Shown(&chances));
         cases.see(input, [error])?;
     }

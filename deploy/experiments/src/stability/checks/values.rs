@@ -84,10 +84,8 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let expected = low + place * (high - low);
         let last_place = expected.abs().max(LEAST) / 2f64.powi(24);
         let error = (f64::from(*found) - expected).abs() - last_place;
-        let error = match (support.0..=support.1).contains(found) {
-            true => error.max(0.0) / (high - low),
-            false => f64::NAN,
-        };
+        let is_within = (support.0..=support.1).contains(found);
+        let error = only_if(is_within, error.max(0.0) / (high - low));
         let input = format_args!("support {support:?}, logits {}", Shown(logits));
         cases.see(input, [error])?;
     }
