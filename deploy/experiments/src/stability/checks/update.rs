@@ -125,34 +125,30 @@ fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Optio
     let (mut agent, reference) = (agent(&Compute::CPU)?, agent(&REFERENCE)?);
     let rows = rng.random_range(2..24);
     let distinct = setting.distinct.min(3 * rows);
-    let mut state = || (0..model.frame_len()).map(|_| rng.random()).collect();
-    let states: Vec<Vec<u8>> = (0..distinct).map(|_| state()).collect();
-    let mut states = || {
+    let state = |_| (0..model.frame_len()).map(|_| rng.random()).collect();
+    let states: Vec<Vec<u8>> = (0..distinct).map(state).collect();
+    let any_states = |rng: &mut ChaCha8Rng| {
         let each = (0..rows).map(|_| &states[rng.random_range(0..distinct)][..]);
         each.collect::<Vec<_>>().concat()
     };
-    let [states_t, states_k, states_n] = [states(), states(), states()];
-    let mut actions = |none: f64| -> Vec<u8> {
-        let mut action = || match rng.random_bool(none) {
+    let actions = |none: f64, rng: &mut ChaCha8Rng| {
+        let action = |_| match rng.random_bool(none) {
             true => NO_ACTION,
             false => rng.random_range(0..ACTIONS as u8),
         };
-        (0..rows).map(|_| action()).collect()
+        (0..rows).map(action).collect()
     };
-    let [action, next_action] = [actions(0.0), actions(0.1)];
-    let returns = (0..rows).map(|_| setting.returns * rng.random_range(-1.0..1.0));
-    let returns: Vec<f32> = returns.collect();
-    let discounts: Vec<f32> = (0..rows).map(|_| one_of(&[0.0, 0.93, 1.0], rng)).collect();
-    let valid: Vec<u8> = (0..rows).map(|_| rng.random_bool(0.8).into()).collect();
     let batch = OwnedBatch {
-        states_t,
-        states_k,
-        states_n,
-        action,
-        next_action,
-        n_step_return: returns,
-        bootstrap_discount: discounts,
-        positive_valid: valid,
+        states_t: any_states(rng),
+        states_k: any_states(rng),
+        states_n: any_states(rng),
+        action: actions(0.0, rng),
+        next_action: actions(0.1, rng),
+        n_step_return: (0..rows)
+            .map(|_| setting.returns * rng.random_range(-1.0..1.0))
+            .collect(),
+        bootstrap_discount: (0..rows).map(|_| one_of(&[0.0, 0.93, 1.0], rng)).collect(),
+        positive_valid: (0..rows).map(|_| rng.random_bool(0.8).into()).collect(),
         ..OwnedBatch::default()
     };
     let (mut losses, mut gradients) = (Vec::new(), Vec::new());
