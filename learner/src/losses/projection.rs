@@ -105,10 +105,4 @@ mod tests {
         assert_eq!(projected(&one_hot(20), -1e30, 0.99), one_hot(0));
         assert_eq!(projected(&one_hot(ATOMS - 1), 5.0, 1.0), one_hot(ATOMS - 1));
     }
-
-    #[test]
-    fn a_return_between_two_atoms_is_split_by_nearness() {
-        let out = projected(&one_hot(7), 0.1, 0.0);
-        assert!((out[25] - 0.75).abs() < 1e-6 && (out[26] - 0.25).abs() < 1e-6);
-    }
 }
