@@ -137,27 +137,6 @@ impl ExactAffinity {
 mod tests {
     use super::*;
 
-    #[test]
-    fn it_is_the_closed_form_of_its_counts() {
-        let settings = ExactSettings {
-            decay: 0.5,
-            smoothing: 1.0,
-        };
-        let mut exact = ExactAffinity::new(Alphabet::raw(2).unwrap(), settings).unwrap();
-        let first = [[(0, 0); 6].as_slice(), &[(0, 1); 2], &[(1, 1); 4]].concat();
-        exact.observe(&first).unwrap();
-        exact.observe(&[(1, 0)]).unwrap();
-        // Counts 3, 1, 1, 2 of 7, rows and columns 4 and 3: independent ones would be 16/7, 12/7, 12/7, 9/7.
-        let ratios = [
-            [4.0 / (16.0 / 7.0 + 1.0), 2.0 / (12.0 / 7.0 + 1.0)],
-            [2.0 / (12.0 / 7.0 + 1.0), 3.0 / (9.0 / 7.0 + 1.0)],
-        ];
-        for (row, [a, b]) in exact.matrix().chunks_exact(2).zip(ratios) {
-            assert!((f64::from(row[0]) - a / (a + b)).abs() < 1e-7);
-            assert!((row[0] + row[1] - 1.0).abs() < 1e-6);
-        }
-    }
-
     fn of_15() -> ExactAffinity {
         let settings = ExactSettings {
             decay: 0.999,
