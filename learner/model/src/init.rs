@@ -126,37 +126,6 @@ mod tests {
 
     use super::*;
 
-    /// Gram matrix of the shorter side.
-    fn largest_error(rows: usize, cols: usize) -> f64 {
-        let weight = orthogonal(rows, cols, RELU_GAIN, &mut ChaCha8Rng::seed_from_u64(3));
-        let count = rows.min(cols);
-        let vector = |index: usize| -> Vec<f64> {
-            let entries: Vec<f64> = weight.iter().map(|&value| f64::from(value)).collect();
-            if rows <= cols {
-                entries[index * cols..][..cols].to_vec()
-            } else {
-                entries.into_iter().skip(index).step_by(cols).collect()
-            }
-        };
-        let vectors: Vec<Vec<f64>> = (0..count).map(vector).collect();
-        let mut largest: f64 = 0.0;
-        for i in 0..count {
-            for j in 0..count {
-                let wanted = if i == j { 2.0 } else { 0.0 };
-                largest = largest.max((dot(&vectors[i], &vectors[j]) - wanted).abs());
-            }
-        }
-        largest
-    }
-
-    #[test]
-    fn wide_tall_and_square_matrices_are_orthogonal() {
-        for (rows, cols) in [(32, 192), (75, 24), (40, 40), (1, 5), (5, 1), (1, 1)] {
-            let error = largest_error(rows, cols);
-            assert!(error < 1e-5, "{rows}x{cols}: {error}");
-        }
-    }
-
     #[test]
     fn uniform_weights_and_biases_have_the_bound_and_variance_of_fan_in() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
