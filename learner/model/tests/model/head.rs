@@ -24,21 +24,6 @@ fn a_noisy_layer_starts_with_its_sigma() {
     assert!(plain.noisy_logits(&f4, noise.as_ref()).is_err());
 }
 
-#[test]
-fn q_values_are_expectations_over_the_atoms() -> Result<()> {
-    let config = small();
-    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
-    let logits = floats(&[3, 5, 11], &mut rng(4));
-    let support = Tensor::from_vec(config.atoms_support(), 11, &Device::Cpu)?;
-    assert_eq!(config.atoms_support()[0], -2.0);
-    assert_eq!(config.atoms_support()[10], 3.0);
-    let wanted = candle_nn::ops::softmax(&logits, 2)?
-        .broadcast_mul(&support)?
-        .sum(2)?;
-    assert_close("values", &network.q_values(&logits).unwrap(), &wanted, 1e-6);
-    Ok(())
-}
-
 /// An offset of the support is one of the values, whatever computes them.
 #[test]
 fn values_over_a_support_far_from_0_are_those_near_it_moved() {

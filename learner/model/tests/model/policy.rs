@@ -97,21 +97,6 @@ fn has_the_same_values_in_any_company(config: &ModelConfig) {
 }
 
 #[test]
-fn ties_go_to_the_lowest_action() {
-    let config = small().without_dim();
-    let parameters = parameters(&config, 1);
-    for (_, var) in parameters.iter() {
-        var.set(&var.zeros_like().unwrap()).unwrap();
-    }
-    let mut policy = policy(&config, &parameters, Precision::F32);
-    let mut actions = [9; 3];
-    policy
-        .greedy_actions(&bytes(3 * config.frame_len(), &mut rng(1)), &mut actions)
-        .unwrap();
-    assert_eq!(actions, [0; 3]);
-}
-
-#[test]
 fn new_weights_take_effect() {
     let config = small();
     let file = |seed: u64| parameters(&config, seed).to_safetensors(|_| true).unwrap();
