@@ -83,29 +83,18 @@ mod tests {
     use super::*;
     use crate::HeadConfig;
 
-    fn config(noisy_sigma: Option<f64>) -> ModelConfig {
-        ModelConfig {
+    /// f(eps) has mean 0 and E f^2 = E|eps| = sqrt(2 / pi); that of a product of two is their product, and both layers are drawn apart.
+    #[test]
+    fn it_has_the_moments_of_the_paper_s_noise() {
+        let config = ModelConfig {
             atoms: 7,
             hidden: 11,
             head: HeadConfig {
                 dueling: true,
-                noisy_sigma,
+                noisy_sigma: Some(0.5),
             },
             ..ModelConfig::small()
-        }
-    }
-
-    #[test]
-    fn a_head_without_noisy_layers_draws_none() {
-        let (mut one, other) = (ChaCha8Rng::seed_from_u64(1), ChaCha8Rng::seed_from_u64(1));
-        assert_eq!(HeadNoise::draw(&config(None), &mut one), None);
-        assert_eq!(one, other);
-    }
-
-    /// f(eps) has mean 0 and E f^2 = E|eps| = sqrt(2 / pi); that of a product of two is their product, and both layers are drawn apart.
-    #[test]
-    fn it_has_the_moments_of_the_paper_s_noise() {
-        let config = config(Some(0.5));
+        };
         let rng = &mut ChaCha8Rng::seed_from_u64(2);
         let mut moments = [0.0; 4];
         let mut count = 0.0;

@@ -4,9 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{
-    ModelConfig, ModelError, Parameters, PolicyNetwork, Precision, StoredAs, TorsoName,
-};
+use driml_model::{ModelConfig, ModelError, Parameters, Precision, StoredAs, TorsoName};
 
 use crate::support::{bits, bytes, parameters, policy, q_values, residual, rng, small, values};
 
@@ -276,27 +274,8 @@ fn corrupted_headers_never_panic() {
 }
 
 #[test]
-fn half_the_bytes_act_nearly_the_same() {
-    let config = small().without_dim();
-    let parameters = parameters(&config, 1);
-    let file = |stored| parameters.to_safetensors_as(stored, |_| true).unwrap();
-    let frames = bytes(4 * config.frame_len(), &mut rng(1));
-    let values = |file: &[u8]| {
-        let mut policy = PolicyNetwork::new(&config, file, Precision::F32).unwrap();
-        let mut values = [0.0; 20];
-        policy.q_values(&frames, &mut values).unwrap();
-        values
-    };
-    let whole = values(&file(StoredAs::F32));
-    for (stored, tolerance) in [(StoredAs::F16, 2e-3), (StoredAs::Bf16, 2e-2)] {
-        let half = file(stored);
-        assert!(half.len() * 3 < file(StoredAs::F32).len() * 2, "{stored:?}");
-        let width = config.v_max - config.v_min;
-        for (whole, half) in whole.iter().zip(values(&half)) {
-            let error = (whole - half).abs();
-            assert!(error <= tolerance * width, "{stored:?}: {whole}, {half}");
-        }
-    }
+fn a_weight_that_is_too_large_for_its_type_is_named() {
+    let parameters = parameters(&small(), 1);
     let weight = parameters.get("head.weight").unwrap();
     let large = (weight.ones_like().unwrap() * 1e5).unwrap();
     weight.set(&large).unwrap();
