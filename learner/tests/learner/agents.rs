@@ -76,20 +76,6 @@ fn curl(rows: &OwnedBatch) -> Batch<'_> {
     }
 }
 
-#[test]
-fn cpc_with_one_offset_is_dim() {
-    let rows = random_batch(7, 2);
-    let one = agent(CPC, ALL_DIM).evaluate(&rows.batch());
-    let dim = agent(DIM, ALL_DIM).evaluate(&rows.batch());
-    let (one, dim) = (one.unwrap(), dim.unwrap());
-    assert_eq!((one.losses.len(), dim.losses.len()), (4, 4));
-    for ((cpc, a), (dim, b)) in one.losses.iter().zip(&dim.losses) {
-        assert_eq!(cpc.strip_prefix("cpc_"), dim.strip_prefix("dim_"));
-        assert!((a - b).abs() < 1e-5, "{cpc} {a} {b}");
-    }
-    assert!((one.total - dim.total).abs() < 1e-4);
-}
-
 /// `states` without those that are not `there`.
 fn packed(states: &[u8], there: &[bool]) -> Vec<u8> {
     let states = states.chunks_exact(states.len() / there.len());
