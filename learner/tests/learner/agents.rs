@@ -5,11 +5,9 @@ use driml_learner::{
     Agent, AuxiliaryKind, Batch, Lambda, LearnerSettings, OwnedBatch, UpdateError,
 };
 use driml_model::{Compute, ModelConfig};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, model, random_batch, settings, values,
+    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, made, model, random_batch, settings, values,
 };
 
 pub(crate) const GLOBAL: Lambda = Lambda {
@@ -50,8 +48,7 @@ pub(crate) fn of(kind: AuxiliaryKind, lambda: Lambda) -> (ModelConfig, LearnerSe
 
 fn agent(kind: AuxiliaryKind, lambda: Lambda) -> Agent {
     let (model, settings) = of(kind, lambda);
-    let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    Agent::new(model, settings, &Compute::CPU, rng).unwrap()
+    made(model, settings, &Compute::CPU, 1)
 }
 
 /// `rows` with `POSITIVES` positives a row; the batch borrows what `later` makes of them.

@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_learner::{
-    AffinityEstimator, Agent, Alphabet, LearnedAffinity, LearnedSettings, Progress,
+    AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Progress,
     checkpoint::{self, CheckpointError, Label, LearnerState, list, load_latest, lock},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
@@ -16,7 +16,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
-use crate::synthetic::{ACTIONS, ALL_DIM, CANDLE, agent, agent_on, model, random_batch, settings};
+use crate::synthetic::{
+    ACTIONS, ALL_DIM, CANDLE, agent, agent_on, made, model, random_batch, settings,
+};
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -363,8 +365,7 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     let mut run = start();
     let mut settings = run.agent.settings().clone();
     settings.average_tau = Some(TAU);
-    let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    run.agent = Agent::new(model(ALL_DIM), settings.clone(), &Compute::CPU, rng).unwrap();
+    run.agent = made(model(ALL_DIM), settings.clone(), &Compute::CPU, 1);
     let values = |parameters: &Parameters| -> Vec<f64> {
         let all = parameters
             .iter()

@@ -1,12 +1,10 @@
 //! Updates on an NVIDIA GPU beside those of the CPU. Built with the feature `cuda` alone; run with
 //! `cargo test --release --features driml-learner/cuda -p driml-learner --test learner -- --ignored cuda`.
 
-use driml_learner::{Agent, Compute, DeviceName, Precision};
+use driml_learner::{Compute, DeviceName, Precision};
 use driml_model::{ModelConfig, TorsoName};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
-use crate::synthetic::{ALL_DIM, batch_of, model, settings};
+use crate::synthetic::{ALL_DIM, batch_of, made, model, settings};
 
 /// Work that several threads queue on a GPU must run in the order in which it was queued. When each thread had a stream, most updates
 /// after the first computed with states that were not there yet. Batches have to be large for that to show.
@@ -26,8 +24,7 @@ fn updates_on_a_gpu_follow_those_on_the_cpu() {
             channels: vec![16, 32, 32],
             ..model(ALL_DIM)
         };
-        let rng = &mut ChaCha8Rng::seed_from_u64(1);
-        let mut agent = Agent::new(model, settings(ALL_DIM), compute, rng).unwrap();
+        let mut agent = made(model, settings(ALL_DIM), compute, 1);
         (0..10)
             .map(|_| agent.update(&rows.batch()).unwrap().total)
             .collect::<Vec<_>>()

@@ -2,11 +2,11 @@
 
 use driml_learner::{Agent, AuxiliaryKind, Compute, Evaluation, Lambda, OwnedBatch, Precision};
 use driml_model::Kernels;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
 use crate::agents::{GLOBAL, curl_table};
-use crate::synthetic::{ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, model, random_batch, settings};
+use crate::synthetic::{
+    ALL_DIM, CANDLE, CPC, CURL, DIM, NO_DIM, made, model, random_batch, settings,
+};
 
 const ROWS: usize = 40;
 
@@ -24,9 +24,7 @@ fn agent(
     }
     let mut model = model(lambda);
     model.dim = settings.dim_heads(model.num_actions);
-    let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    let agent = Agent::new(model, settings, compute, rng).unwrap();
-    agent.with_deduplication(deduplicate)
+    made(model, settings, compute, 1).with_deduplication(deduplicate)
 }
 
 /// Which planes hold states that repeat others.

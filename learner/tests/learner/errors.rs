@@ -8,7 +8,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, changed, model, random_batch, settings,
+    ALL_DIM, CANDLE, NO_DIM, agent, agent_on, changed, made, model, random_batch, settings,
 };
 
 /// What an update says that is refused, after which every weight has the bits that it had.
@@ -30,10 +30,9 @@ fn refused(agent: &mut Agent, batch: &Batch<'_>) -> UpdateError {
 fn a_next_state_whose_values_overflow_is_an_error_that_changes_nothing() {
     let mut settings = settings(NO_DIM);
     settings.double_dqn = true;
-    let rng = &mut ChaCha8Rng::seed_from_u64(16);
-    let agent = Agent::new(model(NO_DIM), settings, &Compute::CPU, rng).unwrap();
+    let agent = made(model(NO_DIM), settings, &Compute::CPU, 16);
     // Black states have features of the biases alone.
-    let mut agent = changed(&agent, |name, values| {
+    let mut agent = changed(agent, |name, values| {
         if name.starts_with("torso") && name.ends_with("weight") {
             values.iter_mut().for_each(|v| *v = v.abs() * 1e15);
         }
@@ -91,12 +90,11 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
         (&Compute::CPU, "dim.phi4.hidden.bias"),
         (&CANDLE, "head.bias"),
     ] {
-        let mut agent = agent_on(compute, ALL_DIM, 22);
-        let var = agent.online().get(poisoned).unwrap();
-        let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
-        values[0] = f32::NAN;
-        var.set(&Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap())
-            .unwrap();
+        let mut agent = changed(agent_on(compute, ALL_DIM, 22), |name, values| {
+            if name == poisoned {
+                values[0] = f32::NAN;
+            }
+        });
         let error = refused(&mut agent, &rows.batch());
         assert!(
             matches!(error, UpdateError::NonFinite { .. }),
@@ -109,8 +107,7 @@ fn arithmetic_that_is_not_finite_is_an_error_that_changes_nothing() {
 fn fast(compute: &Compute, lr: f64) -> Agent {
     let mut settings = settings(ALL_DIM);
     settings.adam.lr = lr;
-    let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    Agent::new(model(ALL_DIM), settings, compute, rng).unwrap()
+    made(model(ALL_DIM), settings, compute, 1)
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnerSettings, NetworkParameters, OwnedBatch,
+    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnerSettings, OwnedBatch,
     auxiliary::{cpc, curl, dim},
 };
 use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters, TorsoName};
@@ -35,18 +35,7 @@ pub(crate) fn model(lambda: Lambda) -> ModelConfig {
         v_min: -5.0,
         v_max: 5.0,
         torso: TorsoName::Nature,
-        conv: vec![
-            ConvLayer {
-                out: 5,
-                kernel: 8,
-                stride: 4,
-            },
-            ConvLayer {
-                out: 6,
-                kernel: 3,
-                stride: 1,
-            },
-        ],
+        conv: vec![ConvLayer::new(5, 8, 4), ConvLayer::new(6, 3, 1)],
         channels: vec![],
         scale_blocks: false,
         hidden: 16,
@@ -83,13 +72,22 @@ pub(crate) fn settings(lambda: Lambda) -> LearnerSettings {
     }
 }
 
+pub(crate) fn made(
+    model: ModelConfig,
+    settings: LearnerSettings,
+    compute: &Compute,
+    seed: u64,
+) -> Agent {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+    Agent::new(model, settings, compute, rng).unwrap()
+}
+
 pub(crate) fn agent(lambda: Lambda, seed: u64) -> Agent {
     agent_on(&Compute::CPU, lambda, seed)
 }
 
 pub(crate) fn agent_on(compute: &Compute, lambda: Lambda, seed: u64) -> Agent {
-    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
-    Agent::new(model(lambda), settings(lambda), compute, rng).unwrap()
+    made(model(lambda), settings(lambda), compute, seed)
 }
 
 /// A learner whose head is made so.
@@ -98,8 +96,7 @@ pub(crate) fn agent_with(head: HeadConfig, settings: LearnerSettings, seed: u64)
         head,
         ..model(settings.lambda)
     };
-    let rng = &mut ChaCha8Rng::seed_from_u64(seed);
-    Agent::new(model, settings, &Compute::CPU, rng).unwrap()
+    made(model, settings, &Compute::CPU, seed)
 }
 
 pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
@@ -159,31 +156,13 @@ pub(crate) fn values(parameters: &Parameters) -> Values {
         .collect()
 }
 
-pub(crate) fn changed(agent: &Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
-    let tensors = |parameters: &Parameters, change: &dyn Fn(&str, &mut [f32])| {
-        let mut tensors = HashMap::new();
-        for (name, var) in parameters.iter() {
-            let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
-            change(name, &mut values);
-            tensors.insert(
-                name.to_owned(),
-                Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap(),
-            );
-        }
-        tensors
-    };
-    let device = Device::Cpu;
-    let model = agent.model();
-    let online =
-        Parameters::from_tensors(model, tensors(agent.online(), &change), &device).unwrap();
-    let acting = model.without_dim();
-    let target =
-        Parameters::from_tensors(&acting, tensors(agent.target(), &|_, _| ()), &device).unwrap();
-    let parameters = NetworkParameters {
-        online,
-        target,
-        key: None,
-    };
-    let settings = agent.settings().clone();
-    Agent::from_parameters(model.clone(), settings, &Compute::CPU, parameters).unwrap()
+/// The agent with its online parameters changed in place.
+pub(crate) fn changed(agent: Agent, change: impl Fn(&str, &mut [f32])) -> Agent {
+    for (name, var) in agent.online().iter() {
+        let mut values: Vec<f32> = var.flatten_all().unwrap().to_vec1().unwrap();
+        change(name, &mut values);
+        let values = Tensor::from_vec(values, var.dims(), &Device::Cpu).unwrap();
+        var.set(&values).unwrap();
+    }
+    agent
 }

@@ -2,14 +2,12 @@
 //! It compares with no outside numbers: `parity` does, and at extreme inputs the property "whole update" of `driml experiment stability`.
 
 use candle_core::Device;
-use driml_learner::{Agent, LearnerSettings, UpdateNoise};
+use driml_learner::{LearnerSettings, UpdateNoise};
 use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, model,
+    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, made, model,
     random_batch, settings, values,
 };
 
@@ -110,10 +108,9 @@ fn double_dqn_chooses_by_the_online_network() {
     let mut chosen = Vec::new();
     for double_dqn in [false, true] {
         settings.double_dqn = double_dqn;
-        let mut rng = rand_chacha::rand_core::SeedableRng::seed_from_u64(16);
-        let agent = Agent::new(model(NO_DIM), settings.clone(), &Compute::CPU, &mut rng).unwrap();
+        let agent = made(model(NO_DIM), settings.clone(), &Compute::CPU, 16);
         // The online network alone turns to action 2.
-        let agent = changed(&agent, |name, values| {
+        let agent = changed(agent, |name, values| {
             if name == "head.bias" {
                 values[2 * 21 + 20] += 50.0;
             }
@@ -172,8 +169,7 @@ fn gradients_hold_nothing_of_the_pass_that_they_come_from() {
     for (layer, kernel) in model.conv.iter_mut().zip([4, 3]) {
         (layer.kernel, layer.stride) = (kernel, 2);
     }
-    let rng = &mut ChaCha8Rng::seed_from_u64(1);
-    let agent = Agent::new(model, settings(NO_DIM), &CANDLE, rng).unwrap();
+    let agent = made(model, settings(NO_DIM), &CANDLE, 1);
     let evaluation = agent.evaluate(&random_batch(4, 1).batch()).unwrap();
     for (name, _) in agent.online().iter() {
         assert!(
