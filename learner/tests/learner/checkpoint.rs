@@ -96,6 +96,12 @@ fn resume(folder: &Path) -> LearnerState {
     run
 }
 
+/// The updates of the checkpoints that there are.
+fn listed(folder: &Folder) -> Vec<u64> {
+    let all = list(&folder.0).unwrap();
+    all.iter().map(|(updates, _)| *updates).collect()
+}
+
 fn bytes(run: &LearnerState) -> [Vec<u8>; 2] {
     let all = |parameters: &Parameters| parameters.to_safetensors(|_| true).unwrap();
     [all(run.agent.online()), all(run.agent.target())]
@@ -116,13 +122,8 @@ pub(crate) fn progress() -> Progress {
 pub(crate) const DESCRIPTION: &str = r#"{"format":1}"#;
 
 pub(crate) fn load(folder: &Path) -> Result<Option<LearnerState>, CheckpointError> {
-    load_latest(
-        folder,
-        &model(ALL_DIM),
-        &settings(ALL_DIM),
-        &Compute::CPU,
-        SPEC,
-    )
+    let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
+    load_latest(folder, &model, &settings, &Compute::CPU, SPEC)
 }
 
 pub(crate) fn sha256(bytes: &[u8]) -> String {
@@ -233,12 +234,7 @@ fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
     }
     save(&run, &folder.0, 2);
     fs::create_dir(folder.0.join("checkpoint-000000000009.tmp")).unwrap();
-    let kept: Vec<u64> = list(&folder.0)
-        .unwrap()
-        .iter()
-        .map(|(updates, _)| *updates)
-        .collect();
-    assert_eq!(kept, [2, 3]);
+    assert_eq!(listed(&folder), [2, 3]);
     assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 3);
 }
 
@@ -254,9 +250,8 @@ fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
     for updates in 1..=3 {
         learn(&mut run, 1);
         save(&run, &folder.0, 1);
-        let all = list(&folder.0).unwrap();
-        let all: Vec<u64> = all.iter().map(|(updates, _)| *updates).collect();
-        assert_eq!(all, [0, updates], "the others are removed all the same");
+        let left = listed(&folder);
+        assert_eq!(left, [0, updates], "the others are removed all the same");
     }
 }
 
@@ -272,15 +267,8 @@ fn what_a_cut_off_save_left_is_gone_after_the_next() {
     }
     learn(&mut run, 1);
     save(&run, &folder.0, 3);
-    let mut names: Vec<_> = fs::read_dir(&folder.0)
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    names.sort();
-    assert_eq!(
-        names,
-        ["checkpoint-000000000001", "checkpoint-000000000002"]
-    );
+    assert_eq!(listed(&folder), [1, 2]);
+    assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 2);
 }
 
 #[test]
@@ -289,23 +277,19 @@ fn a_checkpoint_is_there_while_it_is_replaced() {
     let mut run = start();
     learn(&mut run, 1);
     let path = save(&run, &folder.0, 3);
-    let updates = || -> Vec<u64> {
-        let all = list(&folder.0).unwrap();
-        all.iter().map(|(updates, _)| *updates).collect()
-    };
     // A crash between the two renames.
     let replaced = folder.0.join("checkpoint-000000000001.replaced.tmp");
     fs::rename(&path, &replaced).unwrap();
-    assert_eq!(updates(), [1]);
+    assert_eq!(listed(&folder), [1]);
     assert_eq!(bytes(&resume(&folder.0)), bytes(&run));
     // The next save gives it its name back.
     learn(&mut run, 1);
     save(&run, &folder.0, 3);
-    assert_eq!(updates(), [1, 2]);
+    assert_eq!(listed(&folder), [1, 2]);
     assert!(path.exists() && !replaced.exists());
     // And a crash after them.
     fs::create_dir(&replaced).unwrap();
-    assert_eq!(updates(), [1, 2]);
+    assert_eq!(listed(&folder), [1, 2]);
     save(&run, &folder.0, 3);
     assert!(!replaced.exists());
 }
@@ -314,14 +298,8 @@ fn a_checkpoint_is_there_while_it_is_replaced() {
 fn another_run_s_checkpoint_is_refused() {
     let folder = Folder::new("other");
     save(&start(), &folder.0, 1);
-    let error = load_latest(
-        &folder.0,
-        &model(ALL_DIM),
-        &settings(ALL_DIM),
-        &Compute::CPU,
-        SPEC + 1,
-    )
-    .expect_err("another run");
+    let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
+    let error = load_latest(&folder.0, &model, &settings, &Compute::CPU, SPEC + 1).unwrap_err();
     assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
 }
 
