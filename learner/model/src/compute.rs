@@ -157,8 +157,8 @@ pub enum DeviceName {
 
 /// Why a device cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum DeviceError {
-    /// Not the name of a device.
     #[error("{0:?} is not a device: use cpu, cuda or cuda:N")]
     Name(String),
     /// Only this project's kernels, which are the CPU's, have another precision than f32.
@@ -166,17 +166,12 @@ pub enum DeviceError {
         "{device} computes in f32 alone: set learner.precision = \"f32\", or compute {precision} on the CPU"
     )]
     Precision {
-        /// The device that was asked for.
         device: DeviceName,
-        /// The precision that was asked for.
         precision: Precision,
     },
-    /// The driver refused, or the program has no CUDA in it.
     #[error("{device} cannot be used: {why}; `driml doctor` says what is missing")]
     Open {
-        /// The device that was asked for.
         device: DeviceName,
-        /// What the tensor library says.
         why: candle_core::Error,
     },
 }
