@@ -4,7 +4,7 @@
 use std::borrow::Cow;
 
 use candle_core::Tensor;
-use driml_model::{Compute, HeadNoise, ModelConfig, Network};
+use driml_model::{Compute, HeadNoise, ModelConfig, Network, greedy};
 use driml_protocol::NO_ACTION;
 
 use crate::{
@@ -142,14 +142,4 @@ pub(crate) fn distribution(
 ) -> Result<Tensor, UpdateError> {
     let f4 = network.features(frames)?.f4;
     Ok(network.noisy_logits(&f4, noise)?.detach())
-}
-
-fn greedy(values: &[f32]) -> u8 {
-    let mut best = 0;
-    for (i, value) in values.iter().enumerate() {
-        if *value > values[best] {
-            best = i;
-        }
-    }
-    u8::try_from(best).expect("a model has at most 255 actions")
 }

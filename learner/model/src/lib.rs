@@ -67,6 +67,6 @@ pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use network::{Features, Network};
 pub use parameters::Parameters;
-pub use policy::PolicyNetwork;
+pub use policy::{PolicyNetwork, greedy};
 pub use stored::StoredAs;
 pub use torso::TorsoName;

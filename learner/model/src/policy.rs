@@ -114,16 +114,7 @@ impl PolicyNetwork {
         let result = self.q_values(frames, &mut values);
         if result.is_ok() {
             for (action, values) in actions.iter_mut().zip(values.chunks_exact(count)) {
-                let better = |best: usize, next: usize| {
-                    if values[next] > values[best] {
-                        next
-                    } else {
-                        best
-                    }
-                };
-                let best = (1..count).fold(0, better);
-                *action =
-                    u8::try_from(best).expect("a valid configuration has at most 255 actions");
+                *action = greedy(values);
             }
         }
         self.values = values;
@@ -137,6 +128,13 @@ impl fmt::Debug for PolicyNetwork {
             .field("config", &self.config)
             .finish_non_exhaustive()
     }
+}
+
+/// The action of largest value, the lowest on a tie, of `values` [A] as a valid configuration has them.
+pub fn greedy(values: &[f32]) -> u8 {
+    let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
+    let best = (1..values.len()).fold(0, better);
+    u8::try_from(best).expect("a valid configuration has at most 255 actions")
 }
 
 /// Weights as one instruction set's kernels want them.

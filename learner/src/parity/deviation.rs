@@ -2,7 +2,7 @@
 //! It judges nothing: tolerances are for the cases of the parity check, whose float64 holds both ways of computing.
 
 use candle_core::{DType, Device};
-use driml_model::{Compute, Kernels};
+use driml_model::{Compute, Kernels, greedy};
 use driml_protocol::NO_ACTION;
 
 use crate::{agent::Agent, batch::Batch, error::UpdateError};
@@ -98,12 +98,8 @@ impl QError {
             square += error * error;
             max = max.max(error);
         }
-        let best = |values: &[f32]| {
-            let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
-            (1..values.len()).fold(0, better)
-        };
         let rows = expected.len() / num_actions;
-        let [own, reference] = [got, expected].map(|it| it.chunks_exact(num_actions).map(best));
+        let [own, reference] = [got, expected].map(|it| it.chunks_exact(num_actions).map(greedy));
         let same = own.zip(reference).filter(|(a, b)| a == b).count();
         Self {
             rms: (square / expected.len() as f64).sqrt(),
