@@ -53,9 +53,6 @@ impl<M> Clone for Sealed<M> {
 
 impl<M: Message> Sealed<M> {
     /// A message without a payload, for the run with this hash.
-    ///
-    /// # Errors
-    /// A message over the codec's limits.
     pub fn new(message: &M, spec_hash: u64) -> Result<Self, CodecError> {
         let bytes = codec::encode(spec_hash, message, &[])?;
         Ok(Self {
@@ -66,9 +63,6 @@ impl<M: Message> Sealed<M> {
     }
 
     /// A message with a payload, which is not copied.
-    ///
-    /// # Errors
-    /// A message over the codec's limits.
     pub fn with_payload(message: &M, payload: ZBytes, spec_hash: u64) -> Result<Self, CodecError> {
         let head = codec::seal(spec_hash, message, &payload.to_bytes())?;
         let mut writer = ZBytes::writer();
@@ -131,9 +125,6 @@ impl RunClient {
     }
 
     /// A request that is ready to be sent, as often as need be.
-    ///
-    /// # Errors
-    /// A request over the codec's limits.
     pub fn seal<R: Request>(&self, request: &R) -> Result<Sealed<R>, SessionError> {
         Sealed::new(request, self.spec_hash).map_err(|why| self.too_large::<R>(why))
     }
@@ -183,9 +174,6 @@ impl RunClient {
     }
 
     /// Declares where `M` is announced.
-    ///
-    /// # Errors
-    /// zenoh refused to declare it.
     pub fn announce<M: Keyed>(&self) -> zenoh::Result<Announcer<M>> {
         let publisher = self
             .session
@@ -202,9 +190,6 @@ impl RunClient {
 
     /// Calls `on_message` at each publication of `M`, until the result is dropped. It is called on the thread that reads the socket,
     /// so it must not wait.
-    ///
-    /// # Errors
-    /// zenoh refused to declare it.
     pub fn subscribe<M: Keyed>(
         &self,
         on_message: impl Fn(Result<M, CodecError>) + Send + Sync + 'static,
@@ -220,9 +205,6 @@ impl RunClient {
     }
 
     /// Lets others see that `who` is connected, until the result is dropped.
-    ///
-    /// # Errors
-    /// zenoh refused to declare it.
     pub fn declare_alive(&self, who: Alive) -> zenoh::Result<LivelinessToken> {
         let token = self.session.liveliness();
         token.declare_token(self.keys.alive_key(who)).wait()
@@ -239,9 +221,6 @@ pub struct Announcer<M> {
 
 impl<M: Message> Announcer<M> {
     /// Announces a message to all who listen now.
-    ///
-    /// # Errors
-    /// A message over the codec's limits, or zenoh refused.
     pub fn put(&self, message: &M) -> zenoh::Result<()> {
         let sealed = Sealed::new(message, self.spec_hash)?;
         self.publisher.put(sealed.bytes).wait()

@@ -50,18 +50,12 @@ pub struct Settings(toml::Table);
 
 impl Settings {
     /// Parses the settings, which are TOML.
-    ///
-    /// # Errors
-    /// Text that is not TOML.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let why = |e: toml::de::Error| ConfigError(format!("the settings are not valid TOML: {e}"));
         text.parse().map(Self).map_err(why)
     }
 
     /// Reads one table; unknown keys, missing keys and wrong types are refused by the type.
-    ///
-    /// # Errors
-    /// No such table, or one that does not fit `T`.
     pub fn table<T: DeserializeOwned>(&self, name: &'static str) -> Result<T, ConfigError> {
         let missing = || {
             ConfigError(format!(

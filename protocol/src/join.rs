@@ -73,9 +73,6 @@ pub fn run_info(
 }
 
 /// Asks the replay server once for the run's settings.
-///
-/// # Errors
-/// No answer within `wait_max`, or of another protocol version.
 pub fn run_info_within(
     session: &Session,
     keys: &Keys,

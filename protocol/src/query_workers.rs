@@ -50,9 +50,6 @@ pub struct Incoming<R> {
 
 impl<R: Request> Incoming<R> {
     /// Reads a request without payload.
-    ///
-    /// # Errors
-    /// Whatever makes it unfit to be answered.
     pub fn read(&self) -> Result<R, CodecError> {
         let bytes = self.query.payload().map(ZBytes::to_bytes);
         let (request, _) = codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash))?;
@@ -144,9 +141,6 @@ pub struct QueryWorkers<R> {
 
 impl<R: Request + 'static> QueryWorkers<R> {
     /// Starts `threads` threads, each of which answers one request of the run `spec_hash` after the other with `answer`.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
     pub fn start(
         name: &str,
         threads: usize,
@@ -188,9 +182,6 @@ impl<R: Request + 'static> QueryWorkers<R> {
 
     /// Takes the requests in the client's run, until the result is dropped. No other process need be asked: the
     /// reply is complete.
-    ///
-    /// # Errors
-    /// zenoh refused to declare it.
     pub fn declare(&self, client: &RunClient) -> zenoh::Result<Queryable<()>> {
         self.declare_limited(client, PAYLOAD_BYTES_MAX, |_| ())
     }

@@ -34,9 +34,6 @@ impl Unreachable {
 
 /// Checks once whether something accepts connections at `endpoint`. For `quic/` only the host is resolved, because UDP does not
 /// report a closed port.
-///
-/// # Errors
-/// Why nothing does, and what to do.
 pub fn look(endpoint: &str) -> Result<(), Unreachable> {
     match endpoint.split_once('/') {
         Some(("unixsock-stream", path)) => look_at_socket(endpoint, path.into()),

@@ -44,9 +44,6 @@ fn send(clients: &[RunClient], report: &Report) {
 }
 
 /// Reports what `who` does to the replay servers of `clients`, until `shutdown` or the end of their sessions.
-///
-/// # Errors
-/// The operating system gave no thread.
 pub fn start(
     clients: Vec<RunClient>,
     who: Participant,

@@ -135,9 +135,6 @@ impl RunSpec {
     }
 
     /// Checks every field's range.
-    ///
-    /// # Errors
-    /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (key, value, max) in [
             ("run.frame_height", self.frame_height, 4096),

@@ -54,9 +54,6 @@ impl Sampling {
     }
 
     /// Checks every number's range.
-    ///
-    /// # Errors
-    /// The first number that cannot work.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let Self::Prioritised {
             alpha,

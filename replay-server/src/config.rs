@@ -105,9 +105,6 @@ impl Config {
 
     /// Checks that nothing is set that needs a replay on disk, for one that is in memory alone; `to_keep_it` are the flags that would
     /// change that.
-    ///
-    /// # Errors
-    /// The first key that would have no effect.
     pub fn check_in_memory(&self, to_keep_it: &str) -> Result<(), ConfigError> {
         for (key, set) in [
             ("replay.disk_bytes_max", self.disk_bytes_max),
@@ -126,9 +123,6 @@ impl Config {
     ///
     /// The run cannot stall if slack_transitions * replay_ratio >= batch_size: inserts then wait only while a whole batch
     /// may be sampled.
-    ///
-    /// # Errors
-    /// The first key that cannot work, its value and what to do.
     pub fn validate(&self, spec: &RunSpec, batch_size: u32) -> Result<(), ConfigError> {
         spec.validate()?;
         let (ratio, capacity) = (self.replay_ratio, self.capacity_transitions);

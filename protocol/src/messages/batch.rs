@@ -272,9 +272,6 @@ impl Batch {
     }
 
     /// Makes the chance of each row `share` of what it was: that its replay server was chosen.
-    ///
-    /// # Panics
-    /// As [`Batch::set_draws`].
     pub fn scale_probabilities(&mut self, share: f32) {
         let chances = self.probabilities().expect("rows drawn by priority");
         let scaled = chances.into_iter().map(|chance| chance * share);
@@ -329,9 +326,6 @@ impl Batch {
     }
 
     /// Takes the payload of a decoded reply, checking that it is as long as its header says, with the states that its rows say.
-    ///
-    /// # Errors
-    /// Buffer of another length, or rows that say otherwise.
     pub fn from_payload(header: BatchHeader, payload: Buffer) -> Result<Self, CodecError> {
         header.check_payload(&payload)?;
         Ok(Self::in_memory(header, payload))

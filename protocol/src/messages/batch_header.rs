@@ -76,9 +76,6 @@ impl BatchHeader {
     }
 
     /// Bytes of the payload of such a batch.
-    ///
-    /// # Panics
-    /// If they are more than the address space, which no batch of a run is.
     pub fn payload_bytes(&self) -> usize {
         self.bytes()
             .expect("a batch is far below the address space")

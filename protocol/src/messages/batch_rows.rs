@@ -106,9 +106,6 @@ impl<'a> BatchStatesMut<'a> {
     }
 
     /// Says of which frames state `number` is made, oldest first.
-    ///
-    /// # Panics
-    /// If they are not as many as a stack has.
     pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
         let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
         StackedFrames::write(stack, frames);

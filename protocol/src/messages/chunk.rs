@@ -130,9 +130,6 @@ impl Chunk {
     }
 
     /// A chunk in memory that may hold anything: every row is to be written.
-    ///
-    /// # Panics
-    /// If the memory is not of [`ChunkHeader::payload_bytes`].
     pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
         assert_eq!(
             Some(payload.len()),
@@ -212,9 +209,6 @@ impl Chunk {
     }
 
     /// Reads a chunk in one piece and checks lengths, ends and rewards.
-    ///
-    /// # Errors
-    /// Whatever makes it unfit to be stored in any run; the message says what.
     pub fn decode(bytes: &[u8], spec_hash: u64) -> Result<Self, CodecError> {
         let (header, payload) = codec::decode(bytes, Some(spec_hash))?;
         Self::from_payload(header, payload.to_vec().into())

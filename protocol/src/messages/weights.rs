@@ -134,9 +134,6 @@ pub struct Assembly {
 
 impl Assembly {
     /// Weights of which nothing has come yet, `bytes` bytes in all.
-    ///
-    /// # Errors
-    /// More bytes than any weights have.
     pub fn new(weights: WeightsHeader, bytes: u64) -> Result<Self, CodecError> {
         let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
         CodecError::check_size(bytes, PAYLOAD_BYTES_MAX)?;
@@ -191,9 +188,6 @@ impl Assembly {
     }
 
     /// The whole safetensors file.
-    ///
-    /// # Errors
-    /// It is not what the header describes.
     pub fn finish(self) -> Result<Weights, CodecError> {
         self.weights.check(&self.have)?;
         Ok(Weights {

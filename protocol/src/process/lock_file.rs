@@ -26,9 +26,6 @@ pub fn create(path: &Path, advice: &str) -> io::Result<Option<File>> {
 }
 
 /// Locks `file`; `false` where another process holds it.
-///
-/// # Errors
-/// A file system without locks.
 pub fn try_lock(file: &File) -> io::Result<bool> {
     match file.try_lock() {
         Ok(()) => Ok(true),

@@ -59,9 +59,6 @@ impl Shutdown {
     }
 
     /// The result of `work`, run on a thread of this `name`; `None` if the flag is raised first. The thread is then left alone.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
     pub fn unless_set<T: Send + 'static>(
         &self,
         name: &'static str,

@@ -32,9 +32,6 @@ pub(super) enum EndSign {
 /// death is a sign, given by its number: if it died before this process looked, that is seen too.
 ///
 /// SIGHUP is left ignored where it is ignored at the start, as `nohup` does it.
-///
-/// # Errors
-/// The operating system gave no thread, runtime or signal handler.
 pub(super) fn listen(
     name: &'static str,
     parent: Option<u32>,

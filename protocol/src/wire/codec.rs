@@ -48,25 +48,16 @@ fn decode_within<T: DeserializeOwned, const MAX: usize>(bytes: &[u8]) -> Result<
 }
 
 /// The bytes of a value that travels in no message, for files and hashes.
-///
-/// # Errors
-/// A value over the limit, or one that serde cannot write.
 pub fn encode_value<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
     encode_within(value, VALUE_BYTES_MAX)
 }
 
 /// Reads what [`encode_value`] wrote. That the bytes are undamaged is the caller's to check.
-///
-/// # Errors
-/// Bytes that are no such value, or more than one.
 pub fn decode_value<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
     decode_within::<T, VALUE_BYTES_MAX>(bytes)
 }
 
 /// Prefix and header of a message; the wire carries these bytes followed by `payload`, which is not copied.
-///
-/// # Errors
-/// A header or payload over their limits.
 pub fn seal<M: Message>(
     spec_hash: u64,
     message: &M,

@@ -78,9 +78,6 @@ pub const fn process_bytes(pool: usize) -> usize {
 }
 
 /// Bytes that are free in [`FOLDER`].
-///
-/// # Errors
-/// It is not there; what the system says.
 pub fn free_bytes() -> Result<u64, String> {
     statvfs(FOLDER)
         .map(|it| it.blocks_available().saturating_mul(it.fragment_size()))

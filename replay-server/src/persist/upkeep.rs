@@ -32,9 +32,6 @@ impl Replay {
 
     /// Marks this moment in the log, on the disk. The log can be opened there again, also after it was continued: then all of the
     /// replay is the same as now, to the last bit. The last two marks hold, without those that were given up.
-    ///
-    /// # Errors
-    /// A disk that refuses.
     pub fn mark(&mut self) -> Result<Option<Mark>, PersistError> {
         let snapshot = self.snapshot();
         let marked = self.log.as_mut().map(|log| log.mark(&snapshot));

@@ -110,9 +110,6 @@ impl Replay {
     }
 
     /// Takes what the learner says it has done. If it has saved a checkpoint, so does a replay that is kept on disk.
-    ///
-    /// # Errors
-    /// Counts that no run reaches; the reason, for a person.
     pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
         let (updates, saved_updates) = (learned.updates, learned.saved_updates);
         let rows_received = learned.rows_received;

@@ -51,9 +51,6 @@ impl Replay {
     }
 
     /// Shard `shard` of `config.shards`, which holds its share of the capacity and draws its own numbers.
-    ///
-    /// # Errors
-    /// As [`Replay::new`], and a shard that does not exist.
     pub fn shard(
         spec: &RunSpec,
         config: &Config,
@@ -115,9 +112,6 @@ impl Replay {
     }
 
     /// Takes what the replay's other shards have counted.
-    ///
-    /// # Errors
-    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
     pub fn set_other_shards(&mut self, other_shards: ShardCounts) -> Result<(), String> {
         let held_max = self.config.capacity_transitions;
         self.limiter.set_other_shards(other_shards, held_max)

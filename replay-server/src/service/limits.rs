@@ -81,9 +81,6 @@ pub(super) fn number(settings: &Settings, table: &'static str, key: &str) -> any
 
 /// Bytes of shared memory that so many replay servers of a run take on one host, with all of its actors, as far as the settings know
 /// of them.
-///
-/// # Errors
-/// Settings that are missing.
 pub fn shared_memory_bytes(settings: &Settings, servers: u32) -> anyhow::Result<usize> {
     let spec: RunSpec = settings.table("run")?;
     let config: Config = settings.table("replay")?;

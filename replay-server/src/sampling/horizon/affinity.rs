@@ -32,9 +32,6 @@ impl Affinity {
     }
 
     /// Takes a newer matrix; one that is not newer is ignored.
-    ///
-    /// # Errors
-    /// A matrix of another size, or with an entry that is not a probability.
     pub fn update(&mut self, update: &AffinityUpdate) -> Result<(), CodecError> {
         update.validate(self.num_actions)?;
         if update.version > self.version || self.from_another {
