@@ -34,14 +34,10 @@ const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a process could not join a run.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum JoinError {
-    /// No replay server answers.
     #[error("no replay server answered within {} s: is it running, and is the endpoint right? ({last})", SERVER_MAX.as_secs())]
-    NoReplayServer {
-        /// The last try's error.
-        last: SessionError,
-    },
-    /// An answer that cannot be read.
+    NoReplayServer { last: SessionError },
     #[error("the replay server's run info: {0}")]
     Codec(#[from] CodecError),
     /// Another process has the same role and does not end, or the replay server refuses.
