@@ -21,9 +21,9 @@ use crate::{
     wire::keys::Keys,
 };
 
-/// What a role may do; everything else it may not.
+/// What a role may do, by keys; everything else it may not.
+#[derive(Default)]
 struct Grant {
-    role: Role,
     asks: Vec<String>,
     answers: Vec<String>,
     subscribes: Vec<String>,
@@ -32,23 +32,24 @@ struct Grant {
 
 /// What a role may do in the run whose keys these are; nothing for a replay server, which does not connect.
 fn grant(keys: &Keys, role: Role) -> Grant {
-    let (mut asks, mut answers) = (vec![keys.of::<RunInfo>()], Vec::new());
-    let (mut subscribes, mut lives) = (Vec::new(), Vec::new());
     match role {
-        Role::Actor(actor) => {
-            asks.extend([
+        Role::Actor(actor) => Grant {
+            asks: vec![
+                keys.of::<RunInfo>(),
                 keys.of_actor::<ActorJoin>(actor),
                 keys.of_actor::<ChunkHeader>(actor),
                 keys.of_actor::<ChunkPoll>(actor),
                 keys.of_actor::<Leave>(actor),
                 keys.of_actor::<Report>(actor),
                 keys.of::<WeightsRequest>(),
-            ]);
-            subscribes.push(keys.of::<WeightsVersion>());
-            lives.push(keys.lives_of_actor(actor));
-        }
-        Role::Learner => {
-            asks.extend([
+            ],
+            subscribes: vec![keys.of::<WeightsVersion>()],
+            lives: vec![keys.lives_of_actor(actor)],
+            ..Grant::default()
+        },
+        Role::Learner => Grant {
+            asks: vec![
+                keys.of::<RunInfo>(),
                 keys.of::<LearnerJoin>(),
                 keys.of::<BatchRequest>(),
                 keys.of::<AffinityUpdate>(),
@@ -56,26 +57,22 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<WeightsUpload>(),
                 keys.of::<ReplayStatus>(),
                 keys.of_learner::<Report>(),
-            ]);
-            answers.push(keys.of::<LearnerStatus>());
-            lives.push(keys.lives_of_learner());
-        }
-        Role::Observer => {
-            asks.extend([
+            ],
+            answers: vec![keys.of::<LearnerStatus>()],
+            lives: vec![keys.lives_of_learner()],
+            ..Grant::default()
+        },
+        Role::Observer => Grant {
+            asks: vec![
+                keys.of::<RunInfo>(),
                 keys.of::<ReplayStatus>(),
                 keys.of::<ProcessesStatus>(),
                 keys.of::<LearnerStatus>(),
                 keys.of::<EpisodesRequest>(),
-            ]);
-        }
-        Role::ReplayServer => asks.clear(),
-    }
-    Grant {
-        role,
-        asks,
-        answers,
-        subscribes,
-        lives,
+            ],
+            ..Grant::default()
+        },
+        Role::ReplayServer => Grant::default(),
     }
 }
 
@@ -88,45 +85,35 @@ struct Lists {
 }
 
 impl Lists {
-    fn add(&mut self, grant: &Grant) {
-        let name = grant.role.to_string();
+    fn add(&mut self, name: Role, grant: &Grant) {
         let mut rules = Vec::new();
+        let answers = r#""declare_queryable", "reply""#;
+        let subscribes = r#""declare_subscriber""#;
+        let lives = r#""liveliness_token""#;
         for (what, flow, messages, keys) in [
             ("asks", "ingress", r#""query""#, &grant.asks),
             ("is-answered", "egress", r#""reply""#, &grant.asks),
-            (
-                "answers",
-                "ingress",
-                r#""declare_queryable", "reply""#,
-                &grant.answers,
-            ),
+            ("answers", "ingress", answers, &grant.answers),
             ("is-asked", "egress", r#""query""#, &grant.answers),
-            (
-                "listens",
-                "ingress",
-                r#""declare_subscriber""#,
-                &grant.subscribes,
-            ),
+            ("listens", "ingress", subscribes, &grant.subscribes),
             ("receives", "egress", r#""put""#, &grant.subscribes),
-            ("lives", "ingress", r#""liveliness_token""#, &grant.lives),
+            ("lives", "ingress", lives, &grant.lives),
         ] {
             if keys.is_empty() {
                 continue;
             }
-            let id = format!("\"{name}-{what}\"");
+            let id = format!("{name}-{what}");
+            // Rust writes strings and lists of them as JSON5 does.
             self.rules.push(format!(
-                "{{ id: {id}, permission: \"allow\", flows: [\"{flow}\"], messages: [{messages}], key_exprs: [{}] }}",
-                quoted(keys)
+                "{{ id: {id:?}, permission: \"allow\", flows: [\"{flow}\"], messages: [{messages}], key_exprs: {keys:?} }}"
             ));
             rules.push(id);
         }
         self.subjects.push(format!(
             "{{ id: \"{name}\", cert_common_names: [\"{name}\"], link_protocols: [\"quic\"] }}"
         ));
-        self.policies.push(format!(
-            "{{ rules: [{}], subjects: [\"{name}\"] }}",
-            rules.join(", ")
-        ));
+        self.policies
+            .push(format!("{{ rules: {rules:?}, subjects: [\"{name}\"] }}"));
     }
 
     /// Who comes through a unix socket of this machine: its folder's permissions are the guard.
@@ -143,17 +130,12 @@ impl Lists {
     }
 }
 
-fn quoted(keys: &[String]) -> String {
-    let quoted: Vec<_> = keys.iter().map(|key| format!("\"{key}\"")).collect();
-    quoted.join(", ")
-}
-
 /// The whole of zenoh's `access_control`, JSON5, for the replay server of the run whose keys these are.
 pub(crate) fn rules(keys: &Keys) -> String {
     let mut lists = Lists::default();
     let actors = (0..ACTORS_MAX).map(Role::Actor);
     for role in actors.chain([Role::Learner, Role::Observer]) {
-        lists.add(&grant(keys, role));
+        lists.add(role, &grant(keys, role));
     }
     lists.add_unix_sockets();
     format!(
@@ -168,56 +150,29 @@ pub(crate) fn rules(keys: &Keys) -> String {
 mod tests {
     use super::*;
 
-    /// Every key at which a role may do anything.
-    fn all(grant: &Grant) -> Vec<&str> {
-        let lists = [&grant.asks, &grant.answers, &grant.subscribes, &grant.lives];
-        lists.into_iter().flatten().map(String::as_str).collect()
-    }
-
     #[test]
     fn each_role_has_the_least_it_needs() {
         let keys = Keys::new("d").unwrap();
-        let of = |role| grant(&keys, role);
-        assert_eq!(
-            all(&of(Role::Actor(3))),
-            [
-                "d/run-info",
-                "d/join/actor/3",
-                "d/ingest/3",
-                "d/poll/3",
-                "d/leave/3",
-                "d/report/3",
-                "d/weights",
-                "d/weights-version",
-                "d/alive/actor/3/*",
-            ]
-        );
-        assert_eq!(
-            all(&of(Role::Learner)),
-            [
-                "d/run-info",
-                "d/join/learner",
-                "d/batch",
-                "d/affinity",
-                "d/priorities",
-                "d/weights-upload",
-                "d/status/replay",
-                "d/report/learner",
-                "d/status/learner",
-                "d/alive/learner/*",
-            ]
-        );
-        assert_eq!(
-            all(&of(Role::Observer)),
-            [
-                "d/run-info",
-                "d/status/replay",
-                "d/status/processes",
-                "d/status/learner",
-                "d/episodes",
-            ]
-        );
-        assert!(all(&of(Role::ReplayServer)).is_empty());
+        for (role, expected) in [
+            (
+                Role::Actor(3),
+                "d/run-info d/join/actor/3 d/ingest/3 d/poll/3 d/leave/3 d/report/3 d/weights d/weights-version d/alive/actor/3/*",
+            ),
+            (
+                Role::Learner,
+                "d/run-info d/join/learner d/batch d/affinity d/priorities d/weights-upload d/status/replay d/report/learner \
+                 d/status/learner d/alive/learner/*",
+            ),
+            (
+                Role::Observer,
+                "d/run-info d/status/replay d/status/processes d/status/learner d/episodes",
+            ),
+            (Role::ReplayServer, ""),
+        ] {
+            let grant = grant(&keys, role);
+            let lists = [grant.asks, grant.answers, grant.subscribes, grant.lives];
+            assert_eq!(lists.concat().join(" "), expected);
+        }
     }
 
     #[test]
