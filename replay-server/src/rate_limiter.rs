@@ -15,10 +15,7 @@ use crate::config::Config;
 /// `replay_ratio` is rlpyt's word for Reverb's `samples_per_insert`: rows sampled per transition inserted, not updates per step.
 #[derive(Clone, Debug)]
 pub struct RateLimiter {
-    replay_ratio: f64,
-    warmup_transitions: u64,
-    slack_transitions: u64,
-    transitions_max: Option<u64>,
+    config: Config,
     /// The point from which the ratio holds: no row for the transitions before it beyond those sampled then.
     since: ShardCounts,
     pub(crate) counts: Counts,
@@ -36,42 +33,20 @@ pub(crate) struct Counts {
 }
 
 impl RateLimiter {
-    /// Nothing stored, nothing sampled. The arguments are those of `Config`, validated there.
-    pub fn new(
-        replay_ratio: f64,
-        warmup_transitions: u64,
-        slack_transitions: u64,
-        transitions_max: Option<u64>,
-    ) -> Self {
-        let since = ShardCounts {
-            inserted: warmup_transitions,
-            rows_sampled: 0,
+    /// Nothing stored, nothing sampled, in a run with these settings, whose ratio may have been another before it was resumed.
+    pub fn new(config: &Config) -> Self {
+        let since = match config.since {
+            Some(since) => (since.transitions, since.rows),
+            None => (config.warmup_transitions, 0),
         };
         Self {
-            replay_ratio,
-            warmup_transitions,
-            slack_transitions,
-            transitions_max,
-            since,
+            config: config.clone(),
+            since: ShardCounts {
+                inserted: since.0,
+                rows_sampled: since.1,
+            },
             counts: Counts::default(),
         }
-    }
-
-    /// That of a run with these settings, whose ratio may have been another before it was resumed.
-    pub(crate) fn of(config: &Config) -> Self {
-        let mut limiter = Self::new(
-            config.replay_ratio,
-            config.warmup_transitions,
-            config.slack_transitions,
-            config.transitions_max,
-        );
-        if let Some(since) = config.since {
-            limiter.since = ShardCounts {
-                inserted: since.transitions,
-                rows_sampled: since.rows,
-            };
-        }
-        limiter
     }
 
     /// The same after so much was counted here and in the replay's other shards.
@@ -94,11 +69,12 @@ impl RateLimiter {
     /// Takes what the other shards have counted.
     ///
     /// # Errors
-    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person. `held_max` are
-    /// the transitions that a shard may store before the others report.
-    pub fn set_other_shards(&mut self, others: ShardCounts, held_max: u64) -> Result<(), String> {
+    /// More transitions than the run can ever have, or more rows than it gives for these; the reason, for a person.
+    pub fn set_other_shards(&mut self, others: ShardCounts) -> Result<(), String> {
         let before = self.counts.other_shards;
-        let max = self.transitions_max.unwrap_or(u64::MAX);
+        // So many may a shard store before the others report.
+        let held_max = self.config.capacity_transitions;
+        let max = self.config.transitions_max.unwrap_or(u64::MAX);
         let most = max.max(before.inserted).saturating_add(held_max);
         if others.inserted > most {
             return Err(format!(
@@ -109,8 +85,9 @@ impl RateLimiter {
         // Of more rows the learner would wait for transitions that never come.
         let inserted = others.inserted.max(before.inserted);
         let inserted = inserted.saturating_add(self.counts.this_shard.inserted);
-        let allowed = self.since.rows_sampled as f64 + self.replay_ratio * inserted as f64;
-        let ahead = self.slack_transitions.saturating_add(held_max) as f64 * self.replay_ratio;
+        let allowed = self.since.rows_sampled as f64 + self.config.replay_ratio * inserted as f64;
+        let ahead = self.config.slack_transitions.saturating_add(held_max) as f64
+            * self.config.replay_ratio;
         let most_rows = allowed.max(before.rows_sampled as f64) + ahead;
         if others.rows_sampled as f64 > most_rows {
             return Err(format!(
@@ -124,20 +101,21 @@ impl RateLimiter {
 
     fn credit(&self) -> f64 {
         let after = self.inserted_total().saturating_sub(self.since.inserted);
-        let allowed = self.since.rows_sampled as f64 + self.replay_ratio * after as f64;
+        let allowed = self.since.rows_sampled as f64 + self.config.replay_ratio * after as f64;
         allowed - self.rows_sampled_total() as f64
     }
 
     /// Whether a chunk may be stored now; chunks are stored whole, so inserts may overshoot by one chunk.
     pub fn may_insert(&self) -> bool {
-        let is_ahead = self.credit() > self.slack_transitions as f64 * self.replay_ratio;
+        let is_ahead =
+            self.credit() > self.config.slack_transitions as f64 * self.config.replay_ratio;
         !self.all_in() && (self.counts.refill_left > 0 || !is_ahead)
     }
 
     /// Whether `rows` rows may be sampled now.
     pub fn may_sample(&self, rows: u32) -> bool {
         self.counts.refill_left == 0
-            && self.inserted_total() >= self.warmup_transitions
+            && self.inserted_total() >= self.config.warmup_transitions
             && f64::from(rows) <= self.credit()
     }
 
@@ -145,6 +123,7 @@ impl RateLimiter {
     pub fn all_in(&self) -> bool {
         self.counts.refill_left == 0
             && self
+                .config
                 .transitions_max
                 .is_some_and(|max| self.inserted_total() >= max)
     }
@@ -156,7 +135,7 @@ impl RateLimiter {
 
     /// Most rows that can ever be asked for at once; for more, both sides could wait for each other.
     pub fn rows_max(&self) -> u32 {
-        (self.slack_transitions as f64 * self.replay_ratio) as u32
+        (self.config.slack_transitions as f64 * self.config.replay_ratio) as u32
     }
 
     /// Counts `transitions` stored.
@@ -202,7 +181,7 @@ impl RateLimiter {
             ..
         } = self.counts;
         let (have, need) = match refill_left {
-            0 => (self.inserted_total(), self.warmup_transitions),
+            0 => (self.inserted_total(), self.config.warmup_transitions),
             left => (refilled, refilled + left),
         };
         if self.finished(rows) {

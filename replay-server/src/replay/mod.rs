@@ -79,7 +79,7 @@ impl Replay {
             config: config.clone(),
             batch_size,
             ring: Ring::new(capacity, frames).map_err(not_granted)?,
-            limiter: RateLimiter::of(config),
+            limiter: RateLimiter::new(config),
             sampler: BatchSampler::new(spec, &config.sampling, capacity).map_err(not_granted)?,
             state: State::new(spec, shard),
             requests: Requests::default(),
@@ -113,8 +113,7 @@ impl Replay {
 
     /// Takes what the replay's other shards have counted.
     pub fn set_other_shards(&mut self, other_shards: ShardCounts) -> Result<(), String> {
-        let held_max = self.config.capacity_transitions;
-        self.limiter.set_other_shards(other_shards, held_max)
+        self.limiter.set_other_shards(other_shards)
     }
 
     /// Who waits for whom now, for batches of the size that the replay was made for.

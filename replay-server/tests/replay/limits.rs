@@ -248,7 +248,13 @@ proptest! {
         let batch = (f64::from(rows) / ratio).ceil() as u64 + 1;
         let slack = 4 * batch + extra;
         let max = warmup + batch + length;
-        let mut limiter = RateLimiter::new(ratio, warmup, slack, Some(max));
+        let mut limiter = RateLimiter::new(&Config {
+            replay_ratio: ratio,
+            warmup_transitions: warmup,
+            slack_transitions: slack,
+            transitions_max: Some(max),
+            ..Config::unlimited(1)
+        });
         let (mut inserted, mut sampled) = (0u64, 0u64);
         // Rows that the ratio has allowed, counted one transition at a time.
         let mut allowed = 0.0;
@@ -299,7 +305,8 @@ proptest! {
         let (inserted_there, sampled_there) = others.unwrap_or_default();
         let there = counts(inserted_there % inserted, sampled_there % rows_sampled);
         let here = counts(inserted - there.inserted, rows_sampled - there.rows_sampled);
-        let limiter = RateLimiter::new(8.0, 0, 1000, None).counting_on(here, there);
+        let config = Config { replay_ratio: 8.0, slack_transitions: 1000, ..Config::unlimited(1) };
+        let limiter = RateLimiter::new(&config).counting_on(here, there);
         let near = credit.unsigned_abs() as u32;
         for rows in [1, 32, 256, near, near + 1] {
             prop_assert_eq!(limiter.may_sample(rows), i64::from(rows) <= credit);
