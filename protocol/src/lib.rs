@@ -53,7 +53,7 @@ pub use messages::{
     join::{ActorJoin, JoinReply, LearnerJoin, Welcome},
     leave::Leave,
     priorities::{Origin, PriorityPart, PriorityUpdate},
-    processes::{LogStatus, ProcessName, ProcessStatus, ProcessesStatus, WARNINGS_MAX},
+    processes::{LogStatus, ProcessStatus, ProcessesStatus, WARNINGS_MAX},
     recovering::{Recovering, RecoveryProgress},
     report::{Participant, Report, Warning},
     run_info::RunInfo,
@@ -80,7 +80,7 @@ pub use wire::{
     buffers::{Buffer, BufferPool},
     codec::{self, PROTOCOL_VERSION},
     error::CodecError,
-    keys::{Alive, Keys},
+    keys::{Alive, Keys, ProcessName},
     message::{Keyed, Message, Request},
     shared_memory,
 };

@@ -4,27 +4,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::{report::Warning, status::Waiting};
+use crate::wire::keys::ProcessName;
 
 /// Processes whose last warning is passed on: those with the newest ones.
 pub const WARNINGS_MAX: usize = 64;
-
-/// A process of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub enum ProcessName {
-    /// The learner.
-    Learner,
-    /// The actor of this number.
-    Actor(u32),
-}
-
-impl std::fmt::Display for ProcessName {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Learner => f.write_str("learner"),
-            Self::Actor(actor) => write!(f, "actor-{actor}"),
-        }
-    }
-}
 
 /// What a replay server knows of one process.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

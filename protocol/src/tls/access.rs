@@ -18,7 +18,7 @@ use crate::{
         status::{LearnerStatus, ReplayStatus},
         weights::{WeightsRequest, WeightsUpload, WeightsVersion},
     },
-    wire::keys::Keys,
+    wire::keys::{Keys, ProcessName},
 };
 
 /// What a role may do, by keys; everything else it may not.
@@ -44,7 +44,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of::<WeightsRequest>(),
             ],
             subscribes: vec![keys.of::<WeightsVersion>()],
-            lives: vec![keys.lives_of_actor(actor)],
+            lives: vec![keys.all_lives(ProcessName::Actor(actor))],
             ..Grant::default()
         },
         Role::Learner => Grant {
@@ -59,7 +59,7 @@ fn grant(keys: &Keys, role: Role) -> Grant {
                 keys.of_learner::<Report>(),
             ],
             answers: vec![keys.of::<LearnerStatus>()],
-            lives: vec![keys.lives_of_learner()],
+            lives: vec![keys.all_lives(ProcessName::Learner)],
             ..Grant::default()
         },
         Role::Observer => Grant {

@@ -1,6 +1,9 @@
 //! Where each message travels: its own key under the run's namespace, and one for each process that is connected.
 //! What an actor says stands under its number, so that access can be given by key; versions and lives are in the messages.
 
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::message::Keyed;
@@ -36,28 +39,23 @@ impl Keys {
 
     /// Where messages of type `M` are answered, fetched or announced: of those that have a key an actor, all of them.
     pub fn of<M: Keyed>(&self) -> String {
-        if M::BY_ACTOR {
-            self.key(&format!("{}/*", M::KEY))
-        } else {
-            self.key(M::KEY)
-        }
+        self.said_by::<M>('*')
     }
 
     /// Where `actor` asks messages of type `M`.
     pub fn of_actor<M: Keyed>(&self, actor: u32) -> String {
-        if M::BY_ACTOR {
-            self.key(&format!("{}/{actor}", M::KEY))
-        } else {
-            self.key(M::KEY)
-        }
+        self.said_by::<M>(actor)
     }
 
     /// Where the learner sends messages of type `M`, for which each actor may have its own key.
     pub fn of_learner<M: Keyed>(&self) -> String {
-        if M::BY_ACTOR {
-            self.key(&format!("{}/learner", M::KEY))
-        } else {
-            self.key(M::KEY)
+        self.said_by::<M>("learner")
+    }
+
+    fn said_by<M: Keyed>(&self, who: impl fmt::Display) -> String {
+        match M::BY_ACTOR {
+            true => self.key(&format!("{}/{who}", M::KEY)),
+            false => self.key(M::KEY),
         }
     }
 
@@ -67,21 +65,20 @@ impl Keys {
     }
 
     /// The key of the liveliness token of one life of an actor, or of a learner.
-    pub fn alive_key(&self, who: Alive) -> String {
-        match who {
-            Alive::Actor { actor, mark } => self.key(&format!("alive/actor/{actor}/{mark:016x}")),
-            Alive::Learner { mark } => self.key(&format!("alive/learner/{mark:016x}")),
-        }
+    pub fn alive_key(&self, Alive { process, mark }: Alive) -> String {
+        self.lives(process, format_args!("{mark:016x}"))
     }
 
-    /// The keys of the liveliness tokens of all lives of an actor.
-    pub(crate) fn lives_of_actor(&self, actor: u32) -> String {
-        self.key(&format!("alive/actor/{actor}/*"))
+    /// The keys of the liveliness tokens of all lives of a process.
+    pub(crate) fn all_lives(&self, process: ProcessName) -> String {
+        self.lives(process, '*')
     }
 
-    /// The keys of the liveliness tokens of all learners.
-    pub(crate) fn lives_of_learner(&self) -> String {
-        self.key("alive/learner/*")
+    fn lives(&self, process: ProcessName, mark: impl fmt::Display) -> String {
+        self.key(&match process {
+            ProcessName::Actor(actor) => format!("alive/actor/{actor}/{mark}"),
+            ProcessName::Learner => format!("alive/learner/{mark}"),
+        })
     }
 
     /// Liveliness tokens of all actors and learners.
@@ -93,13 +90,30 @@ impl Keys {
     pub fn alive(&self, key: &str) -> Option<Alive> {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
         let hex = |text| u64::from_str_radix(text, 16).ok();
-        match rest.split('/').collect::<Vec<_>>()[..] {
-            ["actor", actor, mark] => Some(Alive::Actor {
-                actor: actor.parse().ok()?,
-                mark: hex(mark)?,
-            }),
-            ["learner", mark] => Some(Alive::Learner { mark: hex(mark)? }),
-            _ => None,
+        let (process, mark) = match rest.split('/').collect::<Vec<_>>()[..] {
+            ["actor", actor, mark] => (ProcessName::Actor(actor.parse().ok()?), mark),
+            ["learner", mark] => (ProcessName::Learner, mark),
+            _ => return None,
+        };
+        let mark = hex(mark)?;
+        Some(Alive { process, mark })
+    }
+}
+
+/// A process of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum ProcessName {
+    /// The learner.
+    Learner,
+    /// The actor of this number.
+    Actor(u32),
+}
+
+impl fmt::Display for ProcessName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Learner => f.write_str("learner"),
+            Self::Actor(actor) => write!(f, "actor-{actor}"),
         }
     }
 }
@@ -107,32 +121,28 @@ impl Keys {
 /// A process whose liveliness token was seen. Every client can see tokens, so they hide the numbers by which the replay server
 /// knows its actors and its learner: with such a number a client could send in their name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Alive {
-    /// One life of an actor.
-    Actor {
-        /// The actor's number in the run.
-        actor: u32,
-        /// The mark of one life of it.
-        mark: u64,
-    },
-    /// A learner.
-    Learner {
-        /// Its mark.
-        mark: u64,
-    },
+pub struct Alive {
+    /// Which process it is, whatever its life.
+    pub process: ProcessName,
+    /// The mark of this life.
+    pub mark: u64,
 }
 
 impl Alive {
     /// This life of an actor.
     pub fn actor(actor: u32, incarnation: u64) -> Self {
-        let mark = mark(incarnation);
-        Self::Actor { actor, mark }
+        Self {
+            process: ProcessName::Actor(actor),
+            mark: mark(incarnation),
+        }
     }
 
     /// The learner of this number.
     pub fn learner(learner: u64) -> Self {
-        let mark = mark(learner);
-        Self::Learner { mark }
+        Self {
+            process: ProcessName::Learner,
+            mark: mark(learner),
+        }
     }
 }
 

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, Request, RunInfo, Welcome,
+    ActorJoin, Alive, Incoming, JoinReply, LearnerJoin, ProcessName, Request, RunInfo, Welcome,
 };
 use zenoh::sample::SampleKind;
 
@@ -93,12 +93,12 @@ impl State {
 
     /// Whether this incarnation of a process is the one that has joined.
     fn takes_part(&self, who: Alive) -> bool {
-        let known = match who {
-            Alive::Actor { actor, .. } => {
+        let known = match who.process {
+            ProcessName::Actor(actor) => {
                 let life = self.replay.actor_incarnation(actor);
                 life.map(|life| Alive::actor(actor, life))
             }
-            Alive::Learner { .. } => self.replay.learner().map(Alive::learner),
+            ProcessName::Learner => self.replay.learner().map(Alive::learner),
         };
         known == Some(who)
     }

@@ -36,14 +36,6 @@ struct Participant {
     report: Option<(Report, Instant)>,
 }
 
-/// Which process it is, whatever its life.
-const fn name(who: Alive) -> ProcessName {
-    match who {
-        Alive::Actor { actor, .. } => ProcessName::Actor(actor),
-        Alive::Learner { .. } => ProcessName::Learner,
-    }
-}
-
 impl Participants {
     pub(super) fn new(now: Instant) -> Self {
         Self {
@@ -57,7 +49,7 @@ impl Participants {
 
     /// A process has joined. One that asks again has joined once.
     pub(super) fn joined(&mut self, who: Alive, now: Instant) {
-        let earlier = self.processes.get(&name(who));
+        let earlier = self.processes.get(&who.process);
         if earlier.is_some_and(|account| account.alive == who) {
             return;
         }
@@ -69,12 +61,12 @@ impl Participants {
             weights_version: None,
             report: None,
         };
-        self.processes.insert(name(who), account);
+        self.processes.insert(who.process, account);
     }
 
     /// The participant of this life, if it takes part.
     fn of(&mut self, who: Alive) -> Option<&mut Participant> {
-        let account = self.processes.get_mut(&name(who))?;
+        let account = self.processes.get_mut(&who.process)?;
         (account.alive == who).then_some(account)
     }
 

@@ -11,8 +11,8 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, Alive, BatchRequest, Chunk, ChunkHeader, ChunkPoll, Leave, Origin, PriorityPart,
-    PriorityUpdate, ReplayStatus, RequestId, ShardCounts, WeightsRequest, WeightsUpload,
-    WeightsVersion, session,
+    PriorityUpdate, ProcessName, ReplayStatus, RequestId, ShardCounts, WeightsRequest,
+    WeightsUpload, WeightsVersion, session,
 };
 use driml_tests::{Client, Process, TestSystem, check_nothing_lost, new_learner, wait_for};
 use zenoh::{Wait, query::Query};
@@ -230,7 +230,7 @@ fn of_4096_strangers() {
     let lied = lied();
     let client = &lied.client;
     let tokens: Vec<_> = (0..300)
-        .map(|mark| client.run().declare_alive(Alive::Learner { mark }).unwrap())
+        .map(|number| client.run().declare_alive(Alive::learner(number)).unwrap())
         .collect();
     let joins = (0..2 * 4096).map(|number| actor_join(STRANGER + number, LIFE));
     send(
@@ -314,11 +314,11 @@ fn of_processes_whose_number_can_be_read() {
     let mut rows = Vec::new();
     while let Ok(reply) = tokens.recv() {
         let token = reply.into_result().unwrap();
-        let shown = client.keys.alive(token.key_expr().as_str()).unwrap();
+        let Alive { process, mark } = client.keys.alive(token.key_expr().as_str()).unwrap();
         // The mark is of no use in the place of the number.
-        rows.push(match shown {
-            Alive::Actor { actor, mark } => Row::of(client, &leave(actor, mark, 0), "Ack"),
-            Alive::Learner { mark } => {
+        rows.push(match process {
+            ProcessName::Actor(actor) => Row::of(client, &leave(actor, mark, 0), "Ack"),
+            ProcessName::Learner => {
                 let bytes = upload(client.spec.hash(), mark, 1 << 19, b"w");
                 Row::new(client.keys.of::<WeightsUpload>(), bytes, SILENCE)
             }
