@@ -110,14 +110,8 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
     let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
     let mut places = batch.states_mut();
     for row in 0..6 {
-        rng.fill(places.t(row));
-        if let Some(place) = places.n(row) {
-            rng.fill(place);
-        }
-        for p in 0..positives {
-            if let Some(place) = places.k(p, row) {
-                rng.fill(place);
-            }
+        for number in places.of_row(row).collect::<Vec<_>>() {
+            rng.fill(places.frame(number));
         }
     }
     batch

@@ -93,7 +93,7 @@ impl<'a> BatchStatesMut<'a> {
         }
     }
 
-    /// The numbers of the states that `row` has: of s_t, of s_{t+n}, and of s_{t+k} of each positive.
+    /// The numbers of the states that `row` has, in this order: of s_t, of s_{t+n}, and of s_{t+k} of each positive.
     pub fn of_row(&self, row: usize) -> impl Iterator<Item = usize> {
         let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
         let first = [Some(row), self.numbers_n[row]];
@@ -109,28 +109,6 @@ impl<'a> BatchStatesMut<'a> {
     pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
         let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
         StackedFrames::write(stack, frames);
-    }
-
-    /// Where s_t of `row` is written, in a batch whose states are one frame each.
-    pub fn t(&mut self, row: usize) -> &mut [u8] {
-        self.state(row)
-    }
-
-    /// Where s_{t+k} of positive `p` of `row` is written, if the row has it; as [`BatchStatesMut::t`].
-    pub fn k(&mut self, p: usize, row: usize) -> Option<&mut [u8]> {
-        let number = self.numbers_k[p * self.rows + row]?;
-        Some(self.state(number))
-    }
-
-    /// Where s_{t+n} of `row` is written, if the row bootstraps; as [`BatchStatesMut::t`].
-    pub fn n(&mut self, row: usize) -> Option<&mut [u8]> {
-        let number = self.numbers_n[row]?;
-        Some(self.state(number))
-    }
-
-    fn state(&mut self, number: usize) -> &mut [u8] {
-        assert!(self.stacks.is_empty(), "a stack of frames has no place");
-        self.frame(number)
     }
 }
 

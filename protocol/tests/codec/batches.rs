@@ -283,14 +283,12 @@ fn parts_are_merged_row_by_row() {
         let mut batch = Batch::of_rows(header, &rows, Buffer::zeroed);
         let mut places = batch.states_mut();
         for (row, value) in values.enumerate() {
-            places.t(row).fill(value);
-            if let Some(place) = places.n(row) {
-                place.fill(value + 20);
-            }
-            for p in 0..3 {
-                if let Some(place) = places.k(p, row) {
-                    place.fill(value + 40 + 20 * p as u8);
-                }
+            let numbers: Vec<_> = places.of_row(row).collect();
+            let n = value.is_multiple_of(2).then_some(value + 20);
+            let k = [40, 60, 80].map(|more| value + more);
+            let bytes = [value].into_iter().chain(n).chain(k);
+            for (number, byte) in numbers.into_iter().zip(bytes) {
+                places.frame(number).fill(byte);
             }
         }
         batch

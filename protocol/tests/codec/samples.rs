@@ -136,13 +136,11 @@ pub(crate) fn batch_from(origin: Option<Origin>) -> Batch {
     let mut batch = Batch::of_rows(header, &rows(), |bytes| Buffer::from(vec![0xAB; bytes]));
     assert_eq!(batch.header, header);
     let mut places = batch.states_mut();
-    for row in 0..3 {
-        places.t(row).fill(10 + row as u8);
+    let numbers = |row| places.of_row(row).collect::<Vec<_>>();
+    assert_eq!([0, 1, 2].map(numbers), [vec![0, 3], vec![1], vec![2, 5, 4]]);
+    for (number, byte) in [10, 11, 12, 30, 32, 22].into_iter().enumerate() {
+        places.frame(number).fill(byte);
     }
-    assert!(places.n(0).is_none() && places.n(1).is_none() && places.k(0, 1).is_none());
-    places.n(2).unwrap().fill(22);
-    places.k(0, 0).unwrap().fill(30);
-    places.k(0, 2).unwrap().fill(32);
     batch
 }
 
