@@ -16,7 +16,7 @@ use crate::{
 pub const POOL_BATCHES: usize = 6;
 
 /// What a batch says of itself.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BatchHeader {
     /// Rows, B.
     pub rows: u32,
@@ -52,12 +52,9 @@ impl BatchHeader {
             state_bytes: spec.state_bytes() as u32,
             states_k: rows.saturating_mul(positives),
             states_n: rows,
-            counts: ShardCounts::default(),
-            held: 0,
-            mean_age: 0.0,
             weights_versions: (0, u64::MAX),
-            origin: None,
             stacked: StackedFrames::of(spec, rows),
+            ..Self::default()
         }
     }
 

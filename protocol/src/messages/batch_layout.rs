@@ -172,29 +172,12 @@ impl BatchHeader {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::messages::{priorities::Origin, shard_counts::ShardCounts};
+    use crate::messages::priorities::Origin;
 
     const FRAMES: StackedFrames = StackedFrames {
         frames: 5,
         frame_stack: 4,
         frame_channels: 1,
-    };
-
-    const EMPTY: BatchHeader = BatchHeader {
-        rows: 0,
-        positives: 0,
-        state_bytes: 0,
-        states_k: 0,
-        states_n: 0,
-        counts: ShardCounts {
-            inserted: 0,
-            rows_sampled: 0,
-        },
-        held: 0,
-        mean_age: 0.0,
-        weights_versions: (0, 0),
-        origin: None,
-        stacked: None,
     };
 
     #[test]
@@ -213,7 +196,7 @@ mod tests {
                 states_n,
                 origin: rows.is_multiple_of(2).then(Origin::default),
                 stacked: state_bytes.is_multiple_of(4).then_some(FRAMES),
-                ..EMPTY
+                ..BatchHeader::default()
             };
             let mut end = 0;
             for column in Column::ALL {
@@ -229,7 +212,7 @@ mod tests {
             state_bytes: 1,
             states_k: 4,
             states_n: 2,
-            ..EMPTY
+            ..BatchHeader::default()
         };
         assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
         let prioritised = BatchHeader {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::shard_counts::ShardCounts;
 
 /// The learner's request.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
     /// Which learner asks: that of its [`LearnerJoin`](crate::LearnerJoin).
     pub learner: u64,
@@ -35,7 +35,7 @@ pub struct Learned {
 }
 
 /// Tells a request that repeats another from a new one: a batch that did not arrive must not count as sampled.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RequestId {
     /// Who asks: a random number, which tells it from all others. It waits for one request at a time.
     pub client_id: u64,

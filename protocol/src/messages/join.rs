@@ -15,7 +15,7 @@ pub struct ActorJoin {
 }
 
 /// A learner starts: from now on the replay server serves it, and it alone. The same one may be sent any number of times.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LearnerJoin {
     /// Which learner: a random number, drawn anew at each start. All its messages carry it.
     pub learner: u64,

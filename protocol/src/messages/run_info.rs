@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 /// What a joining process needs: the run's resolved settings, from the replay server.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunInfo {
     /// The resolved configuration, TOML.
     pub config_toml: String,

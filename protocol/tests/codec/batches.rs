@@ -254,11 +254,8 @@ fn draws_and_priorities_that_cannot_be_are_refused() {
 #[test]
 fn parts_are_merged_row_by_row() {
     let header = |mean_age, versions| BatchHeader {
-        rows: 0,
         positives: 3,
         state_bytes: 3,
-        states_k: 0,
-        states_n: 0,
         counts: ShardCounts {
             inserted: 10,
             rows_sampled: 1,
@@ -266,8 +263,7 @@ fn parts_are_merged_row_by_row() {
         held: 5,
         mean_age,
         weights_versions: versions,
-        origin: None,
-        stacked: None,
+        ..BatchHeader::default()
     };
     // Rows from `first` on, which have fewer positives and bootstraps, the higher their number.
     let part = |header: BatchHeader, values: std::ops::Range<u8>| {

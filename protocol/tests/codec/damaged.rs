@@ -177,11 +177,7 @@ fn huge_lengths_are_refused_without_taking_memory() {
     // The sender keeps to the limit too.
     let run_info = RunInfo {
         config_toml: "x".repeat(HEADER_BYTES_MAX),
-        inserted_total: 0,
-        has_learner: false,
-        after_updates: 0,
-        shard: (0, 1),
-        shared_memory: false,
+        ..RunInfo::default()
     };
     let refused = codec::seal(SPEC, &run_info, &[]).unwrap_err();
     let max = HEADER_BYTES_MAX;

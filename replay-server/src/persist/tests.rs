@@ -8,7 +8,7 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, Horizon, InsertReply, Learned,
-    LearnerJoin, Leave, RunSpec, Sampling, ShardCounts, TimeoutRule,
+    LearnerJoin, Leave, RunSpec, Sampling, TimeoutRule,
 };
 
 use super::{PersistArgs, PersistError};
@@ -108,11 +108,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
     replay.join_actor(join(0, 1)).unwrap();
     let learner = LearnerJoin {
         learner: 7,
-        run: 0,
-        updates: 0,
-        counts: ShardCounts::default(),
-        other_shards: ShardCounts::default(),
-        restart: false,
+        ..LearnerJoin::default()
     };
     replay.join_learner(learner).unwrap();
     let file = refuse(&mut replay);

@@ -152,7 +152,7 @@ pub(super) fn park_request<Q>(line: &mut VecDeque<ParkedRequest<Q>>, parked: Par
 mod tests {
     use std::borrow::Cow;
 
-    use driml_protocol::{Chunk, Learned, RequestId};
+    use driml_protocol::{Chunk, RequestId};
 
     use super::*;
     use crate::{config::Compression, storage::frame_store::Packer};
@@ -248,12 +248,8 @@ mod tests {
         let mut line = VecDeque::new();
         for (client_id, question) in [(1, "a"), (2, "b"), (1, "a again"), (3, "c")] {
             let request = BatchRequest {
-                learner: 1,
                 id: RequestId::first(client_id),
-                rows: 1,
-                shared_memory: false,
-                learned: Learned::default(),
-                other_shards: None,
+                ..BatchRequest::default()
             };
             let parked = ParkedRequest {
                 request,

@@ -140,8 +140,7 @@ pub(crate) fn learner(learner: u64, updates: u64, rows: u64, inserted: u64) -> L
         run: 1,
         updates,
         counts: counts(inserted, rows),
-        other_shards: ShardCounts::default(),
-        restart: false,
+        ..LearnerJoin::default()
     }
 }
 
