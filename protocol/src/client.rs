@@ -54,12 +54,7 @@ impl<M> Clone for Sealed<M> {
 impl<M: Message> Sealed<M> {
     /// A message without a payload, for the run with this hash.
     pub fn new(message: &M, spec_hash: u64) -> Result<Self, CodecError> {
-        let bytes = codec::encode(spec_hash, message, &[])?;
-        Ok(Self {
-            bytes: bytes.into(),
-            actor: message.actor(),
-            message: PhantomData,
-        })
+        Self::with_payload(message, ZBytes::new(), spec_hash)
     }
 
     /// A message with a payload, which is not copied.
@@ -126,7 +121,7 @@ impl RunClient {
 
     /// A request that is ready to be sent, as often as need be.
     pub fn seal<R: Request>(&self, request: &R) -> Result<Sealed<R>, SessionError> {
-        Sealed::new(request, self.spec_hash).map_err(|why| self.too_large::<R>(why))
+        self.seal_with(request, ZBytes::new())
     }
 
     /// A request with a payload, which is not copied.
@@ -136,11 +131,7 @@ impl RunClient {
         payload: ZBytes,
     ) -> Result<Sealed<R>, SessionError> {
         let sealed = Sealed::with_payload(request, payload, self.spec_hash);
-        sealed.map_err(|why| self.too_large::<R>(why))
-    }
-
-    fn too_large<R: Request>(&self, why: CodecError) -> SessionError {
-        SessionError::Failed(format!("{}: {why}", self.keys.of::<R>()))
+        sealed.map_err(|why| SessionError::Failed(format!("{}: {why}", self.keys.of::<R>())))
     }
 
     /// Sends a request; requests of one priority arrive in the order in which they were sent.

@@ -10,9 +10,9 @@ use zenoh::{Session, Wait};
 
 pub use self::{
     error::SessionError,
-    questions::{PendingBytes, answer, ask, send},
+    questions::{answer, ask},
 };
-pub(crate) use questions::put_off;
+pub(crate) use questions::{PendingBytes, put_off, send};
 
 use crate::{
     process::shutdown::Shutdown,

@@ -18,7 +18,7 @@ const TIMED_OUT: &str = "Timeout";
 
 /// The bytes of a reply that is to come.
 #[derive(Debug)]
-pub struct PendingBytes {
+pub(crate) struct PendingBytes {
     key: String,
     timeout: Duration,
     replies: FifoChannelHandler<Reply>,
@@ -30,7 +30,7 @@ pub struct PendingBytes {
 ///
 /// # Errors
 /// zenoh refused. It may be tried again.
-pub fn send(
+pub(crate) fn send(
     session: &Session,
     key: &str,
     payload: ZBytes,
@@ -57,14 +57,6 @@ pub fn send(
 }
 
 impl PendingBytes {
-    /// Waits for the one answer.
-    ///
-    /// # Errors
-    /// No process answers (at once), no answer in time, or the answerer's error. All may be tried again.
-    pub fn wait(mut self) -> Result<ZBytes, SessionError> {
-        self.wait_for(|bytes| Ok(bytes.clone()))
-    }
-
     /// Waits for the one answer that `read` takes. Without certificates foreign processes may answer, too.
     pub(crate) fn wait_for<T>(
         &mut self,
@@ -132,7 +124,7 @@ impl PendingBytes {
     }
 }
 
-/// Asks one question and waits for its one answer: [`send`] and [`PendingBytes::wait`].
+/// Asks one question and waits for its one answer, whatever it says.
 pub fn ask(
     session: &Session,
     key: &str,
@@ -140,7 +132,7 @@ pub fn ask(
     priority: Priority,
     timeout: Duration,
 ) -> Result<ZBytes, SessionError> {
-    send(session, key, payload, priority, timeout)?.wait()
+    send(session, key, payload, priority, timeout)?.wait_for(|bytes| Ok(bytes.clone()))
 }
 
 /// Answers a question with `payload`; an asker that has gone away is logged and forgotten.
