@@ -1,16 +1,13 @@
 //! A batch that left the replay with its frames still compressed, and their unpacking, for which nothing is locked.
 //! It draws nothing: which frames a row needs was decided before.
 
-use std::ops::Range;
+use std::{ops::Range, sync::Arc};
 
 use driml_protocol::{Batch, BatchStatesMut};
 use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
 use crate::storage::{
-    frame_store::{
-        Frames,
-        compressed::{BlockPart, CompressedFrames},
-    },
+    frame_store::{Block, Frames, Layout},
     ring::Ring,
 };
 
@@ -35,38 +32,28 @@ impl PackedBatch {
     }
 }
 
-/// Copies of the parts of blocks that a batch's frames need, row by row.
+/// The compressed frames that a batch needs, row by row.
 pub(crate) struct PackedFrames {
-    frame_bytes: usize,
-    rows: Vec<PackedRow>,
-    /// Indices in the ring, and places in the batch.
-    frames: Vec<(u64, usize)>,
-    parts: Vec<PackedPart>,
-    bytes: Vec<u8>,
+    layout: Layout,
+    frames: Vec<PackedFrame>,
+    /// How many of them the rows up to each are the first to need.
+    row_ends: Vec<usize>,
 }
 
-/// The frames that a row is the first to need, and the parts with all of them.
-struct PackedRow {
-    frames: Range<usize>,
-    parts: Range<usize>,
-}
-
-struct PackedPart {
-    transitions: Range<u64>,
-    place: Range<usize>,
-    /// The transition whose frame is its dictionary; none for a key. It is a part of the same row, further ahead.
-    key: Option<u64>,
+/// A frame, by its number in its block, and its place in the batch.
+struct PackedFrame {
+    place: usize,
+    block: Arc<Block>,
+    number: usize,
 }
 
 impl PackedFrames {
     /// No rows yet, of frames of this size.
     pub(crate) fn new(frame_bytes: usize) -> Self {
         Self {
-            frame_bytes,
-            rows: Vec::new(),
+            layout: Layout::new(frame_bytes),
             frames: Vec::new(),
-            parts: Vec::new(),
-            bytes: Vec::new(),
+            row_ends: Vec::new(),
         }
     }
 
@@ -84,103 +71,91 @@ impl PackedFrames {
                     places.frame(place).copy_from_slice(frames.frame(index));
                 }
             }
-            Frames::Compressed(frames) => self.take_row(frames, row),
-        }
-    }
-
-    /// Takes what the next row needs; a part that several of its frames share is taken once.
-    fn take_row(&mut self, frames: &CompressedFrames, row: impl Iterator<Item = (u64, usize)>) {
-        let (first_frame, first_part) = (self.frames.len(), self.parts.len());
-        for (index, place) in row {
-            self.frames.push((index, place));
-            if self.has(first_part, index) {
-                continue;
-            }
-            let (key, part) = frames.parts(index);
-            let key_index = key.transitions.start;
-            if !self.has(first_part, key_index) {
-                self.take(key, None);
-            }
-            if let Some(part) = part {
-                self.take(part, Some(key_index));
+            Frames::Compressed(frames) => {
+                self.frames.extend(row.map(|(index, place)| {
+                    let (block, number) = frames.block(index);
+                    PackedFrame {
+                        place,
+                        block: block.clone(),
+                        number,
+                    }
+                }));
+                self.row_ends.push(self.frames.len());
             }
         }
-        self.rows.push(PackedRow {
-            frames: first_frame..self.frames.len(),
-            parts: first_part..self.parts.len(),
-        });
     }
 
-    /// Whether the frame of `index` is among the parts from `first_part` on.
-    fn has(&self, first_part: usize, index: u64) -> bool {
-        let mut taken = self.parts[first_part..].iter();
-        taken.any(|part| part.transitions.contains(&index))
-    }
-
-    fn take(&mut self, part: BlockPart<'_>, key: Option<u64>) {
-        let start = self.bytes.len();
-        self.bytes.extend_from_slice(part.bytes);
-        self.parts.push(PackedPart {
-            transitions: part.transitions,
-            place: start..self.bytes.len(),
-            key,
-        });
-    }
-
-    /// Unpacks every row's parts and writes its frames.
+    /// Unpacks every row's frames and writes them.
     fn write(&self, batch: &mut Batch) {
         let mut places = batch.states_mut();
-        let mut unpacked = Vec::new();
-        for row in &self.rows {
-            let parts = &self.parts[row.parts.clone()];
-            self.unpack(parts, &mut unpacked);
-            for &(index, place) in &self.frames[row.frames.clone()] {
-                let frame = self.frame(parts, &unpacked, index);
-                places.frame(place).copy_from_slice(frame);
+        let (layout, mut start) = (self.layout, 0);
+        let mut unpacked = Unpacked {
+            layout,
+            parts: Vec::new(),
+            bytes: Vec::new(),
+        };
+        for &end in &self.row_ends {
+            unpacked.parts.clear();
+            for frame in &self.frames[start..end] {
+                let part = layout.part_of(frame.number);
+                let first = layout.frames_of(part, frame.block.frames).start;
+                let at = unpacked.part(&frame.block, part);
+                let at = at + (frame.number - first) * layout.frame_bytes;
+                let bytes = &unpacked.bytes[at..at + layout.frame_bytes];
+                places.frame(frame.place).copy_from_slice(bytes);
             }
+            start = end;
         }
     }
+}
 
-    /// Unpacks parts into `out`, one after the other.
-    fn unpack(&self, parts: &[PackedPart], out: &mut Vec<u8>) {
-        let length = parts.iter().map(|part| self.length(part)).sum();
-        if out.len() < length {
-            out.resize(length, 0);
+/// Parts of blocks, unpacked one after the other.
+struct Unpacked<'a> {
+    layout: Layout,
+    parts: Vec<Part<'a>>,
+    /// Longer than the parts are, where there were others before.
+    bytes: Vec<u8>,
+}
+
+struct Part<'a> {
+    block: &'a Block,
+    number: usize,
+    /// Where it lies among the bytes.
+    place: Range<usize>,
+}
+
+impl<'a> Unpacked<'a> {
+    /// Where a part of a block begins; it is unpacked if it was not before.
+    fn part(&mut self, block: &'a Block, number: usize) -> usize {
+        let is_it = |it: &&Part<'_>| std::ptr::eq(it.block, block) && it.number == number;
+        if let Some(known) = self.parts.iter().find(is_it) {
+            return known.place.start;
         }
-        let mut done = 0;
-        for part in parts {
-            let stored = &self.bytes[part.place.clone()];
-            let (before, rest) = out.split_at_mut(done);
-            let to = &mut rest[..self.length(part)];
-            done += to.len();
-            if stored.len() == to.len() {
-                to.copy_from_slice(stored);
-                continue;
-            }
-            let length = match part.key {
+        let frame_bytes = self.layout.frame_bytes;
+        let key = (number > 0).then(|| self.part(block, 0));
+        let start = self.parts.last().map_or(0, |it| it.place.end);
+        let length = self.layout.frames_of(number, block.frames).len() * frame_bytes;
+        let place = start..start + length;
+        if self.bytes.len() < place.end {
+            self.bytes.resize(place.end, 0);
+        }
+        let (before, rest) = self.bytes.split_at_mut(start);
+        let (stored, to) = (block.part(number), &mut rest[..length]);
+        if stored.len() == length {
+            to.copy_from_slice(stored);
+        } else {
+            let unpacked = match key {
                 None => decompress_into(stored, to),
-                Some(key) => decompress_into_with_dict(stored, to, self.frame(parts, before, key)),
+                Some(key) => decompress_into_with_dict(stored, to, &before[key..][..frame_bytes]),
             };
-            let length = length.expect("we packed this part");
-            assert_eq!(length, to.len(), "a part has all its frames");
+            let unpacked = unpacked.expect("we packed this part");
+            assert_eq!(unpacked, length, "a part has all its frames");
         }
-    }
-
-    /// The frame of `index` among unpacked parts.
-    fn frame<'a>(&self, parts: &[PackedPart], unpacked: &'a [u8], index: u64) -> &'a [u8] {
-        let mut start = 0;
-        for part in parts {
-            if part.transitions.contains(&index) {
-                start += (index - part.transitions.start) as usize * self.frame_bytes;
-                return &unpacked[start..start + self.frame_bytes];
-            }
-            start += self.length(part);
-        }
-        unreachable!("the part with frame {index} was taken with its row")
-    }
-
-    /// Bytes of a part's frames.
-    fn length(&self, part: &PackedPart) -> usize {
-        (part.transitions.end - part.transitions.start) as usize * self.frame_bytes
+        self.parts.push(Part {
+            block,
+            number,
+            place,
+        });
+        start
     }
 }

@@ -1,9 +1,9 @@
 //! Frames as compressed blocks, the oldest first, which go in the order in which they came.
 //! It packs and unpacks nothing: that is done without the replay locked.
 
-use std::{collections::VecDeque, ops::Range, sync::Arc};
+use std::{collections::VecDeque, sync::Arc};
 
-use super::{layout::Layout, pack::Block};
+use super::pack::Block;
 
 /// A block, and the transition of its first frame.
 struct Held {
@@ -18,18 +18,11 @@ impl Held {
     }
 }
 
-/// Frames that are unpacked together, and what they are packed to.
-pub(crate) struct BlockPart<'a> {
-    pub(crate) transitions: Range<u64>,
-    pub(crate) bytes: &'a [u8],
-}
-
 /// The frames of the newest transitions.
 ///
 /// Memory: the blocks held, of which the oldest may be overwritten in part, and at most 96 bytes for each.
 /// A block that would not become smaller is kept as it came, so noise takes no more than plain frames and that.
 pub(crate) struct CompressedFrames {
-    layout: Layout,
     bytes_max: u64,
     /// Of all blocks.
     bytes: u64,
@@ -38,9 +31,8 @@ pub(crate) struct CompressedFrames {
 
 impl CompressedFrames {
     /// Nothing yet, and never more than `bytes_max` bytes, beside the 96 a block.
-    pub(crate) fn new(frame_bytes: usize, bytes_max: Option<u64>) -> Self {
+    pub(crate) fn new(bytes_max: Option<u64>) -> Self {
         Self {
-            layout: Layout::new(frame_bytes),
             bytes_max: bytes_max.unwrap_or(u64::MAX),
             bytes: 0,
             blocks: VecDeque::new(),
@@ -77,23 +69,11 @@ impl CompressedFrames {
         }
     }
 
-    /// The key of the block that holds `index`, and the part with its frame, unless that is the key.
-    pub(crate) fn parts(&self, index: u64) -> (BlockPart<'_>, Option<BlockPart<'_>>) {
+    /// The block that holds the frame of `index`, and which of its frames that is.
+    pub(crate) fn block(&self, index: u64) -> (&Arc<Block>, usize) {
         let after = self.blocks.partition_point(|it| it.first <= index);
         let held = &self.blocks[after - 1];
-        let part = self.layout.part_of((index - held.first) as usize);
-        (
-            self.part(held, 0),
-            (part > 0).then(|| self.part(held, part)),
-        )
-    }
-
-    fn part<'a>(&self, held: &'a Held, part: usize) -> BlockPart<'a> {
-        let frames = self.layout.frames_of(part, held.block.frames);
-        BlockPart {
-            transitions: held.first + frames.start as u64..held.first + frames.end as u64,
-            bytes: held.block.part(part),
-        }
+        (&held.block, (index - held.first) as usize)
     }
 
     pub(crate) fn bytes_held(&self) -> u64 {
@@ -109,21 +89,11 @@ impl CompressedFrames {
         let mut bytes = 0;
         for held in &self.blocks {
             assert_eq!(held.first, next, "no gaps");
-            for part in 0..self.layout.parts(held.block.frames) {
-                let part = self.part(held, part);
-                assert_eq!(part.transitions.start, next, "no gaps");
-                let frames_bytes = (part.transitions.end - next) * self.layout.frame_bytes as u64;
-                let part_bytes = part.bytes.len() as u64;
-                assert!(
-                    part_bytes <= frames_bytes,
-                    "no part is larger than its frames"
-                );
-                next = part.transitions.end;
-                bytes += part_bytes;
-            }
+            next = held.end();
+            bytes += held.block.bytes.len() as u64;
         }
         assert_eq!(next, inserted, "every transition has a frame");
-        assert_eq!(bytes, self.bytes, "every byte of a block lies in a part");
+        assert_eq!(bytes, self.bytes, "of all blocks");
         if let Some(held) = self.blocks.front() {
             let holds_oldest = (held.first..held.end()).contains(&oldest);
             assert!(holds_oldest, "what is overwritten is gone");

@@ -1,13 +1,14 @@
 //! How the frames of the transitions held are kept: plain, or compressed without loss.
 //! It knows neither links, episodes nor stacks, and it never stores a frame twice.
 
-pub(crate) mod compressed;
+mod compressed;
 mod layout;
 mod pack;
 
 use crate::config::Compression;
 use compressed::CompressedFrames;
-pub(crate) use pack::Run;
+pub(crate) use layout::Layout;
+pub(crate) use pack::{Block, Run};
 pub use pack::{PackedChunk, Packer};
 
 /// The frames of all transitions held.
@@ -27,10 +28,7 @@ impl Frames {
     ) -> Result<Self, u64> {
         match compression {
             Compression::None => PlainFrames::new(capacity, frame_bytes).map(Self::Plain),
-            Compression::Lz4 => Ok(Self::Compressed(CompressedFrames::new(
-                frame_bytes,
-                bytes_max,
-            ))),
+            Compression::Lz4 => Ok(Self::Compressed(CompressedFrames::new(bytes_max))),
         }
     }
 
