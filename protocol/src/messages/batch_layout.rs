@@ -206,27 +206,5 @@ mod tests {
             }
             assert_eq!(header.bytes(), Some(end));
         }
-        let small = BatchHeader {
-            rows: 2,
-            positives: 2,
-            state_bytes: 1,
-            states_k: 4,
-            states_n: 2,
-            ..BatchHeader::default()
-        };
-        assert_eq!(small.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2)));
-        let prioritised = BatchHeader {
-            origin: Some(Origin::default()),
-            ..small
-        };
-        assert_eq!(prioritised.bytes(), Some(2 * (3 + 1 + 10 + 2 * 2 + 12)));
-        let stacks = BatchHeader {
-            state_bytes: 8,
-            stacked: Some(FRAMES),
-            ..small
-        };
-        // Five frames of two bytes, and four numbers of four for each of eight states.
-        let of_states = 5 * 2 + 8 * 16;
-        assert_eq!(stacks.bytes(), Some(of_states + 2 * (10 + 2 * 2)));
     }
 }
