@@ -241,7 +241,7 @@ impl<M: Message> PendingReply<M> {
     /// Waits for the reply and copies its payload into own memory of `pool`.
     pub fn receive(mut self, pool: &BufferPool) -> Result<(M, Buffer), SessionError> {
         self.bytes.wait_for(|bytes| {
-            codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))
+            codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))
         })
     }
 }

@@ -62,7 +62,7 @@ impl<R: Request> Incoming<R> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
         let (request, payload) =
-            codec::receive(bytes.slices(), bytes.len(), pool, Some(self.spec_hash))?;
+            codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
         self.check_actor(&request)?;
         Ok((request, payload))
     }

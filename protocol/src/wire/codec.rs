@@ -3,6 +3,8 @@
 //!
 //! The prefix's fields are in `prefix`.
 
+use std::io::Read;
+
 use serde::{Serialize, de::DeserializeOwned};
 
 use super::{
@@ -110,62 +112,37 @@ pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[
     Ok((message, payload))
 }
 
-/// Checks a message that came in `pieces`, `len` bytes in all, and copies its payload into own memory of `pool`.
+/// Checks a message of `len` bytes and copies its payload into own memory of `pool`.
 ///
 /// The checksum is the copy's, so what was checked cannot change afterwards, even if it came through shared memory.
-pub fn receive<'a, M: Message>(
-    pieces: impl IntoIterator<Item = &'a [u8]>,
+pub fn receive<M: Message>(
+    mut bytes: impl Read,
     len: usize,
     pool: &BufferPool,
     spec_hash: Option<u64>,
 ) -> Result<(M, Buffer), CodecError> {
-    let mut pieces = Pieces {
-        current: &[],
-        rest: pieces.into_iter(),
-    };
-    let mut bytes = [0; PREFIX_BYTES];
-    pieces.copy_to(&mut bytes, None);
-    let prefix = Prefix::read((len >= PREFIX_BYTES).then_some(&bytes), len)?;
+    let mut prefix = [0; PREFIX_BYTES];
+    let is_there = bytes.read_exact(&mut prefix).is_ok();
+    let prefix = Prefix::read(is_there.then_some(&prefix), len)?;
     let mut sum = prefix.checksum_begun();
     let mut header = vec![0; prefix.header_len()];
-    pieces.copy_to(&mut header, Some(&mut sum));
+    copy(&mut bytes, &mut header, &mut sum);
     let mut payload = pool.take_own(prefix.payload_len());
-    pieces.copy_to(&mut payload, Some(&mut sum));
+    copy(&mut bytes, &mut payload, &mut sum);
     prefix.check(sum, M::KIND, spec_hash)?;
     let message: M = decode_within::<_, HEADER_BYTES_MAX>(&header)?;
     message.validate(&payload)?;
     Ok((message, payload))
 }
 
-/// Bytes that lie in several places.
-struct Pieces<'a, I> {
-    current: &'a [u8],
-    rest: I,
-}
-
-impl<'a, I: Iterator<Item = &'a [u8]>> Pieces<'a, I> {
-    /// Copies the next bytes into `out`, a block at a time, so that the sum finds each block of the copy in the cache.
-    /// Where the pieces end early, the rest of `out` keeps its content: the checksum will not fit.
-    fn copy_to(&mut self, out: &mut [u8], mut sum: Option<&mut crc32fast::Hasher>) {
-        let mut filled = 0;
-        while filled < out.len() {
-            if self.current.is_empty() {
-                match self.rest.next() {
-                    Some(next) => self.current = next,
-                    None => return,
-                }
-                continue;
-            }
-            let count = self.current.len().min(out.len() - filled).min(BLOCK_BYTES);
-            let (now, later) = self.current.split_at(count);
-            let copy = &mut out[filled..filled + count];
-            copy.copy_from_slice(now);
-            if let Some(sum) = &mut sum {
-                sum.update(copy);
-            }
-            self.current = later;
-            filled += count;
+/// Copies the next bytes into `out`, a block at a time, so that the sum finds each block of the copy in the cache.
+/// Where they end early, the sum will not fit.
+fn copy(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
+    for block in out.chunks_mut(BLOCK_BYTES) {
+        if bytes.read_exact(block).is_err() {
+            return;
         }
+        sum.update(block);
     }
 }
 

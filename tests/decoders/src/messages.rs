@@ -1,6 +1,6 @@
 //! Messages: as they come, and with a prefix that fits, so that what is behind the checksum is reached.
 
-use std::fmt::Debug;
+use std::{fmt::Debug, io::Read as _};
 
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, Batch, BatchReply, BatchRequest, BufferPool, Chunk,
@@ -21,7 +21,7 @@ fn read<M: Message + Debug>(bytes: &[u8]) {
     let whole = codec::decode::<M>(bytes, Some(SPEC));
     let (first, second) = bytes.split_at(bytes.len() / 3);
     let pool = BufferPool::new(0);
-    let pieces = codec::receive::<M>([first, &[], second], bytes.len(), &pool, None);
+    let pieces = codec::receive::<M>(first.chain(second), bytes.len(), &pool, None);
     match (whole, pieces) {
         (Ok((message, payload)), Ok((same, copy))) => {
             assert_eq!(payload, &copy[..]);
