@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 
 pub(crate) const SHARDS_MAX: u32 = 256;
 
-/// Smallest segment of a replay that is kept on disk.
 pub(crate) const SEGMENT_BYTES_MIN: u64 = 1 << 20;
 
 /// How frames are kept in memory. Batches are the same, bit for bit, whatever it is.

@@ -38,7 +38,6 @@ impl StackedFrames {
             && (self.frames as usize).div_ceil(stack) <= states
     }
 
-    /// Bytes of one frame, where states of so many bytes fit.
     pub(super) const fn frame_bytes(&self, state_bytes: usize) -> usize {
         state_bytes / self.frame_stack as usize
     }

@@ -163,7 +163,6 @@ pub enum BatchReply {
 }
 
 impl BatchReply {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
             Self::Batch(header) => header.check_payload(payload),

@@ -53,7 +53,6 @@ impl Column {
         Self::Probability,
     ];
 
-    /// Whether it has a value for each positive of a row.
     const fn is_per_positive(self) -> bool {
         matches!(self, Self::StatesK | Self::PositiveValid | Self::K)
     }
@@ -117,7 +116,6 @@ impl BatchHeader {
         chances.iter().map(|&chance| f32::from_le_bytes(chance))
     }
 
-    /// The columns of states.
     pub(super) fn of_states<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
         &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
     }
@@ -137,7 +135,6 @@ impl BatchHeader {
         }
     }
 
-    /// Values that a row has in a column.
     pub(super) const fn values_a_row(&self, column: Column) -> usize {
         if column.is_per_positive() {
             self.positives as usize

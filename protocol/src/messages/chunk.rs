@@ -67,7 +67,6 @@ pub struct ChunkHeader {
 }
 
 impl ChunkHeader {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
             return Ok(());

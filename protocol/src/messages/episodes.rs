@@ -56,7 +56,6 @@ impl EpisodesReply {
         self.before.saturating_add(self.episodes.len() as u64)
     }
 
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.up_to() > self.ended || self.episodes.len() > EPISODES_MAX {
             return Err(CodecError::Header(format!(

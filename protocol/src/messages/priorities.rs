@@ -42,7 +42,6 @@ impl PriorityUpdate {
         self.parts.iter().map(|part| part.transitions.len()).sum()
     }
 
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         no_payload(payload)?;
         for part in &self.parts {

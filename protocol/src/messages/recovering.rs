@@ -57,7 +57,6 @@ impl fmt::Display for Recovering {
 }
 
 impl Recovering {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         let since_s = self.progress.since_s;
         if !since_s.is_finite() || since_s < 0.0 {

@@ -81,7 +81,6 @@ impl Report {
     }
 }
 
-/// The beginning of `text`, at most `bytes_max` of it.
 fn cut(text: &str, bytes_max: usize) -> String {
     let mut end = text.len().min(bytes_max);
     while !text.is_char_boundary(end) {
@@ -91,7 +90,6 @@ fn cut(text: &str, bytes_max: usize) -> String {
 }
 
 impl Report {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         let warning = self.last_warning.as_ref();
         let too_long = self.doing.len() > DOING_MAX
@@ -110,7 +108,6 @@ impl Report {
         no_payload(payload)
     }
 
-    /// The actor whose report it is.
     pub(super) fn actor(&self) -> Option<u32> {
         match self.who {
             Participant::Actor { actor, .. } => Some(actor),

@@ -48,7 +48,6 @@ pub struct WeightsUpload {
 }
 
 impl WeightsUpload {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         self.weights.check(payload)
     }
@@ -87,7 +86,6 @@ pub enum WeightsReply {
 }
 
 impl WeightsReply {
-    /// Checks a received one with its payload.
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         match self {
             // Which piece is due is for [`Assembly`] to know.

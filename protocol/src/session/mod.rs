@@ -37,7 +37,6 @@ const NOTHING_LISTENS: &str = "Unable to connect to any of";
 /// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
 /// be small enough for this: 3 MB need 3 Mbit/s.
 const STALLED_MAX: Duration = Duration::from_secs(8);
-/// How long a client tries to connect.
 const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// How long a first try may take to find that those who listen understand; then it is looked who they are.
 const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);

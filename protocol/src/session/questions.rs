@@ -16,7 +16,6 @@ use crate::wire::{codec, error::CodecError};
 /// What zenoh replies where a process does not.
 const TIMED_OUT: &str = "Timeout";
 
-/// The bytes of a reply that is to come.
 #[derive(Debug)]
 pub(crate) struct PendingBytes {
     key: String,

@@ -301,7 +301,6 @@ fn check_signed(
     verified.map(drop).map_err(describe)
 }
 
-/// The names and addresses that a certificate is for.
 fn hosts_of(certificate: &X509Certificate<'_>) -> Vec<String> {
     let Ok(Some(names)) = certificate.subject_alternative_name() else {
         return Vec::new();

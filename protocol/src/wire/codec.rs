@@ -27,10 +27,8 @@ pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 /// Bytes that are copied, then summed while they are in the nearest cache.
 const BLOCK_BYTES: usize = 1 << 14;
 
-/// Longest value of [`encode_value`], bytes.
 const VALUE_BYTES_MAX: usize = 1 << 28;
 
-/// The bincode bytes of `value`, no more than `max`.
 fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecError> {
     let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
         .map_err(|e| CodecError::Header(e.to_string()))?;

@@ -39,7 +39,6 @@ pub enum CodecError {
 }
 
 impl CodecError {
-    /// Refuses more than `max` bytes.
     pub(crate) const fn check_size(have: usize, max: usize) -> Result<(), Self> {
         match have > max {
             true => Err(Self::TooLarge { have, max }),

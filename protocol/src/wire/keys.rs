@@ -69,7 +69,6 @@ impl Keys {
         self.lives(process, format_args!("{mark:016x}"))
     }
 
-    /// The keys of the liveliness tokens of all lives of a process.
     pub(crate) fn all_lives(&self, process: ProcessName) -> String {
         self.lives(process, '*')
     }

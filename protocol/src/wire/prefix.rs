@@ -18,9 +18,7 @@ pub(super) struct Prefix {
     pub(super) kind: u16,
     /// The hash of the run's spec, so that runs are not mixed.
     pub(super) spec_hash: u64,
-    /// Length of the header, which follows the prefix.
     pub(super) header_bytes: u32,
-    /// Length of the payload, which follows the header.
     pub(super) payload_bytes: u64,
     /// CRC-32 of the prefix before it, the header and the payload. It stays the last field.
     pub(super) checksum: u32,

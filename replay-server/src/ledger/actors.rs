@@ -24,7 +24,6 @@ pub(crate) struct Stream {
     pub(crate) episode: Option<Played>,
 }
 
-/// What is counted of one life of an actor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Count {
     incarnation: u64,
@@ -53,7 +52,6 @@ impl Actor {
     }
 }
 
-/// What is to be done with a chunk.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
     /// The next of its actor: store it.
@@ -82,7 +80,6 @@ impl Difference {
     }
 }
 
-/// All actors that ever joined.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Actors {
     actors: BTreeMap<u32, Actor>,

@@ -67,7 +67,6 @@ pub(super) struct LogId {
     /// A random number, drawn when the log was begun.
     pub(super) identity: u64,
     pub(super) spec_hash: u64,
-    /// Which of the replay's shards it is, and how many there are.
     pub(super) shard: (u32, u32),
 }
 
@@ -104,7 +103,6 @@ impl LogFolder {
         self.path.join(format!("segment-{number:012}.log"))
     }
 
-    /// The numbers of all segments in the folder, in order.
     pub(super) fn segments(&self) -> Result<Vec<u64>, PersistError> {
         let number = |entry: io::Result<fs::DirEntry>| {
             let name = entry?.file_name();
@@ -126,7 +124,6 @@ impl LogFolder {
         fs::read(&path).map_err(io_error("reading", &path))
     }
 
-    /// Ends a segment's file at byte `at`.
     pub(super) fn cut_off(&self, number: u64, at: usize) -> Result<(), PersistError> {
         let path = self.segment(number);
         let opened = File::options().write(true).open(&path);
@@ -140,7 +137,6 @@ impl LogFolder {
         fs::remove_file(&path).map_err(io_error("removing", &path))
     }
 
-    /// Which log is in the folder; none if it is a new one.
     pub(super) fn read_id(&self) -> Result<Option<LogId>, PersistError> {
         let path = self.path.join(ID);
         let text = match fs::read_to_string(&path) {
@@ -153,7 +149,6 @@ impl LogFolder {
         })
     }
 
-    /// Says which log is in the folder.
     pub(super) fn write_id(&self, id: &LogId) -> Result<(), PersistError> {
         let path = self.path.join(ID);
         let text = toml::to_string(id).expect("a struct of numbers is TOML");

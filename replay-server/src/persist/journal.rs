@@ -32,7 +32,6 @@ const MARKS: usize = 2;
 #[derive(Debug)]
 pub(super) struct Segment {
     pub(super) number: u64,
-    /// The first transition that it may hold.
     pub(super) first_row: u64,
     pub(super) bytes: u64,
     /// Those of the state that it begins with; 0 where they do not matter any more.
@@ -55,7 +54,6 @@ pub(super) struct Place {
 pub(super) struct Limits {
     /// From this size on, a segment is followed by another.
     pub(super) segment_bytes: u64,
-    /// Most that all segments take.
     pub(super) disk_bytes_max: Option<u64>,
     /// How often it is flushed; zero after each write.
     pub(super) fsync: Duration,
@@ -123,7 +121,6 @@ impl Journal {
         })
     }
 
-    /// Hash of the spec of the run whose chunks it holds.
     pub(crate) const fn spec_hash(&self) -> u64 {
         self.id.spec_hash
     }

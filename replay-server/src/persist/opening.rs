@@ -134,7 +134,6 @@ fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Limits {
     }
 }
 
-/// The folder of shard `shard` of `shards` in a run's `--replay-dir`.
 pub(crate) fn shard_dir(dir: &Path, shard: u32, shards: u32) -> PathBuf {
     match shards {
         1 => dir.to_owned(),

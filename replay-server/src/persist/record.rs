@@ -85,7 +85,6 @@ fn checksum(head: &[u8], checked: &[u8]) -> u32 {
     sum.finalize()
 }
 
-/// The u32 at byte `at` of a head.
 fn number(head: &[u8; HEAD_BYTES], at: usize) -> u32 {
     u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]])
 }

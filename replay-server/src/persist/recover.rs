@@ -68,7 +68,6 @@ pub struct Recovery {
     pub warnings: Vec<String>,
 }
 
-/// Removes what the log in `folder` says after `mark`.
 pub(super) fn go_back(folder: &LogFolder, mark: Mark) -> Result<(), PersistError> {
     let no_mark = || PersistError::NoMark(folder.segment(mark.0));
     let numbers = folder.segments()?;
@@ -266,7 +265,6 @@ impl Reader<'_> {
         }
     }
 
-    /// Notes that a segment cannot be used.
     fn set_aside(&mut self, path: PathBuf, why: &str) {
         self.warn(format!("{} cannot be used, {why}", file_name(&path)));
         self.aside.push(path);

@@ -50,7 +50,6 @@ pub(crate) struct State {
 }
 
 impl State {
-    /// The start of a run in shard `shard`.
     pub(crate) fn new(spec: &RunSpec, shard: u32) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
         rng.set_stream(RNG_STREAM + u64::from(shard));
@@ -81,7 +80,6 @@ impl State {
 pub(crate) struct Snapshot {
     /// Transitions stored since the start: the number of the next one.
     pub(crate) inserted: u64,
-    /// The oldest that is held.
     pub(crate) oldest: u64,
     pub(crate) capacity: u64,
     pub(crate) counts: Counts,

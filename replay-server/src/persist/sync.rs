@@ -15,7 +15,6 @@ use driml_protocol::{LogLimiter, Shutdown, fail_point};
 /// Segments that wait to be flushed; with one more they are flushed before anything else is written.
 const WAITING_MAX: usize = 32;
 
-/// What was written and is not flushed yet.
 struct Unflushed {
     segments: BTreeMap<u64, Arc<File>>,
     /// The folder, if a segment was made in it.
@@ -98,7 +97,6 @@ impl Syncer {
         })
     }
 
-    /// Segment `number` was made just now.
     pub(super) fn opened(&self, number: u64, file: Arc<File>) {
         let mut unflushed = self.shared.unflushed();
         unflushed.segments.insert(number, file);

@@ -24,7 +24,6 @@ pub(crate) struct RowStates {
 }
 
 impl RowStates {
-    /// The transition of s_t.
     pub(crate) const fn anchor(&self) -> u64 {
         self.t
     }
@@ -64,7 +63,6 @@ impl Assembler {
         }
     }
 
-    /// The row of the window's anchor.
     pub(crate) fn row(
         &mut self,
         affinity: &Affinity,

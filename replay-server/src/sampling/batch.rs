@@ -120,7 +120,6 @@ impl BatchSampler {
 /// A frame is known by where the ring holds it: two that look the same are two.
 #[derive(Default)]
 struct NeededFrames {
-    /// Indices in the ring.
     indices: Vec<u64>,
     /// How many are needed by the rows up to each.
     row_ends: Vec<usize>,

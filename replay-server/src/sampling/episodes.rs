@@ -88,7 +88,6 @@ impl Episodes {
         true
     }
 
-    /// Frames of one state.
     pub(crate) const fn frame_stack(&self) -> usize {
         self.frame_stack
     }

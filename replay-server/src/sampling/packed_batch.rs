@@ -85,7 +85,6 @@ impl PackedFrames {
         }
     }
 
-    /// Unpacks every row's frames and writes them.
     fn write(&self, batch: &mut Batch) {
         let mut places = batch.states_mut();
         let (layout, mut start) = (self.layout, 0);
@@ -120,7 +119,6 @@ struct Unpacked<'a> {
 struct Part<'a> {
     block: &'a Block,
     number: usize,
-    /// Where it lies among the bytes.
     place: Range<usize>,
 }
 

@@ -99,7 +99,6 @@ impl Service {
 }
 
 impl State {
-    /// Stores a chunk, or parks it until it may be stored.
     fn take_chunk(&mut self, packed: PackedChunk<'static>, question: Question) -> Answers {
         let header = packed.chunk.header;
         let (version, arrived) = (header.weights_version, question.arrived);

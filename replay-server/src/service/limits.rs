@@ -33,12 +33,10 @@ pub(super) struct Limits {
     pub(super) priorities: usize,
     /// Whatever has no payload.
     pub(super) small: usize,
-    /// Rows of a batch.
     pub(super) batch_rows: u32,
 }
 
 impl Limits {
-    /// The limits of a run with these settings and weights of so many bytes.
     pub(super) fn of(
         settings: &Settings,
         spec: &RunSpec,

@@ -20,13 +20,11 @@ const HOLD_MAX: Duration = Duration::from_secs(1);
 /// The same for a part of a batch: this shard does not learn meanwhile what another one counts.
 const SHARD_HOLD_MAX: Duration = Duration::from_millis(50);
 
-/// A chunk that is stored as soon as the limiter lets it pass.
 pub(super) struct ParkedChunk<Q> {
     pub(super) chunk: PackedChunk<'static>,
     /// Where the answer goes; none between a `Wait` and the actor's poll.
     pub(super) question: Option<Q>,
     pub(super) arrived: Instant,
-    /// When the question came.
     pub(super) asked: Instant,
 }
 
@@ -87,14 +85,12 @@ impl<Q> ParkedChunks<Q> {
         Ok(())
     }
 
-    /// The parked chunk that `poll` is about.
     pub(super) fn polled(&mut self, poll: &ChunkPoll) -> Option<&mut ParkedChunk<Q>> {
         let of = |it: &ChunkHeader| (it.actor, it.incarnation, it.sequence);
         let polled = (poll.actor, poll.incarnation, poll.sequence);
         self.line.iter_mut().find(|it| of(it.header()) == polled)
     }
 
-    /// Takes an actor's chunk out of the line.
     pub(super) fn take(&mut self, actor: u32) -> Option<ParkedChunk<Q>> {
         self.line.remove(self.place(actor)?)
     }
@@ -122,7 +118,6 @@ impl<Q> ParkedChunks<Q> {
     }
 }
 
-/// A request that is served as soon as the limiter allows it.
 pub(super) struct ParkedRequest<Q> {
     pub(super) request: BatchRequest,
     pub(super) question: Q,

@@ -26,7 +26,6 @@ pub(super) struct Participants {
 
 /// One participant, over all its lives.
 struct Participant {
-    /// Its newest life.
     alive: Alive,
     lives: u32,
     /// When it was connected, or went.
@@ -47,7 +46,6 @@ impl Participants {
         }
     }
 
-    /// A process has joined. One that asks again has joined once.
     pub(super) fn joined(&mut self, who: Alive, now: Instant) {
         let earlier = self.processes.get(&who.process);
         if earlier.is_some_and(|account| account.alive == who) {
@@ -70,7 +68,6 @@ impl Participants {
         (account.alive == who).then_some(account)
     }
 
-    /// All actors, or the learner.
     fn all(&self, learner: bool) -> impl Iterator<Item = &Participant> {
         let processes = self.processes.iter();
         let processes =

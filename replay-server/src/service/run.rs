@@ -46,7 +46,6 @@ const HOLD_MAX: Duration = Duration::from_secs(2);
 /// Pieces of memory kept for later chunks and batches.
 const SPARE_MAX: usize = 8;
 
-/// How long the threads may take to end.
 const THREADS_END_MAX: Duration = Duration::from_secs(2);
 
 /// What a replay server is told at its start.

@@ -24,12 +24,10 @@ use crate::{persist::Reading, replay::Replay, storage::frame_store::Packer};
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);
 
-/// What all threads share.
 pub(super) struct Service {
     pub(super) limits: Limits,
     pub(super) shard: (u32, u32),
     pub(super) config_toml: String,
-    /// Whether chunks may come through shared memory.
     pub(super) shared_memory: bool,
     /// How long a question about a chunk is held before it is answered `Wait`: far below the actors' time-out, so that an actor
     /// can tell a server that makes it wait from an unresponsive one.
@@ -99,7 +97,6 @@ impl Service {
 }
 
 impl State {
-    /// Notes which side waits now.
     fn note_waiting(&mut self, now: Instant) {
         let waiting = self.replay.waiting();
         self.participants.note_waiting(waiting, now);
@@ -130,7 +127,6 @@ impl State {
 pub(super) struct Admission {
     /// Set once the replay is there.
     pub(super) service: OnceLock<Arc<Service>>,
-    /// How far the reading is.
     pub(super) reading: Reading,
     pub(super) config_toml: String,
 }

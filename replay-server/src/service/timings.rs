@@ -56,7 +56,6 @@ impl Default for Timings {
 }
 
 impl Timings {
-    /// A question about a chunk was answered after so long.
     pub(super) fn answered(&mut self, after: Duration) {
         add(&mut self.answers, after);
     }

@@ -11,7 +11,6 @@ use driml_protocol::{
     PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload, codec,
 };
 
-/// The file with the newest weights.
 const FILE: &str = "weights.message";
 
 /// Versions that are kept while actors pull them. When so many are being pulled, one that begins gets the newest of these: many

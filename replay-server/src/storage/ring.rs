@@ -67,7 +67,6 @@ pub(crate) struct Step {
 }
 
 impl Step {
-    /// A step without links.
     pub(crate) const fn new(action: u8, reward: f32, end: End, weights_version: u64) -> Self {
         Self {
             next: NO_NEXT,
@@ -133,12 +132,10 @@ impl Ring {
         self.frames.start_at(first);
     }
 
-    /// The first transition that was ever stored here.
     pub(crate) const fn first(&self) -> u64 {
         self.first
     }
 
-    /// Lets go of the transitions before `oldest`.
     pub(crate) fn forget_before(&mut self, oldest: u64) {
         self.oldest = self.oldest.max(oldest.min(self.inserted));
         self.frames.forget_before(self.oldest);
@@ -218,12 +215,10 @@ impl Ring {
         &self.steps[self.slot(index)]
     }
 
-    /// The frames of all transitions held.
     pub(crate) const fn frames(&self) -> &Frames {
         &self.frames
     }
 
-    /// What lies before `index` in its level.
     pub(crate) fn previous(&self, index: u64) -> Previous {
         match self.step(index).previous {
             LEVEL_START => Previous::Start,

@@ -30,7 +30,6 @@ pub(crate) trait RowSampler: Send {
     /// A run of consecutive transitions of one stream was stored, those from `first` on; `link` was the first one's.
     fn stored(&mut self, _ring: &Ring, _first: u64, _link: Link) {}
 
-    /// Transitions were let go.
     fn forget(&mut self, _ring: &Ring) {}
 
     /// Leaves the window of an anchor in `window`; false if there is none.
@@ -74,7 +73,6 @@ pub(crate) enum RowsState {
     Uniform { are_listed: bool },
     /// What cannot be told from the transitions held.
     Prioritised {
-        /// The highest priority seen.
         highest: f64,
         /// Of each transition held, the oldest first, its mass.
         masses: Vec<f64>,

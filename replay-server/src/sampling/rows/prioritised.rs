@@ -34,7 +34,6 @@ pub(crate) struct Priorities {
     episodes: Episodes,
     /// By slot, the index modulo the capacity, (priority + [`PRIORITY_MIN`])^alpha; 0 where no anchor is.
     masses: SumTree,
-    /// The highest priority seen.
     highest: f64,
     /// Transitions before this one have mass 0.
     oldest: u64,

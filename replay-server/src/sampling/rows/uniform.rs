@@ -19,7 +19,6 @@ pub(crate) struct Uniform {
     valid: Vec<u64>,
     /// Transitions the ring had stored when `valid` was listed; 0 before the first.
     listed_at: u64,
-    /// The oldest one that it held then.
     listed_from: u64,
 }
 

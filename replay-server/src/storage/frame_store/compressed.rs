@@ -5,14 +5,12 @@ use std::{collections::VecDeque, sync::Arc};
 
 use super::pack::Block;
 
-/// A block, and the transition of its first frame.
 struct Held {
     first: u64,
     block: Arc<Block>,
 }
 
 impl Held {
-    /// The transition after the last.
     fn end(&self) -> u64 {
         self.first + self.block.frames as u64
     }
@@ -61,7 +59,6 @@ impl CompressedFrames {
         oldest
     }
 
-    /// Lets go of the blocks that end before `oldest`.
     pub(crate) fn forget_before(&mut self, oldest: u64) {
         while let Some(held) = self.blocks.front().filter(|it| it.end() <= oldest) {
             self.bytes -= held.block.bytes.len() as u64;

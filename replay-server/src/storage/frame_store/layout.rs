@@ -17,7 +17,6 @@ const PARTS_MAX: usize = 5;
 /// Bytes up to the end of each part of a block, from its start; 0 for parts that it does not have.
 pub(crate) type PartEnds = [u32; 1 + PARTS_MAX];
 
-/// How blocks are cut into parts.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layout {
     pub(crate) frame_bytes: usize,

@@ -11,7 +11,6 @@ pub(crate) use layout::Layout;
 pub(crate) use pack::{Block, Run};
 pub use pack::{PackedChunk, Packer};
 
-/// The frames of all transitions held.
 pub(crate) enum Frames {
     Plain(PlainFrames),
     Compressed(CompressedFrames),
@@ -44,7 +43,6 @@ impl Frames {
         }
     }
 
-    /// Bytes of memory taken for frames.
     pub(crate) fn bytes_held(&self) -> u64 {
         match self {
             Self::Plain(frames) => frames.bytes.len() as u64,

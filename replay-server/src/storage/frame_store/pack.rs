@@ -67,7 +67,6 @@ impl PackedChunk<'_> {
         self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed.sum::<usize>()
     }
 
-    /// The frames of each stream.
     pub(crate) fn runs(&self) -> impl Iterator<Item = Run<'_>> {
         let plain = self.packed.is_empty();
         let plain = plain.then(|| runs(&self.chunk).map(Run::Plain));
@@ -119,7 +118,6 @@ impl Block {
         }
     }
 
-    /// The bytes of one part.
     pub(crate) fn part(&self, part: usize) -> &[u8] {
         let end = |part: usize| self.part_ends[part] as usize;
         &self.bytes[part.checked_sub(1).map_or(0, end)..end(part)]
