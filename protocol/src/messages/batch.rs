@@ -9,7 +9,6 @@ use super::{
     batch_layout::Column,
     batch_rows::{BatchStatesMut, RowScalars},
     priorities::{Origin, PriorityPart, PriorityUpdate},
-    shard_counts::ShardCounts,
 };
 use crate::wire::{buffers::Buffer, error::CodecError};
 
@@ -119,45 +118,28 @@ impl Batch {
 
     /// The header of [`Batch::merge`]; none if `parts` are none or differ in shape.
     pub fn merged_header(parts: &[Self]) -> Option<BatchHeader> {
-        let mut merged = parts.first()?.header;
-        let mut age_total = 0.0;
-        (merged.rows, merged.counts, merged.held) = (0, ShardCounts::default(), 0);
-        (merged.states_k, merged.states_n) = (0, 0);
-        let without_frames = |stacked: StackedFrames| StackedFrames {
-            frames: 0,
-            ..stacked
+        // What is the same in all parts.
+        let shape = |it: &BatchHeader| {
+            let frames = it.stacked.map(|it| StackedFrames { frames: 0, ..it });
+            (it.positives, it.state_bytes, it.origin.is_some(), frames)
         };
-        merged.stacked = merged.stacked.map(without_frames);
-        let frames_of = merged.stacked;
-        for BatchHeader {
-            rows,
-            positives,
-            state_bytes,
-            states_k,
-            states_n,
-            counts,
-            held,
-            mean_age,
-            weights_versions: (newest, oldest),
-            origin,
-            stacked,
-        } in parts.iter().map(|part| part.header)
-        {
-            if (positives, state_bytes) != (merged.positives, merged.state_bytes)
-                || origin.is_some() != merged.origin.is_some()
-                || stacked.map(without_frames) != frames_of
-            {
+        let (first, others) = parts.split_first()?;
+        let mut merged = first.header;
+        let mut age_total = merged.mean_age * f64::from(merged.rows);
+        for part in others.iter().map(|part| part.header) {
+            if shape(&part) != shape(&merged) {
                 return None;
             }
-            if let (Some(merged), Some(part)) = (&mut merged.stacked, stacked) {
+            if let (Some(merged), Some(part)) = (&mut merged.stacked, part.stacked) {
                 merged.frames += part.frames;
             }
-            merged.rows += rows;
-            merged.states_k += states_k;
-            merged.states_n += states_n;
-            merged.counts = merged.counts + counts;
-            merged.held += held;
-            age_total += mean_age * f64::from(rows);
+            merged.rows += part.rows;
+            merged.states_k += part.states_k;
+            merged.states_n += part.states_n;
+            merged.counts = merged.counts + part.counts;
+            merged.held += part.held;
+            age_total += part.mean_age * f64::from(part.rows);
+            let (newest, oldest) = part.weights_versions;
             let (a, b) = merged.weights_versions;
             merged.weights_versions = (a.max(newest), b.min(oldest));
         }

@@ -81,23 +81,8 @@ impl BatchHeader {
     /// Checks that `payload` is as long as such a batch's, has as many states as its rows say, and that these are made of its frames.
     pub(super) fn check_payload(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.bytes() != Some(payload.len()) || self.rows == 0 {
-            let of_frames = self.stacked.map_or_else(String::new, |stacked| {
-                let StackedFrames {
-                    frames,
-                    frame_stack,
-                    frame_channels,
-                } = stacked;
-                format!(
-                    ", made of {frames} frames of {frame_channels} channels, {frame_stack} each,"
-                )
-            });
             return Err(CodecError::Header(format!(
-                "{} rows with {} positives of {} bytes, {} and {} of them there{of_frames} do not fill {} bytes of payload",
-                self.rows,
-                self.positives,
-                self.state_bytes,
-                self.states_k,
-                self.states_n,
+                "the rows, states and frames of {self:?} do not fill {} bytes of payload",
                 payload.len()
             )));
         }
