@@ -85,53 +85,42 @@ impl Sampling {
 mod tests {
     use super::*;
 
-    fn rainbow(change: impl FnOnce(&mut [f64; 3])) -> Sampling {
-        let mut numbers = [0.5, 0.4, 1.0];
-        change(&mut numbers);
+    fn rule(numbers: [f64; 3], beta_updates: u64) -> Sampling {
         let [alpha, beta_start, beta_end] = numbers;
         Sampling::Prioritised {
             alpha,
             beta_start,
             beta_end,
-            beta_updates: 600,
+            beta_updates,
         }
     }
 
     #[test]
     fn beta_rises_in_a_straight_line_and_stays() {
-        let rule = rainbow(|_| ());
-        let near = |updates, beta: f64| assert!((rule.beta(updates) - beta).abs() < 1e-12);
-        near(0, 0.4);
-        near(300, 0.7);
-        near(600, 1.0);
-        near(u64::MAX, 1.0);
+        let rule = rule([0.5, 0.4, 1.0], 600);
+        for (updates, beta) in [(0, 0.4), (300, 0.7), (600, 1.0), (u64::MAX, 1.0)] {
+            assert!((rule.beta(updates) - beta).abs() < 1e-12);
+        }
         assert_eq!(Sampling::Uniform {}.beta(7), 0.0);
     }
 
     #[test]
     fn numbers_out_of_range_are_named() {
-        assert_eq!(rainbow(|_| ()).validate(), Ok(()));
+        assert_eq!(rule([0.5, 0.4, 1.0], 600).validate(), Ok(()));
         assert_eq!(Sampling::Uniform {}.validate(), Ok(()));
-        for (at, value, key) in [
-            (0, -0.1, "alpha"),
-            (0, f64::NAN, "alpha"),
-            (0, f64::INFINITY, "alpha"),
-            (1, 1.5, "beta_start"),
-            (2, 2.0, "beta_end"),
-            (2, 0.3, "beta_end"),
+        for (numbers, beta_updates, key) in [
+            ([-0.1, 0.4, 1.0], 600, "alpha"),
+            ([f64::NAN, 0.4, 1.0], 600, "alpha"),
+            ([f64::INFINITY, 0.4, 1.0], 600, "alpha"),
+            ([0.5, 1.5, 1.0], 600, "beta_start"),
+            ([0.5, 0.4, 2.0], 600, "beta_end"),
+            ([0.5, 0.4, 0.3], 600, "beta_end"),
+            ([0.5, 0.4, 1.0], 0, "beta_updates"),
         ] {
-            let said = rainbow(|numbers| numbers[at] = value).validate();
+            let said = rule(numbers, beta_updates).validate();
             let said = said.unwrap_err().to_string();
             let key = format!("replay.sampling.{key} = ");
             assert!(said.starts_with(&key), "{said}");
         }
-        let never = Sampling::Prioritised {
-            alpha: 0.5,
-            beta_start: 0.4,
-            beta_end: 1.0,
-            beta_updates: 0,
-        };
-        let said = never.validate().unwrap_err().to_string();
-        assert!(said.contains("beta_updates = 0 "), "{said}");
     }
 }
