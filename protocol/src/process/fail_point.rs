@@ -2,6 +2,8 @@
 //! `DRIML_TEST_HOLD=UPDATES FILE` a learner that has made so many updates waits for the file.
 //! They exist in debug builds only; a release build reads no such variables.
 
+use std::{env, path::Path, sync::OnceLock, thread::sleep, time::Duration};
+
 /// The variable that names the point at which to panic.
 pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 
@@ -12,16 +14,11 @@ pub const VARIABLE: &str = "DRIML_TEST_PANIC";
 #[inline]
 #[track_caller]
 pub fn reach(name: &str) {
-    #[cfg(debug_assertions)]
-    {
-        use std::sync::OnceLock;
-
-        static WANTED: OnceLock<Option<String>> = OnceLock::new();
-        let wanted = WANTED.get_or_init(|| std::env::var(VARIABLE).ok());
+    static WANTED: OnceLock<Option<String>> = OnceLock::new();
+    if cfg!(debug_assertions) {
+        let wanted = WANTED.get_or_init(|| env::var(VARIABLE).ok());
         assert!(wanted.as_deref() != Some(name), "{VARIABLE}={name}");
     }
-    #[cfg(not(debug_assertions))]
-    let _ = name;
 }
 
 /// The variable that says after how many updates to wait, and for which file.
@@ -32,22 +29,17 @@ pub const HOLD: &str = "DRIML_TEST_HOLD";
 /// A run that is held is not over before the test that watches it has seen and done what it has to, however slow the test is.
 #[inline]
 pub fn hold(updates: u64) {
-    #[cfg(debug_assertions)]
+    static WANTED: OnceLock<Option<(u64, String)>> = OnceLock::new();
+    let read = || {
+        let text = env::var(HOLD).ok()?;
+        let (count, file) = text.split_once(' ')?;
+        Some((count.parse().ok()?, file.to_owned()))
+    };
+    if cfg!(debug_assertions)
+        && let Some((count, file)) = WANTED.get_or_init(read)
     {
-        use std::{path::Path, sync::OnceLock, time::Duration};
-
-        static WANTED: OnceLock<Option<(u64, String)>> = OnceLock::new();
-        let read = || {
-            let text = std::env::var(HOLD).ok()?;
-            let (count, file) = text.split_once(' ')?;
-            Some((count.parse().ok()?, file.to_owned()))
-        };
-        if let Some((count, file)) = WANTED.get_or_init(read) {
-            while updates >= *count && !Path::new(file).exists() {
-                std::thread::sleep(Duration::from_millis(10));
-            }
+        while updates >= *count && !Path::new(file).exists() {
+            sleep(Duration::from_millis(10));
         }
     }
-    #[cfg(not(debug_assertions))]
-    let _ = updates;
 }
