@@ -26,13 +26,11 @@
 //!     horizon: Horizon::Fixed { k: 2 },
 //!     timeout: TimeoutRule::Terminal,
 //! };
-//! let config: Config = toml::from_str(
-//!     "capacity_transitions = 1000
-//!      shards = 1
-//!      replay_ratio = 8.0
-//!      warmup_transitions = 10
-//!      slack_transitions = 100",
-//! )?;
+//! let config = Config {
+//!     replay_ratio: 8.0,
+//!     warmup_transitions: 10,
+//!     ..Config::unlimited(1000)
+//! };
 //! let mut replay = Replay::new(&spec, &config, 4)?;
 //! replay.join_actor(ActorJoin { actor: 0, incarnation: 1 })?;
 //!
