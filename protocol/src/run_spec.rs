@@ -136,6 +136,7 @@ impl RunSpec {
 
     /// Checks every field's range.
     pub fn validate(&self) -> Result<(), ConfigError> {
+        let mut bytes = 1_u64;
         for (key, value, max) in [
             ("run.frame_height", self.frame_height, 4096),
             ("run.frame_width", self.frame_width, 4096),
@@ -144,21 +145,11 @@ impl RunSpec {
         ] {
             let why = "it must be at least 1 and of a sensible size";
             check((1..=max).contains(&value), key, value, || why)?;
+            bytes *= u64::from(value);
         }
-        let state = [
-            self.frame_height,
-            self.frame_width,
-            self.frame_channels,
-            self.frame_stack,
-        ];
-        let bytes: u64 = state.into_iter().map(u64::from).product();
+        let fits = u32::try_from(bytes).is_ok();
         let why = "with these sizes a state has 4 GiB or more";
-        check(
-            u32::try_from(bytes).is_ok(),
-            "run.frame_height",
-            self.frame_height,
-            || why,
-        )?;
+        check(fits, "run.frame_height", self.frame_height, || why)?;
         let fits = (1..=255).contains(&self.num_actions);
         let why = "a world has 1 to 255 actions";
         check(fits, "run.num_actions", self.num_actions, || why)?;

@@ -127,12 +127,8 @@ impl Config {
         let (ratio, capacity) = (self.replay_ratio, self.capacity_transitions);
         let (warmup, slack) = (self.warmup_transitions, self.slack_transitions);
         let is_ratio = ratio.is_finite() && ratio > 0.0;
-        check(
-            is_ratio,
-            "replay.replay_ratio",
-            ratio,
-            || "rows per transition must be a number above 0",
-        )?;
+        let why = "rows per transition must be a number above 0";
+        check(is_ratio, "replay.replay_ratio", ratio, || why)?;
         self.sampling.validate()?;
         let rows_max = rows_max(spec, &self.sampling);
         let fits = (1..=rows_max).contains(&batch_size);
@@ -152,20 +148,13 @@ impl Config {
         })?;
         let bytes = capacity.checked_mul(spec.frame_bytes() as u64);
         let fits = bytes.is_some_and(|bytes| bytes <= isize::MAX as u64);
-        check(
-            fits,
-            "replay.capacity_transitions",
-            capacity,
-            || "this many frames exceed any machine's address space; hold fewer",
-        )?;
+        let why = "this many frames exceed any machine's address space; hold fewer";
+        check(fits, "replay.capacity_transitions", capacity, || why)?;
         if let Some(max) = self.compressed_bytes_max {
             let key = "replay.compressed_bytes_max";
-            check(
-                self.compression != Compression::None,
-                key,
-                max,
-                || "nothing is compressed; use compression = \"lz4\", or capacity_transitions",
-            )?;
+            let fits = self.compression != Compression::None;
+            let why = "nothing is compressed; use compression = \"lz4\", or capacity_transitions";
+            check(fits, key, max, || why)?;
             let least = window * spec.frame_bytes() as u64 * u64::from(self.shards);
             check(max >= least, key, max, || {
                 format!(
