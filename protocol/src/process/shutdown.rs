@@ -83,13 +83,7 @@ impl Shutdown {
 
     /// A flag that is raised at the first reason to exit: a signal, a closed terminal or stderr, or the death of the process `parent`.
     pub fn on_signals(parent: Option<u32>) -> std::io::Result<Self> {
-        let shutdown = Self::default();
-        let raised = shutdown.clone();
-        termination::listen("signals", parent, move |_| {
-            raised.set();
-            ControlFlow::Break(())
-        })?;
-        Ok(shutdown)
+        GracefulShutdown::on_signals(parent).map(|steps| steps.ending)
     }
 }
 

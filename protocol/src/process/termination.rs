@@ -66,7 +66,7 @@ pub(super) fn listen(
                 () = received(&mut hangup) => EndSign::Abandoned,
                 // Said once: it stays so.
                 _ = look.tick(), if !abandoned => {
-                    abandoned = stderr_is_gone() || parent.is_some_and(|pid| parent_id() != pid);
+                    abandoned = is_gone(std::io::stderr()) || parent.is_some_and(|pid| parent_id() != pid);
                     if !abandoned {
                         continue;
                     }
@@ -107,12 +107,8 @@ fn ignored_signals(status: &str) -> u64 {
         .unwrap_or_default()
 }
 
-/// Whether stderr has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
+/// Whether an output has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
 /// count.
-fn stderr_is_gone() -> bool {
-    is_gone(std::io::stderr())
-}
-
 fn is_gone(output: impl AsFd) -> bool {
     let mut output = [PollFd::new(output.as_fd(), PollFlags::empty())];
     let found = poll(&mut output, PollTimeout::ZERO);
