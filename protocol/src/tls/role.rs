@@ -35,13 +35,9 @@ impl std::str::FromStr for Role {
     /// Reads what [`Role`] is displayed as, and nothing else.
     fn from_str(name: &str) -> Result<Self, String> {
         let number = name.strip_prefix("actor-").and_then(|it| it.parse().ok());
-        let role = match name {
-            "learner" => Some(Self::Learner),
-            "replay-server" => Some(Self::ReplayServer),
-            "observer" => Some(Self::Observer),
-            _ => number.map(Self::Actor),
-        };
-        role.filter(|role| role.to_string() == name).ok_or_else(|| {
+        let others = [Self::Learner, Self::ReplayServer, Self::Observer];
+        let mut all = others.into_iter().chain(number.map(Self::Actor));
+        all.find(|role| role.to_string() == name).ok_or_else(|| {
             format!("{name:?} is not a role: use replay-server, learner, observer or actor-N")
         })
     }
