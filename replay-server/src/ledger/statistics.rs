@@ -74,12 +74,10 @@ impl Statistics {
             return false;
         }
         self.differences += 1;
-        for (count, more) in [
-            (&mut self.counted.transitions_lost, lost),
-            (&mut self.counted.transitions_duplicated, duplicated),
-        ] {
-            *count = count.saturating_add(more);
-        }
+        let counted = &mut self.counted;
+        counted.transitions_lost = counted.transitions_lost.saturating_add(lost);
+        let doubles = &mut counted.transitions_duplicated;
+        *doubles = doubles.saturating_add(duplicated);
         self.differences.is_power_of_two()
     }
 

@@ -57,13 +57,8 @@ impl Actor {
     }
 
     pub(crate) const fn last_word(&self) -> Leave {
-        let ChunkHeader {
-            actor,
-            incarnation,
-            first_transition,
-            ..
-        } = self.next;
-        last_word(actor, incarnation, first_transition)
+        let next = &self.next;
+        last_word(next.actor, next.incarnation, next.first_transition)
     }
 }
 
