@@ -113,7 +113,7 @@ impl RawOptions {
             ("rand_seed", int(options.rand_seed)),
             ("num_threads", int(i32(options.num_threads))),
             ("debug_mode", int(0)),
-            ("distribution_mode", int(options.distribution_mode.number())),
+            ("distribution_mode", int(options.distribution_mode as i32)),
             ("render_human", flag(false)),
             ("use_generated_assets", flag(false)),
             ("use_monochrome_assets", flag(false)),
