@@ -115,22 +115,24 @@ mod tests {
 
     use super::*;
 
-    const CERTAIN: Chance = Chance {
-        epsilon: 0.0,
-        switch_probability: 1.0,
-    };
+    const fn chance(epsilon: f64, switch_probability: f64) -> Chance {
+        Chance {
+            epsilon,
+            switch_probability,
+        }
+    }
 
     #[test]
     fn followers_close_in_and_avoiders_do_not() {
         let maze = Maze::new();
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let (mut rng, certain) = (ChaCha8Rng::seed_from_u64(1), chance(0.0, 1.0));
         let places = maze.items.len() as u16;
         for place in 0..places {
             for agent in (0..places).filter(|&agent| agent != place && maze.in_sight(place, agent))
             {
                 let (mut follower, mut avoider) = (Ghost::at(place), Ghost::at(place));
-                follower.step(&maze, agent, false, CERTAIN, &mut rng);
-                avoider.step(&maze, agent, true, CERTAIN, &mut rng);
+                follower.step(&maze, agent, false, certain, &mut rng);
+                avoider.step(&maze, agent, true, certain, &mut rng);
                 assert_eq!((follower.mode, avoider.mode), (Mode::Follow, Mode::Avoid));
                 assert_eq!(
                     maze.distance(follower.place, agent),
@@ -154,16 +156,7 @@ mod tests {
         let agent = 0;
         assert!(!maze.in_sight(ghost.place, agent));
         for _ in 0..maze.distance(ghost.place, agent) {
-            ghost.step(
-                &maze,
-                agent,
-                false,
-                Chance {
-                    switch_probability: 0.0,
-                    ..CERTAIN
-                },
-                &mut rng,
-            );
+            ghost.step(&maze, agent, false, chance(0.0, 0.0), &mut rng);
         }
         assert_eq!((ghost.place, ghost.mode), (agent, Mode::Follow));
     }
@@ -177,16 +170,7 @@ mod tests {
         let changed = (0..trials)
             .filter(|_| {
                 let mut ghost = start;
-                ghost.step(
-                    &maze,
-                    start.place,
-                    false,
-                    Chance {
-                        switch_probability: p,
-                        ..CERTAIN
-                    },
-                    &mut rng,
-                );
+                ghost.step(&maze, start.place, false, chance(0.0, p), &mut rng);
                 ghost.mode == Mode::Follow
             })
             .count() as f64;
@@ -212,16 +196,7 @@ mod tests {
                 heading: Some(1),
                 ..Ghost::at(crossing)
             };
-            ghost.step(
-                &maze,
-                0,
-                false,
-                Chance {
-                    epsilon: 1.0,
-                    switch_probability: 0.0,
-                },
-                &mut rng,
-            );
+            ghost.step(&maze, 0, false, chance(1.0, 0.0), &mut rng);
             counts[usize::from(ghost.heading.unwrap())] += 1;
         }
         let chi: f64 = counts
@@ -238,15 +213,11 @@ mod tests {
     fn wanderers_turn_back_only_in_dead_ends() {
         let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let never = Chance {
-            epsilon: 0.0,
-            switch_probability: 0.0,
-        };
         let mut ghost = Ghost::at(maze.ghost_starts[1]);
         let mut visited = std::collections::BTreeSet::new();
         for _ in 0..20_000 {
             let before = ghost;
-            ghost.step(&maze, before.place, false, never, &mut rng);
+            ghost.step(&maze, before.place, false, chance(0.0, 0.0), &mut rng);
             visited.insert(ghost.place);
             let back = before
                 .heading
