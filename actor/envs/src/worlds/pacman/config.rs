@@ -3,10 +3,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::PacmanWorld;
 use super::maze::{GHOSTS, HEIGHT, WIDTH};
-use crate::environment::FrameShape;
+use super::render::CHANNELS;
+use crate::environment::{Environment, FrameShape};
 use crate::error::EnvError;
-use crate::worlds::ising::{Boundary, IsingLattice};
+use crate::settings::WorldSettings;
+use crate::worlds::ising::check_temperature;
 
 /// The settings of Ms. PacMan. Ghosts 0 to 3 are red, cyan, orange and green.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,10 +68,8 @@ pub struct IsingOverlay {
     pub sweeps_per_step: u32,
 }
 
-impl PacmanConfig {
-    /// # Errors
-    /// Says which setting cannot work.
-    pub fn validate(&self) -> Result<(), EnvError> {
+impl WorldSettings for PacmanConfig {
+    fn validate(&self) -> Result<(), EnvError> {
         for (name, value) in [
             ("epsilon", self.epsilon),
             ("switch_probability", self.switch_probability),
@@ -94,7 +95,7 @@ impl PacmanConfig {
             return Err(invalid("step_limit must be at least 1, got 0".into()));
         }
         if let Some(ising) = &self.ising {
-            crate::worlds::ising::check_temperature(ising.temperature)?;
+            check_temperature(ising.temperature)?;
             if ising.sweeps_per_step == 0 {
                 return Err(invalid(
                     "ising.sweeps_per_step must be at least 1, got 0".into(),
@@ -107,16 +108,38 @@ impl PacmanConfig {
     }
 
     /// 21 x 19 x 3.
-    pub const fn frame_shape(&self) -> FrameShape {
-        FrameShape::new(HEIGHT, WIDTH, super::render::CHANNELS)
+    fn frame_shape(&self) -> FrameShape {
+        FrameShape::new(HEIGHT, WIDTH, CHANNELS)
     }
 
-    /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0.
-    pub fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
-        match &self.lethal_schedule {
-            None => self.lethal,
-            Some(schedule) => std::array::from_fn(|ghost| ghost == schedule.ghost_in(episode)),
-        }
+    fn action_names(&self) -> Vec<&str> {
+        PacmanWorld::ACTION_NAMES.to_vec()
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
+    }
+
+    fn is_resumable(&self) -> bool {
+        // Which ghost is lethal depends on how many episodes were played.
+        self.lethal_schedule.is_none()
+    }
+}
+
+impl PacmanConfig {
+    /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
+    pub(super) fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
+        let Some(schedule) = &self.lethal_schedule else {
+            return self.lethal;
+        };
+        let task = episode / schedule.episodes_per_task % schedule.order.len() as u64;
+        let lethal = usize::from(schedule.order[task as usize]);
+        std::array::from_fn(|ghost| ghost == lethal)
     }
 }
 
@@ -140,22 +163,6 @@ impl LethalSchedule {
             )),
             None => Ok(()),
         }
-    }
-
-    /// The lethal ghost of an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
-    pub fn ghost_in(&self, episode: u64) -> usize {
-        self.order[(episode / self.episodes_per_task % self.order.len() as u64) as usize].into()
-    }
-}
-
-impl IsingOverlay {
-    /// The lattice of one environment: a site in each wall, free boundary.
-    pub(super) fn lattice(
-        &self,
-        walls: &[bool],
-        rng: &mut impl rand::Rng,
-    ) -> Result<IsingLattice, EnvError> {
-        IsingLattice::masked(HEIGHT, WIDTH, walls, self.temperature, Boundary::Free, rng)
     }
 }
 

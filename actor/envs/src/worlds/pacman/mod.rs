@@ -23,15 +23,15 @@ pub(crate) mod tests;
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use game::Game;
 use ghost::Chance;
-use maze::Maze;
+use maze::{HEIGHT, Maze, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{FrameShape, StepEnd};
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved::check;
 use crate::settings::WorldSettings;
-use crate::worlds::ising::IsingLattice;
+use crate::worlds::ising::{Boundary, IsingLattice};
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
@@ -65,9 +65,12 @@ impl PacmanWorld {
         let start = |env| Game::start(config, &maze, &fresh, env_rng(seed, env, RngUse::Game), 0);
         let mut walls = Vec::new();
         if let Some(overlay) = &config.ising {
+            let (sites, temperature) = (maze.walls(), overlay.temperature);
             for env in 0..num_envs {
                 let mut rng = env_rng(seed, env, RngUse::Overlay);
-                let mut lattice = overlay.lattice(&maze.walls(), &mut rng)?;
+                let free = Boundary::Free;
+                let mut lattice =
+                    IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng)?;
                 lattice.randomise(&mut rng);
                 walls.push((lattice, rng));
             }
@@ -84,34 +87,6 @@ impl PacmanWorld {
             fresh,
             walls,
         })
-    }
-}
-
-impl WorldSettings for PacmanConfig {
-    fn validate(&self) -> Result<(), EnvError> {
-        PacmanConfig::validate(self)
-    }
-
-    fn frame_shape(&self) -> FrameShape {
-        PacmanConfig::frame_shape(self)
-    }
-
-    fn action_names(&self) -> Vec<&str> {
-        PacmanWorld::ACTION_NAMES.to_vec()
-    }
-
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
-        Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
-    }
-
-    fn is_resumable(&self) -> bool {
-        // Which ghost is lethal depends on how many episodes were played.
-        self.lethal_schedule.is_none()
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::tests::config;
 use super::*;
+use crate::environment::Environment;
 
 fn schedule(episodes_per_task: u64, order: &[u8]) -> Option<LethalSchedule> {
     Some(LethalSchedule {
