@@ -1,4 +1,6 @@
-//! How tests play a world.
+//! How tests play a world, and what they ask of an error.
+
+use std::fmt::Display;
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -36,4 +38,14 @@ pub(crate) fn play(
         seen.push((frames, rewards, ends));
     }
     seen
+}
+
+/// The text of an error, which has all of these sentences.
+#[track_caller]
+pub(crate) fn fails<T, E: Display>(result: Result<T, E>, sentences: &[&str]) -> String {
+    let text = result.err().expect("an error").to_string();
+    for sentence in sentences {
+        assert!(text.contains(sentence), "no {sentence:?} in {text}");
+    }
+    text
 }

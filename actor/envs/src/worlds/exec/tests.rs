@@ -9,7 +9,7 @@ use super::world::seeds;
 use super::*;
 use crate::environment::{Environment, StepEnd};
 use crate::error::EnvError;
-use crate::playing::{frames, step};
+use crate::playing::{fails, frames, step};
 use crate::saved::tests::continues;
 use crate::settings::WorldSettings;
 
@@ -33,8 +33,12 @@ pub(crate) fn config(command: String) -> ExecConfig {
     }
 }
 
-fn said(error: EnvError) -> String {
-    error.to_string()
+/// What a world of these settings declares, with one copy.
+const ONE: &str = r#"{"driml_env": 1, "copies": 1, "height": 12, "width": 12, "channels": 1, "actions": ["no-op", "left", "right"]}"#;
+
+/// The command of a process that declares itself with this line, and nothing else.
+fn declares(line: &str) -> String {
+    format!("read -r line; echo '{line}'; read -r line")
 }
 
 #[test]
@@ -104,54 +108,87 @@ fn an_environment_s_seed_does_not_depend_on_how_many_environments_there_are() {
     assert_eq!(different.len(), 64);
 }
 
-/// The error of a world that fails in its third step.
-fn fault(arguments: &str, step_timeout_ms: u64) -> String {
+/// A world that fails as its arguments say: when its state is saved or loaded, or in its third step.
+fn faulty(arguments: &str) -> Result<(), EnvError> {
+    let hangs = arguments.contains("hang");
     let config = ExecConfig {
-        step_timeout_ms,
-        ..config(numbered(&format!("{arguments} 3")))
+        step_timeout_ms: if hangs { 700 } else { 60_000 },
+        ..config(numbered(arguments))
     };
     let mut world = ExecWorld::new(&config, 2, 1).unwrap();
-    let (mut rewards, mut ends) = ([0.0; 2], [StepEnd::Running; 2]);
-    let mut step = || world.step(&[0, 1], &mut rewards, &mut ends);
-    step().unwrap();
-    step().unwrap();
-    said(step().unwrap_err())
+    if arguments.starts_with("saves") {
+        let state = world.save()?;
+        return world.load(&state);
+    }
+    for _ in 0..2 {
+        step(&mut world, &[0, 1]);
+    }
+    world.step(&[0, 1], &mut [0.0; 2], &mut [StepEnd::Running; 2])
 }
 
 #[test]
-fn each_way_a_step_can_fail_has_its_sentence() {
+fn each_way_a_process_can_fail_has_its_sentence() {
     for (arguments, sentences) in [
         (
-            "raise",
-            vec![
+            "raise 3",
+            &[
                 "ended in the middle of a step (exit status: 1)",
                 "RuntimeError: the dragon got out",
+            ][..],
+        ),
+        ("kill 3", &["ended in the middle of a step (signal: 9"]),
+        ("small 3", &["(exit status: 1)", "Error: "]),
+        ("nan 3", &["gave copy 1 the reward NaN"]),
+        ("end 3", &["ended the step of copy 1 with 7; 0 runs on"]),
+        ("hang 3", &["--set world.step_timeout_ms=N", "sleeping"]),
+        (
+            "saves never",
+            &["cannot save its state: the dragon sits on it"],
+        ),
+        ("saves nothing", &["wrote no state"]),
+        (
+            "saves large",
+            &["wrote a state of 67108865 bytes; 67108864 are possible"],
+        ),
+        (
+            "saves byte",
+            &["answered in the middle of saving its state with the byte 0x3f"],
+        ),
+        (
+            "saves raise",
+            &[
+                "ended in the middle of saving its state (exit status: 1)",
+                "RuntimeError: the dragon ate it",
             ],
         ),
-        ("kill", vec!["ended in the middle of a step (signal: 9"]),
-        ("small", vec!["(exit status: 1)", "Error: "]),
-        ("nan", vec!["gave copy 1 the reward NaN"]),
-        ("end", vec!["ended the step of copy 1 with 7; 0 runs on"]),
-        ("hang", vec!["--set world.step_timeout_ms=N", "sleeping"]),
+        (
+            "saves hang",
+            &[
+                "has not answered for 0.7 s in the middle of saving its state",
+                "--set world.step_timeout_ms=N",
+            ],
+        ),
+        (
+            "saves lost",
+            &[
+                "ended in the middle of loading its state",
+                "the dragon does not give it back",
+            ],
+        ),
     ] {
-        let limit = if arguments == "hang" { 700 } else { 60_000 };
         let started = Instant::now();
-        let text = fault(arguments, limit);
-        assert!(
-            text.starts_with("the world `exec python3 "),
-            "{arguments}: {text}"
-        );
-        for sentence in sentences {
-            assert!(text.contains(sentence), "{arguments}: {text}");
-        }
+        let failed = faulty(arguments);
         assert!(started.elapsed() < Duration::from_secs(50), "{arguments}");
+        let not_saved = matches!(failed, Err(EnvError::NotSaved(_)));
+        assert_eq!(not_saved, arguments == "saves never", "{arguments}");
+        let text = fails(failed, sentences);
+        assert!(text.starts_with("the world `exec python3 "), "{text}");
     }
 }
 
 #[test]
 fn each_way_a_start_can_fail_has_its_sentence() {
-    let answer = |json: &str| format!("read -r line; echo '{json}'; read -r line");
-    let whole = r#""copies": 1, "height": 12, "width": 12, "channels": 1, "actions": ["a"]"#;
+    let no_actions = ONE.replace(r#""no-op", "left", "right""#, "");
     for (command, sentence) in [
         (
             "no-such-command --now".into(),
@@ -174,69 +211,50 @@ fn each_way_a_start_can_fail_has_its_sentence() {
             "echo hello; read -r line".into(),
             "does not declare itself as a world: its first line on stdout is \"hello\"",
         ),
-        (answer("{}"), "\"driml_env\" is missing"),
-        (answer(r#"{"driml_env": 1, "copies": 1}"#), "missing field"),
+        (declares("{}"), "\"driml_env\" is missing"),
         (
-            answer(r#"{"driml_env": 2, "colour": 3}"#),
+            declares(r#"{"driml_env": 1, "copies": 1}"#),
+            "missing field",
+        ),
+        (
+            declares(r#"{"driml_env": 2, "colour": 3}"#),
             "speaks version 2 of the protocol, and this driml speaks version 1",
         ),
         (
-            answer(&format!(
-                "{{\"driml_env\": 1, {}}}",
-                whole.replace("12", "0")
-            )),
+            declares(&ONE.replace("12", "0")),
             "declares frames of 0 x 0 x 1",
         ),
-        (
-            answer(&format!(
-                "{{\"driml_env\": 1, {}}}",
-                whole.replace("\"a\"", "")
-            )),
-            "declares 0 actions",
-        ),
+        (declares(&no_actions), "declares 0 actions"),
     ] {
         // Long enough for everything that answers at all.
         let limit = if command == "sleep 60" { 500 } else { 60_000 };
-        let error = declaration(&command, limit, 1000).unwrap_err().to_string();
-        assert!(error.contains(sentence), "{command}: {error}");
+        fails(declaration(&command, limit, 1000), &[sentence]);
     }
 }
 
 #[test]
 fn a_world_that_is_another_than_the_settings_say_is_refused() {
-    let other = |change: fn(&mut ExecConfig)| {
+    let refused = |sentence: &str, change: fn(&mut ExecConfig)| {
         let mut config = config(numbered(""));
         change(&mut config);
-        said(ExecWorld::new(&config, 2, 1).map(drop).unwrap_err())
+        fails(ExecWorld::new(&config, 2, 1), &[sentence]);
     };
-    let text = other(|config| config.height = 13);
-    assert!(
-        text.contains("declares frames of 12 x 12 x 1 and the 3 actions no-op, left, right, but the run's settings say frames of 13 x 12 x 1"),
-        "{text}"
+    refused(
+        "declares frames of 12 x 12 x 1 and the 3 actions no-op, left, right, but the run's settings say frames of 13 x 12 x 1",
+        |config| config.height = 13,
     );
-    let text = other(|config| config.actions.swap(0, 1));
-    assert!(text.contains("settings say"), "{text}");
-    let one = r#"{"driml_env": 1, "copies": 1, "height": 12, "width": 12, "channels": 1, "actions": ["no-op", "left", "right"]}"#;
-    let text = other(|config| config.command = String::new());
-    assert!(text.contains("without a command"), "{text}");
-    let config = config(format!("read -r line; echo '{one}'; read -r line"));
-    let text = said(ExecWorld::new(&config, 2, 1).map(drop).unwrap_err());
-    assert!(
-        text.contains("has 1 copies where 2 were asked for"),
-        "{text}"
-    );
+    refused("settings say", |config| config.actions.swap(0, 1));
+    refused("without a command", |config| config.command.clear());
+    refused("has 1 copies where 2 were asked for", |config| {
+        config.command = declares(ONE);
+    });
 }
 
 #[test]
 fn what_is_printed_into_the_protocol_is_named() {
-    let one = r#"{"driml_env": 1, "copies": 1, "height": 12, "width": 12, "channels": 1, "actions": ["no-op", "left", "right"]}"#;
-    let command = format!("read -r line; echo '{one}'; read -r line; echo ready");
-    let text = said(
-        ExecWorld::new(&config(command), 1, 1)
-            .map(drop)
-            .unwrap_err(),
-    );
-    assert!(text.contains("the byte 0x72 and not with `.`"), "{text}");
+    let config = config(declares(ONE) + "; echo ready");
+    let sentence = "the byte 0x72 and not with `.`";
+    fails(ExecWorld::new(&config, 1, 1), &[sentence]);
 }
 
 #[test]
@@ -257,72 +275,6 @@ fn a_world_that_offers_it_continues_where_it_was_saved() {
     assert_eq!(frames(&mut other), frames(&mut world));
 }
 
-/// The error of a world that offers to save its state, when it is asked to.
-fn save_fault(kind: &str) -> EnvError {
-    let config = ExecConfig {
-        step_timeout_ms: if kind == "hang" { 700 } else { 60_000 },
-        ..config(numbered(&format!("saves {kind}")))
-    };
-    let mut world = ExecWorld::new(&config, 2, 1).unwrap();
-    let state = world.save();
-    match kind {
-        "lost" => world.load(&state.unwrap()).unwrap_err(),
-        _ => state.unwrap_err(),
-    }
-}
-
-#[test]
-fn each_way_in_which_saving_can_fail_has_its_sentence() {
-    for (kind, sentences) in [
-        (
-            "never",
-            vec!["cannot save its state: the dragon sits on it"],
-        ),
-        ("nothing", vec!["wrote no state"]),
-        (
-            "large",
-            vec!["wrote a state of 67108865 bytes; 67108864 are possible"],
-        ),
-        (
-            "byte",
-            vec!["answered in the middle of saving its state with the byte 0x3f"],
-        ),
-        (
-            "raise",
-            vec![
-                "ended in the middle of saving its state (exit status: 1)",
-                "RuntimeError: the dragon ate it",
-            ],
-        ),
-        (
-            "hang",
-            vec![
-                "has not answered for 0.7 s in the middle of saving its state",
-                "--set world.step_timeout_ms=N",
-            ],
-        ),
-        (
-            "lost",
-            vec![
-                "ended in the middle of loading its state",
-                "the dragon does not give it back",
-            ],
-        ),
-    ] {
-        let error = save_fault(kind);
-        let not_saved = matches!(error, EnvError::NotSaved(_));
-        assert_eq!(not_saved, kind == "never", "{kind}");
-        let text = said(error);
-        assert!(
-            text.starts_with("the world `exec python3 "),
-            "{kind}: {text}"
-        );
-        for sentence in sentences {
-            assert!(text.contains(sentence), "{kind}: {text}");
-        }
-    }
-}
-
 #[test]
 fn a_world_that_does_not_offer_it_is_not_asked() {
     let mut world = ExecWorld::new(&config(numbered("")), 2, 1).unwrap();
@@ -336,36 +288,31 @@ fn a_state_of_another_world_is_refused_by_name() {
     let world =
         |arguments: &str, copies| ExecWorld::new(&config(numbered(arguments)), copies, 1).unwrap();
     let state = world("saves", 2).save().unwrap();
-    let refused = |arguments: &str, copies, state: &[u8]| {
-        said(world(arguments, copies).load(state).unwrap_err())
+    let refused = |arguments: &str, copies, state: &[u8], sentences: &[&str]| {
+        fails(world(arguments, copies).load(state), sentences);
     };
-    let text = refused("saves none other", 2, &state);
-    assert!(text.contains("it is of the world `exec python3 "), "{text}");
-    assert!(text.contains("numbered.py saves`, and this is `"), "{text}");
-    assert!(
-        text.contains("saves none other`: give the command"),
-        "{text}"
-    );
-    let text = refused("saves", 3, &state);
-    assert!(
-        text.contains("2 environments, and this world has 3"),
-        "{text}"
-    );
+    let sentences = [
+        "it is of the world `exec python3 ",
+        "numbered.py saves`, and this is `",
+        "saves none other`: give the command",
+    ];
+    refused("saves none other", 2, &state, &sentences);
+    let sentence = "2 environments, and this world has 3";
+    refused("saves", 3, &state, &[sentence]);
     for wrong in [
         &state[..state.len() - 1],
         &[state.clone(), vec![0]].concat(),
         &[],
     ] {
-        let text = refused("saves", 2, wrong);
-        assert!(text.contains("no state of this world"), "{text}");
+        refused("saves", 2, wrong, &["no state of this world"]);
     }
     // The same command, which is another world now.
     let config = ExecConfig {
         height: 13,
         ..config(numbered("saves"))
     };
-    let why = SavedExec::from_bytes(&state, &config, 2).unwrap_err();
-    assert!(said(why).contains("the shape of its frames or its actions"));
+    let sentence = "the shape of its frames or its actions";
+    fails(SavedExec::from_bytes(&state, &config, 2), &[sentence]);
 }
 
 /// Processes with this word in their command line.
