@@ -59,7 +59,7 @@ pub(crate) mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::playing::play;
+    use crate::playing::{fails, play};
     use crate::worlds::{chain, ising};
     use crate::{Environment, IsingConfig, RestrictedWorld, StepEnd, WorldConfig};
 
@@ -130,8 +130,7 @@ pub(crate) mod tests {
             (ising(9), state(chain(), ENVS)),
         ] {
             let mut world = config.build(ENVS, 3, 0).unwrap();
-            let said = world.load(&state.unwrap()).unwrap_err().to_string();
-            assert!(said.contains("no state of this world"), "{said}");
+            fails(world.load(&state.unwrap()), &["no state of this world"]);
         }
     }
 

@@ -4,6 +4,7 @@
 use super::tests::config;
 use super::*;
 use crate::environment::Environment;
+use crate::playing::fails;
 
 fn schedule(episodes_per_task: u64, order: &[u8]) -> Option<LethalSchedule> {
     Some(LethalSchedule {
@@ -72,8 +73,7 @@ fn a_state_that_no_game_has_is_refused() {
     let refuse = |what: &str, change: fn(&mut Game)| {
         let mut wrong = fine();
         change(&mut wrong);
-        let said = wrong.check(&maze).unwrap_err();
-        assert!(said.to_string().contains(what), "{said}");
+        fails(wrong.check(&maze), &[what]);
     };
     refuse("the agent's place", |game| game.agent = 10_000);
     refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));

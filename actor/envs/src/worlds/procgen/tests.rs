@@ -9,7 +9,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
-use crate::playing;
+use crate::playing::{self, fails};
 
 /// The installed engine, or a line that says the test was skipped.
 pub(crate) fn engine() -> Option<&'static Engine> {
@@ -79,17 +79,11 @@ fn another_build_of_the_library_is_played_by_its_path() {
         library: Some(library.display().to_string()),
         ..config(Game::Coinrun)
     };
-    let said = |library: &std::path::Path| {
-        let made = ProcgenWorld::new(&other(library), 1, 1, 0);
-        made.map(drop).unwrap_err().to_string()
-    };
-    assert!(said(&library).contains("put Procgen's folder `assets` beside it"));
+    let made = |library: &std::path::Path| ProcgenWorld::new(&other(library), 1, 1, 0);
+    let no_pictures = "put Procgen's folder `assets` beside it";
+    fails(made(&library), &[no_pictures]);
     let nowhere = folder.path().join("nowhere.so");
-    assert!(
-        said(&nowhere).contains("No such file"),
-        "{}",
-        said(&nowhere)
-    );
+    fails(made(&nowhere), &["No such file"]);
     std::os::unix::fs::symlink(engine.assets(), folder.path().join("assets")).unwrap();
 
     crate::saved::tests::continues("another build", 50, || {
@@ -154,15 +148,10 @@ fn wrong_settings_are_refused_without_an_engine() {
     for (change, text) in refused {
         let mut config = maze();
         change(&mut config);
-        let error = config.validate().unwrap_err().to_string();
-        assert!(error.contains(text), "{error}");
+        fails(config.validate(), &[text]);
     }
     for (num_envs, threads, text) in [(0, 0, "0 environments"), (1, 1000, "1000 threads")] {
-        let error = ProcgenWorld::new(&maze(), num_envs, 1, threads)
-            .err()
-            .unwrap()
-            .to_string();
-        assert!(error.contains(text), "{error}");
+        fails(ProcgenWorld::new(&maze(), num_envs, 1, threads), &[text]);
     }
 }
 
@@ -177,18 +166,20 @@ fn settings_are_read_in_full_or_not_at_all() {
         toml::from_str::<ProcgenConfig>(&text).unwrap(),
         config(Game::Maze)
     );
-    let error = |text: &str| {
-        toml::from_str::<ProcgenConfig>(text)
-            .unwrap_err()
-            .to_string()
-    };
-    assert!(error(&text.replace("num_levels = 500\n", "")).contains("missing field `num_levels`"));
-    assert!(error(&format!("{text}\nlevels = 1")).contains("unknown field `levels`"));
-    assert!(
-        error(&text.replace("\"maze\"", "\"mase\""))
-            .contains("unknown variant `mase`, expected one of")
-    );
-    assert!(error(&text.replace("\"easy\"", "\"medium\"")).contains("medium"));
+    for (text, words) in [
+        (
+            text.replace("num_levels = 500\n", ""),
+            "missing field `num_levels`",
+        ),
+        (format!("{text}\nlevels = 1"), "unknown field `levels`"),
+        (
+            text.replace("\"maze\"", "\"mase\""),
+            "unknown variant `mase`, expected one of",
+        ),
+        (text.replace("\"easy\"", "\"medium\""), "medium"),
+    ] {
+        fails(toml::from_str::<ProcgenConfig>(&text), &[words]);
+    }
 }
 
 #[test]
