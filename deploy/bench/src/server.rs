@@ -16,7 +16,8 @@ use driml_learner::{
 };
 use driml_machine::effort::Effort;
 use driml_protocol::{
-    ActorJoin, Alive, Keys, LearnerJoin, RunClient, ShardCounts, Shutdown, join,
+    ActorJoin, Alive, JoinReply, Keys, LearnerJoin, Request, RunClient, ShardCounts, Shutdown,
+    join,
     session::{self, Endpoints, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
@@ -107,7 +108,11 @@ impl Server {
         self.actors += 1;
         let (actor, pool) = (self.actors, self.actor.chunk_memory());
         let client = self.client(Role::Actor(actor), self.actor.spec.hash())?;
-        let alive = join_as_actor(&client, actor)?;
+        let join = ActorJoin {
+            actor,
+            incarnation: INCARNATION,
+        };
+        let alive = take_part(&client, Alive::actor(actor, INCARNATION), &join)?;
         let limits = DeliveryLimits::of(&self.actor.actor);
         let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
         let mut chunks = recording.chunks(actor, shape, pool);
@@ -131,7 +136,16 @@ impl Server {
         let LearnerConfig {
             learner, transport, ..
         } = &self.learner;
-        let _alive = join_as_learner(&client)?;
+        // One that has learned from nothing.
+        let join = LearnerJoin {
+            learner: LEARNER,
+            run: LEARNER,
+            updates: 0,
+            counts: ShardCounts::default(),
+            other_shards: ShardCounts::default(),
+            restart: false,
+        };
+        let _alive = take_part(&client, Alive::learner(LEARNER), &join)?;
         let requests = Requests {
             learner: LEARNER,
             rows: learner.batch_size,
@@ -204,35 +218,15 @@ impl Wire {
     }
 }
 
-/// Joins as an actor, which counts as connected until the result is dropped.
-fn join_as_actor(client: &RunClient, actor: u32) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(client, Alive::actor(actor, INCARNATION))?;
-    let join = ActorJoin {
-        actor,
-        incarnation: INCARNATION,
-    };
-    join::take_part(client, &join, &Shutdown::default())?
+/// Takes part in the run as `join` says, and counts as connected until the result is dropped.
+fn take_part(
+    client: &RunClient,
+    who: Alive,
+    join: &impl Request<Reply = JoinReply>,
+) -> anyhow::Result<LivelinessToken> {
+    let alive = client.declare_alive(who);
+    let alive = alive.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))?;
+    join::take_part(client, join, &Shutdown::default())?
         .context("this client was not told to stop")?;
     Ok(alive)
-}
-
-/// Joins as the learner, which has learned from nothing and counts as connected until the result is dropped.
-fn join_as_learner(client: &RunClient) -> anyhow::Result<LivelinessToken> {
-    let alive = alive(client, Alive::learner(LEARNER))?;
-    let join = LearnerJoin {
-        learner: LEARNER,
-        run: LEARNER,
-        updates: 0,
-        counts: ShardCounts::default(),
-        other_shards: ShardCounts::default(),
-        restart: false,
-    };
-    join::take_part(client, &join, &Shutdown::default())?
-        .context("this client was not told to stop")?;
-    Ok(alive)
-}
-
-fn alive(client: &RunClient, who: Alive) -> anyhow::Result<LivelinessToken> {
-    let token = client.declare_alive(who);
-    token.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))
 }
