@@ -36,11 +36,11 @@ pub struct Preset {
     /// One line for `driml presets`.
     pub about: &'static str,
     /// Laid over base and world, under the agent: a preset does not change what makes an agent, such as Rainbow's epsilon of 0.
-    layers: &'static [Layer],
+    layer: Option<Layer>,
     /// The worlds it is made for; none means all.
     families: &'static [&'static str],
-    /// What it gives up for speed, with the largest errors that were measured: a line that a run prints.
-    pub(crate) price: Option<&'static str>,
+    /// What it gives up for speed, with the largest errors that were measured: lines that a run prints.
+    pub(crate) price: &'static [&'static str],
 }
 
 const TUNED: &str = "tuned";
@@ -51,69 +51,42 @@ pub fn preset_or_default(name: Option<&str>, world: WorldName) -> Result<&'stati
     preset(name.unwrap_or(if is_game { TUNED } else { PRESETS[0].name }))
 }
 
-/// Every preset, `paper` first.
-pub const PRESETS: &[Preset] = &[
-    Preset {
-        name: "paper",
-        about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
-        layers: &[],
-        families: &[],
-        price: None,
-    },
-    Preset {
-        name: TUNED,
-        about: "more exploration, fewer and smaller updates, a soft target network, on three games a residual torso (the default on Procgen)",
-        layers: &[layer!("variant/tuned")],
-        families: &["procgen"],
-        price: None,
-    },
-    Preset {
-        name: "paper-observation",
-        about: "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic",
-        layers: &[layer!("variant/paper-observation")],
-        families: &["procgen"],
-        price: None,
-    },
-    Preset {
-        name: "split",
-        about: "`paper` with one of 500 Procgen levels per episode, and unseen levels to test on",
-        layers: &[layer!("variant/split")],
-        families: &["procgen"],
-        price: None,
-    },
-    Preset {
-        name: "exact",
-        about: "`paper` with products, weights and frames as exact as the program can compute them",
-        layers: &[layer!("variant/exact")],
-        families: &[],
-        price: None,
-    },
-    Preset {
-        name: "balanced",
-        about: "`exact` in the learner; bf16 arithmetic and f16 weights in the actors",
-        layers: &[layer!("variant/balanced")],
-        families: &[],
-        price: Some(
-            "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md",
-        ),
-    },
-    Preset {
-        name: "fast",
-        about: "bf16 in learner and actors, f16 weights sent to actors",
-        layers: &[layer!("variant/fast")],
-        families: &[],
-        price: Some(
-            "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md",
-        ),
-    },
-    Preset {
-        name: "smoke",
-        about: "a tiny network, batch and replay: shows within a minute that all processes work together",
-        layers: &[layer!("variant/smoke")],
-        families: &[],
-        price: None,
-    },
-];
+/// Makes [`PRESETS`]: a line has a preset's name, which is that of its file in `presets/variant/`, the worlds for which it is made if these
+/// are not all, what it is, and what it gives up.
+macro_rules! presets {
+    ($($name:literal $(for $family:literal)?: $about:literal $(, $price:literal)?;)+) => {
+        /// Every preset, `paper` first.
+        pub const PRESETS: &[Preset] = &[
+            Preset {
+                name: "paper",
+                about: "as the paper's authors ran it, at the world's own frame size (the default outside Procgen)",
+                layer: None,
+                families: &[],
+                price: &[],
+            },
+            $(Preset {
+                name: $name,
+                about: $about,
+                layer: Some(layer!("variant/" $name)),
+                families: &[$($family)?],
+                price: &[$($price)?],
+            }),+
+        ];
+    };
+}
+
+presets! {
+    "tuned" for "procgen":
+        "more exploration, fewer and smaller updates, a soft target network, on three games a residual torso (the default on Procgen)";
+    "paper-observation" for "procgen": "`paper` with Procgen's frame enlarged to the paper's 104 x 80: 2.3 times the arithmetic";
+    "split" for "procgen": "`paper` with one of 500 Procgen levels per episode, and unseen levels to test on";
+    "exact": "`paper` with products, weights and frames as exact as the program can compute them";
+    "balanced": "`exact` in the learner; bf16 arithmetic and f16 weights in the actors",
+        "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md";
+    "fast": "bf16 in learner and actors, f16 weights sent to actors",
+        "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md";
+    "smoke": "a tiny network, batch and replay: shows within a minute that all processes work together";
+}
 
 /// An agent: its name and its layer of settings.
 #[derive(Clone, Debug)]
@@ -252,9 +225,8 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
 
 /// The files that are laid over one another, the lowest first.
 pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
-    let over = preset.layers.iter().copied();
     let below = [BASE, world_layer(world)].into_iter();
-    below.chain(over).chain([agent.layer]).collect()
+    below.chain(preset.layer).chain([agent.layer]).collect()
 }
 
 /// Lays one file over `table`: first what holds everywhere, then each `[[only]]` block that names `world`.

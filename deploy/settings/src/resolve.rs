@@ -117,7 +117,8 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
     let mut config = RunConfig::from_table(&table).map_err(of_file)?;
     config.notes.extend(note);
     if let Source::Layers(preset, ..) = source {
-        config.notes.extend(preset.price.map(str::to_owned));
+        let price = preset.price.iter().copied();
+        config.notes.extend(price.map(str::to_owned));
     }
     Ok(config)
 }

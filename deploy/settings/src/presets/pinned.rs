@@ -31,7 +31,7 @@ pub(super) fn all_layers() -> BTreeMap<&'static str, Layer> {
     // A command is not a world's name; any one stands for all.
     let exec = "exec:true".parse().unwrap();
     let worlds = WorldName::all().chain([exec]).map(world_layer);
-    let variants = PRESETS.iter().flat_map(|it| it.layers).copied();
+    let variants = PRESETS.iter().filter_map(|it| it.layer);
     let all = agents.chain(worlds).chain(variants).chain([BASE]);
     all.map(|layer| (layer.name, layer)).collect()
 }
