@@ -3,8 +3,6 @@
 use driml_envs::EnvError;
 use driml_model::ModelError;
 
-use crate::schedule::BeyondLadder;
-
 /// A world, a policy or settings that do not go together, or the failure of one of them.
 #[derive(Debug, thiserror::Error)]
 pub enum ActError {
@@ -22,10 +20,7 @@ pub enum ActError {
         /// What the world says.
         source: EnvError,
     },
-    /// An actor for which the ladder has no epsilon.
-    #[error(transparent)]
-    BeyondLadder(#[from] BeyondLadder),
-    /// Settings that do not go together with the world or the network, or episodes that do not end.
+    /// Settings that do not go together with the world, the network or the actor's number, or episodes that do not end.
     #[error("{0}")]
     Other(String),
 }

@@ -83,4 +83,4 @@ pub use evaluate::{Evaluation, Watch, episode_returns};
 pub use policy::{NetworkPolicy, Policy, RandomPolicy};
 pub use recorder::{ChunkNumbers, ChunkRecorder};
 pub use run::{RunArgs, run};
-pub use schedule::{BeyondLadder, Schedule};
+pub use schedule::Schedule;

@@ -1,7 +1,10 @@
 //! The probability with which an actor acts at random: one that falls over the run, or one fixed for each actor.
 //! It does not count frames: the caller says how many the run has.
 
-use crate::config::{Config, EpsilonLadder};
+use crate::{
+    config::{Config, EpsilonLadder},
+    error::ActError,
+};
 
 /// One actor's epsilon over the run.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,17 +22,6 @@ pub enum Schedule {
     Fixed(f64),
 }
 
-/// An actor for which the ladder has no epsilon.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "actor {actor} is beyond the {actors} of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or the \
-     replay server with --set actor.epsilon_ladder.actors={}", u64::from(*actor) + 1
-)]
-pub struct BeyondLadder {
-    actor: u32,
-    actors: u32,
-}
-
 impl Schedule {
     /// Largest error of an epsilon, a probability, for any counts of frames.
     pub const ERROR: f64 = 1e-15;
@@ -38,7 +30,7 @@ impl Schedule {
     ///
     /// # Errors
     /// A ladder that has fewer epsilons.
-    pub fn new(config: &Config, actor: u32) -> Result<Self, BeyondLadder> {
+    pub fn new(config: &Config, actor: u32) -> Result<Self, ActError> {
         match &config.epsilon_ladder {
             Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),
             None => Ok(Self::Falling {
@@ -71,14 +63,18 @@ impl Schedule {
 }
 
 /// `base^(1 + alpha * i / (N - 1))` for actor i of N.
-fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, BeyondLadder> {
+fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, ActError> {
     let EpsilonLadder {
         base,
         alpha,
         actors,
     } = *ladder;
     if actor >= actors {
-        return Err(BeyondLadder { actor, actors });
+        return Err(ActError::Other(format!(
+            "actor {actor} is beyond the {actors} of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or \
+             the replay server with --set actor.epsilon_ladder.actors={}",
+            u64::from(actor) + 1
+        )));
     }
     let down = f64::from(actor) / f64::from(actors - 1);
     Ok(base.powf(1.0 + alpha * down))
