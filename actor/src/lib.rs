@@ -5,58 +5,27 @@
 //! steps a world with a [`Policy`], [`ChunkRecorder`] makes chunks of the steps, and [`Delivery`] brings them to the replay server.
 //!
 //! ```
-//! use driml_actor::{ActError, Acting, Policy, ChunkRecorder};
-//! use driml_envs::{EnvError, Environment, FrameShape, StepEnd};
+//! use driml_actor::{ActError, Acting, ChunkRecorder, RandomPolicy};
+//! use driml_envs::{ChainConfig, WorldConfig};
 //! use driml_protocol::BufferPool;
 //! use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 //!
-//! /// Two environments that show how often they were stepped.
-//! struct Counter(u8);
-//!
-//! impl Environment for Counter {
-//!     fn frame_shape(&self) -> FrameShape {
-//!         FrameShape::new(1, 1, 1)
-//!     }
-//!     fn num_actions(&self) -> usize {
-//!         3
-//!     }
-//!     fn num_envs(&self) -> usize {
-//!         2
-//!     }
-//!     fn observe(&mut self, frames: &mut [u8]) {
-//!         frames.fill(self.0);
-//!     }
-//!     fn step(&mut self, _: &[u8], rewards: &mut [f32], ends: &mut [StepEnd]) -> Result<(), EnvError> {
-//!         self.0 += 1;
-//!         rewards.fill(0.5);
-//!         ends.fill(StepEnd::Running);
-//!         Ok(())
-//!     }
-//! }
-//!
-//! /// Takes the same action in every state.
-//! struct Always(u8);
-//!
-//! impl Policy for Always {
-//!     fn act(&mut self, _: &[u8], _: f64, _: &mut ChaCha8Rng, actions: &mut [u8]) -> Result<(), ActError> {
-//!         actions.fill(self.0);
-//!         Ok(())
-//!     }
-//! }
-//!
-//! let mut acting = Acting::new(Box::new(Counter(0)), 1, ChaCha8Rng::seed_from_u64(1))?;
-//! // Chunks of actor 7's incarnation 1, from two environments with frames of one byte.
-//! let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 1, 2, 1);
+//! let chain = WorldConfig::Chain(ChainConfig {
+//!     cells: 8, height: 1, width: 8, step_limit: 30, reward_left: 0.1, reward_right: 1.0,
+//! });
+//! let mut acting = Acting::new(chain.build(2, 7, 0)?, 1, ChaCha8Rng::seed_from_u64(1))?;
+//! // Chunks of actor 7's incarnation 1, from two environments with frames of eight bytes.
+//! let mut recorder = ChunkRecorder::new(BufferPool::new(1), 7, 1, 2, 8);
 //! recorder.begin(0, 3);
 //! let chunk = loop {
-//!     let step = acting.step(&mut Always(2), 0.0)?;
+//!     let step = acting.step(&mut RandomPolicy::new(3), 0.0)?;
 //!     let full = recorder.record(step.frames, step.actions, step.rewards, step.ends);
 //!     if let Some(chunk) = full {
 //!         break chunk;
 //!     }
 //! };
-//! assert_eq!(chunk.frames(), [0, 1, 2, 0, 1, 2]);
-//! assert_eq!(chunk.actions(), [2; 6]);
+//! assert_eq!(chunk.frames()[..8], [0, 255, 0, 0, 0, 0, 0, 0]); // An agent begins beside the near end.
+//! assert_eq!(chunk.actions().len(), 6);
 //! # Ok::<(), ActError>(())
 //! ```
 
