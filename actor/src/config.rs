@@ -176,9 +176,7 @@ impl ActorSettings {
     const fn transition_bytes(&self) -> usize {
         self.spec.frame_bytes() + TRANSITION_BYTES
     }
-}
 
-impl ActorSettings {
     /// Memory for the chunks of one actor: one that is filled, and those that are not acknowledged. Shared memory is for chunks
     /// as long as they are with the actors that are planned; longer ones lie in the process's own.
     pub fn chunk_memory(&self) -> BufferPool {

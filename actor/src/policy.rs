@@ -164,14 +164,6 @@ pub(crate) mod tests {
     const ACTIONS: usize = 5;
     const STATES: usize = 4000;
 
-    fn policy() -> NetworkPolicy {
-        policy_of(1)
-    }
-
-    fn policy_of(seed: u64) -> NetworkPolicy {
-        policy_with(HeadConfig::PLAIN, seed)
-    }
-
     pub(crate) fn model() -> ModelConfig {
         ModelConfig {
             height: 4,
@@ -232,7 +224,7 @@ pub(crate) mod tests {
 
     #[test]
     fn each_action_is_random_with_probability_epsilon_and_else_greedy() {
-        let mut policy = policy();
+        let mut policy = policy_with(HeadConfig::PLAIN, 1);
         let greedy = counts(&mut policy, 0.0);
         let best = greedy.iter().position(|&count| count > 0).unwrap();
         assert_eq!(greedy[best], STATES);
@@ -251,7 +243,7 @@ pub(crate) mod tests {
         let states: Vec<u8> = (0..16 * STATES).map(|_| rng.random()).collect();
         // Weights that do not prefer one action in every state.
         let decides = |seed| {
-            let mut policy = policy_of(seed);
+            let mut policy = policy_with(HeadConfig::PLAIN, seed);
             let mut greedy = vec![0; STATES];
             policy.network.greedy_actions(&states, &mut greedy).unwrap();
             let differ = greedy.iter().any(|&action| action != greedy[0]);
