@@ -45,13 +45,10 @@ impl ChunkRecorder {
         let header = ChunkHeader {
             actor,
             incarnation,
-            sequence: 0,
-            first_transition: 0,
-            weights_version: 0,
-            leaving: false,
             streams,
             steps: 1,
             frame_bytes,
+            ..ChunkHeader::default()
         };
         Self {
             header,

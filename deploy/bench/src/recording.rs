@@ -120,13 +120,11 @@ impl Recording {
             next: ChunkHeader {
                 actor,
                 incarnation: INCARNATION,
-                sequence: 0,
-                first_transition: 0,
                 weights_version: 1,
-                leaving: false,
                 streams,
                 steps,
                 frame_bytes: self.frame_bytes as u32,
+                ..ChunkHeader::default()
             },
         }
     }
