@@ -46,9 +46,6 @@ pub struct ActingState {
 
 impl Acting {
     /// Starts `world` with stacks of `frame_stack` frames; `rng` is for exploration alone.
-    ///
-    /// # Errors
-    /// A stack of no frames.
     pub fn new(
         world: Box<dyn Environment>,
         frame_stack: usize,
@@ -67,10 +64,7 @@ impl Acting {
         })
     }
 
-    /// Lets `policy` act once in every environment.
-    ///
-    /// # Errors
-    /// The policy or the world failed; the world must not be stepped again.
+    /// Lets `policy` act once in every environment. After an error the world must not be stepped again.
     pub fn step(&mut self, policy: &mut dyn Policy, epsilon: f64) -> Result<Step<'_>, ActError> {
         self.world.observe(&mut self.frames);
         self.stack.push(&self.frames, &self.first);
@@ -91,9 +85,6 @@ impl Acting {
     }
 
     /// How it stands.
-    ///
-    /// # Errors
-    /// [`EnvError::NotSaved`]: a world whose state cannot be saved; a fault of the engine.
     pub fn state(&mut self) -> Result<ActingState, EnvError> {
         Ok(ActingState {
             world: self.world.save()?,
@@ -104,9 +95,6 @@ impl Acting {
     }
 
     /// Restores a snapshot taken with the same world.
-    ///
-    /// # Errors
-    /// A state of another world.
     pub fn go_on_from(&mut self, state: ActingState) -> Result<(), EnvError> {
         if state.first.len() != self.first.len() {
             let (found, own) = (state.first.len(), self.first.len());

@@ -136,9 +136,6 @@ impl Collector {
     }
 
     /// Acts with other weights from the next chunk on; on an error the old ones stay.
-    ///
-    /// # Errors
-    /// Weights that do not fit the model.
     pub fn set_weights(&mut self, version: u64, safetensors: &[u8]) -> Result<(), ActError> {
         self.policy.load(safetensors)?;
         self.weights_version = version;
@@ -151,9 +148,6 @@ impl Collector {
     }
 
     /// Acts until one chunk of `steps` steps is full. `frames` is the run's count so far, which fixes epsilon for the chunk.
-    ///
-    /// # Errors
-    /// The policy or the world failed.
     pub fn collect(&mut self, frames: u64, steps: u32) -> Result<Chunk, ActError> {
         self.recorder.begin(self.weights_version, steps);
         let epsilon = self.schedule.epsilon(frames);
@@ -169,9 +163,6 @@ impl Collector {
     }
 
     /// How it stands between two chunks.
-    ///
-    /// # Errors
-    /// A world whose state cannot be saved; a fault of the engine.
     pub fn state(&mut self) -> Result<CollectorState, ActError> {
         Ok(CollectorState {
             acting: self.acting.state()?,
@@ -180,9 +171,6 @@ impl Collector {
     }
 
     /// Restores a snapshot taken with the same settings: with the same weights it gives the same chunks.
-    ///
-    /// # Errors
-    /// A state of other settings.
     pub fn go_on_from(&mut self, state: CollectorState) -> Result<(), ActError> {
         self.acting.go_on_from(state.acting)?;
         self.recorder.go_on_at(state.next_chunk);

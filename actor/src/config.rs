@@ -91,9 +91,6 @@ struct Planned {
 
 impl ActorSettings {
     /// Reads the tables from a run's resolved settings.
-    ///
-    /// # Errors
-    /// A table that is missing or does not fit, or values that cannot work.
     pub fn from_toml(text: &str) -> Result<Self, SettingsError> {
         let settings = Settings::parse(text)?;
         let this = Self {
@@ -154,9 +151,6 @@ impl ActorSettings {
     }
 
     /// Checks that the longest chunk fits a message.
-    ///
-    /// # Errors
-    /// It does not; what to do.
     pub fn check_chunk(&self) -> Result<(), ConfigError> {
         let Config {
             envs,
@@ -214,9 +208,6 @@ impl Config {
     }
 
     /// Checks every field's range.
-    ///
-    /// # Errors
-    /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (key, value, most, why) in [
             (

@@ -10,9 +10,6 @@ use crate::error::ActError;
 /// Chooses one action for each of N states.
 pub trait Policy: Send {
     /// Writes actions [N] for `states` [N, H, W, C * stack]; each is random with probability `epsilon`.
-    ///
-    /// # Errors
-    /// The network failed on these states.
     fn act(
         &mut self,
         states: &[u8],
@@ -67,9 +64,6 @@ pub struct NetworkPolicy {
 impl NetworkPolicy {
     /// A policy with the weights of a safetensors file; `enlarge` makes the network's input of a state, if that is not it. Its
     /// products are computed in `precision`.
-    ///
-    /// # Errors
-    /// Weights that do not fit the model.
     pub fn new(
         model: &ModelConfig,
         enlarge: Option<Enlarge>,
@@ -102,9 +96,6 @@ impl NetworkPolicy {
     }
 
     /// Replaces the weights; on an error the old ones stay.
-    ///
-    /// # Errors
-    /// Weights that do not fit the model.
     pub fn load(&mut self, safetensors: &[u8]) -> Result<(), ActError> {
         Ok(self.network.load(safetensors)?)
     }

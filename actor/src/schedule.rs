@@ -27,9 +27,6 @@ impl Schedule {
     pub const ERROR: f64 = 1e-15;
 
     /// The schedule of actor number `actor`.
-    ///
-    /// # Errors
-    /// A ladder that has fewer epsilons.
     pub fn new(config: &Config, actor: u32) -> Result<Self, ActError> {
         match &config.epsilon_ladder {
             Some(ladder) => ladder_epsilon(ladder, actor).map(Self::Fixed),

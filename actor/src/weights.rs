@@ -175,9 +175,6 @@ pub(crate) fn first(
 }
 
 /// Watches until `shutdown`, on its own thread.
-///
-/// # Errors
-/// No subscription, or no thread.
 pub(crate) fn watch(
     client: RunClient,
     version: u64,

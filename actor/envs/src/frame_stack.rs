@@ -83,9 +83,6 @@ impl FrameStack {
     }
 
     /// Takes the stacked observations [N, H, W, C * stack] that another stack of these sizes had.
-    ///
-    /// # Errors
-    /// Another length.
     pub fn load(&mut self, stacked: &[u8]) -> Result<(), EnvError> {
         saved::check(stacked.len() == self.stacked.len(), "a stack of frames")?;
         self.stacked.copy_from_slice(stacked);

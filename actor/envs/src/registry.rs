@@ -140,9 +140,6 @@ impl WorldConfig {
 
     /// The same world by the code that `name` has, where its own code is a person's: a command, or a library. A machine may have them
     /// elsewhere than the one on which the run was made.
-    ///
-    /// # Errors
-    /// A name of another world.
     pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {
         let mut changed = self.clone();
         match &mut changed {

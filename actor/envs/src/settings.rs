@@ -37,9 +37,6 @@ pub trait WorldSettings {
 
     /// Builds `num_envs` environments. Environment i depends on (`seed`, i) and its actions only. `threads` is how many threads
     /// the world may start, 0 for none.
-    ///
-    /// # Errors
-    /// Settings that cannot work, or an engine that cannot be had.
     fn build(
         &self,
         num_envs: usize,

@@ -21,9 +21,6 @@ pub struct Cache {
 
 impl Cache {
     /// As this process's environment says.
-    ///
-    /// # Errors
-    /// No variable says where it is.
     pub fn from_env() -> Result<Cache, ProcgenError> {
         Cache::from_variables(|name| std::env::var_os(name))
     }

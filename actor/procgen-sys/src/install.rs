@@ -80,9 +80,6 @@ impl Engine {
     }
 
     /// Loads the engine's library, which makes no game yet.
-    ///
-    /// # Errors
-    /// A library of the system that is missing, or anything else that the loader reports.
     pub fn check_loads(&self) -> Result<(), ProcgenError> {
         library::load(&self.library).map(drop)
     }

@@ -47,9 +47,6 @@ pub struct Options {
 
 impl Options {
     /// Says why the engine could not take these settings.
-    ///
-    /// # Errors
-    /// Numbers out of range, or a mode that the game does not have.
     pub fn validate(&self) -> Result<(), ProcgenError> {
         let Options {
             game,

@@ -193,9 +193,6 @@ impl VecGame {
     }
 
     /// The complete state of environment `env`: its level, its generators, everything.
-    ///
-    /// # Errors
-    /// No such environment.
     pub fn state(&mut self, env: usize) -> Result<State, ProcgenError> {
         let index = self.index(env)?;
         let mut bytes = vec![0_u8; self.state_bytes];
@@ -223,9 +220,6 @@ impl VecGame {
     }
 
     /// Puts environment `env` into a state of the same game; its frame, reward and flags become those of that state.
-    ///
-    /// # Errors
-    /// No such environment, or a state of another game.
     pub fn set_state(&mut self, env: usize, state: &State) -> Result<(), ProcgenError> {
         let index = self.index(env)?;
         if state.game != self.game {

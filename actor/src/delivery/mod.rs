@@ -32,9 +32,6 @@ pub struct Delivery {
 impl Delivery {
     /// Starts the thread. `inserted_total` is the run's count so far; `pool` is where the chunks' memory comes from. The actor
     /// has joined the run with the incarnation of its chunks.
-    ///
-    /// # Errors
-    /// The operating system gave no thread.
     pub fn start(
         client: RunClient,
         inserted_total: u64,
@@ -116,9 +113,6 @@ impl Delivery {
     }
 
     /// Waits for the last chunk and sends `Leave`; gives the number of transitions that were not wanted any more.
-    ///
-    /// # Errors
-    /// A chunk that could not be delivered.
     pub fn finish(self) -> Result<u64, DeliveryError> {
         drop(self.queue);
         let panicked = |_| DeliveryError::Failed("the delivery thread panicked".into());

@@ -47,9 +47,6 @@ use crate::{
 
 /// Runs one bench and reports its figures. A bench that computes in this process starts the program again in its place, if it has
 /// another number of threads than the flags ask for.
-///
-/// # Errors
-/// A component that failed, an engine that cannot be had, a file that cannot be written.
 pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
     let on = match command {
         BenchCommand::Learner(args) => args.on.device,

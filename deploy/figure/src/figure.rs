@@ -59,10 +59,7 @@ pub enum Format {
 }
 
 impl Format {
-    /// By the file's extension.
-    ///
-    /// # Errors
-    /// Any but `.svg`, `.pdf` and `.png`.
+    /// By the file's extension: `.svg`, `.pdf` or `.png`.
     pub fn of(path: &Path) -> Result<Self, FigureError> {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => Ok(Self::Svg),
@@ -84,17 +81,11 @@ pub enum Look {
 
 impl Figure {
     /// Writes the figure in the format of the file's extension.
-    ///
-    /// # Errors
-    /// Another extension, a file that cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), FigureError> {
         self.save_as(path, Look::Card)
     }
 
     /// [`Figure::save`] with another look.
-    ///
-    /// # Errors
-    /// As there.
     pub fn save_as(&self, path: &Path, look: Look) -> Result<(), FigureError> {
         let format = Format::of(path)?;
         let svg = |letters| self.draw(look, letters).into_svg();
@@ -108,9 +99,6 @@ impl Figure {
     }
 
     /// Writes `folder/stem.svg` and `folder/stem.png`.
-    ///
-    /// # Errors
-    /// Files that cannot be written.
     pub fn save_both(&self, folder: &Path, stem: &str) -> Result<(), FigureError> {
         let save = |extension| self.save(&folder.join(format!("{stem}.{extension}")));
         save("svg").and_then(|()| save("png"))

@@ -30,10 +30,7 @@ pub struct Film {
 }
 
 impl Film {
-    /// Whether a film can have this name.
-    ///
-    /// # Errors
-    /// It does not end in `.gif`.
+    /// Whether a film can have this name: it ends in `.gif`.
     pub fn check_name(path: &Path) -> Result<(), FigureError> {
         match path.extension() {
             Some(extension) if extension == "gif" => Ok(()),
@@ -83,9 +80,6 @@ impl Film {
 
     /// Adds a picture, which is shown `times` as long as the film's pictures are.
     ///
-    /// # Errors
-    /// A file that cannot be written.
-    ///
     /// # Panics
     /// If the picture is of another size than the film.
     pub fn add(&mut self, picture: &Picture, times: f64) -> Result<(), FigureError> {
@@ -111,9 +105,6 @@ impl Film {
     }
 
     /// Ends the film and gives it its name.
-    ///
-    /// # Errors
-    /// A file that cannot be written.
     pub fn finish(self) -> Result<(), FigureError> {
         let path = self.path;
         let ended = self.encoder.into_inner().map_err(io::Error::other);

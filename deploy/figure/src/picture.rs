@@ -52,9 +52,6 @@ pub struct Picture(Pixmap);
 
 impl Picture {
     /// An empty picture of this size in pixels.
-    ///
-    /// # Errors
-    /// A size without area, or too large for memory.
     pub fn new(width: usize, height: usize) -> Result<Self, FigureError> {
         let mut pixmap = render::pixmap(width, height)?;
         let [r, g, b] = CARD.rgb;
@@ -156,9 +153,6 @@ impl Picture {
     }
 
     /// The picture as a PNG.
-    ///
-    /// # Errors
-    /// It cannot be encoded.
     pub fn png(&self) -> Result<Vec<u8>, FigureError> {
         render::packed(&self.0)
     }

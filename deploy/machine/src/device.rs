@@ -15,9 +15,6 @@ pub struct DeviceFlag {
 }
 
 /// Makes sure that this program can compute on `device`.
-///
-/// # Errors
-/// A program without the feature `cuda`, or a device that is not there.
 pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
     match device {
         DeviceName::Cpu => Ok(()),

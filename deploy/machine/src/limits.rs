@@ -28,9 +28,6 @@ pub fn open_files_max() -> u64 {
 }
 
 /// Whether this process, or one that it starts, may have so many open files.
-///
-/// # Errors
-/// It may not; what to do, for a person.
 pub fn check_open_files(needed: u64, whose: &str) -> Result<(), String> {
     let max = open_files_max();
     if needed <= max {

@@ -61,9 +61,6 @@ impl ChainWorld {
     pub const ACTION_NAMES: [&str; 3] = ["no-op", "left", "right"];
 
     /// `num_envs` corridors. No seed: nothing in them is left to chance.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub fn new(config: &ChainConfig, num_envs: usize) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;

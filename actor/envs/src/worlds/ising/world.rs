@@ -60,9 +60,6 @@ impl IsingWorld {
     pub const ACTION_NAMES: [&str; 1] = ["no-op"];
 
     /// `num_envs` fields; environment i depends on (`seed`, i) only.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub fn new(config: &IsingConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;

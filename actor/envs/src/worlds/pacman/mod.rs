@@ -53,9 +53,6 @@ impl PacmanWorld {
     pub const ACTION_NAMES: [&str; 5] = ["no-op", "up", "down", "left", "right"];
 
     /// `num_envs` games; environment i depends on (`seed`, i) and its actions only.
-    ///
-    /// # Errors
-    /// Settings that cannot work.
     pub fn new(config: &PacmanConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;

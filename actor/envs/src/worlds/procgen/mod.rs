@@ -105,9 +105,6 @@ impl ProcgenWorld {
     /// beforehand and watch it.
     ///
     /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
-    ///
-    /// # Errors
-    /// Settings that the engine does not take, or an engine that cannot be fetched or loaded.
     pub fn new(
         config: &ProcgenConfig,
         num_envs: usize,
@@ -120,9 +117,6 @@ impl ProcgenWorld {
     }
 
     /// As `new`, with an engine that is known to be installed.
-    ///
-    /// # Errors
-    /// Settings that the engine does not take, or an engine that cannot be loaded.
     pub fn with_engine(
         engine: &Engine,
         config: &ProcgenConfig,
