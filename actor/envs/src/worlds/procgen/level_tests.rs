@@ -10,7 +10,7 @@ use super::*;
 
 #[test]
 fn completed_levels_are_followed_by_levels_of_the_set() {
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     for (game, start_level, num_levels) in [
         (Game::Leaper, 0, 500),
         (Game::Maze, 30, 7),
@@ -21,7 +21,7 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
             num_levels,
             ..config(game)
         };
-        let mut world = ProcgenWorld::with_engine(engine, &config, 16, 3, 0).unwrap();
+        let mut world = ProcgenWorld::new(&config, 16, 3, 0).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let mut changes = 0;
         for _ in 0..1000 {
@@ -51,7 +51,7 @@ fn a_redrawn_level_is_the_level_itself() {
     let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let config = config(game);
-        let mut world = ProcgenWorld::with_engine(engine, &config, 3, 11, 0).unwrap();
+        let mut world = ProcgenWorld::new(&config, 3, 11, 0).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let mut last_move = 7;
         let mut draw = || {
@@ -109,12 +109,12 @@ fn a_redrawn_level_is_the_level_itself() {
 /// Levels have no order: whichever was played, each level of the set is as likely to be the next.
 #[test]
 fn redrawn_levels_are_uniform_over_the_set_after_each_level() {
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     let config = ProcgenConfig {
         num_levels: 5,
         ..config(Game::Maze)
     };
-    let mut world = ProcgenWorld::with_engine(engine, &config, 1, 17, 0).unwrap();
+    let mut world = ProcgenWorld::new(&config, 1, 17, 0).unwrap();
     let mut counts = [[0.0; 5]; 5];
     for _ in 0..2500 {
         let before = world.levels()[0] as usize;

@@ -35,7 +35,7 @@ mod shrink;
 pub(crate) mod tests;
 mod visible_actions;
 
-use procgen_sys::{Engine, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
+use procgen_sys::{Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
@@ -101,7 +101,7 @@ impl ProcgenWorld {
         "e",
     ];
 
-    /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`Engine::install`] for how to do that
+    /// Makes `num_envs` environments. Fetches the engine if it is not installed; see [`procgen_sys::Engine::install`] for how to do that
     /// beforehand and watch it.
     ///
     /// `seed` decides which levels are drawn; `threads` is the number of threads that step, 0 for the calling one.
@@ -111,20 +111,8 @@ impl ProcgenWorld {
         seed: u64,
         threads: usize,
     ) -> Result<ProcgenWorld, EnvError> {
-        config.options(num_envs, seed, threads)?;
-        let engine = config.engine(&mut |_| {})?;
-        ProcgenWorld::with_engine(&engine, config, num_envs, seed, threads)
-    }
-
-    /// As `new`, with an engine that is known to be installed.
-    pub fn with_engine(
-        engine: &Engine,
-        config: &ProcgenConfig,
-        num_envs: usize,
-        seed: u64,
-        threads: usize,
-    ) -> Result<ProcgenWorld, EnvError> {
         let options = config.options(num_envs, seed, threads)?;
+        let engine = config.engine(&mut |_| {})?;
         let levels = if config.use_sequential_levels {
             let spare = procgen_sys::Options {
                 num_envs: 1,
@@ -137,13 +125,13 @@ impl ProcgenWorld {
             };
             Some(LevelSet {
                 levels: options.start_level..end,
-                spare: VecGame::new(engine, &spare)?,
+                spare: VecGame::new(&engine, &spare)?,
             })
         } else {
             None
         };
         Ok(ProcgenWorld {
-            game: VecGame::new(engine, &options)?,
+            game: VecGame::new(&engine, &options)?,
             steps_taken: vec![0; num_envs],
             time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
             actions: vec![0; num_envs],

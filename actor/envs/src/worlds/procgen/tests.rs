@@ -4,7 +4,7 @@
 use std::hash::{Hash, Hasher};
 use std::sync::OnceLock;
 
-use procgen_sys::{DistributionMode, FRAME_BYTES, Game, Options};
+use procgen_sys::{DistributionMode, Engine, FRAME_BYTES, Game, Options};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -98,7 +98,7 @@ fn another_build_of_the_library_is_played_by_its_path() {
 
 #[test]
 fn smaller_and_grey_frames_are_the_engines_own_made_so() {
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     let world = |frame_side, grey| {
         let config = ProcgenConfig {
             frame_side,
@@ -109,7 +109,7 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
             config.frame_shape().bytes(),
             (frame_side * frame_side) as usize * if grey { 1 } else { 3 }
         );
-        ProcgenWorld::with_engine(engine, &config, 3, 7, 0).unwrap()
+        ProcgenWorld::new(&config, 3, 7, 0).unwrap()
     };
     let mut whole = world(64, false);
     let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -193,12 +193,11 @@ fn seeds_are_mixed_and_not_negative() {
 
 #[test]
 fn the_same_seed_gives_the_same_frames_and_environments_do_not_depend_on_their_number() {
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     // Maze is won by chance within a few steps, so this crosses redrawn levels too.
     let run = |num_envs: usize, seed: u64, threads: usize| {
         let config = config(Game::Maze);
-        let mut world =
-            ProcgenWorld::with_engine(engine, &config, num_envs, seed, threads).unwrap();
+        let mut world = ProcgenWorld::new(&config, num_envs, seed, threads).unwrap();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut tape = Vec::new();
         for _ in 0..600 {
@@ -223,14 +222,14 @@ fn the_same_seed_gives_the_same_frames_and_environments_do_not_depend_on_their_n
 
 #[test]
 fn ends_are_told_apart() {
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     for use_sequential_levels in [false, true] {
         // Standing still in a maze: nothing happens until the limit.
         let config = ProcgenConfig {
             use_sequential_levels,
             ..config(Game::Maze)
         };
-        let mut world = ProcgenWorld::with_engine(engine, &config, 2, 1, 0).unwrap();
+        let mut world = ProcgenWorld::new(&config, 2, 1, 0).unwrap();
         for t in 1..=1000 {
             let (_, _, ends) = step(&mut world, &[4, 4]);
             let expected = if t % 500 == 0 {
@@ -258,7 +257,7 @@ fn ends_are_told_apart() {
         assert!(reached > 0);
     }
     // Being eaten by a larger fish is not a time-out.
-    let mut world = ProcgenWorld::with_engine(engine, &config(Game::Bigfish), 8, 1, 0).unwrap();
+    let mut world = ProcgenWorld::new(&config(Game::Bigfish), 8, 1, 0).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let ends: Vec<StepEnd> = (0..500)
         .flat_map(|_| step(&mut world, &draw(&mut rng, 8)).2)
@@ -323,12 +322,12 @@ fn visible_actions_are_what_the_engine_does() {
 fn every_game_continues_where_it_was_saved() {
     use crate::saved::tests::continues;
 
-    let Some(engine) = engine() else { return };
+    let Some(_engine) = engine() else { return };
     let mut ended = 0;
     for game in Game::ALL {
         let config = config(game);
         ended += continues(game.name(), 200, || {
-            Box::new(ProcgenWorld::with_engine(engine, &config, 2, 5, 0).unwrap())
+            Box::new(ProcgenWorld::new(&config, 2, 5, 0).unwrap())
         });
     }
     assert!(ended > 16, "{ended} ends in all games");
