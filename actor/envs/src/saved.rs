@@ -133,26 +133,4 @@ pub(crate) mod tests {
             fails(world.load(&state.unwrap()), &["no state of this world"]);
         }
     }
-
-    #[test]
-    fn a_world_that_says_nothing_of_itself_cannot_be_saved() {
-        struct Silent;
-        impl Environment for Silent {
-            fn frame_shape(&self) -> crate::FrameShape {
-                crate::FrameShape::new(1, 1, 1)
-            }
-            fn num_actions(&self) -> usize {
-                1
-            }
-            fn num_envs(&self) -> usize {
-                1
-            }
-            fn observe(&mut self, _: &mut [u8]) {}
-            fn step(&mut self, _: &[u8], _: &mut [f32], _: &mut [StepEnd]) -> Result<(), EnvError> {
-                Ok(())
-            }
-        }
-        assert!(matches!(Silent.save(), Err(EnvError::NotSaved(_))));
-        assert!(matches!(Silent.load(&[]), Err(EnvError::NotSaved(_))));
-    }
 }
