@@ -9,15 +9,16 @@ use serde::{Serialize, de::DeserializeOwned};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::error::EnvError;
 use crate::saved;
+use crate::settings::WorldSettings;
 
 /// A world whose environments are stepped one by one, each by itself.
 pub(crate) trait Envs: Send {
+    type Config: WorldSettings;
+
     /// All of an environment that does not follow from the settings.
     type Saved: Serialize + DeserializeOwned;
 
-    fn shape(&self) -> FrameShape;
-
-    fn actions(&self) -> usize;
+    fn config(&self) -> &Self::Config;
 
     fn count(&self) -> usize;
 
@@ -34,11 +35,11 @@ pub(crate) trait Envs: Send {
 
 impl<W: Envs> Environment for W {
     fn frame_shape(&self) -> FrameShape {
-        self.shape()
+        self.config().frame_shape()
     }
 
     fn num_actions(&self) -> usize {
-        self.actions()
+        self.config().action_names().len()
     }
 
     fn num_envs(&self) -> usize {
@@ -46,9 +47,9 @@ impl<W: Envs> Environment for W {
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
-        check_frames(frames, self.count(), self.shape());
-        let bytes = self.shape().bytes();
-        for (env, frame) in frames.chunks_exact_mut(bytes).enumerate() {
+        let shape = self.frame_shape();
+        check_frames(frames, self.count(), shape);
+        for (env, frame) in frames.chunks_exact_mut(shape.bytes()).enumerate() {
             self.draw(env, frame);
         }
     }
@@ -59,7 +60,7 @@ impl<W: Envs> Environment for W {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
-        check_step(self.count(), self.actions(), actions, rewards, ends)?;
+        check_step(self.count(), self.num_actions(), actions, rewards, ends)?;
         for (env, &action) in actions.iter().enumerate() {
             (rewards[env], ends[env]) = self.act(env, action);
         }

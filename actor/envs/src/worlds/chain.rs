@@ -118,15 +118,13 @@ impl WorldSettings for ChainConfig {
 }
 
 impl Envs for ChainWorld {
+    type Config = ChainConfig;
+
     /// Cell, and steps of the episode.
     type Saved = (usize, u32);
 
-    fn shape(&self) -> FrameShape {
-        self.config.frame_shape()
-    }
-
-    fn actions(&self) -> usize {
-        Self::ACTION_NAMES.len()
+    fn config(&self) -> &ChainConfig {
+        &self.config
     }
 
     fn count(&self) -> usize {

@@ -134,15 +134,13 @@ impl WorldSettings for IsingConfig {
 }
 
 impl Envs for IsingWorld {
+    type Config = IsingConfig;
+
     /// With the patch's spins.
     type Saved = (Now, Vec<i8>);
 
-    fn shape(&self) -> FrameShape {
-        self.config.frame_shape()
-    }
-
-    fn actions(&self) -> usize {
-        Self::ACTION_NAMES.len()
+    fn config(&self) -> &IsingConfig {
+        &self.config
     }
 
     fn count(&self) -> usize {

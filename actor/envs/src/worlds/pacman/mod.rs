@@ -26,7 +26,7 @@ use ghost::Chance;
 use maze::{HEIGHT, Maze, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
-use crate::environment::{FrameShape, StepEnd};
+use crate::environment::StepEnd;
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved::check;
@@ -88,15 +88,13 @@ impl PacmanWorld {
 }
 
 impl Envs for PacmanWorld {
+    type Config = PacmanConfig;
+
     /// A game; and the spins in its walls with their generator, where walls flicker.
     type Saved = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
-    fn shape(&self) -> FrameShape {
-        self.config.frame_shape()
-    }
-
-    fn actions(&self) -> usize {
-        Self::ACTION_NAMES.len()
+    fn config(&self) -> &PacmanConfig {
+        &self.config
     }
 
     fn count(&self) -> usize {
