@@ -5,7 +5,6 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::process::Patience;
-use crate::environment::FrameShape;
 
 /// A command, and the world that it declared when the run was made. Each actor checks that its own process declares the same.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -29,7 +28,10 @@ pub struct ExecConfig {
 
 impl ExecConfig {
     pub(super) const fn start_patience(&self) -> Patience {
-        start_patience(self.start_timeout_ms)
+        Patience {
+            limit: Duration::from_millis(self.start_timeout_ms),
+            setting: "world.start_timeout_ms",
+        }
     }
 
     pub(super) const fn step_patience(&self) -> Patience {
@@ -38,23 +40,16 @@ impl ExecConfig {
             setting: "world.step_timeout_ms",
         }
     }
-}
 
-/// What a process declares, in words.
-pub(super) fn describe(shape: FrameShape, actions: &[String]) -> String {
-    format!(
-        "frames of {} x {} x {} and the {} actions {}",
-        shape.height,
-        shape.width,
-        shape.channels,
-        actions.len(),
-        actions.join(", ")
-    )
-}
-
-pub(super) const fn start_patience(timeout_ms: u64) -> Patience {
-    Patience {
-        limit: Duration::from_millis(timeout_ms),
-        setting: "world.start_timeout_ms",
+    /// What it declares, in words.
+    pub(super) fn describe(&self) -> String {
+        format!(
+            "frames of {} x {} x {} and the {} actions {}",
+            self.height,
+            self.width,
+            self.channels,
+            self.actions.len(),
+            self.actions.join(", ")
+        )
     }
 }

@@ -90,6 +90,17 @@ impl Declaration {
             None => Err(no_world("\"driml_env\" is missing".into())),
         }
     }
+
+    /// These settings, with what was declared.
+    pub(super) fn over(self, config: &ExecConfig) -> ExecConfig {
+        ExecConfig {
+            height: self.height,
+            width: self.width,
+            channels: self.channels,
+            actions: self.actions,
+            ..config.clone()
+        }
+    }
 }
 
 /// Each column begins at a multiple of this, so that no two of them share a line of a processor's cache.

@@ -5,7 +5,7 @@ use rand::Rng;
 use serde_json::json;
 use tracing::Level;
 
-use super::config::{ExecConfig, describe, start_patience};
+use super::config::ExecConfig;
 use super::process::{Patience, WorldProcess};
 use super::protocol::{Block, Declaration, SavedExec, StateMemory, VERSION, WORLD_STATE_BYTES_MAX};
 use crate::environment::{Environment, FrameShape, StepEnd};
@@ -60,29 +60,24 @@ impl ExecWorld {
         config.validate()?;
         check_num_envs(num_envs)?;
         let patience = config.start_patience();
-        let (mut process, declared) = introduce(
-            &config.command,
-            patience,
-            seeds(seed, num_envs),
-            Level::INFO,
-        )?;
-        let shape = FrameShape::new(declared.height, declared.width, declared.channels);
-        if shape != config.frame_shape() || declared.actions != config.actions {
-            let found = describe(shape, &declared.actions);
-            let promised = describe(config.frame_shape(), &config.actions);
+        let (mut process, declared) = introduce(config, seeds(seed, num_envs), Level::INFO)?;
+        let (copies, saves) = (declared.copies, declared.saves);
+        let found = declared.over(config);
+        if found != *config {
             let other = format!(
-                "declares {found}, but the run's settings say {promised}: start the run anew, or the command as it was"
+                "declares {}, but the run's settings say {}: start the run anew, or the command as it was",
+                found.describe(),
+                config.describe()
             );
             return Err(process.fail(&other));
         }
-        let copies = declared.copies;
         if copies != num_envs {
             let other = format!(
                 "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
             );
             return Err(process.fail(&other));
         }
-        let block = Block::new(num_envs, shape)
+        let block = Block::new(num_envs, config.frame_shape())
             .map_err(|e| process.system("making the memory that it shares", &e))?;
         let doing = "before its first frames";
         process.say_line(b"", &block.opening(), doing)?;
@@ -91,7 +86,7 @@ impl ExecWorld {
             block,
             config: config.clone(),
             num_envs,
-            saves: declared.saves,
+            saves,
         };
         world.hear_done(patience, doing)?;
         Ok(world)
@@ -167,16 +162,15 @@ impl ExecWorld {
 
 /// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
 fn introduce(
-    command: &str,
-    patience: Patience,
+    config: &ExecConfig,
     seeds: Vec<u32>,
     level: Level,
 ) -> Result<(WorldProcess, Declaration), EnvError> {
-    let mut process = WorldProcess::start(command, level)?;
+    let mut process = WorldProcess::start(&config.command, level)?;
     let doing = "before it declared itself";
     let request = json!({"driml_env": VERSION, "copies": seeds.len(), "seeds": seeds});
     process.say_line(b"", &request, doing)?;
-    let line = process.line(patience, doing)?;
+    let line = process.line(config.start_patience(), doing)?;
     let declaration = Declaration::parse(&line).map_err(|why| process.fail(&why))?;
     Ok((process, declaration))
 }
@@ -190,22 +184,18 @@ pub fn declaration(
     start_timeout_ms: u64,
     step_timeout_ms: u64,
 ) -> Result<ExecConfig, EnvError> {
-    let (process, declared) = introduce(
-        command,
-        start_patience(start_timeout_ms),
-        vec![0],
-        Level::DEBUG,
-    )?;
-    drop(process);
-    let config = ExecConfig {
+    let asked = ExecConfig {
         command: command.into(),
-        height: declared.height,
-        width: declared.width,
-        channels: declared.channels,
-        actions: declared.actions,
+        height: 0,
+        width: 0,
+        channels: 0,
+        actions: Vec::new(),
         start_timeout_ms,
         step_timeout_ms,
     };
+    let (process, declared) = introduce(&asked, vec![0], Level::DEBUG)?;
+    drop(process);
+    let config = declared.over(&asked);
     config.validate()?;
     Ok(config)
 }
