@@ -72,7 +72,6 @@ struct Filmed {
 struct Moment {
     shots: Vec<Shot>,
     seen: Option<Seen>,
-    /// Of all environments, if local DIM is asked.
     actions: Vec<u8>,
     ends: Vec<StepEnd>,
 }
@@ -141,23 +140,20 @@ impl Recording {
             let frame = &step.frames[i * frame_bytes..][..frame_bytes];
             shots.push(env.take(frame, step, i, self.episodes_max));
         }
-        let mut moment = Moment {
-            shots,
-            seen: None,
-            actions: Vec::new(),
-            ends: Vec::new(),
-        };
-        let mut ahead = 0;
+        let (mut seen, mut ahead) = (None, 0);
         if let Some(Overlay { viewer, local_k }) = &mut self.overlay {
             // Other environments than the filmed are what local DIM tells a state from.
             let looked_at = local_k.map_or(self.envs.len(), |_| played);
             let states = &step.states[..step.states.len() / played * looked_at];
-            moment.seen = Some(viewer.look(states)?);
-            moment.actions = step.actions.to_vec();
-            moment.ends = step.ends.to_vec();
+            seen = Some(viewer.look(states)?);
             ahead = local_k.unwrap_or(0);
         }
-        self.waiting.push_back(moment);
+        self.waiting.push_back(Moment {
+            shots,
+            seen,
+            actions: step.actions.to_vec(),
+            ends: step.ends.to_vec(),
+        });
         self.steps += 1;
         if self.waiting.len() > ahead {
             self.draw_next(ahead)?;
