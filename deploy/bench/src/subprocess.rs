@@ -6,8 +6,8 @@ use std::path::Path;
 use anyhow::Context;
 use driml_launch::{
     console::Screen,
+    endpoint::wait_until_listening,
     managed_process::{ManagedProcess, THREADS},
-    processes::wait_until_listening,
 };
 use driml_machine::process_env;
 use driml_protocol::Shutdown;

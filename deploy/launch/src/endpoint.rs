@@ -4,16 +4,23 @@
 use std::{
     io::ErrorKind,
     net::{TcpListener, ToSocketAddrs, UdpSocket},
+    time::{Duration, Instant},
 };
 
+use anyhow::Context;
 use driml_machine::error::{Usage, usage};
-use driml_protocol::reach;
+use driml_protocol::{Shutdown, reach};
 
 /// The prefix of a run's keys unless it is told otherwise.
 pub const NAMESPACE: &str = "driml";
 
 /// The longest path of a unix socket, bytes: `sun_path` of `unix(7)`, whose last byte is 0.
 pub(crate) const SOCKET_PATH_MAX: usize = 107;
+
+/// How long the replay server may take to listen.
+const LISTEN_MAX: Duration = Duration::from_secs(60);
+/// How often it is looked whether it does.
+const LOOK: Duration = Duration::from_millis(20);
 
 /// What a person has said about who may connect.
 #[derive(Clone, Copy, Debug, Default)]
@@ -74,6 +81,25 @@ pub fn check_unused(endpoints: &[String]) -> Result<(), Usage> {
         }
     }
     Ok(())
+}
+
+/// Waits until something listens at `endpoint`; false once it is `interrupted`. `check_alive` says whether it still can.
+pub fn wait_until_listening(
+    endpoint: &str,
+    interrupted: &Shutdown,
+    mut check_alive: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<bool> {
+    let deadline = Instant::now() + LISTEN_MAX;
+    while let Err(e) = reach::look(endpoint) {
+        check_alive()?;
+        if Instant::now() > deadline {
+            return Err(e).context("waiting for the replay server");
+        }
+        if interrupted.wait_timeout(LOOK) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 fn is_taken<T>(bound: std::io::Result<T>) -> bool {

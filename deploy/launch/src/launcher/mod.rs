@@ -17,17 +17,19 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     console::{self, Screen, print_wrapped},
+    endpoint::wait_until_listening,
     evaluator::Evaluator,
     last_play,
     managed_process::ManagedProcess,
     open_files,
-    processes::{Processes, stop, wait_until_listening},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView, updates_served},
     view::{Display, Poller, Reached, TEMPLATE, notes},
 };
+
+use self::processes::{Processes, stop};
 
 const POLL: Duration = Duration::from_secs(1);
 /// How long a process may leave questions unanswered, from its start too, before the run is given up.
