@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::{LogLimiter, Shutdown, Silence, reach};
+use driml_protocol::{LogLimiter, Shutdown, reach};
 
 pub use self::watched::Outputs;
 use self::watched::Watched;
@@ -83,19 +83,14 @@ pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
 fn wait_until_known(poller: &mut Poller, interrupted: &Shutdown) -> anyhow::Result<()> {
     let silent_max = Duration::from_millis(poller.config.learner.unreachable_max_ms);
-    let (mut silence, mut said) = (Silence::begin(), LogLimiter::default());
+    let mut said = LogLimiter::default();
     loop {
         let view = poller.ask();
         if view.is_answered() && view.after_updates.is_some() {
             return Ok(());
         }
-        if view.is_answered() || view.recovering().next().is_some() {
-            silence.answered();
-        } else {
-            silence.unanswered();
-        }
         let is_another_run = view.servers.iter().any(|it| it.is_another_run);
-        if is_another_run || silence.length() > silent_max {
+        if is_another_run || view.replay_silence.length() > silent_max {
             bail!("{}", needed(view).join("; "));
         }
         if said.due().is_some() {
