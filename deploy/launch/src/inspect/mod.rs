@@ -68,16 +68,11 @@ impl Inspection {
             ("computes: FLOPs a decision", &self.decision_flops, true),
             ("holds and sends: bytes", &self.bytes, false),
         ] {
-            text += &format!(
-                "\n{}",
-                row(heading, ["is", "everything"].map(str::to_owned))
-            );
+            text += &format!("\n{}", row(heading, "is", "everything"));
             let sum = is_summed.then(|| sum("all", lines));
             for line in lines.iter().chain(&sum) {
-                text += &row(
-                    &line.what,
-                    [line.is, line.everything].map(|count| HumanCount(count).to_string()),
-                );
+                let [is, all] = [line.is, line.everything].map(|n| HumanCount(n).to_string());
+                text += &row(&line.what, &is, &all);
             }
         }
         format!("{text}\neverything: {}\n", self.everything)
@@ -113,7 +108,7 @@ fn sum(what: &str, lines: &[Line]) -> Line {
     }
 }
 
-fn row(what: &str, [is, everything]: [String; 2]) -> String {
+fn row(what: &str, is: &str, everything: &str) -> String {
     format!("{what:WHAT_COLUMNS$}{is:>NUMBER_COLUMNS$}{everything:>NUMBER_COLUMNS$}\n")
 }
 
