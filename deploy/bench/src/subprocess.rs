@@ -37,7 +37,7 @@ pub(super) fn start(
     let run = ["--env", world, "--agent", agent, "--preset", "paper"];
     let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
     let args = [args, &run, &sets].concat();
-    ManagedProcess::start(name, &args, 1, folder, &Screen::plain(), None)
+    ManagedProcess::start(name, &args, 1, folder, &Screen::default(), None)
 }
 
 /// Waits until a process listens at `endpoint`.

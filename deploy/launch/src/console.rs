@@ -225,7 +225,7 @@ fn text(event: &Event<'_>) -> String {
 /// How long one line about a full disk stands for those of all processes and files.
 const FULL_DISK_PERIOD: Duration = Duration::from_secs(600);
 
-/// Where messages go: stderr, above a progress bar if stderr is a terminal. Clones share the bar;
+/// Where messages go: stderr, above a progress bar if stderr is a terminal and there is one. Clones share the bar;
 /// each has its own time of the next plain line.
 #[derive(Clone, Debug, Default)]
 pub struct Screen {
@@ -275,11 +275,6 @@ impl Screen {
             plain_next: Some(Instant::now() + PLAIN_PERIOD),
             ..Self::default()
         }
-    }
-
-    /// Without a progress bar.
-    pub fn plain() -> Self {
-        Self::default()
     }
 
     /// The progress bar, if there is one.

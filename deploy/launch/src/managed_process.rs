@@ -98,7 +98,7 @@ impl ManagedProcess {
         let mut command = Command::new("sh");
         command.args(["-c", script]).stdin(Stdio::null());
         let log = ProcessLog::open("script", logs).unwrap();
-        Self::spawn("script", command, log, &Screen::plain()).unwrap()
+        Self::spawn("script", command, log, &Screen::default()).unwrap()
     }
 
     /// The process's number.

@@ -161,7 +161,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut log = ProcessLog::open("actor-0", folder.path()).unwrap();
         let lines: String = (0..10).map(|n| format!("line {n}\n")).collect();
-        let screen = Screen::plain();
+        let screen = Screen::default();
         log.follow(std::io::Cursor::new(lines.clone()), &screen)
             .unwrap();
         log.finish();

@@ -171,7 +171,7 @@ mod tests {
     };
 
     fn display() -> Display {
-        Display::new(Screen::plain(), Instant::now(), 0)
+        Display::new(Screen::default(), Instant::now(), 0)
     }
 
     fn view(planned: (u64, u64), replay: ReplayStatus, learner: LearnerStatus) -> RunView {
