@@ -118,7 +118,7 @@ fn lock(kept: &Mutex<Kept>) -> MutexGuard<'_, Kept> {
 impl Kept {
     /// Keeps a line. A warning is returned the first time that one cannot be written.
     fn add(&mut self, line: String) -> Option<String> {
-        let warning = self.file.add(format!("{line}\n").into_bytes());
+        let warning = self.file.add([format!("{line}\n").into_bytes()]);
         if self.tail.len() == TAIL_LINES_MAX {
             self.tail.pop_front();
         }

@@ -140,7 +140,7 @@ impl TrainingEpisodes {
             self.received[shard] = received;
         }
         // Those that could not be written before are tried again, too.
-        warnings.extend(self.table.add_all(rows));
+        warnings.extend(self.table.add(rows));
         warnings
     }
 

@@ -169,7 +169,7 @@ impl RunRecorder {
         let points = points(view);
         let events = self.events.as_mut();
         let drawn = events.and_then(|it| it.add(&points, &view.replay, view.learner.finished));
-        let written = self.metrics.add(row);
+        let written = self.metrics.add([row]);
         written.into_iter().chain(drawn).collect()
     }
 

@@ -148,13 +148,8 @@ impl AppendLog {
         })
     }
 
-    /// Adds a row, after those that wait. A warning is returned the first time that a row has to wait.
-    pub(crate) fn add(&mut self, row: Vec<u8>) -> Option<String> {
-        self.add_all([row])
-    }
-
-    /// [`Self::add`] of several rows, in one write.
-    pub(super) fn add_all(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
+    /// Adds rows in one write, after those that wait. A warning is returned the first time that rows have to wait.
+    pub(crate) fn add(&mut self, rows: impl IntoIterator<Item = Vec<u8>>) -> Option<String> {
         self.waiting.extend(rows);
         let more = self.waiting.len().saturating_sub(self.waiting_max);
         self.waiting.drain(..more);
@@ -230,18 +225,19 @@ mod tests {
     #[test]
     fn what_is_appended_waits_until_it_can_be_written() {
         let folder = tempfile::tempdir().unwrap();
-        let row = |n: u64| format!("\"{n}, of five\"\n");
+        let text = |n: u64| format!("\"{n}, of five\"\n");
+        let row = |n| [text(n).into_bytes()];
         for (name, unit, waiting_max, lost) in [
             ("metrics.csv", "rows", WAITING_MAX, 0),
             ("the log of actor-0", "lines", 2, 1),
         ] {
             let full = Path::new("/dev/full");
             let mut log = AppendLog::open(full, name.into(), unit, waiting_max).unwrap();
-            let said = log.add(row(1).into_bytes()).unwrap();
+            let said = log.add(row(1)).unwrap();
             let why = format!("{name} cannot be written: No space left");
             let wait = format!("; its {unit} wait in memory until it can be");
             assert!(said.starts_with(&why) && said.ends_with(&wait), "{said}");
-            assert_eq!(log.add(row(2).into_bytes()), None, "it is logged once");
+            assert_eq!(log.add(row(2)), None, "it is logged once");
             let missing = log.missing().unwrap();
             let why = format!("2 {unit} of {name} are lost: No space left");
             assert!(missing.starts_with(&why), "{missing}");
@@ -250,8 +246,8 @@ mod tests {
             fs::write(&path, "a\n").unwrap();
             log.file = File::options().append(true).open(&path).unwrap();
             // Of more than may wait the oldest are lost.
-            assert_eq!(log.add(row(3).into_bytes()), None);
-            let kept: String = (1 + lost..=3).map(row).collect();
+            assert_eq!(log.add(row(3)), None);
+            let kept: String = (1 + lost..=3).map(text).collect();
             assert_eq!(fs::read_to_string(&path).unwrap(), format!("a\n{kept}"));
             assert_eq!((log.lost, log.missing().is_some()), (lost, lost > 0));
         }

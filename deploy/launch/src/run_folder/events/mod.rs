@@ -89,7 +89,7 @@ impl Events {
             records.extend(self.histograms(at, replay));
             records.extend(self.affinity(at));
         }
-        self.file.add_all(records)
+        self.file.add(records)
     }
 
     /// What was counted since the last histograms.
