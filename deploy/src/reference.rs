@@ -108,7 +108,6 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The presets of a folder: their names and files.
 fn presets(folder: &str) -> Vec<(String, PathBuf)> {
     let folder = root().join("deploy/settings/presets").join(folder);
     let files = fs::read_dir(folder).unwrap().map(|it| it.unwrap().path());

@@ -23,7 +23,6 @@ use tracing_subscriber::{
     util::SubscriberInitExt,
 };
 
-/// How often a progress bar is drawn at most, times a second.
 const DRAWS_PER_SECOND: u8 = 20;
 /// How often a line says how far something is where there is no progress bar.
 const PLAIN_PERIOD: Duration = Duration::from_secs(10);
@@ -155,7 +154,6 @@ pub(crate) fn join_losses(lines: impl IntoIterator<Item = String>) -> Vec<String
 const OF_OTHERS: &str = "zenoh=error,zenoh::api::session=off,zenoh::api::handlers=off,\
                          zenoh::net::routing::hat::broker::token=off,zenoh_link_commons::quic=warn,quinn=error";
 
-/// The usual filter of the log, with driml's own crates at `level`.
 fn usual_filter(level: &str) -> String {
     format!("warn,driml={level},{OF_OTHERS}")
 }

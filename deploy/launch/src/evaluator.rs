@@ -85,7 +85,6 @@ const POLL: Duration = Duration::from_millis(100);
 
 /// Which checkpoints of a run are to be played.
 pub(crate) struct Due {
-    /// None if none is.
     config: Option<EvaluationConfig>,
     /// Updates of the newest checkpoint that was played or is.
     newest: u64,

@@ -367,7 +367,6 @@ mod tests {
         assert!(column("dim_4t4").is_none());
     }
 
-    /// All metrics as a table of Markdown.
     fn markdown() -> String {
         let mut table =
             "| column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();

@@ -103,7 +103,6 @@ fn processes(config: &RunConfig, lockstep: bool) -> String {
     format!("{servers}; learner {learner}; {count} {actors} with {envs} environments each")
 }
 
-/// Bytes in a unit that fits them.
 fn size(bytes: u64) -> String {
     match bytes >> 20 {
         mib @ 0..1024 => format!("{} MiB", mib + 1),

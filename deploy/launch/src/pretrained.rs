@@ -57,7 +57,6 @@ pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
     read(&shown, bytes).map(Some)
 }
 
-/// The network of `game` among `all`.
 fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     let games: Vec<_> = all.iter().map(|(game, _)| *game).collect();
     let Some((_, bytes)) = all.iter().find(|(known, _)| *known == game) else {

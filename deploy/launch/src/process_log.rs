@@ -36,7 +36,6 @@ struct Kept {
 }
 
 impl ProcessLog {
-    /// Opens the log of the process `name` in the folder `logs`, to append to it.
     pub(crate) fn open(name: &str, logs: &Path) -> anyhow::Result<Self> {
         let path = logs.join(format!("{name}.log"));
         let kept = Kept {

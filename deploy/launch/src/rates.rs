@@ -13,13 +13,11 @@ pub(crate) struct Speed {
     pub(crate) updates: f64,
 }
 
-/// The time over which rates are means.
 const RATE_WINDOW: Duration = Duration::from_secs(20);
 
 /// When counts were taken, and how many frames and updates they were.
 type Sample = (Instant, u64, u64);
 
-/// The counts of the last while.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Rates(VecDeque<Sample>);
 

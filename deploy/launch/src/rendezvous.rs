@@ -23,7 +23,6 @@ const PREFIX: &str = "driml-run-";
 const SOCKET: &str = "/driml-run-XXXXXX/replay-server-255.sock";
 /// Where the folder is if the one for temporary files has too long a name.
 const SHORT_PLACE: &str = "/tmp";
-/// The file whose lock says that the folder is used.
 const IN_USE: &str = "in-use";
 
 /// A run's folder for sockets. Dropping it removes it.
@@ -111,7 +110,6 @@ fn is_free(path: &Path) -> Option<bool> {
     lock_file::try_lock(&lock).ok()
 }
 
-/// Whether a process still uses the folder at `path`.
 pub(crate) fn is_used(path: &Path) -> bool {
     is_free(path) == Some(false)
 }

@@ -28,7 +28,6 @@ pub struct Plan {
     /// The probability with which all actors act at random; none where they differ in it.
     #[serde(skip)]
     pub(crate) epsilon: Option<Schedule>,
-    /// The names of the agent's auxiliary losses.
     #[serde(skip)]
     pub(crate) losses: &'static [&'static str],
 }
@@ -110,10 +109,8 @@ pub(crate) struct Recorded {
     pub(crate) rss_mib: Vec<(String, Option<f64>)>,
 }
 
-/// What one replay server answers.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(crate) struct ServerAnswer {
-    /// What it is called in messages.
     #[serde(skip)]
     pub(crate) name: String,
     pub(crate) endpoint: String,
@@ -136,7 +133,6 @@ pub struct RunView {
     pub(crate) plan: Plan,
     /// Updates after which it was resumed; none before that is known.
     pub(crate) after_updates: Option<u64>,
-    /// What each replay server answered last time.
     pub(crate) servers: Vec<ServerAnswer>,
     /// The replay servers' counts when all of them answered last.
     pub(crate) shards: Vec<ReplayStatus>,
@@ -144,7 +140,6 @@ pub struct RunView {
     pub replay: ReplayStatus,
     /// The learner's last status.
     pub learner: LearnerStatus,
-    /// Whether the learner answered last time.
     pub(crate) learner_answers: bool,
     /// For how long not all replay servers have answered, and the learner has not.
     pub(crate) replay_silence: Silence,
@@ -154,7 +149,6 @@ pub struct RunView {
     /// What its recorder knew after the last counts; none where it is not recorded.
     pub(crate) recorded: Option<Recorded>,
     rates: Rates,
-    /// How fast it is, over the last while.
     pub(crate) speed: Speed,
 }
 
@@ -267,7 +261,6 @@ impl RunView {
         recorded.map_or_else(|| self.up_s(), |it| Some(it.seconds))
     }
 
-    /// The training's episodes.
     pub(crate) fn episodes(&self) -> Episodes {
         let of_replay = || Episodes::of(self.replay.episodes, self.replay.returns.newest.iter());
         self.recorded
@@ -275,7 +268,6 @@ impl RunView {
             .map_or_else(of_replay, |it| it.episodes)
     }
 
-    /// The k of the rows served with a positive.
     pub(crate) fn k(&self) -> Option<Spread> {
         let recorded = self.recorded.as_ref();
         recorded.map_or_else(|| Spread::of_k(&self.replay), |it| it.k)

@@ -6,7 +6,6 @@ use std::{collections::BTreeSet, fs, path::PathBuf};
 
 use driml_protocol::shared_memory::FOLDER;
 
-/// What the names of zenoh's segments end with.
 const EXTENSION: &str = ".zenoh";
 
 /// Removes the segments of shared memory that this process alone has in its memory. It must not use them any more.

@@ -22,7 +22,6 @@ pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
     it
 }
 
-/// The settings of a preset, world and agent, with these `--set`s.
 pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> RunConfig {
     of_names(preset, world, agent, sets, &MACHINE).unwrap()
 }
@@ -43,7 +42,6 @@ pub(crate) fn untrained(world: &str, agent: &str) -> Player {
     }
 }
 
-/// Returns of a few episodes.
 pub(crate) fn played(player: &Player) -> Vec<f64> {
     let returns = player.returns(Who::Agent, Levels::Train, 4, 3).unwrap();
     returns.unwrap()

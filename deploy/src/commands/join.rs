@@ -66,7 +66,6 @@ impl TlsFlags {
         self.tls_dir.is_some()
     }
 
-    /// The certificate of `role`, if one was asked for.
     pub(super) fn credentials(&self, role: Role) -> Result<Option<Arc<Credentials>>, Usage> {
         let read = |folder: &PathBuf| Credentials::read(folder, role).map(Arc::new);
         let read = self.tls_dir.as_ref().map(read).transpose();

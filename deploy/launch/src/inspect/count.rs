@@ -19,7 +19,6 @@ const EVERY_POSITIVES: usize = 5;
 const NOISY_SIGMA: f64 = 0.5;
 pub(super) const BATCH: &str = "a batch";
 
-/// One row of the table.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Line {
     pub(crate) what: String,

@@ -194,7 +194,6 @@ pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
     names
 }
 
-/// `replay-server`, or one for each of several shards.
 fn server_names(shards: u32) -> Vec<String> {
     match shards {
         1 => vec!["replay-server".into()],

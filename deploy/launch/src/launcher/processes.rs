@@ -22,7 +22,6 @@ const RESTARTS_MAX: u32 = 8;
 const ACTOR_RESTARTS_MAX: u32 = 16;
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
-/// How long a process may take to end once it was killed.
 const KILLED_MAX: Duration = Duration::from_secs(30);
 
 #[derive(Default)]
@@ -84,7 +83,6 @@ pub(super) fn stop(
     late
 }
 
-/// A command of this program and flags with their values.
 fn call<'a>(
     command: &'a str,
     flags: impl IntoIterator<Item = (&'a str, &'a OsStr)>,

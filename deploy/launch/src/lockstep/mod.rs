@@ -130,7 +130,6 @@ pub fn run(
     resume::say_next(&summary, &config.world, run_dir)
 }
 
-/// Ends this process at a second interrupt, whatever it does.
 fn exit_at_a_second(second: Shutdown) -> anyhow::Result<()> {
     let exit = move || {
         second.wait();

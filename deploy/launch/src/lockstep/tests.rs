@@ -23,7 +23,6 @@ fn weights(config: &RunConfig) -> String {
     ended(Lockstep::in_memory(config).unwrap())
 }
 
-/// The SHA-256 of the weights with which it ends.
 fn ended(mut lockstep: Lockstep) -> String {
     while lockstep.round().unwrap() {}
     lockstep.end().unwrap();

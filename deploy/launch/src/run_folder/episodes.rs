@@ -171,7 +171,6 @@ impl TrainingEpisodes {
         }
     }
 
-    /// Counts an episode and gives its row.
     fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
         self.episode += 1;
         self.frames = self.frames.max(ended.frames);
@@ -197,7 +196,6 @@ impl TrainingEpisodes {
         ]
     }
 
-    /// The episodes of a run that counts so many.
     pub(super) fn so_far(&self, count: u64) -> Episodes {
         Episodes::of(count, self.newest.iter())
     }

@@ -142,7 +142,6 @@ pub(crate) struct Candidate {
 }
 
 impl Candidate {
-    /// Reads the files of a checkpoint of the run.
     pub(crate) fn read(checkpoint: &Path) -> anyhow::Result<Self> {
         let doing = || format!("reading {}", checkpoint.display());
         let mut files = Vec::new();

@@ -14,7 +14,6 @@ use nix::unistd::{AccessFlags, access};
 
 use super::table::{Table, write_whole};
 
-/// What the names of TensorBoard's files begin with.
 pub(super) const EVENTS: &str = "events.out.tfevents.";
 
 /// Makes a method for each file and folder of a run's, which gives its path.
@@ -156,7 +155,6 @@ impl RunFolder {
         })
     }
 
-    /// Checks that what a run has written is still there.
     pub(crate) fn check_whole(&self) -> anyhow::Result<()> {
         // A run in lockstep has no logs.
         let files = [self.config(), self.metrics(), self.episodes(), self.logs()];

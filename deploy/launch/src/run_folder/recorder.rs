@@ -181,7 +181,6 @@ impl RunRecorder {
         missing
     }
 
-    /// The whole run's episodes.
     pub(crate) fn episodes(&self, replay: &ReplayStatus) -> Episodes {
         self.episodes.so_far(self.episodes_before + replay.episodes)
     }
@@ -198,7 +197,6 @@ impl RunRecorder {
     }
 }
 
-/// The columns of the metrics of a run with these processes.
 fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
     let mut nothing = RunView::new(Plan::of(config));
     nothing.recorded = Some(Recorded {

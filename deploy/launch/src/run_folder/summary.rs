@@ -171,7 +171,6 @@ impl Summary {
         serde_json::from_slice(&text).with_context(doing)
     }
 
-    /// Removes the one of an earlier time from the run folder, if there is one.
     pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.summary();
         match fs::remove_file(&path) {
@@ -209,7 +208,6 @@ impl Summary {
         format!("{counts}\n{earned}{}\n", run_dir.display())
     }
 
-    /// The line about what was played; empty if nothing was.
     fn earned(&self) -> String {
         let played = self.played.as_ref();
         played.map(LastPlay::describe).unwrap_or_default()

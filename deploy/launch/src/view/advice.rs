@@ -14,7 +14,6 @@ use crate::run_view::{RunView, ServerAnswer};
 const UNRESPONSIVE_S: f64 = 30.0;
 /// How long a replay server or the learner may leave questions unanswered before a note says so.
 const SILENT_MAX: Duration = Duration::from_secs(10);
-/// Unresponsive actors that a note names.
 const NAMED_MAX: usize = 4;
 
 /// Each replay server that answered, and its account.
@@ -173,7 +172,6 @@ pub(crate) fn notes(view: &RunView) -> Vec<String> {
     notes
 }
 
-/// What to say of a replay server that reads its replay back.
 pub(crate) fn recovery(server: &str, progress: RecoveryProgress) -> String {
     format!("{server}: reads its replay back from disk, {progress}")
 }

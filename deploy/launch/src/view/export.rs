@@ -51,7 +51,6 @@ pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
 /// The file for Prometheus, which is written anew at each answer.
 pub(crate) struct PrometheusFile {
     path: PathBuf,
-    /// It could not be written, and a line says so.
     has_warned: bool,
 }
 

@@ -46,7 +46,6 @@ fn number(value: Option<f64>) -> String {
     value.map_or("-".into(), |value| format!("{value:.2}"))
 }
 
-/// The live lines.
 #[derive(Debug)]
 pub(crate) struct Display {
     screen: Screen,
@@ -55,7 +54,6 @@ pub(crate) struct Display {
     learns_since: Option<Instant>,
     /// When the run began: a terminal's bar has its own clock.
     began: Instant,
-    /// Frames that the bar shows.
     position: u64,
 }
 

@@ -25,7 +25,6 @@ const ANSWER_MAX: Duration = Duration::from_secs(3);
 /// A replay server that is reached.
 #[derive(Debug)]
 pub struct Reached {
-    /// What it is called in messages.
     name: String,
     endpoint: String,
     /// Asks it, through a session that the poller closes.

@@ -146,7 +146,6 @@ impl Watched {
     }
 }
 
-/// Begins to record the run in `folder`, or continues.
 fn record(
     folder: &RunFolder,
     config: &RunConfig,
@@ -171,7 +170,6 @@ fn record(
     Ok(recorder)
 }
 
-/// Refuses the folder of a run with other settings.
 fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
     let there = match folder.config().exists() {
         true => config_of(folder)?.run,

@@ -233,7 +233,6 @@ fn describe(name: &str, returns: &[f64]) -> String {
 /// Who played, and the returns of the episodes.
 type Played<'a> = (&'a str, Vec<f64>);
 
-/// A table of every episode's return.
 fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     let mut text = "policy,episode,return\n".to_owned();
     for (name, returns) in played {
@@ -244,7 +243,6 @@ fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
     file.write_all(text.as_bytes())
 }
 
-/// An evaluation for programs: one JSON object.
 fn json(
     player: &Player,
     levels: Levels,
@@ -276,7 +274,6 @@ fn json(
     Ok(serde_json::to_string(&object)? + "\n")
 }
 
-/// How far a policy's episodes are.
 fn progress(policy: &str, returns: &[f64], of: usize) -> String {
     let mean = match returns {
         [] => String::new(),

@@ -58,7 +58,6 @@ struct Overlay {
     local_k: Option<usize>,
 }
 
-/// One filmed environment.
 #[derive(Clone, Default)]
 struct Filmed {
     episode: u32,

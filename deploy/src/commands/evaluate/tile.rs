@@ -38,7 +38,6 @@ pub(super) struct Look<'a> {
     pub(super) matches: Option<&'a [f64]>,
 }
 
-/// Where everything stands.
 #[derive(Debug)]
 pub(super) struct Layout {
     frame: (usize, usize, usize),
