@@ -22,15 +22,6 @@ const LISTEN_MAX: Duration = Duration::from_secs(60);
 /// How often it is looked whether it does.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// What a person has said about who may connect.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Guard {
-    /// `--tls-dir`: there are certificates.
-    pub tls: bool,
-    /// `--allow-insecure`: every client that can connect is trusted.
-    pub allow_insecure: bool,
-}
-
 /// Refuses endpoints to connect to that zenoh could not open, or that do not fit `--tls-dir`.
 pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     endpoints.iter().try_for_each(|it| {
@@ -44,14 +35,15 @@ pub fn check_endpoints(endpoints: &[String], tls: bool) -> Result<(), Usage> {
     })
 }
 
-/// Refuses endpoints to listen on that zenoh could not open, and those that others can reach and nothing guards.
-pub fn check_listening(endpoints: &[String], guard: Guard) -> Result<(), Usage> {
+/// Refuses endpoints to listen on that zenoh could not open or that do not fit `--tls-dir`, and without `--allow-insecure` those that
+/// others can reach and nothing guards.
+pub fn check_listening(endpoints: &[String], tls: bool, allow_insecure: bool) -> Result<(), Usage> {
     for endpoint in endpoints {
-        check_endpoint(endpoint, guard.tls)?;
+        check_endpoint(endpoint, tls)?;
         if !is_open(endpoint) {
             continue;
         }
-        if !guard.allow_insecure {
+        if !allow_insecure {
             return Err(usage!(
                 "{endpoint} can be reached from other machines, and anyone who reaches it can read, change and stop the run. \
                  Listen on quic/HOST:PORT with --tls-dir DIR (deploy/certs.sh makes the certificates); or, if you trust every machine \
@@ -155,17 +147,10 @@ mod tests {
 
     use super::*;
 
-    fn listening(endpoint: &str, guard: Guard) -> Result<(), String> {
-        check_listening(&[endpoint.into()], guard).map_err(|e| e.to_string())
+    fn listening(endpoint: &str, tls: bool, allow_insecure: bool) -> Result<(), String> {
+        let checked = check_listening(&[endpoint.into()], tls, allow_insecure);
+        checked.map_err(|e| e.to_string())
     }
-
-    const fn guard(tls: bool, allow_insecure: bool) -> Guard {
-        Guard {
-            tls,
-            allow_insecure,
-        }
-    }
-    const TLS: Guard = guard(true, false);
 
     /// Endpoints to connect to, with or without certificates, and a part of the answer; none to one that can work.
     #[test]
@@ -200,7 +185,7 @@ mod tests {
             let fits = found.is_empty() == said.is_empty() && found.contains(said);
             assert!(fits, "{endpoint}: {found}");
         }
-        assert_eq!(listening("quic/[::]:1", TLS), Ok(()));
+        assert_eq!(listening("quic/[::]:1", true, false), Ok(()));
     }
 
     #[test]
@@ -244,25 +229,25 @@ mod tests {
 
     #[test]
     fn what_other_machines_reach_is_guarded() {
-        let (nothing, trusted) = (Guard::default(), guard(false, true));
         let tcp = ["127.0.0.1", "127.9.9.9", "[::1]", "localhost"].map(|it| format!("tcp/{it}:1"));
         for closed in tcp
             .iter()
             .map(String::as_str)
             .chain(["unixsock-stream//tmp/s"])
         {
-            assert_eq!(listening(closed, nothing), Ok(()), "{closed}");
+            assert_eq!(listening(closed, false, false), Ok(()), "{closed}");
         }
         for open in ["tcp/0.0.0.0:7447", "tcp/[::]:1", "tcp/192.0.2.1:1"] {
-            let said = listening(open, nothing).unwrap_err();
+            let said = listening(open, false, false).unwrap_err();
             let words = [
                 "--tls-dir DIR",
                 "--allow-insecure",
                 "change and stop the run",
             ];
             assert!(words.iter().all(|it| said.contains(it)), "{said}");
-            assert_eq!(listening(open, trusted), Ok(()), "{open}");
-            assert_eq!(listening(&open.replace("tcp", "quic"), TLS), Ok(()));
+            assert_eq!(listening(open, false, true), Ok(()), "{open}");
+            let encrypted = open.replace("tcp", "quic");
+            assert_eq!(listening(&encrypted, true, false), Ok(()));
         }
     }
 }

@@ -4,10 +4,7 @@ use std::{io, path::PathBuf, sync::Arc};
 
 use anyhow::Context;
 use clap::Args;
-use driml_launch::{
-    endpoint::{Guard, NAMESPACE},
-    rendezvous, shared_memory,
-};
+use driml_launch::{endpoint::NAMESPACE, rendezvous, shared_memory};
 use driml_machine::error::Usage;
 use driml_protocol::{
     Keys, session,
@@ -49,16 +46,6 @@ pub(crate) struct NetworkFlag {
     /// Allow other machines to connect without certificates: anyone who reaches the endpoint can read, change and stop the run
     #[arg(long, alias = "insecure-network")]
     pub(crate) allow_insecure: bool,
-}
-
-impl NetworkFlag {
-    /// What a person has said about who may connect.
-    pub(super) const fn guard(&self, tls: &TlsFlags) -> Guard {
-        Guard {
-            tls: tls.is_set(),
-            allow_insecure: self.allow_insecure,
-        }
-    }
 }
 
 impl TlsFlags {

@@ -41,7 +41,7 @@ pub(crate) struct ReplayServerArgs {
 }
 
 pub(crate) fn run(mut args: ReplayServerArgs) -> anyhow::Result<()> {
-    check_listening(&args.listen, args.network.guard(&args.tls))?;
+    check_listening(&args.listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(&args.listen)?;
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::ReplayServer)?;

@@ -124,8 +124,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             (config, from, None)
         }
     };
-    check_listening(args.listen.as_slice(), args.network.guard(&args.tls))?;
-    check_unused(args.listen.as_slice())?;
+    let listen = args.listen.as_slice();
+    check_listening(listen, args.tls.is_set(), args.network.allow_insecure)?;
+    check_unused(listen)?;
     if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
         return Err(usage!(
             "--tls-dir is for processes on other machines, which need an endpoint: add --listen quic/HOST:PORT"
