@@ -153,19 +153,8 @@ fn the_generated_pages_are_up_to_date() {
 
 /// The words of a shell's line, without its comment and redirection.
 fn words(line: &str) -> Vec<String> {
-    let mut words = vec![String::new()];
-    let mut quote = None;
-    for c in line.chars() {
-        match (c, quote) {
-            ('#' | '>', None) if words.last().is_some_and(String::is_empty) => break,
-            ('"' | '\'', None) => quote = Some(c),
-            (c, Some(open)) if c == open => quote = None,
-            (' ', None) => words.push(String::new()),
-            (c, _) => words.last_mut().unwrap().push(c),
-        }
-    }
-    words.retain(|it| !it.is_empty());
-    words
+    let words = shlex::split(line).unwrap().into_iter();
+    words.take_while(|it| !it.starts_with('>')).collect()
 }
 
 /// The lines of a page's shell blocks that call the program.
