@@ -26,7 +26,7 @@ use crate::{
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView, updates_served},
-    view::{Display, Poller, Reached, TEMPLATE, notes},
+    view::{Display, Poller, Reached, TEMPLATE},
 };
 
 use self::processes::{Processes, stop};
@@ -270,11 +270,9 @@ impl Launch<'_> {
             }
             recorder.complete(&mut poller.view);
             let view = &poller.view;
-            self.display.show(view, &notes(view));
+            self.display.show(view);
             self.evaluator.look(&self.screen);
             if view.is_learned() {
-                self.display
-                    .show_alone("all frames and updates are done: the processes exit");
                 return Ok(Outcome::Finished);
             }
             let counts = (view.replay.transitions_inserted, view.learner.updates);

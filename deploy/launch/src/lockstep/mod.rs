@@ -100,7 +100,7 @@ pub fn run(
             warnings.iter().for_each(|line| screen.line(line));
             if show {
                 shown = Instant::now();
-                display.show(&view, &[]);
+                display.show(&view);
             }
         }
         if is_stopped() {

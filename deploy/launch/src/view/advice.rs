@@ -148,7 +148,10 @@ fn certificates(endpoint: &str) -> &'static str {
 }
 
 /// What to say below the live lines: the processes that do not respond, and for how long.
-pub(crate) fn notes(view: &RunView) -> Vec<String> {
+pub(super) fn notes(view: &RunView) -> Vec<String> {
+    if view.is_learned() {
+        return vec!["all frames and updates are done: the processes exit".into()];
+    }
     let recovering = view.recovering().map(|(it, how)| recovery(&it.name, how));
     let recovering: Vec<_> = recovering.collect();
     if !recovering.is_empty() {

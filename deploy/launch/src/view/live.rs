@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use driml_machine::units::duration;
 use driml_protocol::{ReplayStatus, Waiting};
 
+use super::advice::notes;
 use crate::{
     console::{self, Screen},
     run_view::RunView,
@@ -54,7 +55,6 @@ pub(crate) struct Display {
     learns_since: Option<Instant>,
     /// When the run began: a terminal's bar has its own clock.
     began: Instant,
-    position: u64,
 }
 
 impl Display {
@@ -65,33 +65,24 @@ impl Display {
             updates_before,
             learns_since: None,
             began,
-            position: 0,
         }
     }
 
-    /// Shows the state of the run, and `notes` under it, such as who does not answer.
-    pub(crate) fn show(&mut self, view: &RunView, notes: &[String]) {
+    /// Shows the state of the run, and notes under it, such as who does not answer.
+    pub(crate) fn show(&mut self, view: &RunView) {
         if view.learner.updates > self.updates_before {
             self.learns_since.get_or_insert_with(Instant::now);
         }
         let mut texts = self.text(view).to_vec();
+        let notes = notes(view);
         if !notes.is_empty() {
             texts.push(notes.join("; "));
         }
         let frames = view.replay.transitions_inserted;
-        self.position = frames.min(view.plan.frames_planned);
-        self.write(&texts);
-    }
-
-    /// Shows `note` in the place of the state of the run, which is not known now.
-    pub(crate) fn show_alone(&mut self, note: &str) {
-        self.write(&[note.to_owned()]);
-    }
-
-    fn write(&mut self, texts: &[String]) {
-        self.screen.show(self.position, |is_bar| match is_bar {
+        let position = frames.min(view.plan.frames_planned);
+        self.screen.show(position, |is_bar| match is_bar {
             true => console::wrapped(&texts.join("\n"), "  ", 0),
-            false => plain(self.began.elapsed(), texts),
+            false => plain(self.began.elapsed(), &texts),
         });
     }
 
@@ -220,7 +211,7 @@ mod tests {
             let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = frames);
             let learner = with(|it: &mut LearnerStatus| it.updates = updates);
             let view = view((8_000, 218), replay, learner);
-            display.show(&view, &[]);
+            display.show(&view);
             display.text(&view).join("\n")
         };
         expect![[r#"

@@ -7,7 +7,7 @@ mod page;
 mod poll;
 
 pub(crate) use self::{
-    advice::{needed, notes, recovery},
+    advice::{needed, recovery},
     export::{PrometheusFile, json},
     live::Display,
     page::page,

@@ -18,7 +18,7 @@ use crate::{
     launcher::process_names,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::{RunView, updates_served},
-    view::{Display, Poller, TEMPLATE, notes},
+    view::{Display, Poller, TEMPLATE},
 };
 
 /// How long replay servers that said that everything is sampled may be silent before they have ended.
@@ -84,8 +84,7 @@ impl Watched {
             warnings.extend(recorder.record(&mut poller.view, &[]));
             warnings.iter().for_each(|line| self.screen.line(line));
         }
-        let view = &poller.view;
-        self.display.show(view, &notes(view));
+        self.display.show(&poller.view);
         self.is_over(poller)
     }
 
