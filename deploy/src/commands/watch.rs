@@ -8,7 +8,7 @@ use driml_launch::{
     endpoint::{NAMESPACE, check_endpoints},
     run_folder::RunFolder,
     view::Poller,
-    watch::{self, Live, Look, Outputs, endpoints_of},
+    watch::{self, Live, Outputs, endpoints_of},
 };
 use driml_protocol::tls::Role;
 
@@ -81,14 +81,11 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    let look = Look {
-        again: args.watch,
-        json: args.json,
+    let Some(mut poller) = args.look.open()? else {
+        return Ok(());
     };
-    match args.look.open()? {
-        Some(mut poller) => watch::look(&mut poller, args.look.folder().as_ref(), look),
-        None => Ok(()),
-    }
+    let folder = args.look.folder();
+    watch::look(&mut poller, folder.as_ref(), args.watch, args.json)
 }
 
 impl LookFlags {

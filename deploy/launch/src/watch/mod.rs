@@ -23,20 +23,17 @@ const POLL: Duration = Duration::from_secs(1);
 const LAST_POLL: Duration = Duration::from_millis(200);
 const PAGE_PERIOD: Duration = Duration::from_secs(2);
 
-/// How a run is looked at, a page at a time.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Look {
-    /// Again and again until the run is over or Ctrl-C.
-    pub again: bool,
-    /// An object of JSON instead of a page.
-    pub json: bool,
-}
-
-/// Asks a run and prints a page. Once no process can be asked any more, the run's `folder` tells how it ended, if it is known.
+/// Asks a run and prints a page or an object of JSON, once or `again` and again until the run is over or Ctrl-C. Once no process can be
+/// asked any more, the run's `folder` tells how it ended, if it is known.
 ///
 /// # Errors
 /// [`Interrupted`] if one answer was asked for and Ctrl-C came first.
-pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyhow::Result<()> {
+pub fn look(
+    poller: &mut Poller,
+    folder: Option<&RunFolder>,
+    again: bool,
+    as_json: bool,
+) -> anyhow::Result<()> {
     let interrupted = Shutdown::on_signals(None)?;
     // For the speed: what happens until the next answer.
     poller.ask();
@@ -45,17 +42,17 @@ pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyh
     }
     loop {
         let view = poller.ask();
-        if let Some(folder) = folder.filter(|_| view.is_gone() && !look.json)
+        if let Some(folder) = folder.filter(|_| view.is_gone() && !as_json)
             && let Live::Over(how) = endpoints_of(folder)?
         {
             return console::print(&how);
         }
-        match look.json {
+        match as_json {
             true => console::print(&json(view)?)?,
-            false if look.again => console::print_page(&page(view))?,
+            false if again => console::print_page(&page(view))?,
             false => console::print(&page(view))?,
         }
-        if !look.again || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
+        if !again || view.is_over() || interrupted.wait_timeout(PAGE_PERIOD) {
             return Ok(());
         }
     }
@@ -65,9 +62,8 @@ pub fn look(poller: &mut Poller, folder: Option<&RunFolder>, look: Look) -> anyh
 ///
 /// # Errors
 /// The run is not well: a process is missing, gone or unresponsive. A file that cannot be written; [`Interrupted`].
-pub fn once(mut poller: Poller, outputs: &Outputs, json: bool) -> anyhow::Result<()> {
-    let again = false;
-    look(&mut poller, None, Look { again, json })?;
+pub fn once(mut poller: Poller, outputs: &Outputs, as_json: bool) -> anyhow::Result<()> {
+    look(&mut poller, None, false, as_json)?;
     poller.close();
     if let Some(path) = &outputs.prometheus
         && let Some(failed) = PrometheusFile::new(path).write(&poller.view)
@@ -142,7 +138,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         }
         poller.ask();
         if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-            watched.say(&failed);
+            watched.screen.line(&failed);
         }
     };
     poller.close();

@@ -38,7 +38,7 @@ pub struct Outputs {
 }
 
 pub(super) struct Watched {
-    screen: Screen,
+    pub(super) screen: Screen,
     display: Display,
     recorder: Option<RunRecorder>,
     /// When the run began, as far as is known.
@@ -86,10 +86,6 @@ impl Watched {
         }
         self.display.show(&poller.view);
         self.is_over(poller)
-    }
-
-    pub(super) fn say(&self, line: &str) {
-        self.screen.line(line);
     }
 
     fn is_over(&mut self, poller: &mut Poller) -> anyhow::Result<bool> {
