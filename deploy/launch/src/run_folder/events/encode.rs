@@ -12,14 +12,14 @@ const BYTES: u8 = 2;
 const FIXED32: u8 = 5;
 
 #[derive(Debug)]
-pub(super) enum Value<'a> {
+pub(super) enum Value {
     Scalar(f32),
     /// How often each of 0, 1, 2, ... was counted.
-    Counts(&'a [u64]),
+    Counts(Vec<u64>),
     Image {
         width: usize,
         height: usize,
-        png: &'a [u8],
+        png: Vec<u8>,
     },
 }
 
@@ -40,8 +40,8 @@ pub(super) fn begin_anew(at: At) -> Vec<u8> {
     record(at, 7, &number(1, START))
 }
 
-pub(super) fn summary(at: At, values: &[(String, Value<'_>)]) -> Vec<u8> {
-    let field = |(name, value): &(String, Value<'_>)| {
+pub(super) fn summary(at: At, values: &[(String, Value)]) -> Vec<u8> {
+    let field = |(name, value): &(String, Value)| {
         let value = match value {
             Value::Scalar(value) => fixed(2, FIXED32, &value.to_le_bytes()),
             Value::Counts(counts) => bytes(5, &histogram(counts)),

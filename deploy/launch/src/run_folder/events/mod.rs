@@ -94,23 +94,21 @@ impl Events {
 
     /// What was counted since the last histograms.
     fn histograms(&mut self, at: At, replay: &ReplayStatus) -> Option<Vec<u8>> {
-        let kinds = [
+        let mut histograms = Vec::new();
+        for (name, now, before) in [
             ("k/served", &replay.k_histogram, &mut self.k),
             (
                 "actions/stored",
                 &replay.action_histogram,
                 &mut self.actions,
             ),
-        ];
-        let counted = kinds.map(|(name, now, before)| {
-            let since = since(now, before);
+        ] {
+            let counts = since(now, before);
             before.clone_from(now);
-            (name, since)
-        });
-        let some = counted.iter().filter(|it| it.1.iter().any(|&n| n > 0));
-        let histograms: Vec<_> = some
-            .map(|(name, counts)| ((*name).to_owned(), Value::Counts(counts)))
-            .collect();
+            if counts.iter().any(|&n| n > 0) {
+                histograms.push((name.to_owned(), Value::Counts(counts)));
+            }
+        }
         (!histograms.is_empty()).then(|| encode::summary(at, &histograms))
     }
 
@@ -129,11 +127,7 @@ impl Events {
         let picture = draw(affinity.num_actions(), &affinity.matrix()).ok()?;
         let (width, height) = picture.size();
         let png = picture.png().ok()?;
-        let image = Value::Image {
-            width,
-            height,
-            png: &png,
-        };
+        let image = Value::Image { width, height, png };
         Some(encode::summary(at, &[("affinity/A".to_owned(), image)]))
     }
 
