@@ -28,18 +28,8 @@ use super::join::{NetworkFlag, TlsFlags};
 
 /// Characters of a world's name that stand in the name of a run's folder.
 const WORLD_CHARS_MAX: usize = 40;
-const RESUMED: [&str; 10] = [
-    "env",
-    "agent",
-    "preset",
-    "config",
-    "actors",
-    "replay_shards",
-    "envs",
-    "seed",
-    "run_dir",
-    "lockstep",
-];
+/// What a run that is resumed has from its folder.
+const RESUMED: &str = "env agent preset config actors replay_shards envs seed run_dir lockstep";
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainArgs {
@@ -49,7 +39,7 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) run_dir: Option<PathBuf>,
     /// Resume the run in this folder from its newest checkpoint, with its own settings; --frames, --device and --set may change
-    #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED)]
+    #[arg(long, value_name = "DIR", conflicts_with_all = RESUMED.split(' '))]
     pub(crate) resume: Option<PathBuf>,
     /// Device of the learner: cpu, cuda (the first GPU) or cuda:N [default: cpu]
     #[arg(long, value_name = "DEVICE")]
