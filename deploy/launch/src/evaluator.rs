@@ -182,16 +182,9 @@ impl Evaluator {
         episodes: u32,
         screen: &Screen,
     ) -> anyhow::Result<ManagedProcess> {
-        let [updates, episodes] = [updates, episodes.into()].map(|it: u64| it.to_string());
-        let args = [
-            OsStr::new("evaluate"),
-            self.run_dir.path().as_os_str(),
-            OsStr::new("--keep"),
-            OsStr::new("--checkpoint"),
-            OsStr::new(&updates),
-            OsStr::new("--episodes"),
-            OsStr::new(&episodes),
-        ];
+        let words = format!("evaluate --keep --checkpoint {updates} --episodes {episodes}");
+        let mut args: Vec<_> = words.split(' ').map(OsStr::new).collect();
+        args.push(self.run_dir.path().as_os_str());
         ManagedProcess::start("evaluation", &args, 1, &self.run_dir.logs(), screen, None)
     }
 
