@@ -261,7 +261,8 @@ impl Launch<'_> {
                     bail!("the {name} has not answered for {silent}: {why}");
                 }
             }
-            let rss = self.processes.rss_mib();
+            let processes = self.processes.all();
+            let rss: Vec<_> = processes.map(ManagedProcess::rss_mib).collect();
             if view.is_answered() {
                 let ask = |shard, since| poller.episodes(shard, since, true);
                 let mut warnings = recorder.record_episodes(view, ask);
@@ -409,7 +410,7 @@ impl Launch<'_> {
                 &mut poller.view
             }
         };
-        let logs = self.processes.missing_log_lines();
+        let logs = self.processes.all().filter_map(|it| it.missing_log_lines());
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, view);

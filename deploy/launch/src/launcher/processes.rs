@@ -32,20 +32,10 @@ pub(super) struct Processes {
 }
 
 impl Processes {
-    /// Replay servers, learner, actors, in this order.
-    fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
+    /// Replay servers, learner, actors, in the order of their names.
+    pub(super) fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
         let first = self.replay_servers.iter_mut().chain(&mut self.learner);
         first.chain(&mut self.actors)
-    }
-
-    /// Memory of each in MiB, in the order of [`Processes::all`]; none of one that has ended.
-    pub(super) fn rss_mib(&mut self) -> Vec<Option<f64>> {
-        self.all().map(ManagedProcess::rss_mib).collect()
-    }
-
-    pub(super) fn missing_log_lines(&mut self) -> Vec<String> {
-        let missing = |it: &mut ManagedProcess| it.missing_log_lines();
-        self.all().filter_map(missing).collect()
     }
 }
 
