@@ -1,5 +1,5 @@
 //! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
-//! And one that is stopped, and resumes. What Ctrl-C does is in `failures`.
+//! And one that is stopped, and resumes. What Ctrl-C does is in `resume` and `failures`.
 
 use std::{
     fs::{File, OpenOptions},

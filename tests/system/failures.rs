@@ -1,26 +1,12 @@
 //! Runs that end early: Ctrl-C, a process that dies, a launcher that dies. No process is ever left.
-//! What a dead process's successor may do is in `by_hand` (actors) and `successors` (learners).
+//! What a dead process's successor may do is in `by_hand` (actors) and `successors` (learners); one Ctrl-C is in `resume`.
 
 use std::{fs, process::Command};
 
-use driml_tests::{Ended, Outcome, Process, TestSystem, wait_for};
+use driml_tests::{Ended, Outcome, Process, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
-
-#[test]
-fn an_interrupt_saves_and_ends_all_processes() {
-    let system = system();
-    let process = launched(&system, 100);
-    let ended = process
-        .interrupt()
-        .expect_code(130)
-        .expect_said("stopping: actors deliver what they have");
-    assert_eq!(system.survivors(), []);
-    ended.expect_printed("interrupted: ");
-    let summary = system.run_folder("run").check(Outcome::Interrupted);
-    assert!(summary.updates > 100, "{summary:#?}");
-}
 
 #[test]
 fn a_second_interrupt_ends_at_once() {
@@ -38,13 +24,13 @@ fn a_second_interrupt_ends_at_once() {
 }
 
 /// Signals at nearly the same time count as one request, so this repeats it until it is noticed.
-fn interrupt_until_it_ends(mut process: Process) -> Ended {
-    wait_for("the launcher's end", || {
-        if process.is_running() {
+pub(crate) fn interrupt_until_it_ends(mut process: Process) -> Ended {
+    wait_until("the launcher's end", || {
+        let is_over = !process.is_running();
+        if !is_over {
             process.signal(Signal::SIGINT);
-            return None;
         }
-        Some(())
+        is_over
     });
     process.wait()
 }
@@ -66,47 +52,6 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
         );
         assert_eq!(system.survivors(), []);
     }
-}
-
-/// A run of two actors, of which one stands still, that has learned from all its transitions.
-fn complete_but_for_a_frozen_actor(system: &TestSystem) -> Process {
-    let flags = "--env chain --agent c51 --preset smoke --frames 6000 --actors 2 --set replay.replay_ratio=8";
-    let process = system.start(&system.local(flags));
-    let client = system.connect();
-    client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    system.find_process("actor").signal(Signal::SIGSTOP);
-    client.wait_for_learner("the last update", |learner| learner.finished);
-    process
-}
-
-#[test]
-fn a_complete_run_is_finished_though_an_actor_stands_still() {
-    let system = system();
-    let process = complete_but_for_a_frozen_actor(&system);
-    process
-        .wait()
-        .expect_code(0)
-        .expect_said("did not end within 1 min 0 s and was killed")
-        .expect_printed("finished: ");
-    assert_eq!(
-        system.run_folder("run").summary().outcome,
-        Outcome::Finished
-    );
-    assert_eq!(system.survivors(), []);
-}
-
-/// The first interrupt waits for the actor, the second does not; neither makes the run another one.
-#[test]
-fn an_interrupt_of_a_complete_run_leaves_it_finished() {
-    let system = system();
-    interrupt_until_it_ends(complete_but_for_a_frozen_actor(&system))
-        .expect_code(0)
-        .expect_printed("finished: ");
-    assert_eq!(
-        system.run_folder("run").summary().outcome,
-        Outcome::Finished
-    );
-    assert_eq!(system.survivors(), []);
 }
 
 #[test]
@@ -212,29 +157,15 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
     drop(client);
     launcher.signal(Signal::SIGKILL);
     system.wait_until_all_have_ended();
-    let said = |role: &str| std::fs::read_to_string(system.path(role)).unwrap();
     for (role, words) in [
         ("actor", "actor 0 leaves: "),
         ("learner", "finished after "),
         ("server", "this process is to end, and 0 processes are left"),
     ] {
-        assert!(said(role).contains(words), "{}", said(role));
+        let said = system.read(role);
+        assert!(said.contains(words), "{said}");
+        assert!(!said.contains("did not receive this actor's"), "{said}");
     }
-    assert!(!said("actor").contains("did not receive this actor's"));
-}
-
-#[test]
-fn a_frozen_process_does_not_keep_a_replay_server_whose_launcher_died() {
-    let system = system();
-    let process = launched(&system, 100);
-    let [server, actor] = ["replay-server", "actor"].map(|role| system.find_process(role));
-    actor.signal(Signal::SIGSTOP);
-    process.kill();
-    wait_for("the replay server's end", || {
-        (!system.survivors().contains(&server)).then_some(())
-    });
-    actor.signal(Signal::SIGKILL);
-    system.wait_until_all_have_ended();
 }
 
 #[test]

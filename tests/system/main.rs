@@ -16,6 +16,7 @@ mod evaluate;
 mod experiments;
 mod failures;
 mod films;
+mod frozen;
 mod leftovers;
 mod limits;
 mod local;
@@ -56,6 +57,11 @@ fn system() -> TestSystem {
 ///
 /// 1280 frames are whole chunks of one or two actors (4 environments x 8 steps), and (1280 - 200) * 8 / 16 is whole.
 const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.replay_ratio=8";
+
+/// [`SHORT`] with so many frames.
+fn chain(frames: u64) -> String {
+    SHORT.replace("1280", &frames.to_string())
+}
 
 /// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.
 const LONG: &str = "--env chain --preset smoke --frames 100000000 --set replay.replay_ratio=8";

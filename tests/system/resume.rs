@@ -44,7 +44,7 @@ fn resumes(system: &TestSystem) -> Summary {
 }
 
 #[test]
-fn an_interrupted_run_continues() {
+fn an_interrupt_saves_and_ends_all_processes_and_the_run_continues() {
     let system = system();
     // 1,000 updates are 2,200 frames, in which more than 100 episodes end.
     let process = launched(&system, 1_000);
@@ -52,8 +52,12 @@ fn an_interrupted_run_continues() {
     process
         .interrupt()
         .expect_code(130)
-        .expect_said("`driml train --resume run` resumes it");
-    let before = system.run_folder("run").summary();
+        .expect_said("stopping: actors deliver what they have")
+        .expect_said("`driml train --resume run` resumes it")
+        .expect_printed("interrupted: ");
+    assert_eq!(system.survivors(), []);
+    let before = system.run_folder("run").check(Outcome::Interrupted);
+    assert!(before.updates > 1_000, "{before:#?}");
     let summary = resumes(&system);
     // A few tens of episodes ended since, the short ones first; the mean return is of 100 all the same.
     let since = summary.episodes - before.episodes;

@@ -1,0 +1,138 @@
+//! One process that stands still (Ctrl-Z, a debugger, a paused container): the others continue, and wait for it only so long.
+//! A whole run that stands still is in `closed_terminal`.
+
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
+
+use driml_tests::{Outcome, Process, TestSystem, wait_until};
+use nix::sys::signal::Signal;
+
+use crate::{LONG, SHORT, failures::interrupt_until_it_ends, launched, system};
+
+/// All at the same time, as they wait for time-outs of up to a minute.
+#[test]
+fn a_frozen_process_does_not_hold_the_others_up() {
+    let checks: [fn(); 5] = [
+        a_complete_run_is_finished,
+        an_interrupt_of_a_complete_run_leaves_it_finished,
+        a_replay_server_ends_without_its_actor,
+        a_replay_server_ends_whose_launcher_died,
+        a_frozen_actor_does_not_stop_the_others,
+    ];
+    thread::scope(|scope| {
+        for check in checks {
+            scope.spawn(check);
+        }
+    });
+}
+
+/// A run of two actors, of which one stands still, that has learned from all its transitions.
+fn complete_but_for_an_actor(system: &TestSystem) -> Process {
+    // It is not over before its second actor has started.
+    system.hold_at(100);
+    let flags = format!("--agent c51 {SHORT} --actors 2");
+    let process = system.start(&system.local(&flags));
+    let client = system.connect();
+    client.wait_for_replay("both actors", |replay| replay.actors == 2);
+    system.find_process("actor").signal(Signal::SIGSTOP);
+    system.let_go();
+    client.wait_for_learner("the last update", |learner| learner.finished);
+    process
+}
+
+fn check_finished(system: &TestSystem) {
+    let summary = system.run_folder("run").summary();
+    assert_eq!(summary.outcome, Outcome::Finished);
+    assert_eq!(system.survivors(), []);
+}
+
+fn a_complete_run_is_finished() {
+    let system = system();
+    complete_but_for_an_actor(&system)
+        .wait()
+        .expect_code(0)
+        .expect_said("did not end within 1 min 0 s and was killed")
+        .expect_printed("finished: ");
+    check_finished(&system);
+}
+
+/// The first interrupt waits for the actor, the second does not; neither makes the run another one.
+fn an_interrupt_of_a_complete_run_leaves_it_finished() {
+    let system = system();
+    interrupt_until_it_ends(complete_but_for_an_actor(&system))
+        .expect_code(0)
+        .expect_printed("finished: ");
+    check_finished(&system);
+}
+
+fn a_replay_server_ends_without_its_actor() {
+    let system = system();
+    let listen = system.endpoint();
+    let server = system.start_process(&format!(
+        "replay-server --listen {listen} --agent c51 {SHORT}"
+    ));
+    let mut frozen = system.start_actor(1);
+    frozen.wait_for_stderr("waiting for the learner's first weights");
+    frozen.signal(Signal::SIGSTOP);
+    let learner = system.start_process(&format!("learner --connect {listen} --run-dir run"));
+    system.start_actor(0).wait().expect_code(0);
+    learner.wait().expect_code(0);
+    server
+        .wait()
+        .expect_code(0)
+        .expect_said("the run is over, and ");
+    frozen.kill();
+}
+
+fn a_replay_server_ends_whose_launcher_died() {
+    let system = system();
+    let process = launched(&system, 100);
+    let [server, actor] = ["replay-server", "actor"].map(|role| system.find_process(role));
+    actor.signal(Signal::SIGSTOP);
+    process.kill();
+    wait_until("the replay server's end", || {
+        !system.survivors().contains(&server)
+    });
+    actor.signal(Signal::SIGKILL);
+    system.wait_until_all_have_ended();
+}
+
+/// A model whose weights are 5 MB, sent to the actors after each update: a frozen process is likely in the middle of a pull.
+const LARGE: &str = "--set model.hidden=4096 --set learner.publish_period_updates=1";
+
+/// An actor that is suspended in the middle of its work delays the others for seconds, and continues when it is released.
+fn a_frozen_actor_does_not_stop_the_others() {
+    let system = system();
+    let _server = system.start_replay_server(&format!("--agent c51 {LONG} {LARGE}"));
+    let mut learner = system.start_learner("run");
+    let mut healthy = system.start_actor(0);
+    let mut frozen = system.start_actor(1);
+    let client = system.connect();
+    client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
+    let version = client.wait_for_updates(0).weights_version;
+    client.wait_for_learner("weights to pull", |it| it.weights_version > version + 5);
+    frozen.signal(Signal::SIGSTOP);
+    // Long past the moment when the link is given up, and short of the session's lease, which would end it in any case.
+    let started = Instant::now();
+    let late = |after_s| started.elapsed() > Duration::from_secs(after_s);
+    let rows = || client.replay().map_or(0, |replay| replay.rows_sampled);
+    wait_until("the time that a link may stand still", || late(12));
+    let before = rows();
+    wait_until("batches while an actor is frozen", || {
+        assert!(!late(25), "none after {before} rows");
+        rows() > before
+    });
+    assert!(learner.is_running() && healthy.is_running() && frozen.is_running());
+    frozen.signal(Signal::SIGCONT);
+    let others = client.replay().unwrap().transitions_inserted;
+    client.wait_for_replay("more transitions", |replay| {
+        replay.transitions_inserted > others + 500
+    });
+    for actor in [healthy, frozen] {
+        actor.stop().expect_code(0).expect_said("leaves: ");
+    }
+    client.check_nothing_lost();
+    learner.stop().expect_code(0);
+}
