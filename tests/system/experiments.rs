@@ -294,7 +294,7 @@ fn tradeoff() {
 fn killed_and_resumed() {
     let system = system();
     let call =
-        "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 20000";
+        "experiment procgen --smoke --games mspacman --agents c51 --seeds 1 --out x --frames 4000";
     // Its run is not over before it is killed.
     system.hold_at(100);
     let process = system.start(call);

@@ -6,7 +6,7 @@ use std::{fs, process::Command};
 use driml_tests::{Ended, Outcome, Process, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, launched, system};
+use crate::{LONG, SHORT, chain, launched, system};
 
 #[test]
 fn a_second_interrupt_ends_at_once() {
@@ -89,9 +89,10 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
 #[test]
 fn a_dead_actor_is_started_again() {
     let system = system();
-    let flags = "--env chain --agent c51 --preset smoke --frames 12000 --actors 2 --set replay.replay_ratio=32";
-    system.hold_at(4_000);
-    let mut process = system.start(&system.local(flags));
+    // Held there, it has room for 1,400 transitions and the slack, and the limiter is closed.
+    system.hold_at(600);
+    let flags = format!("--agent c51 {} --actors 2", chain(2_560));
+    let mut process = system.start(&system.local(&flags));
     let client = system.connect();
     for (restarts, signal) in [(1, Signal::SIGKILL), (2, Signal::SIGTERM)] {
         client.wait_for_replay("both actors", |replay| replay.actors == 2);
@@ -113,7 +114,7 @@ fn a_dead_actor_is_started_again() {
     assert_eq!(summary.actors_restarted, 2);
     assert_eq!(system.survivors(), []);
 
-    system.run_ok("local --resume run --frames 13000");
+    system.run_ok("local --resume run --frames 3000");
     let summary = system.run_folder("run").summary();
     assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }

@@ -8,7 +8,7 @@ use std::{
 
 use driml_tests::{Client, Outcome, Summary, wait_until};
 
-use crate::{LONG, SHORT, system};
+use crate::{LONG, SHORT, chain, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
@@ -55,9 +55,8 @@ fn c51_leaves_a_whole_run_folder() {
 fn driml_ada_with_two_actors_over_tcp() {
     let system = system();
     // The run is not over before its second actor has started.
-    system.hold_at(1_000);
-    let longer = SHORT.replace("--frames 1280", "--frames 5120");
-    assert_ne!(longer, SHORT);
+    system.hold_at(500);
+    let longer = chain(2_560);
     let endpoint = free_tcp_endpoint();
     let flags = format!("{longer} --actors 2 --listen {endpoint} --run-dir run");
     // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the

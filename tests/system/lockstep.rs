@@ -6,7 +6,7 @@ use driml_settings::presets::AGENTS;
 use driml_tests::{Process, Summary, TestSystem, is_offline, note};
 use nix::sys::signal::Signal;
 
-use crate::{PRIORITISED, SHORT, system};
+use crate::{PRIORITISED, chain, system};
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
     system.run_ok(&format!("local --lockstep {flags} --run-dir {name}"));
@@ -16,7 +16,7 @@ fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
 /// Each row: the flags of two runs that are the same, what makes both so, and what makes a third one another.
 #[test]
 fn seed_and_settings_decide_the_weights() {
-    let ada = format!("{SHORT} --agent driml-ada");
+    let ada = format!("{} --agent driml-ada", chain(640));
     let of_two = format!("{ada} --actors 2 --envs 3");
     let curl = "--env mspacman --agent curl --preset smoke --frames 320 --seed 3";
     let bf16 = "--seed 3 --set learner.precision=bf16 --set actor.precision=bf16";
@@ -113,11 +113,11 @@ pub(crate) fn continues_exactly(env: &str, flags: &str, frames: u64) {
 
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
-    continues_exactly("chain", "--preset smoke --agent driml-ada", 4096);
+    continues_exactly("chain", "--preset smoke --agent driml-ada", 2048);
     // Its noise continues, in the learner and in the actors. Else beta rises over a run's own length.
     let beta = "--set replay.sampling.beta_updates=500";
     let flags = format!("--preset smoke --agent rainbow {beta}");
-    continues_exactly("chain", &flags, 4096);
+    continues_exactly("chain", &flags, 2048);
 }
 
 /// N updates, saved and resumed for N more, are 2 N.

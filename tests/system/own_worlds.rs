@@ -76,7 +76,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
 #[test]
 fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
     let flags = format!("{SMALL} --agent driml-ada");
-    continues_exactly(&numbered("saves"), &flags, 4096);
+    continues_exactly(&numbered("saves"), &flags, 2048);
 }
 
 #[test]

@@ -4,7 +4,7 @@
 use driml_tests::Outcome;
 use nix::sys::signal::Signal;
 
-use crate::{PRIORITISED, SHORT, system};
+use crate::{PRIORITISED, SHORT, chain, system};
 
 /// Rows whose priority was set, came too late and came twice, by the last word of a replay server.
 fn said(log: &str) -> [u64; 3] {
@@ -51,7 +51,7 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
 #[test]
 fn a_replay_server_that_dies_continues_with_equal_priorities() {
     let system = system();
-    let longer = SHORT.replace("--frames 1280", "--frames 6400");
+    let longer = chain(3_200);
     system.hold_at(1_000);
     let flags = format!("--durable --agent c51 {longer} {PRIORITISED}");
     let process = system.start(&system.local(&flags));

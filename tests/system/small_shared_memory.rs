@@ -10,7 +10,7 @@ use std::{
 use driml_tests::{Ended, succeeds};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, system};
+use crate::{LONG, chain, system};
 
 /// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that the test is skipped, if
 /// that is not permitted.
@@ -44,7 +44,10 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
             return;
         };
         let system = system();
-        let run = format!("local --agent c51 {SHORT} --actors {actors} --run-dir run");
+        let run = format!(
+            "local --agent c51 {} --actors {actors} --run-dir run",
+            chain(640)
+        );
         let ended = system.run_after(&words, &run).expect_code(0);
         assert_eq!(warnings(&ended), usize::from(!enough), "{size}: {ended:#?}");
         if !enough {

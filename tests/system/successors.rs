@@ -3,7 +3,7 @@
 
 use driml_tests::{Client, Process, TestSystem};
 
-use crate::{LONG, SHORT, system};
+use crate::{LONG, SHORT, chain, system};
 
 /// Versions that a learner may have named and not sent when it is killed.
 const UNSENT_MAX: u64 = 5;
@@ -12,7 +12,7 @@ const UNSENT_MAX: u64 = 5;
 #[test]
 fn killed_learners_cost_no_update_of_the_plan() {
     let system = system();
-    let longer = SHORT.replace("--frames 1280", "--frames 5120");
+    let longer = chain(1_600);
     let server = system.start_replay_server(&format!(
         "--agent driml-ada {longer} --set learner.checkpoint_period_updates=200"
     ));
