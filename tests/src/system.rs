@@ -123,6 +123,13 @@ impl TestSystem {
         Process::start(format!("{variable}={value} {args}"), command)
     }
 
+    /// [`Self::start`] with `--env`, whose value may have blanks.
+    pub fn start_with_world(&self, args: &str, world: &str) -> Process {
+        let mut command = self.command(args);
+        command.args(["--env", world]);
+        Process::start(format!("{args} --env {world:?}"), command)
+    }
+
     /// How the program is started, for tests that do it in their own way.
     pub fn command(&self, args: &str) -> Command {
         self.command_after(&[], args)

@@ -58,6 +58,7 @@ fn files_and_runs_that_are_not_there() {
     let mut cut = 100u64.to_le_bytes().to_vec();
     cut.extend(b"{\"input.fr");
     fs::write(system.path("cut.safetensors"), cut).unwrap();
+    fs::write(system.path("odd"), "").unwrap();
     for (call, why) in [
         (
             "parity cut.safetensors",
@@ -69,6 +70,10 @@ fn files_and_runs_that_are_not_there() {
         ),
         ("actor --connect unixsock-stream/absent.sock", "error: "),
         ("man /proc/none/man1", "writing pages into /proc/none/man1"),
+        (
+            "experiment random-walk --smoke --out odd",
+            "making odd/pieces",
+        ),
     ] {
         system.run(call).expect_code(1).expect_said(why);
     }
@@ -114,6 +119,6 @@ fn completions_and_pages() {
         ended.expect_printed(text).expect_printed("eval-interval");
     }
     system.run_ok("man man1");
-    let page = fs::read_to_string(system.path("man1/driml-train.1")).unwrap();
+    let page = system.read("man1/driml-train.1");
     assert!(page.contains("\\-\\-frames"), "{page}");
 }

@@ -315,16 +315,6 @@ fn killed_and_resumed() {
 }
 
 #[test]
-fn a_file_where_the_folder_should_be_is_an_error() {
-    let system = system();
-    fs::write(system.path("file"), "").unwrap();
-    system
-        .run("experiment random-walk --smoke --out file")
-        .expect_code(1)
-        .expect_said("making file/pieces");
-}
-
-#[test]
 fn a_grid_makes_every_combination_once() {
     let system = system();
     let fixed = "grid --env chain --agent c51,driml-ada --preset smoke";

@@ -43,6 +43,9 @@ fn c51_leaves_a_whole_run_folder() {
         .expect_printed("trains      c51 on chain, seed 1")
         .expect_printed("finished: 1280 frames and 540 updates");
     assert_eq!(system.survivors(), []);
+    let names = system.names("run").into_iter();
+    let events = names.filter(|name| name.contains("tfevents"));
+    assert_eq!(events.count(), 0, "there are none without the flag");
     // The settings that it left repeat it. Processes race, so the weights differ; the counts do not.
     system.run_ok("local --config run/config.toml --run-dir again");
     let again = system.run_folder("again");

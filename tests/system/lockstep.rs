@@ -3,7 +3,7 @@
 
 use driml_envs::{ChainConfig, optimal_discounted_return};
 use driml_settings::presets::AGENTS;
-use driml_tests::{Process, Summary, TestSystem, is_offline, note};
+use driml_tests::{Summary, TestSystem, is_offline, note};
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, chain, system};
@@ -65,10 +65,7 @@ pub(crate) fn continues_exactly(env: &str, flags: &str, frames: u64) {
             "local --lockstep {flags} --actors 2 --frames {frames} --set replay.replay_ratio=8 \
              --set learner.checkpoint_period_updates=100 --run-dir {name}"
         );
-        let mut command = system.command(&args);
-        // Its name may have blanks.
-        command.args(["--env", env]);
-        Process::start(format!("{args} --env {env:?}"), command)
+        system.start_with_world(&args, env)
     };
     let system = system();
     let run = |frames: u64, name: &str| {

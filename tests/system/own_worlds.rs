@@ -3,7 +3,7 @@
 
 use std::{fs, path::Path};
 
-use driml_tests::{Process, TestSystem, python, skip, skipped_offline, wait_for};
+use driml_tests::{python, skip, skipped_offline, wait_until};
 
 use crate::{lockstep::continues_exactly, system};
 
@@ -25,25 +25,15 @@ fn numbered(fault: &str) -> String {
     )
 }
 
-/// Starts the program with a world whose name has blanks.
-fn start(system: &TestSystem, args: &str, env: &str) -> Process {
-    let mut command = system.command(args);
-    command.args(["--env", env]);
-    Process::start(format!("{args} --env {env:?}"), command)
-}
-
 #[test]
 fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
     let env = numbered("");
     let flags = format!("{SMALL} --agent driml-ada --frames 1280");
-    start(
-        &system,
-        &format!("local {flags} --actors 2 --run-dir run"),
-        &env,
-    )
-    .wait()
-    .expect_code(0);
+    system
+        .start_with_world(&format!("local {flags} --actors 2 --run-dir run"), &env)
+        .wait()
+        .expect_code(0);
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.frames, 1280);
@@ -57,7 +47,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let lockstep = |args: &str, name: &str| {
         let args = format!("local --lockstep {args} --run-dir {name}");
         let process = if name == "first" {
-            start(&system, &args, &env)
+            system.start_with_world(&args, &env)
         } else {
             system.start(&args)
         };
@@ -90,7 +80,7 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
         ),
     ] {
         let system = system();
-        let process = start(&system, &format!("{flags} --run-dir run"), &numbered(fault));
+        let process = system.start_with_world(&format!("{flags} --run-dir run"), &numbered(fault));
         let ended = process.wait().expect_code(0);
         assert!(!ended.stdout.contains("--resume"), "{}", ended.stdout);
         ended
@@ -105,14 +95,11 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     }
     // One that fails in it ends the run.
     let system = system();
-    start(
-        &system,
-        &format!("{flags} --run-dir run"),
-        &numbered("saves large"),
-    )
-    .wait()
-    .expect_code(1)
-    .expect_said("wrote a state of 67108865 bytes; 67108864 are possible");
+    system
+        .start_with_world(&format!("{flags} --run-dir run"), &numbered("saves large"))
+        .wait()
+        .expect_code(1)
+        .expect_said("wrote a state of 67108865 bytes; 67108864 are possible");
 }
 
 #[test]
@@ -128,7 +115,8 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
     ] {
         let system = system();
         let args = format!("local {SMALL} {limit} --agent c51 --frames 100000 --run-dir run");
-        start(&system, &args, &numbered(fault))
+        system
+            .start_with_world(&args, &numbered(fault))
             .wait()
             .expect_code(1)
             .expect_said(sentence);
@@ -142,7 +130,8 @@ fn what_was_played_before_a_world_failed_is_stored() {
     let system = system();
     let slow = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
     let args = format!("local {SMALL} {slow} --agent c51 --frames 100000 --run-dir run");
-    start(&system, &args, &numbered("raise 25"))
+    system
+        .start_with_world(&args, &numbered("raise 25"))
         .wait()
         .expect_code(1);
     // On a slow machine the actor is started again, and plays as much once more.
@@ -155,7 +144,8 @@ fn a_command_that_is_no_world_is_refused_before_anything_starts() {
     let system = system();
     let refused = |env: &str, sentence: &str| {
         let args = format!("local {SMALL} --run-dir run");
-        start(&system, &args, env)
+        system
+            .start_with_world(&args, env)
             .wait()
             .expect_code(64)
             .expect_said(sentence);
@@ -179,7 +169,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         system.endpoint(),
         std::process::id()
     );
-    let server = start(&system, &flags, &numbered(""));
+    let server = system.start_with_world(&flags, &numbered(""));
     let learner = system.start_learner("run");
     system
         .start_actor(0)
@@ -192,16 +182,17 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         system.endpoint(),
         std::process::id()
     );
-    start(&system, &actor, "chain")
+    system
+        .start_with_world(&actor, "chain")
         .wait()
         .expect_code(1)
         .expect_said("and not chain");
     // The same world by another command, as another machine may have it; it will hang.
-    let hanging = start(&system, &format!("{actor} --id 1"), &numbered("hang 50"));
+    let hanging = system.start_with_world(&format!("{actor} --id 1"), &numbered("hang 50"));
     let client = system.connect();
     client.wait_for_replay("the actor", |replay| replay.actors == 1);
-    wait_for("the world's hanging", || {
-        hanging.stderr().contains("sleeping").then_some(())
+    wait_until("the world's hanging", || {
+        hanging.stderr().contains("sleeping")
     });
     // A process that ignores its pipes does not outlive its actor, however that ends.
     let worlds = || {
@@ -211,7 +202,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     };
     assert_eq!(worlds(), 1);
     hanging.kill();
-    wait_for("the world's end", || (worlds() == 0).then_some(()));
+    wait_until("the world's end", || worlds() == 0);
     drop(client);
     learner.stop().expect_code(0);
     server.stop().expect_code(0);
@@ -257,13 +248,13 @@ fn atari_by_gymnasium_trains() {
         "exec:{python} {} ALE/Pong-v5 --atari",
         file("deploy/python/driml_env.py")
     );
-    start(
-        &system,
-        "local --preset smoke --agent c51 --frames 480 --run-dir run",
-        &env,
-    )
-    .wait()
-    .expect_code(0);
+    system
+        .start_with_world(
+            "local --preset smoke --agent c51 --frames 480 --run-dir run",
+            &env,
+        )
+        .wait()
+        .expect_code(0);
     let run = system.run_folder("run");
     assert_eq!(run.check_finished().frames, 480);
     let config = run.config();

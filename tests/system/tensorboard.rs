@@ -105,13 +105,3 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
     let files = names.filter(|name| name.contains("tfevents"));
     assert_eq!(files.count(), 2, "a file for each time it was started");
 }
-
-#[test]
-fn without_the_flag_there_are_no_events() {
-    let system = system();
-    system.run_ok(
-        "local --lockstep --env chain --agent c51 --preset smoke --frames 256 --run-dir run",
-    );
-    let names = system.names("run");
-    assert!(!names.iter().any(|name| name.contains("tfevents")));
-}
