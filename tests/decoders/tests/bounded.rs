@@ -119,35 +119,17 @@ impl Drop for Said<'_> {
     }
 }
 
-#[test]
-fn wire() {
-    run("wire");
+/// A test for each decoder.
+macro_rules! bounded {
+    ($($name:ident)*) => {
+        $(#[test]
+        fn $name() {
+            run(stringify!($name));
+        })*
+    };
 }
 
-#[test]
-fn messages() {
-    run("messages");
-}
-
-#[test]
-fn replay() {
-    run("replay");
-}
-
-#[test]
-fn state() {
-    run("state");
-}
-
-#[test]
-fn config() {
-    run("config");
-}
-
-#[test]
-fn segments() {
-    run("segments");
-}
+bounded!(wire messages replay state config segments);
 
 /// Each decoder has a target, and `messages` has the seeds of `wire` (which a test of the protocol writes), without their prefix:
 /// `UPDATE_CORPUS=1` writes them.
