@@ -175,6 +175,15 @@ impl TestSystem {
         self.run(args).expect_code(64).expect_said(words)
     }
 
+    /// Checks a table of calls: a line is a call, ` => `, and the words with which it is refused as [`Self::refuses`] says.
+    #[track_caller]
+    pub fn refuses_each(&self, table: &str) {
+        for line in table.trim().lines() {
+            let (call, words) = line.split_once(" => ").expect("a call => words");
+            self.refuses(call.trim(), words);
+        }
+    }
+
     /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
     pub fn start_process(&self, args: &str) -> Process {
         let parent = std::process::id();

@@ -124,17 +124,17 @@ fn an_exported_network_is_played_without_its_run() {
     assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
     let online = system.run_folder("moved").newest_checkpoint();
     let online = online.join("online.safetensors").display().to_string();
-    for (args, said) in [
-        ("net.safetensors --keep", "is a single network"),
-        ("net.safetensors --weights online", "is a single network"),
-        ("net.safetensors --checkpoint best", "is a single network"),
-        ("none.safetensors", "reading none.safetensors: No such file"),
-        (&online, "is not an exported network"),
-        ("pretrained:pong", "no pretrained weights of \"pong\""),
-        ("moved --export net", "ends in .safetensors"),
-    ] {
-        system.refuses(&format!("evaluate {args}"), said);
-    }
+    system.refuses_each(&format!(
+        "
+        evaluate net.safetensors --keep => is a single network
+        evaluate net.safetensors --weights online => is a single network
+        evaluate net.safetensors --checkpoint best => is a single network
+        evaluate none.safetensors => reading none.safetensors: No such file
+        evaluate {online} => is not an exported network
+        evaluate pretrained:pong => no pretrained weights of \"pong\"
+        evaluate moved --export net => ends in .safetensors
+        "
+    ));
 }
 
 #[test]
@@ -257,18 +257,13 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it() {
     assert_eq!(rows, [(540, 3), (updates, 1), (540, 5), (updates, 5)]);
 
     // The episodes that choose are never those of a report.
-    system.refuses(
-        "evaluate run --keep --seed 0",
-        "'--keep' cannot be used with",
-    );
-    system.refuses(
-        "evaluate run --checkpoint bset",
-        "the updates of a checkpoint",
-    );
-    system.refuses(
-        &format!("local {SHORT} --eval-interval 150 --set learner.checkpoint_period_updates=100"),
-        "local.evaluation.every_updates = 150: checkpoints are played",
-    );
+    system.refuses_each(&format!(
+        "
+        evaluate run --keep --seed 0 => '--keep' cannot be used with
+        evaluate run --checkpoint bset => the updates of a checkpoint
+        local {SHORT} --eval-interval 150 --set learner.checkpoint_period_updates=100 => local.evaluation.every_updates = 150: checkpoints are played
+        "
+    ));
 }
 
 /// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
@@ -295,12 +290,12 @@ fn it_plays_in_the_precision_of_the_run() {
 fn a_folder_that_is_no_run_s() {
     let system = system();
     fs::create_dir(system.path("empty")).unwrap();
-    for folder in ["empty", "none"] {
-        system.refuses(
-            &format!("evaluate --run {folder}"),
-            &format!("error: {folder} is not the folder of a run"),
-        );
-    }
+    system.refuses_each(
+        "
+        evaluate --run empty => error: empty is not the folder of a run
+        evaluate --run none => error: none is not the folder of a run
+        ",
+    );
     fs::write(system.path("empty/config.toml"), "[run]\n").unwrap();
     system.refuses("evaluate --run empty", "config.toml that driml wrote");
 }

@@ -33,20 +33,14 @@ fn a_film_changes_nothing_that_is_played() {
 #[test]
 fn films_that_cannot_be_are_refused_before_anything_is_played() {
     let system = with_run();
-    for (flags, said) in [
-        ("--record play.mp4", "use one that ends in .gif"),
-        (
-            "--record none/play.gif",
-            "--record none/play.gif: No such file or directory",
-        ),
-        ("--overlay", "--record <FILE.gif>"),
-        (
-            "--record play.gif --record-steps 0",
-            "0 is not in 1..=10000",
-        ),
-    ] {
-        system.refuses(&format!("evaluate run {flags}"), said);
-    }
+    system.refuses_each(
+        "
+        evaluate run --record play.mp4 => use one that ends in .gif
+        evaluate run --record none/play.gif => --record none/play.gif: No such file or directory
+        evaluate run --overlay => --record <FILE.gif>
+        evaluate run --record play.gif --record-steps 0 => 0 is not in 1..=10000
+        ",
+    );
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     system.refuses("evaluate run --record play.gif", "has no checkpoint yet");
     assert!(!system.names(".").iter().any(|name| name.contains("play")));

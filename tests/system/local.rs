@@ -185,12 +185,10 @@ fn two_replay_shards_are_one_replay() {
     let owed = (summary.frames - 200) * 8 / 16;
     assert!(owed - summary.updates <= 1, "{summary:#?}");
 
-    system.refuses(
-        &format!("local {SHORT} --replay-shards 2 --actors 1"),
-        "2 replay shards for 1 actors",
-    );
-    system.refuses(
-        &format!("local {SHORT} --replay-shards 2 --actors 2 --lockstep"),
-        "leave --replay-shards out",
-    );
+    system.refuses_each(&format!(
+        "
+        local {SHORT} --replay-shards 2 --actors 1 => 2 replay shards for 1 actors
+        local {SHORT} --replay-shards 2 --actors 2 --lockstep => leave --replay-shards out
+        "
+    ));
 }

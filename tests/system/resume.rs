@@ -112,11 +112,12 @@ fn a_run_whose_processes_were_all_killed_continues() {
 #[test]
 fn what_cannot_be_resumed() {
     let system = system();
-    system.refuses(
-        "local --resume nowhere",
-        "--resume takes the folder of a run that was interrupted",
+    system.refuses_each(
+        "
+        local --resume nowhere => --resume takes the folder of a run that was interrupted
+        local --resume run --agent c51 => cannot be used with
+        ",
     );
-    system.refuses("local --resume run --agent c51", "cannot be used with");
     let run = format!("local --agent c51 {SHORT} --run-dir run");
     system.run_ok(&run);
     for less in ["", "--frames 700"] {

@@ -75,12 +75,6 @@ impl TlsSystem {
         .unwrap();
         Client::over(session)
     }
-
-    /// A process whose files cannot be used exits before it does anything.
-    fn rejects_own_files(&self, role: &str, folder: &str, words: &str) {
-        let ended = self.start(role, folder).wait();
-        ended.expect_code(64).expect_said(words);
-    }
 }
 
 /// A stranger in the place of a replay server.
@@ -209,62 +203,36 @@ fn own_files_that_cannot_be_used() {
     spoiled("new").sign_again("learner", Valid::From2090);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     std::fs::copy(foreign.path("ca.pem"), spoiled("mixed").path("ca.pem")).unwrap();
-    let (actor, learner) = ("actor --id 0", "learner --run-dir run");
-    for (role, folder, words) in [
-        (
-            "actor --id 9",
-            "tls",
-            "tls/actor-9.pem is not there: the role actor-9 needs ca.pem, actor-9.pem and actor-9.key; \
-             `deploy/certs.sh tls --actors 10` makes them",
-        ),
-        (
-            "actor --id 1024",
-            "tls",
-            "actors have the numbers 0 to 1023",
-        ),
-        (actor, "nowhere", "nowhere/ca.pem is not there"),
-        (
-            actor,
-            "role",
-            "role/actor-0.pem is the certificate of \"learner\", not of \"actor-0\"",
-        ),
-        (
-            actor,
-            "number",
-            "is the certificate of \"actor-1\", not of \"actor-0\"",
-        ),
-        (
-            actor,
-            "key",
-            "key/actor-0.key is not the key of key/actor-0.pem",
-        ),
-        (
-            learner,
-            "garbage",
-            "garbage/learner.key holds no private key in PEM",
-        ),
-        (learner, "old", "old/learner.pem expired at"),
-        (learner, "new", "new/learner.pem is valid only from"),
-        (
-            learner,
-            "mixed",
-            "mixed/learner.pem was not signed by the authority of mixed/ca.pem",
-        ),
-    ] {
-        tls.rejects_own_files(role, folder, words);
-    }
+    let [actor, learner] = ["actor --id 0", "learner --run-dir run"]
+        .map(|role| format!("{role} --connect {} --tls-dir", tls.endpoint));
+    let other = |id: u32| actor.replace("--id 0", &format!("--id {id}"));
+    tls.system.refuses_each(&format!(
+        "
+        {} tls => tls/actor-9.pem is not there: the role actor-9 needs ca.pem, actor-9.pem and actor-9.key; `deploy/certs.sh tls --actors 10` makes them
+        {} tls => actors have the numbers 0 to 1023
+        {actor} nowhere => nowhere/ca.pem is not there
+        {actor} role => role/actor-0.pem is the certificate of \"learner\", not of \"actor-0\"
+        {actor} number => is the certificate of \"actor-1\", not of \"actor-0\"
+        {actor} key => key/actor-0.key is not the key of key/actor-0.pem
+        {learner} garbage => garbage/learner.key holds no private key in PEM
+        {learner} old => old/learner.pem expired at
+        {learner} new => new/learner.pem is valid only from
+        {learner} mixed => mixed/learner.pem was not signed by the authority of mixed/ca.pem
+        ",
+        other(9),
+        other(1024)
+    ));
     assert!(!tls.system.path("run").exists(), "nothing was begun");
 
-    let server = "replay-server --listen quic/127.0.0.1:1 --tls-dir old --env chain --agent c51";
     std::fs::remove_file(tls.system.path("old/replay-server.pem")).unwrap();
-    let ended = tls.system.run(server);
-    ended
-        .expect_code(64)
-        .expect_said("old/replay-server.pem is not there");
-    let server = server.replace("quic/127.0.0.1", "tcp/127.0.0.1");
-    tls.system.refuses(&server, "it is quic/127.0.0.1:1");
-    let without = "actor --connect quic/127.0.0.1:1";
-    tls.system.refuses(without, "add --tls-dir DIR");
+    let server = "--tls-dir old --env chain --agent c51";
+    tls.system.refuses_each(&format!(
+        "
+        replay-server --listen quic/127.0.0.1:1 {server} => old/replay-server.pem is not there
+        replay-server --listen tcp/127.0.0.1:1 {server} => it is quic/127.0.0.1:1
+        actor --connect quic/127.0.0.1:1 => add --tls-dir DIR
+        "
+    ));
 }
 
 /// A replay server rejects each certificate that is not good, and logs why; accepted connections stay.

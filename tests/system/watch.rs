@@ -79,16 +79,13 @@ fn a_launched_run_is_watched_and_continues_without() {
     let before = rows();
     assert!(!system.path("seen/summary.json").exists());
 
-    // Where its launcher writes, no other process does.
-    system.refuses(
-        "watch --run run --run-dir run",
-        "run is written by `driml train` or by another `driml watch`",
-    );
-    // Another run's folder is not this one's.
+    // Where its launcher writes, no other process does; and another run's folder is not this one's.
     system.run_ok(&format!("local --agent c51 {SHORT} --run-dir other"));
-    system.refuses(
-        "watch --run run --run-dir other",
-        "other holds another run (chain with c51, seed 1)",
+    system.refuses_each(
+        "
+        watch --run run --run-dir run => run is written by `driml train` or by another `driml watch`
+        watch --run run --run-dir other => other holds another run (chain with c51, seed 1)
+        ",
     );
 
     let watched = system.start("watch --run run --run-dir seen");
