@@ -89,9 +89,6 @@ impl Client {
     }
 
     /// A client of the run at an endpoint, once its replay server answers.
-    ///
-    /// # Panics
-    /// At the deadline.
     pub fn join(endpoint: &str) -> Self {
         let deadline = Instant::now() + DEADLINE;
         // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
@@ -173,9 +170,6 @@ impl Client {
     }
 
     /// Takes part as an actor; its chunks are of this `incarnation`.
-    ///
-    /// # Panics
-    /// If the replay server does not take it.
     pub fn join_as_actor(&self, actor: u32, incarnation: u64) {
         let join = ActorJoin { actor, incarnation };
         let never = Shutdown::default();
@@ -183,9 +177,6 @@ impl Client {
     }
 
     /// Takes part as the learner, which has learned nothing yet.
-    ///
-    /// # Panics
-    /// If the replay server does not take it.
     pub fn join_as_learner(&self, learner: u64) {
         let never = Shutdown::default();
         join::take_part(&self.run(), &new_learner(learner), &never).unwrap();
@@ -197,9 +188,6 @@ impl Client {
     }
 
     /// Sends a chunk as an actor would.
-    ///
-    /// # Panics
-    /// If no process answers, or the answer cannot be read.
     pub fn insert(&self, chunk: &Chunk) -> InsertReply {
         let key = self.keys.of_actor::<ChunkHeader>(chunk.header.actor);
         let reply = self.ask(&key, self.seal(chunk));

@@ -69,9 +69,6 @@ impl Output {
 }
 
 /// What a command prints that is not the program.
-///
-/// # Panics
-/// If it fails, with what it said.
 pub(crate) fn run(command: &mut Command) -> String {
     let output = command.output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -115,9 +112,6 @@ impl Process {
     }
 
     /// Waits until standard error holds `words`.
-    ///
-    /// # Panics
-    /// At the deadline, or when the process has ended without them.
     pub fn wait_for_stderr(&mut self, words: &str) {
         wait_for(&format!("{}: {words:?} on stderr", self.name), || {
             // In this order: what it said just before its end is not missed.
@@ -139,10 +133,7 @@ impl Process {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// Waits for its end.
-    ///
-    /// # Panics
-    /// At the deadline; the process is then killed.
+    /// Waits for its end; at the deadline it is killed.
     pub fn wait(mut self) -> Ended {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
@@ -159,9 +150,6 @@ impl Process {
     }
 
     /// Kills it and waits for its end.
-    ///
-    /// # Panics
-    /// If it ended in another way.
     pub fn kill(self) {
         self.signal(Signal::SIGKILL);
         assert_eq!(self.wait().signal, Some(Signal::SIGKILL as i32));
@@ -197,10 +185,7 @@ impl Drop for Process {
 }
 
 impl Ended {
-    /// Checks the exit code.
-    ///
-    /// # Panics
-    /// On any other code, with all that the process said; and if it panicked itself.
+    /// Checks the exit code, and that no thread panicked.
     #[track_caller]
     pub fn expect_code(self, code: i32) -> Self {
         assert!(
@@ -215,9 +200,6 @@ impl Ended {
     }
 
     /// Standard output, as JSON.
-    ///
-    /// # Panics
-    /// If it is not.
     #[track_caller]
     pub fn json(&self) -> serde_json::Value {
         let said = serde_json::from_str(&self.stdout);
@@ -225,9 +207,6 @@ impl Ended {
     }
 
     /// Checks that standard error holds `words`.
-    ///
-    /// # Panics
-    /// If it does not, with what it holds.
     #[track_caller]
     pub fn expect_said(self, words: &str) -> Self {
         let said = &self.stderr;
@@ -236,9 +215,6 @@ impl Ended {
     }
 
     /// Checks that standard output holds `words`.
-    ///
-    /// # Panics
-    /// If it does not, with what it holds.
     #[track_caller]
     pub fn expect_printed(self, words: &str) -> Self {
         let said = &self.stdout;

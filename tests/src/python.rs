@@ -27,9 +27,6 @@ pub fn python_with(modules: &[&str]) -> Option<String> {
 }
 
 /// What a Python prints when it runs `script` with `args`.
-///
-/// # Panics
-/// If it fails, with what it said.
 pub fn run(python: &str, script: &[&str], args: &[&str]) -> String {
     let mut command = Command::new(python);
     // Nothing is left beside the scripts.

@@ -197,9 +197,6 @@ impl RunFolder {
     }
 
     /// Checks what holds of every run that ended in order, and gives its summary.
-    ///
-    /// # Panics
-    /// At the first thing that does not hold.
     #[track_caller]
     pub fn check(&self, outcome: Outcome) -> Summary {
         let summary = self.summary();
@@ -245,9 +242,6 @@ impl RunFolder {
     }
 
     /// Checks, beyond [`Self::check`], what holds of a run that went to its end.
-    ///
-    /// # Panics
-    /// At the first thing that does not hold.
     #[track_caller]
     pub fn check_finished(&self) -> Summary {
         let summary = self.check(Outcome::Finished);
