@@ -24,7 +24,7 @@ const TRANSITIONS: u64 = ACTORS as u64 * OF_AN_ACTOR;
 pub(crate) const WARMUP: u64 = 200;
 pub(crate) const ROWS: u32 = 16;
 /// Rows for each transition.
-const RATIO: u64 = 64;
+const RATIO: u64 = 16;
 /// How often each transition is drawn at the end, on average: that one is never drawn has a probability of exp(-64).
 const DRAWN: u64 = 64;
 /// How often the server is killed.
