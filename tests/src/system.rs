@@ -17,7 +17,7 @@ use nix::{
 use crate::{
     client::Client,
     process::{Ended, Process},
-    run_folder::RunFolder,
+    run_folder::{Outcome, RunFolder, Summary},
     waiting::wait_for,
 };
 
@@ -99,6 +99,15 @@ impl TestSystem {
     /// A run folder in the system's folder, whether or not it is there yet.
     pub fn run_folder(&self, name: &str) -> RunFolder {
         RunFolder::new(self.path(name))
+    }
+
+    /// Checks that no process is left, and that the run in the folder `run` came to this; gives its summary.
+    #[track_caller]
+    pub fn check_over(&self, outcome: Outcome) -> Summary {
+        assert_eq!(self.survivors(), []);
+        let summary = self.run_folder("run").summary();
+        assert_eq!(summary.outcome, outcome, "{summary:#?}");
+        summary
     }
 
     /// The endpoint at which this system's processes meet: a unix socket, so that no port can be taken.

@@ -44,9 +44,8 @@ fn parameters_that_are_not_finite_are_neither_saved_nor_acted_with() {
                 "local --agent driml-fix {SHORT} {at_once} --set learner.update.adam.lr={lr} --run-dir run"
             ))
             .expect_code(1);
-        assert_eq!(system.survivors(), []);
+        system.check_over(Outcome::Failed);
         let run = system.run_folder("run");
-        assert_eq!(run.summary().outcome, Outcome::Failed);
         let log = run.log("learner");
         assert!(log.contains(said), "{lr}:\n{log}");
         let log = run.log("actor-0");

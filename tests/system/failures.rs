@@ -19,8 +19,7 @@ fn a_second_interrupt_ends_at_once() {
     interrupt_until_it_ends(process)
         .expect_code(1)
         .expect_said("stopped at once by a second interrupt: what was not saved is lost");
-    assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
+    system.check_over(Outcome::Failed);
 }
 
 /// Signals at nearly the same time count as one request, so this repeats it until it is noticed.
@@ -46,11 +45,7 @@ fn an_interrupt_at_the_start_is_an_interrupt() {
         let ended = process.interrupt().expect_code(130);
         assert!(!ended.stderr.contains("error:"), "{}", ended.stderr);
         ended.expect_printed("no episode ended");
-        assert_eq!(
-            system.run_folder("run").summary().outcome,
-            Outcome::Interrupted
-        );
-        assert_eq!(system.survivors(), []);
+        system.check_over(Outcome::Interrupted);
     }
 }
 
@@ -80,8 +75,7 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
                 "error: {role} was killed by signal 9 SIGKILL (log: "
             ))
             .expect_said("`driml train --resume run` resumes it");
-        assert_eq!(system.survivors(), []);
-        assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
+        system.check_over(Outcome::Failed);
     }
 }
 
@@ -135,8 +129,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
         .expect_code(1)
         .expect_said("error: actor-0 was killed by signal 9 SIGKILL (log: ")
         .expect_said("actor-0 is not started again: the ghosts of this run change");
-    assert_eq!(system.survivors(), []);
-    assert_eq!(system.run_folder("run").summary().outcome, Outcome::Failed);
+    system.check_over(Outcome::Failed);
 }
 
 /// They all notice it at once: the replay server stays until the others have delivered what they have and left.

@@ -42,12 +42,6 @@ fn complete_but_for_an_actor(system: &TestSystem) -> Process {
     process
 }
 
-fn check_finished(system: &TestSystem) {
-    let summary = system.run_folder("run").summary();
-    assert_eq!(summary.outcome, Outcome::Finished);
-    assert_eq!(system.survivors(), []);
-}
-
 fn a_complete_run_is_finished() {
     let system = system();
     complete_but_for_an_actor(&system)
@@ -55,7 +49,7 @@ fn a_complete_run_is_finished() {
         .expect_code(0)
         .expect_said("did not end within 1 min 0 s and was killed")
         .expect_printed("finished: ");
-    check_finished(&system);
+    system.check_over(Outcome::Finished);
 }
 
 /// The first interrupt waits for the actor, the second does not; neither makes the run another one.
@@ -64,7 +58,7 @@ fn an_interrupt_of_a_complete_run_leaves_it_finished() {
     interrupt_until_it_ends(complete_but_for_an_actor(&system))
         .expect_code(0)
         .expect_printed("finished: ");
-    check_finished(&system);
+    system.check_over(Outcome::Finished);
 }
 
 fn a_replay_server_ends_without_its_actor() {
