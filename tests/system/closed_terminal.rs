@@ -15,7 +15,7 @@ use std::{
 };
 
 use driml_protocol::hangup_is_ignored;
-use driml_tests::{Outcome, Process, TestSystem, wait_for};
+use driml_tests::{Outcome, Process, TestSystem, wait_for, wait_until};
 use nix::{
     fcntl::OFlag,
     poll::{PollFd, PollFlags, poll},
@@ -104,8 +104,8 @@ fn a_closed_window_saves_the_run() {
     let (window, terminal) = Window::open();
     let mut child = start(&system, terminal.try_clone().unwrap(), terminal);
     system.connect().wait_for_updates(100);
-    wait_for("the progress bar", || {
-        window.shown().contains("replay ratio 7").then_some(())
+    wait_until("the progress bar", || {
+        window.shown().contains("replay ratio 7")
     });
     window.close();
     check_saved(&system, end(&mut child));
@@ -219,10 +219,10 @@ fn a_run_that_was_stopped_for_long_resumes() {
     signal(&process, Signal::SIGCONT);
     let client = system.connect();
     let before = client.wait_for_updates(100);
-    wait_for("500 more updates", || {
+    wait_until("500 more updates", || {
         assert!(process.is_running(), "{}", process.stderr());
-        let updates = client.learner()?.updates;
-        (updates > before.updates + 500).then_some(())
+        let learner = client.learner();
+        learner.is_some_and(|it| it.updates > before.updates + 500)
     });
     process.stop().expect_code(130);
     system.run_folder("run").check(Outcome::Interrupted);

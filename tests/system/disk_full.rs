@@ -8,7 +8,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Outcome, Process, TestSystem, succeeds, wait_for};
+use driml_tests::{Outcome, Process, TestSystem, succeeds, wait_for, wait_until};
 
 use crate::{LONG, SHORT, system};
 
@@ -152,12 +152,10 @@ fn a_checkpoint_that_finds_no_room_is_tried_again() {
     client.wait_for_updates(then + 600);
     filler.remove();
     let now = client.learner().unwrap().updates;
-    wait_for("a checkpoint after that", || {
+    wait_until("a checkpoint after that", || {
         let names = system.names("disk/run/checkpoints");
-        let mut saved = names
-            .iter()
-            .filter_map(|name| name.strip_prefix("checkpoint-")?.parse().ok());
-        saved.any(|updates: u64| updates > now).then_some(())
+        let updates = |name: &String| name.strip_prefix("checkpoint-")?.parse::<u64>().ok();
+        names.iter().any(|name| updates(name) > Some(now))
     });
     process.interrupt().expect_code(130);
     system.run_folder("disk/run").check(Outcome::Interrupted);
@@ -193,16 +191,16 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
     let ask = format!("status --connect {}", system.endpoint());
-    wait_for("a status that says it", || {
+    let words = [
+        "replay on disk: ",
+        "REFUSED for",
+        "No space left on device",
+        "If the replay server dies now",
+        "to do: the disk of the replay server on",
+    ];
+    wait_until("a status that says it", || {
         let said = system.run(&ask).stdout;
-        let words = [
-            "replay on disk: ",
-            "REFUSED for",
-            "No space left on device",
-            "If the replay server dies now",
-            "to do: the disk of the replay server on",
-        ];
-        words.iter().all(|it| said.contains(it)).then_some(())
+        words.iter().all(|it| said.contains(it))
     });
     filler.remove();
     client.wait_for_replay("more frames", |replay| {

@@ -42,8 +42,8 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
             "local --lockstep {flags} {sets} --run-dir cut-{name}"
         ));
         let folder = system.run_folder(&format!("cut-{name}"));
-        let text = std::fs::read_to_string(system.path(&format!("cut-{name}")).join("config.toml"));
-        let config = RunConfig::parse("config.toml", &text.unwrap()).unwrap();
+        let text = system.read(&format!("cut-{name}/config.toml"));
+        let config = RunConfig::parse("config.toml", &text).unwrap();
         assert_eq!([config.run.frame_height, config.run.frame_width], cut);
         let whole = config.with_whole_frames().unwrap();
         assert_eq!([whole.run.frame_height, whole.run.frame_width], [64, 64]);
@@ -85,8 +85,7 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
     let system = system();
     system
         .run_ok("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table");
-    let folder = system.path("table");
-    let page = std::fs::read_to_string(folder.join("README.md")).unwrap();
+    let page = system.read("table/README.md");
     for line in [
         "| game | random | c51 training | c51 greedy | c51 paper |",
         "| 4.45 |\n",
@@ -95,7 +94,7 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
     ] {
         assert!(page.contains(line), "{line}\n{page}");
     }
-    let table = std::fs::read_to_string(folder.join("table.csv")).unwrap();
+    let table = system.read("table/table.csv");
     assert!(
         table.contains("\nbigfish,driml-ada,nature,3,608,"),
         "{table}"

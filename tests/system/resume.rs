@@ -77,8 +77,7 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
     let border =
         "--set world.height=15 --set world.width=17 --set input.height=15 --set input.width=17";
     system.run_ok(&format!("local --lockstep {SHORT} {border} --run-dir cut"));
-    let text = fs::read_to_string(system.path("cut").join("config.toml")).unwrap();
-    let cut = RunConfig::parse("config.toml", &text).unwrap();
+    let cut = RunConfig::parse("config.toml", &system.read("cut/config.toml")).unwrap();
     assert_eq!((cut.run.frame_height, cut.run.frame_width), (14, 16));
     let old = cut.with_whole_frames().unwrap();
     fs::write(system.path("old.toml"), old.to_toml()).unwrap();
@@ -139,9 +138,9 @@ fn a_run_cut_off_at_its_end_is_finished() {
             "--agent c51 {SHORT} --actors {shards} --replay-shards {shards} --run-dir {dir}"
         );
         system.run_ok(&format!("local {run}"));
-        let path = system.path(&dir).join("summary.json");
-        let summary = fs::read_to_string(&path).unwrap();
-        fs::write(&path, summary.replace(": \"finished\"", ": \"failed\"")).unwrap();
+        let path = format!("{dir}/summary.json");
+        let failed = system.read(&path).replace(": \"finished\"", ": \"failed\"");
+        fs::write(system.path(&path), failed).unwrap();
         let run = system.run_folder(&dir);
         let before = run.summary().updates;
         system.run_ok(&format!("local --resume {dir}"));

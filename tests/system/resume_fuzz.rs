@@ -4,7 +4,7 @@
 
 use std::{fmt::Write as _, fs, time::Duration};
 
-use driml_tests::{Outcome, RunFolder, Survivor, TestSystem};
+use driml_tests::{Outcome, RunFolder, Survivor, TestSystem, check_nothing_lost, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
@@ -176,8 +176,7 @@ fn resume_once(seed: u64) {
     let said = format!("{about}\n{before:?}\n{after:#?}");
     assert_eq!(after.outcome, Outcome::Finished, "{said}");
     let replay = &after.replay;
-    let wrong = (replay.transitions_lost, replay.transitions_duplicated);
-    assert_eq!(wrong, (0, 0), "{said}");
+    check_nothing_lost(replay);
     assert!(
         is_fresh || after.frames >= change.frames.max(before.frames),
         "{said}"
@@ -211,9 +210,8 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
         return;
     }
     let process = system.start(flags);
-    driml_tests::wait_for("the run's settings", || {
-        run.path().join("config.toml").exists().then_some(())
-    });
+    let settings = run.path().join("config.toml");
+    wait_until("the run's settings", || settings.exists());
     std::thread::sleep(moment);
     match stop {
         Stop::End => {}

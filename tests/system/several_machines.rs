@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_tests::{Network, Process, TestSystem, note, skip, wait_for};
+use driml_tests::{Network, Process, TestSystem, note, skip, wait_for, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use serde_json::Value;
@@ -94,9 +94,7 @@ impl Run {
     }
 
     fn wait_for_frames(&self, frames: u64) {
-        wait_for(&format!("{frames} frames"), || {
-            (self.inserted() >= frames).then_some(())
-        });
+        wait_until(&format!("{frames} frames"), || self.inserted() >= frames);
     }
 
     /// Waits for the end of the run, which must be as if nothing had happened.

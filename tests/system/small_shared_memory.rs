@@ -1,11 +1,7 @@
 //! Shared memory of which there is too little, at the start or later: a run says so once, goes through sockets, and ends well.
 //! A small `/dev/shm` takes root's rights to mount; without them a line says what is skipped.
 
-use std::{
-    fs::{self, File},
-    io::Write,
-    process::Command,
-};
+use std::{fs::File, io::Write, process::Command};
 
 use driml_tests::{Ended, succeeds};
 use nix::sys::signal::Signal;
@@ -87,6 +83,6 @@ fn a_run_continues_when_others_fill_it_up() {
     drop(client);
     let ended = process.interrupt().expect_code(130);
     assert_eq!(warnings(&ended), 1, "{ended:#?}");
-    let log = fs::read_to_string(system.path("run/logs/replay-server.log")).unwrap();
+    let log = system.run_folder("run").log("replay-server");
     assert!(!log.contains("panicked"), "{log}");
 }

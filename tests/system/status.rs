@@ -1,7 +1,7 @@
 //! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
 //! What processes log while they wait is here too.
 
-use driml_tests::{Ended, TestSystem, wait_for};
+use driml_tests::{TestSystem, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -85,10 +85,9 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
     let process = system.start(&format!(
         "local --agent c51 {LONG} --actors 2 --run-dir run"
     ));
-    let live =
-        |ended: Ended| (ended.code == Some(0) && ended.stdout.contains("learns")).then_some(());
-    wait_for("a status of the living run", || {
-        live(system.run("status --run run"))
+    wait_until("a status of the living run", || {
+        let ended = system.run("status --run run");
+        ended.code == Some(0) && ended.stdout.contains("learns")
     });
     process.interrupt().expect_code(130);
     system
