@@ -8,13 +8,14 @@ use std::{
 /// How long any one wait may take. The longest are for experiments of many runs: three minutes where four other processes want the
 /// same two cores. A CI job's limit is above it.
 pub const DEADLINE: Duration = Duration::from_secs(600);
-/// Between two looks at a condition.
-const LOOK_AGAIN: Duration = Duration::from_millis(10);
+/// Between two looks at a condition: as long as a look takes, as one may start a process, within these limits.
+const LOOK_AGAIN: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(200)];
 
 /// Waits until `look` gives something.
 pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let started = Instant::now();
     loop {
+        let looked = Instant::now();
         if let Some(seen) = look() {
             return seen;
         }
@@ -22,7 +23,7 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
             started.elapsed() < DEADLINE,
             "waited {DEADLINE:?} for: {what}"
         );
-        thread::sleep(LOOK_AGAIN);
+        thread::sleep(looked.elapsed().clamp(LOOK_AGAIN[0], LOOK_AGAIN[1]));
     }
 }
 
