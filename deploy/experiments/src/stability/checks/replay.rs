@@ -1,7 +1,7 @@
 //! N-step returns and discounts, as a replay's batches have them.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Config, RETURN_ERROR, Replay, return_sum_error};
 
@@ -37,27 +37,23 @@ pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
     }
 }
 
-/// Of a replay in which neither side waits and rows are drawn uniformly.
-pub(super) fn config(capacity_transitions: u64) -> Config {
-    Config {
-        replay_ratio: 8.0,
-        ..Config::unlimited(capacity_transitions)
-    }
-}
-
-/// A replay which actor 0 has joined.
-pub(super) fn replay(spec: &RunSpec, rows: u32, config: &Config) -> anyhow::Result<Replay> {
-    let mut replay = Replay::new(spec, config, rows)?;
+/// A replay, in which neither side waits, of these steps of actor 0.
+pub(super) fn replay(
+    spec: &RunSpec,
+    sampling: Sampling,
+    rows: u32,
+    steps: &[(f32, End)],
+) -> anyhow::Result<Replay> {
+    let config = Config {
+        sampling,
+        ..Config::unlimited(4096)
+    };
+    let mut replay = Replay::new(spec, &config, rows)?;
     let join = ActorJoin {
         actor: 0,
         incarnation: 1,
     };
     replay.join_actor(join).map_err(anyhow::Error::msg)?;
-    Ok(replay)
-}
-
-/// The first steps of a stream as a chunk.
-pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         incarnation: 1,
         streams: 1,
@@ -66,12 +62,17 @@ pub(super) fn chunk(steps: &[(f32, End)]) -> Chunk {
         ..ChunkHeader::default()
     });
     for (row, (reward, end)) in steps.iter().enumerate() {
-        chunk
-            .frame_mut(row)
-            .copy_from_slice(&(row as u32).to_le_bytes());
+        let number = (row as u32).to_le_bytes();
+        chunk.frame_mut(row).copy_from_slice(&number);
         chunk.set(row, 1, *reward, *end);
     }
-    chunk
+    let stored = replay.insert(&chunk);
+    let is_stored = matches!(stored, InsertReply::Stored { .. });
+    anyhow::ensure!(
+        is_stored,
+        "a chunk within the limits was not stored: {stored:?}"
+    );
+    Ok(replay)
 }
 
 /// The number of the step that a state [1, 4, 1] is of.
@@ -146,13 +147,7 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
 
     let rows = 16;
     let spec = spec(n as u32, gamma, timeout);
-    let mut replay = replay(&spec, rows, &config(4096))?;
-    let stored = replay.insert(&chunk(&stream.steps));
-    let is_stored = matches!(stored, InsertReply::Stored { .. });
-    anyhow::ensure!(
-        is_stored,
-        "a chunk within the limits was not stored: {stored:?}"
-    );
+    let mut replay = replay(&spec, Sampling::default(), rows, &stream.steps)?;
     // An episode may have ended nowhere in reach.
     let Ok(batch) = replay.sample(rows) else {
         return Ok(());

@@ -6,7 +6,7 @@ use driml_protocol::{
     AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{
-    CHANCE_ERROR, Config, PRIORITY_MIN, Replay,
+    CHANCE_ERROR, PRIORITY_MIN, Replay,
     horizon::{
         Affinity,
         nhg::{GO_ON_ERROR, draw_k},
@@ -14,7 +14,7 @@ use driml_replay_server::{
 };
 use rand::RngCore;
 
-use super::replay::{chunk, config, number, replay, spec};
+use super::replay::{number, replay, spec};
 use crate::stability::property::*;
 
 /// Deviations of a chi-square that one right law in two million passes.
@@ -190,28 +190,23 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     // Of one batch the law is not seen.
     let batches = cases.of(&[cases.settings.law_draws / u64::from(ROWS)], |_| 1);
 
-    let config = Config {
-        sampling: Sampling::Prioritised {
-            alpha,
-            beta_start: 0.4,
-            beta_end: 1.0,
-            beta_updates: 100,
-        },
-        // As often as the law is to be seen.
-        replay_ratio: 1e9,
-        ..config(4096)
+    let sampling = Sampling::Prioritised {
+        alpha,
+        beta_start: 0.4,
+        beta_end: 1.0,
+        beta_updates: 100,
     };
     let spec = RunSpec {
         seed: cases.rng.random(),
         ..spec(1, 0.99, TimeoutRule::Terminal)
     };
-    let mut replay = replay(&spec, ROWS, &config)?;
+    // The last one lacks a step that follows.
+    let steps = [(1.0, End::Running); HELD + 1];
+    let mut replay = replay(&spec, sampling, ROWS, &steps)?;
     let batch_of = |replay: &mut Replay| {
         let batch = replay.sample(ROWS);
         batch.map_err(|why| anyhow::anyhow!("no batch: {why:?}"))
     };
-    // The last one lacks a step that follows.
-    replay.insert(&chunk(&[(1.0, End::Running); HELD + 1]));
     let origin = batch_of(&mut replay)?.header.origin;
     let update = PriorityUpdate {
         learner: 1,
