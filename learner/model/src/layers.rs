@@ -5,6 +5,12 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::init::InitialLaw;
 
+#[derive(Clone, Debug)]
+pub(crate) struct Layer<T> {
+    pub(crate) weight: T,
+    pub(crate) bias: T,
+}
+
 /// A layer's name, the shapes of its parameters, and how they are drawn at the start of a run.
 ///
 /// Source of the laws: the paper authors' code. A C51 head that starts orthogonal too gives first Q values twice as large,

@@ -11,13 +11,15 @@ use rayon::prelude::*;
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::heads::acting::{ActingHead, InputsFirst};
+use crate::heads::acting::ActingHead;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
+use crate::heads::streams::HeadLayer;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::{Dense, activate};
 use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
 use crate::kernels::precision::Precision;
+use crate::layers::Layer;
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
@@ -174,17 +176,16 @@ impl<S: Simd> UnitWeights<S> {
         precision: Precision,
     ) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
-        let mut take = |name: &str| {
+        let mut take = |layer: &str, part: &str| {
             let (_, values) = parameters
-                .remove(name)
+                .remove(&format!("{layer}.{part}"))
                 .expect("decode returns every parameter of the configuration");
-            values
+            Ok::<_, Infallible>(values)
         };
         let torso = config.torso();
-        let Ok(of_torso) = TorsoParameters::of(&*torso, |layer, part| {
-            Ok::<_, Infallible>(take(&format!("{layer}.{part}")))
-        });
-        let head = ActingHead::new(config, &mut take);
+        let Ok(of_torso) = TorsoParameters::of(&*torso, &mut take);
+        let Ok(of_head) = HeadLayer::all(config, take);
+        let head = ActingHead::new(of_head);
         Ok(Self {
             simd,
             frame_len: config.frame_len(),
@@ -206,7 +207,7 @@ impl<S: Simd> UnitWeights<S> {
     }
 }
 
-fn dense<S: Simd>(simd: S, layer: &InputsFirst) -> Dense<S> {
+fn dense<S: Simd>(simd: S, layer: &Layer<Vec<f32>>) -> Dense<S> {
     Dense::new(simd, &layer.weight, layer.bias.clone())
 }
 

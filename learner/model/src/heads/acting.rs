@@ -1,44 +1,25 @@
 //! The C51 head's parameters as an actor holds them, and the one linear layer that they amount to: `streams` without a graph.
 //! It applies no layer.
 
-use crate::config::ModelConfig;
 use crate::heads::noise::HeadNoise;
+use crate::heads::streams::HeadLayer;
+use crate::layers::Layer;
 
-/// Weight [in, out] and bias [out] of a linear layer.
-#[derive(Clone, Debug)]
-pub(crate) struct InputsFirst {
-    pub(crate) weight: Vec<f32>,
-    pub(crate) bias: Vec<f32>,
-}
-
-/// A layer of the head: what it is without noise, and what scales its noise if it is a noisy one.
-pub(crate) struct ActingLayer {
-    mean: InputsFirst,
-    sigma: Option<InputsFirst>,
-}
-
-/// The head's layers: the value's and the advantage's of a dueling head, else one.
+/// The head's layers, with weights [in, out].
 pub(crate) struct ActingHead {
-    layers: Vec<ActingLayer>,
+    layers: Vec<HeadLayer<Vec<f32>>>,
 }
 
 impl ActingHead {
-    /// The head of `config`; `take` gives a parameter by its name.
-    pub(crate) fn new(config: &ModelConfig, mut take: impl FnMut(&str) -> Vec<f32>) -> Self {
-        let mut layer = |name: &str, outputs: usize, end: &str| InputsFirst {
-            weight: transposed(&take(&format!("{name}.weight{end}")), outputs),
-            bias: take(&format!("{name}.bias{end}")),
+    /// The head of `layers`, with weights [out, in].
+    pub(crate) fn new(layers: Vec<HeadLayer<Vec<f32>>>) -> Self {
+        let inputs_first = |layer: Layer<Vec<f32>>| Layer {
+            weight: transposed(&layer.weight, layer.bias.len()),
+            bias: layer.bias,
         };
-        let layers = config.head_layers().into_iter();
-        let layers = layers.map(|(name, outputs)| match config.head.noisy_sigma {
-            None => ActingLayer {
-                mean: layer(name, outputs, ""),
-                sigma: None,
-            },
-            Some(_) => ActingLayer {
-                mean: layer(name, outputs, "_mu"),
-                sigma: Some(layer(name, outputs, "_sigma")),
-            },
+        let layers = layers.into_iter().map(|layer| HeadLayer {
+            mean: inputs_first(layer.mean),
+            sigma: layer.sigma.map(inputs_first),
         });
         Self {
             layers: layers.collect(),
@@ -46,8 +27,8 @@ impl ActingHead {
     }
 
     /// The layer of A * N outputs that they amount to with this noise, or without.
-    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> InputsFirst {
-        let with_noise = |(number, layer): (usize, &ActingLayer)| {
+    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Layer<Vec<f32>> {
+        let with_noise = |(number, layer): (usize, &HeadLayer<Vec<f32>>)| {
             let mut sum = layer.mean.clone();
             if let (Some(noise), Some(sigma)) = (noise, &layer.sigma) {
                 let noise = noise.of_layer(number);

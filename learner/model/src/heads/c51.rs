@@ -11,9 +11,10 @@ use crate::compute::Kernels;
 use crate::config::ModelConfig;
 use crate::error::Result;
 use crate::heads::noise::HeadNoise;
-use crate::heads::streams::{LinearLayer, Streams};
+use crate::heads::streams::Streams;
 use crate::kernels::exponentials::exp_below;
 use crate::kernels::tensors::floats;
+use crate::layers::Layer;
 use crate::parameters::Parameters;
 
 /// Distributions that one task takes.
@@ -59,10 +60,9 @@ impl C51Head {
         noise: Option<&HeadNoise>,
     ) -> Result<Tensor> {
         let active = self.kernels.relu(f4)?;
-        let LinearLayer { weight, bias } = self.streams.layer(noise)?;
-        Ok(self
-            .kernels
-            .grouped_linear(&active, &weight, &bias, actions, self.atoms)?)
+        let Layer { weight, bias } = self.streams.layer(noise)?;
+        let (with, atoms) = (self.kernels, self.atoms);
+        Ok(with.grouped_linear(&active, &weight, &bias, actions, atoms)?)
     }
 
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.

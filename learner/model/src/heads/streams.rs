@@ -9,47 +9,47 @@ use candle_core::{D, Tensor};
 
 use crate::config::ModelConfig;
 use crate::error::{ModelError, Result};
-use crate::heads::config::{ADVANTAGE, HEAD, VALUE};
 use crate::heads::noise::HeadNoise;
+use crate::layers::Layer;
 use crate::parameters::Parameters;
-
-/// Weight [out, in] and bias [out] of a linear layer.
-#[derive(Clone, Debug)]
-pub(crate) struct LinearLayer {
-    pub(crate) weight: Tensor,
-    pub(crate) bias: Tensor,
-}
 
 /// A layer of the head: what it is without noise, and what scales its noise if it is a noisy one.
 #[derive(Debug)]
-struct HeadLayer {
-    mean: LinearLayer,
-    sigma: Option<LinearLayer>,
+pub(crate) struct HeadLayer<T> {
+    pub(crate) mean: Layer<T>,
+    pub(crate) sigma: Option<Layer<T>>,
 }
 
-impl HeadLayer {
-    fn new(name: &str, config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
-        let layer = |end: &str| -> Result<LinearLayer> {
-            Ok(LinearLayer {
-                weight: parameters.tensor(name, &format!("weight{end}"))?,
-                bias: parameters.tensor(name, &format!("bias{end}"))?,
+impl<T> HeadLayer<T> {
+    /// The layers of the head of `config`: the value's and the advantage's of a dueling head, else one. `take` gives a parameter by
+    /// its layer's name and its own.
+    pub(crate) fn all<E>(
+        config: &ModelConfig,
+        mut take: impl FnMut(&str, &str) -> std::result::Result<T, E>,
+    ) -> std::result::Result<Vec<Self>, E> {
+        let mut layer = |name: &str, end: &str| -> std::result::Result<Layer<T>, E> {
+            Ok(Layer {
+                weight: take(name, &format!("weight{end}"))?,
+                bias: take(name, &format!("bias{end}"))?,
             })
         };
-        Ok(if config.head.noisy_sigma.is_some() {
-            Self {
-                mean: layer("_mu")?,
-                sigma: Some(layer("_sigma")?),
-            }
-        } else {
-            Self {
-                mean: layer("")?,
-                sigma: None,
-            }
-        })
+        let (mean, sigma) = match config.head.noisy_sigma {
+            None => ("", None),
+            Some(_) => ("_mu", Some("_sigma")),
+        };
+        let layers = config.head_layers().into_iter().map(|(name, _)| {
+            Ok(Self {
+                mean: layer(name, mean)?,
+                sigma: sigma.map(|end| layer(name, end)).transpose()?,
+            })
+        });
+        layers.collect()
     }
+}
 
+impl HeadLayer<Tensor> {
     /// mu + sigma * eps, of the noise of the head's layer with this number; mu without noise.
-    fn with_noise(&self, noise: Option<&HeadNoise>, number: usize) -> Result<LinearLayer> {
+    fn with_noise(&self, noise: Option<&HeadNoise>, number: usize) -> Result<Layer<Tensor>> {
         let (Some(noise), Some(sigma)) = (noise, &self.sigma) else {
             if noise.is_some() {
                 let what = "noise for a head without noisy layers";
@@ -63,7 +63,7 @@ impl HeadLayer {
             let noise = Tensor::from_vec(noise, sigma.dims(), sigma.device())?;
             Ok((mean + (sigma * noise)?)?)
         };
-        Ok(LinearLayer {
+        Ok(Layer {
             weight: add(&self.mean.weight, &sigma.weight, &weight)?,
             bias: add(&self.mean.bias, &sigma.bias, &bias)?,
         })
@@ -72,34 +72,28 @@ impl HeadLayer {
 
 #[derive(Debug)]
 pub(crate) struct Streams {
-    /// Of N outputs; there in a dueling head.
-    value: Option<HeadLayer>,
-    /// Of A * N outputs: the advantage's of a dueling head, else the whole head.
-    actions: HeadLayer,
+    layers: Vec<HeadLayer<Tensor>>,
     atoms: usize,
 }
 
 impl Streams {
     pub(crate) fn new(config: &ModelConfig, parameters: &Parameters) -> Result<Self> {
-        let layer = |name: &str| HeadLayer::new(name, config, parameters);
-        let dueling = config.head.dueling;
         Ok(Self {
-            value: dueling.then(|| layer(VALUE)).transpose()?,
-            actions: layer(if dueling { ADVANTAGE } else { HEAD })?,
+            layers: HeadLayer::all(config, |layer, part| parameters.tensor(layer, part))?,
             atoms: config.atoms,
         })
     }
 
     /// The layer of A * N outputs that they amount to with this noise, or without; of a plain head its own, whose parameters then are
     /// variables.
-    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Result<LinearLayer> {
-        let Some(value) = &self.value else {
-            return self.actions.with_noise(noise, 0);
+    pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Result<Layer<Tensor>> {
+        let first = self.layers[0].with_noise(noise, 0)?;
+        let Some(advantage) = self.layers.get(1) else {
+            return Ok(first);
         };
-        let value = value.with_noise(noise, 0)?;
-        let advantage = self.actions.with_noise(noise, 1)?;
+        let (value, advantage) = (first, advantage.with_noise(noise, 1)?);
         let (v, a) = (value.bias.unsqueeze(1)?, advantage.bias.unsqueeze(1)?);
-        Ok(LinearLayer {
+        Ok(Layer {
             weight: dueling(&value.weight, &advantage.weight, self.atoms)?,
             bias: dueling(&v, &a, self.atoms)?.squeeze(D::Minus1)?,
         })

@@ -8,6 +8,7 @@ use candle_core::Tensor;
 use crate::compute::Kernels;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
+use crate::layers::Layer;
 
 /// A torso of given sizes, without its parameters: frames to f3, its convolutions' map, and f4, a fully connected layer on it. It ends before
 /// f4's ReLU, because DIM sees f4 before it and the C51 head after it.
@@ -58,12 +59,6 @@ pub(crate) struct TorsoConvolution {
     pub(crate) locations: usize,
     /// What its initial weight is multiplied by.
     pub(crate) initial_scale: f32,
-}
-
-#[derive(Clone, Debug)]
-pub(crate) struct Layer<T> {
-    pub(crate) weight: T,
-    pub(crate) bias: T,
 }
 
 #[derive(Clone, Debug)]
