@@ -58,7 +58,6 @@ pub(crate) mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    use super::*;
     use crate::playing::{fails, play};
     use crate::worlds::{chain, ising};
     use crate::{Environment, IsingConfig, RestrictedWorld, StepEnd, WorldConfig};
