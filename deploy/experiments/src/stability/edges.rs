@@ -26,12 +26,8 @@ pub(super) fn finite(rng: &mut impl Rng) -> f32 {
         4..6 => {
             // Every bit pattern is as likely but those that are not finite, which lose a bit of their exponent.
             let bits = rng.random::<u32>();
-            let any = f32::from_bits(bits);
-            if any.is_finite() {
-                any
-            } else {
-                f32::from_bits(bits ^ 0x4000_0000)
-            }
+            let is_lost = !f32::from_bits(bits).is_finite();
+            f32::from_bits(bits ^ (u32::from(is_lost) << 30))
         }
         6 => f32::from_bits(rng.random::<u32>() & 0x807f_ffff),
         7..9 => {
@@ -178,10 +174,8 @@ pub(super) fn off(found: f32, expected: f64) -> f64 {
 
 /// The largest of errors, and NaN if one is.
 pub(super) fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
-    let larger = |a: f64, b: f64| if b.is_nan() || b > a { b } else { a };
-    errors
-        .into_iter()
-        .fold(0.0, |a, b| if a.is_nan() { a } else { larger(a, b) })
+    let larger = |a: f64, b: f64| if b <= a || a.is_nan() { a } else { b };
+    errors.into_iter().fold(0.0, larger)
 }
 
 /// An error where this holds; else NaN, the largest.

@@ -57,10 +57,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         rows.extend(property::tried(of_property));
     }
     session.csv("promises", COLUMNS, table_of(&rows))?;
-    session.figure(
-        "worst",
-        &figure::figure(&rows, &HumanCount(cases(&rows)).to_string()),
-    )?;
+    session.figure("worst", &figure::figure(&rows, &cases(&rows)))?;
     let page = session.folder().join("README.md");
     session.finish(include_str!("page.md.j2"), values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
@@ -94,14 +91,14 @@ fn number(value: f64) -> String {
     }
 }
 
-fn cases(rows: &[Row]) -> u64 {
-    rows.iter().map(|row| row.cases).sum()
+fn cases(rows: &[Row]) -> String {
+    HumanCount(rows.iter().map(|row| row.cases).sum()).to_string()
 }
 
 /// What came out, in a sentence.
 fn verdict(rows: &[Row]) -> String {
     let kept = rows.iter().filter(|row| row.is_kept()).count();
-    let (all, cases) = (rows.len(), HumanCount(cases(rows)));
+    let (all, cases) = (rows.len(), cases(rows));
     format!("{kept} of {all} promises are kept, in {cases} cases.")
 }
 
