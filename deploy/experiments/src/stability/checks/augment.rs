@@ -145,13 +145,8 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         hue: 0.0,
         ..view
     };
-    let errors = [
-        picture.crop_error(&augment, &plain),
-        picture.colour_error(&view),
-    ];
-    let size = picture.size;
-    cases.see(
-        format_args!("{size:?}, crop_side {crop_side}: {view:?}"),
-        errors,
-    )
+    let of_crop = picture.crop_error(&augment, &plain);
+    let of_colour = picture.colour_error(&view);
+    let input = format_args!("{:?}, crop_side {crop_side}: {view:?}", picture.size);
+    cases.see(input, [of_crop, of_colour])
 }
