@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use candle_core::Tensor;
-use driml_model::{DimHeads, Features, Network};
+use driml_model::DimHeads;
 
 use super::{
     dim::{Dim, Vectors},
@@ -12,10 +12,7 @@ use super::{
     positives::Positives,
 };
 use crate::{
-    batch::Batch,
-    deduplicate::State,
-    error::UpdateError,
-    losses::{info_nce::info_nce_loss, scores::Dots},
+    batch::Batch, deduplicate::State, error::UpdateError, losses::info_nce::info_nce_loss,
 };
 
 /// Its line of the menu.
@@ -41,15 +38,6 @@ struct Cpc {
     pairs: Dim,
 }
 
-/// The dot products of one offset, in the order of `settings::PAIRS`, and the rows that have a positive there.
-#[derive(Debug)]
-struct Offset {
-    /// Rows with a positive, at least two.
-    rows: usize,
-    /// [L, rows, rows] for the pairs with a weight above 0.
-    dots: [Option<Dots>; 4],
-}
-
 impl AuxiliaryLoss for Cpc {
     fn heads(&self, action: bool) -> DimHeads {
         self.pairs.heads(action)
@@ -71,16 +59,26 @@ impl AuxiliaryLoss for Cpc {
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let (online, valid) = (inputs.online, inputs.batch.positive_valid);
-        let (anchors, later) = (&inputs.features.anchors, inputs.features.later.as_ref());
-        let action = inputs.action()?;
-        let offsets = self.offsets(online, anchors, later, &action, valid)?;
+        let (online, batch) = (inputs.online, inputs.batch);
+        let (anchors, wanted) = (&inputs.features.anchors, self.pairs.lambda.wanted());
         let mut sums = [const { None::<Tensor> }; 4];
         let mut all_dots = [const { Vec::new() }; 4];
-        for Offset { rows, dots } in offsets {
-            let all = vec![1; rows];
-            for ((sum, all_dots), dots) in sums.iter_mut().zip(&mut all_dots).zip(dots) {
-                if let Some(dots) = dots {
+        if let Some(later) = &inputs.features.later {
+            let vectors = Vectors::new(online, anchors, later, &inputs.action()?, wanted)?;
+            let mut first = 0;
+            for valid in batch.positive_valid.chunks_exact(batch.rows) {
+                let there = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
+                let rows: Vec<u32> = there.map(|(row, _)| row).collect();
+                let candidates = first..first + rows.len();
+                first = candidates.end;
+                if rows.len() < 2 {
+                    continue;
+                }
+                let all = vec![1; rows.len()];
+                let here = of_offset(&vectors, batch.rows, &rows, candidates)?;
+                let sums = sums.iter_mut().zip(&mut all_dots);
+                for ((sum, all_dots), dots) in sums.zip(here.dots(wanted)?) {
+                    let Some(dots) = dots else { continue };
                     let scores = self.pairs.scores(dots.width);
                     let loss = info_nce_loss(&dots.dots, &all, scores, online.kernels())?;
                     *sum = Some(match sum.take() {
@@ -95,7 +93,7 @@ impl AuxiliaryLoss for Cpc {
         let mut losses = Vec::new();
         for (((name, weight), sum), dots) in NAMES.into_iter().zip(lambda).zip(sums).zip(all_dots) {
             let loss = match sum {
-                Some(sum) => sum.affine(1.0 / inputs.batch.positives as f64, 0.0)?,
+                Some(sum) => sum.affine(1.0 / batch.positives as f64, 0.0)?,
                 None if weight > 0.0 => Tensor::new(0f32, anchors.f4.device())?,
                 None => continue,
             };
@@ -107,46 +105,6 @@ impl AuxiliaryLoss for Cpc {
             });
         }
         Ok(losses)
-    }
-}
-
-impl Cpc {
-    /// The dot products of each offset at which two rows or more have a positive.
-    ///
-    /// `features_t` of s_t, B rows; `features_k` of the positives that exist, offset by offset, none if there are none;
-    /// `action` [B]; `valid` [P, B]: 0 where a row has no positive.
-    fn offsets(
-        &self,
-        network: &Network,
-        features_t: &Features,
-        features_k: Option<&Features>,
-        action: &Tensor,
-        valid: &[u8],
-    ) -> Result<Vec<Offset>, UpdateError> {
-        let Some(features_k) = features_k else {
-            return Ok(Vec::new());
-        };
-        let wanted = self.pairs.lambda.wanted();
-        let vectors = Vectors::new(network, features_t, features_k, action, wanted)?;
-        let rows = action.elem_count();
-        let mut offsets = Vec::new();
-        let mut first = 0;
-        for valid in valid.chunks_exact(rows) {
-            let anchors: Vec<u32> = (0..)
-                .zip(valid)
-                .filter_map(|(row, &valid)| (valid != 0).then_some(row))
-                .collect();
-            let candidates = first..first + anchors.len();
-            first = candidates.end;
-            if anchors.len() >= 2 {
-                let here = of_offset(&vectors, rows, &anchors, candidates)?;
-                offsets.push(Offset {
-                    rows: anchors.len(),
-                    dots: here.dots(wanted)?,
-                });
-            }
-        }
-        Ok(offsets)
     }
 }
 
