@@ -70,18 +70,11 @@ impl Alphabet {
 
     /// Checks what holds of every alphabet that [`Alphabet::new`] makes; a saved one may be anything.
     pub(super) fn check_valid(&self) -> Result<(), AffinityError> {
-        let n = self.index.len();
-        let used = |visible: usize| {
-            self.index
-                .iter()
-                .any(|&index| usize::from(index) == visible)
-        };
-        let below = self
-            .index
-            .iter()
-            .all(|&index| usize::from(index) < self.len);
-        if (1..=255).contains(&n) && (1..=n).contains(&self.len) && below && (0..self.len).all(used)
-        {
+        let mut used = self.index.clone();
+        used.sort_unstable();
+        used.dedup();
+        let is_dense = used.into_iter().map(usize::from).eq(0..self.len);
+        if is_dense && (1..=255).contains(&self.index.len()) {
             return Ok(());
         }
         Err(AffinityError(format!(
