@@ -3,7 +3,7 @@
 
 use std::{
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
         mpsc,
     },
@@ -20,6 +20,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     error::BatchError,
+    lock,
     shards::{self, Count, PartialBatch},
 };
 use crate::progress::{Progress, ServedPart};
@@ -133,7 +134,7 @@ impl Shared {
 
     /// Which side waits for the other, by the last answer that was no batch.
     pub(super) fn waiting(&self) -> Waiting {
-        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        *lock(&self.waiting)
     }
 }
 
@@ -214,13 +215,13 @@ impl Fetcher {
         let answer = self.answer(asked)?;
         self.id = self.id.next();
         Ok(match answer {
-            Answer::Batch(batch) => {
+            Ok(batch) => {
                 let parts = vec![self.received(0, &batch)];
                 Some(Fetched::Batch(Box::new(Served { batch, parts })))
             }
-            Answer::Wait => None,
-            Answer::Finished => Some(Fetched::Finished),
-            Answer::Refused(why) => Some(Fetched::Failed(BatchError::Refused(why))),
+            Err(NotReady::Wait(_)) => None,
+            Err(NotReady::Finished) => Some(Fetched::Finished),
+            Err(NotReady::Refused { why }) => Some(Fetched::Failed(BatchError::Refused(why))),
         })
     }
 
@@ -239,10 +240,7 @@ impl Fetcher {
     /// give, so that their rate limiters decide as one.
     fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let shared = self.shared.clone();
-        let mut partial = shared
-            .partial
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let mut partial = lock(&shared.partial);
         if partial.parts.is_empty() && partial.pending.iter().all(|&rows| rows == 0) {
             self.recount(&mut partial, |count, now| count.is_old(now))?;
             match shards::split(self.shared.requests.rows, &partial.counts, &mut self.rng) {
@@ -286,7 +284,7 @@ impl Fetcher {
             };
             ids[shard] = ids[shard].next();
             match answer {
-                Answer::Batch(mut part) => {
+                Ok(mut part) => {
                     counts[shard] = Count {
                         counts: part.header.counts,
                         held: part.header.held,
@@ -299,9 +297,9 @@ impl Fetcher {
                     }
                     parts.push(part);
                 }
-                Answer::Wait => {}
-                Answer::Finished => finished = true,
-                Answer::Refused(why) => {
+                Err(NotReady::Wait(_)) => {}
+                Err(NotReady::Finished) => finished = true,
+                Err(NotReady::Refused { why }) => {
                     return Ok(Some(Fetched::Failed(BatchError::Refused(why))));
                 }
             }
@@ -384,10 +382,11 @@ impl Fetcher {
         Ok((asked, request.shared_memory))
     }
 
+    /// What a shard answers: a batch, or why there is none.
     fn answer(
         &mut self,
         (asked, shared_memory): (PendingReply<BatchReply>, bool),
-    ) -> Result<Answer, BatchError> {
+    ) -> Result<Result<Batch, NotReady>, BatchError> {
         // A process that may not map shared memory never sees the reply: to it the request looks unanswered.
         let (reply, payload) = asked.receive(&self.shared.pool).inspect_err(|e| {
             let unheard = matches!(
@@ -403,26 +402,14 @@ impl Fetcher {
                 if shared_memory {
                     self.trust.worked();
                 }
-                Answer::Batch(Batch::from_payload(header, payload)?)
+                Ok(Batch::from_payload(header, payload)?)
             }
-            BatchReply::NotReady(NotReady::Wait(waiting)) => {
-                *self
-                    .shared
-                    .waiting
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner) = waiting;
-                Answer::Wait
+            BatchReply::NotReady(not_ready) => {
+                if let NotReady::Wait(waiting) = not_ready {
+                    *lock(&self.shared.waiting) = waiting;
+                }
+                Err(not_ready)
             }
-            BatchReply::NotReady(NotReady::Finished) => Answer::Finished,
-            BatchReply::NotReady(NotReady::Refused { why }) => Answer::Refused(why),
         })
     }
-}
-
-/// What a replay server answers.
-enum Answer {
-    Batch(Batch),
-    Wait,
-    Finished,
-    Refused(String),
 }

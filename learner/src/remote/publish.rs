@@ -5,7 +5,7 @@
 use std::{
     collections::VecDeque,
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        Arc, Condvar, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
     time::{Duration, Instant},
@@ -17,6 +17,8 @@ use driml_protocol::{
     fail_point, session::SessionError,
 };
 use zenoh::query::Queryable;
+
+use super::lock;
 
 const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
 const PRIORITIES_TIMEOUT: Duration = Duration::from_secs(5);
@@ -83,10 +85,6 @@ impl<T> Newest<T> {
     fn is_full(&self) -> bool {
         lock(&self.waiting).len() == self.most
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Publisher {
