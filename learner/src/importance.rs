@@ -62,11 +62,4 @@ mod tests {
         assert!(chi_square(drawn) > 1_000.0);
         assert!(chi_square(even) < 24.3, "{even:?}");
     }
-
-    #[test]
-    fn the_likelier_row_weighs_less() {
-        assert_eq!(importance_weights(&[0.5, 0.125], 1.0), [0.25, 1.0]);
-        assert_eq!(importance_weights(&[0.5, 0.125], 0.5), [0.5, 1.0]);
-        assert_eq!(importance_weights(&[0.25; 3], 0.7), [1.0; 3]);
-    }
 }

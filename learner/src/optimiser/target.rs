@@ -90,20 +90,3 @@ impl InplaceOp2 for Follow {
         Ok(())
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use candle_core::{Device, Result, Var};
-
-    use super::*;
-
-    #[test]
-    fn it_moves_by_tau() -> Result<()> {
-        let target = Var::new(&[1.0f32, -2.0], &Device::Cpu)?;
-        let online = Var::new(&[3.0f32, 2.0], &Device::Cpu)?;
-        target.inplace_op2(&online, &Follow { tau: 0.75 })?;
-        assert_eq!(target.to_vec1::<f32>()?, [2.5, 1.0]);
-        assert_eq!(online.to_vec1::<f32>()?, [3.0, 2.0]);
-        Ok(())
-    }
-}
