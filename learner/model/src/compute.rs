@@ -135,14 +135,6 @@ impl Compute {
             kernels: Kernels::Fused(precision),
         }
     }
-
-    /// A device with the faster kernels that it has.
-    pub fn on(device: &Device) -> Self {
-        Self {
-            device: device.clone(),
-            kernels: Kernels::of(device),
-        }
-    }
 }
 
 /// A device by its name: `cpu`, `cuda` (the first GPU) or `cuda:N`.
@@ -203,7 +195,10 @@ impl DeviceName {
                 // One stream for all threads: `Device::new_cuda` gives each its own, unordered with the others'.
                 let device = Device::new_cuda_with_stream(ordinal)
                     .map_err(|why| DeviceError::Open { device: self, why })?;
-                Ok(Compute::on(&device))
+                Ok(Compute {
+                    kernels: Kernels::of(&device),
+                    device,
+                })
             }
         }
     }
