@@ -58,7 +58,7 @@ pub struct LearnerSettings {
 fn own_tables<'de, D: Deserializer<'de>>(from: D) -> Result<toml::Table, D::Error> {
     let own = toml::Table::deserialize(from)?;
     let mut names = own.keys();
-    let unknown = names.find(|name| name.parse::<AuxiliaryKind>().is_err());
+    let unknown = names.find(|&name| AuxiliaryKind::try_from(name.clone()).is_err());
     match unknown {
         Some(name) => Err(D::Error::custom(format!("unknown field `{name}`"))),
         None => Ok(own),

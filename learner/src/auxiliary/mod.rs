@@ -13,7 +13,7 @@ pub mod none;
 pub mod positives;
 pub mod settings;
 
-use std::{fmt, str::FromStr, sync::OnceLock};
+use std::{fmt, sync::OnceLock};
 
 use loss::{AuxiliaryLoss, MenuItem};
 use positives::Positives;
@@ -104,10 +104,10 @@ impl fmt::Debug for AuxiliaryKind {
     }
 }
 
-impl FromStr for AuxiliaryKind {
-    type Err = String;
+impl TryFrom<String> for AuxiliaryKind {
+    type Error = String;
 
-    fn from_str(name: &str) -> Result<Self, String> {
+    fn try_from(name: String) -> Result<Self, String> {
         let item = all().find(|item| item.name == name);
         item.map(Self).ok_or_else(|| {
             let known: Vec<_> = all().map(|item| format!("`{}`", item.name)).collect();
@@ -116,14 +116,6 @@ impl FromStr for AuxiliaryKind {
                 known.join(", ")
             )
         })
-    }
-}
-
-impl TryFrom<String> for AuxiliaryKind {
-    type Error = String;
-
-    fn try_from(name: String) -> Result<Self, String> {
-        name.parse()
     }
 }
 
