@@ -11,6 +11,7 @@ mod checkpoint_damage;
 mod cuda;
 mod deduplicate;
 mod errors;
+mod insight;
 mod ranges;
 mod served;
 mod synthetic;
