@@ -7,7 +7,7 @@ use std::{
 };
 
 use driml_learner::{
-    AffinityEstimator, Alphabet, LearnedAffinity, LearnedSettings, Progress,
+    AffinityEstimator, Alphabet, LearnedAffinity, Progress,
     checkpoint::{self, CheckpointError, Label, LearnerState, list, load_latest, lock},
 };
 use driml_model::{Compute, ModelConfig, Parameters, Precision, TorsoName};
@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
 
 use crate::synthetic::{
-    ACTIONS, ALL_DIM, CANDLE, agent, agent_on, made, model, random_batch, settings,
+    ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, made, model, random_batch, settings,
 };
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
@@ -43,16 +43,8 @@ impl Drop for Folder {
 /// A learner's state at the start of a run that others have begun.
 pub(crate) fn start() -> LearnerState {
     let mut rng = ChaCha8Rng::seed_from_u64(99);
-    let settings = LearnedSettings {
-        hidden: 8,
-        lr: 1e-3,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-8,
-        keep: 0.9,
-    };
-    let affinity =
-        LearnedAffinity::new(Alphabet::raw(ACTIONS).unwrap(), settings, &mut rng).unwrap();
+    let alphabet = Alphabet::raw(ACTIONS).unwrap();
+    let affinity = LearnedAffinity::new(alphabet, LEARNED, &mut rng).unwrap();
     LearnerState {
         agent: agent(ALL_DIM, 1),
         affinity: Some(AffinityEstimator::Learned(affinity)),

@@ -19,7 +19,7 @@ use crate::{
     agents,
     augment::{NOTHING, PAPER},
     checkpoint::Folder,
-    synthetic::{CPC, CURL, DIM},
+    synthetic::{CPC, CURL, DIM, LEARNED},
 };
 
 const STATE: usize = 20 * 24 * 2;
@@ -153,12 +153,8 @@ fn an_augmenting_run_resumes_bit_for_bit() {
             estimator: EstimatorKind::Learned,
             alphabet: Some(AlphabetKind::Raw),
             learned: Some(LearnedSettings {
-                hidden: 8,
-                lr: 1e-3,
-                beta1: 0.9,
-                beta2: 0.999,
                 eps: 1e-23,
-                keep: 0.9,
+                ..LEARNED
             }),
             ..config.learner.affinity
         };

@@ -5,10 +5,11 @@ use std::collections::HashMap;
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
-    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnerSettings, OwnedBatch,
+    AdamSettings, Agent, AuxiliaryKind, Lambda, LearnedSettings, LearnerSettings, OwnedBatch,
     auxiliary::{cpc, curl, dim},
+    parity::deviation::REFERENCE,
 };
-use driml_model::{Compute, ConvLayer, HeadConfig, Kernels, ModelConfig, Parameters, TorsoName};
+use driml_model::{Compute, ConvLayer, HeadConfig, ModelConfig, Parameters, TorsoName};
 use driml_protocol::NO_ACTION;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -23,6 +24,15 @@ pub(crate) const ALL_DIM: Lambda = Lambda {
     l3t4: 0.5,
     l4t3: 0.25,
     l4t4: 2.0,
+};
+
+pub(crate) const LEARNED: LearnedSettings = LearnedSettings {
+    hidden: 8,
+    lr: 1e-3,
+    beta1: 0.9,
+    beta2: 0.999,
+    eps: 1e-8,
+    keep: 0.9,
 };
 
 pub(crate) fn model(lambda: Lambda) -> ModelConfig {
@@ -105,10 +115,7 @@ pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
 };
 
 /// The operations of a GPU, on the CPU.
-pub(crate) const CANDLE: Compute = Compute {
-    kernels: Kernels::Candle,
-    ..Compute::CPU
-};
+pub(crate) const CANDLE: Compute = REFERENCE;
 
 pub(crate) fn random_batch(rows: usize, seed: u64) -> OwnedBatch {
     batch_of(rows, 20 * 24 * 2, seed)
