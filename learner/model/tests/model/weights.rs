@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::{DType, Device, Tensor};
-use driml_model::{ModelConfig, ModelError, Parameters, Precision, StoredAs, TorsoName};
+use driml_model::{ModelConfig, Parameters, Precision, StoredAs, TorsoName};
 
 use crate::support::{bits, bytes, parameters, policy, q_values, residual, rng, small, values};
 
@@ -158,43 +158,27 @@ fn copies_share_nothing_and_clones_share_all() {
 fn tensors_that_do_not_fit_are_named() {
     let config = small();
     let good = tensors(&parameters(&config, 1));
-    let problem = |change: &dyn Fn(&mut HashMap<String, Tensor>)| {
-        let mut tensors = good.clone();
-        change(&mut tensors);
-        match Parameters::from_tensors(&config, tensors, &Device::Cpu) {
-            Err(ModelError::Parameter { name, problem }) => format!("{name} {problem}"),
-            other => panic!("{other:?}"),
-        }
-    };
-    let insert = |name: &str, tensor: Tensor| {
-        let name = name.to_owned();
-        move |tensors: &mut HashMap<String, Tensor>| {
-            tensors.insert(name.clone(), tensor.clone());
-        }
-    };
     let nan = Tensor::new(&[f32::NAN; 19], &Device::Cpu).unwrap();
     let transposed = good["head.weight"].t().unwrap();
     let double = good["head.bias"].to_dtype(DType::F64).unwrap();
-    assert_eq!(
-        problem(&|tensors| drop(tensors.remove("torso.fc.bias"))),
-        "torso.fc.bias is missing"
-    );
-    assert_eq!(
-        problem(&insert("dim.extra", nan.clone())),
-        "dim.extra is not part of this network"
-    );
-    assert_eq!(
-        problem(&insert("torso.fc.bias", nan)),
-        "torso.fc.bias is NaN at index 0"
-    );
-    assert_eq!(
-        problem(&insert("head.weight", transposed)),
-        "head.weight has shape [19, 55], wanted [55, 19]"
-    );
-    assert_eq!(
-        problem(&insert("head.bias", double)),
-        "head.bias has type F64, wanted F32"
-    );
+    let shapes = "has shape [19, 55], wanted [55, 19]";
+    for (name, tensor, problem) in [
+        ("torso.fc.bias", None, "is missing"),
+        (
+            "dim.extra",
+            Some(nan.clone()),
+            "is not part of this network",
+        ),
+        ("torso.fc.bias", Some(nan), "is NaN at index 0"),
+        ("head.weight", Some(transposed), shapes),
+        ("head.bias", Some(double), "has type F64, wanted F32"),
+    ] {
+        let mut changed = good.clone();
+        changed.remove(name);
+        changed.extend(tensor.map(|tensor| (name.to_owned(), tensor)));
+        let error = Parameters::from_tensors(&config, changed, &Device::Cpu).unwrap_err();
+        assert_eq!(error.to_string(), format!("parameter {name}: {problem}"));
+    }
 }
 
 /// Loads the file both ways; both must fail and leave the policy as it was.
