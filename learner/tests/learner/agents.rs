@@ -289,56 +289,56 @@ fn batches_that_an_agent_cannot_use_are_refused() {
 
 #[test]
 fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
-    let with = |kind, lambda, condition_on_action, key_tau: Option<f64>| LearnerSettings {
+    let with = |kind, lambda, condition_on_action, own: &str| LearnerSettings {
         auxiliary_loss: kind,
         condition_on_action,
-        own: curl_table(key_tau),
+        own: own.parse().unwrap(),
         ..settings(lambda)
     };
-    let said = |kind, lambda, condition_on_action| {
-        let settings = with(kind, lambda, condition_on_action, Some(0.1));
+    let said = |kind, lambda, condition_on_action, own: &str| {
+        let settings = with(kind, lambda, condition_on_action, own);
         settings.validate().unwrap_err().to_string()
     };
-    assert!(said(AuxiliaryKind::NONE, GLOBAL, false).contains("but lambda.4t4 is above 0"));
-    for kind in [DIM, CPC, CURL] {
-        assert!(said(kind, NO_DIM, false).contains("but all lambdas are 0"));
+    for (kind, lambda, condition_on_action, wanted) in [
+        (
+            AuxiliaryKind::NONE,
+            GLOBAL,
+            false,
+            "but lambda.4t4 is above 0",
+        ),
+        (DIM, NO_DIM, false, "but all lambdas are 0"),
+        (CPC, NO_DIM, false, "but all lambdas are 0"),
+        (CURL, NO_DIM, false, "but all lambdas are 0"),
+        (CURL, ALL_DIM, false, "lambda.4t4 alone"),
+        (CURL, GLOBAL, true, "condition_on_action"),
+        (DIM, GLOBAL, true, "has no use for the table curl"),
+        (
+            AuxiliaryKind::NONE,
+            NO_DIM,
+            true,
+            "has no use for the table curl",
+        ),
+    ] {
+        let said = said(kind, lambda, condition_on_action, "curl.key_tau = 0.1");
+        assert!(said.contains(wanted), "{said}");
     }
-    assert!(said(CURL, ALL_DIM, false).contains("lambda.4t4 alone"));
-    assert!(said(CURL, GLOBAL, true).contains("condition_on_action"));
-    assert!(said(DIM, GLOBAL, true).contains("has no use for the table curl"));
-    assert!(said(AuxiliaryKind::NONE, NO_DIM, true).contains("has no use for the table curl"));
-    for kind in [AuxiliaryKind::NONE, DIM, CPC] {
-        let (name, lambda) = (
-            kind.name(),
-            if kind == DIM || kind == CPC {
-                GLOBAL
-            } else {
-                NO_DIM
-            },
-        );
+    for (kind, lambda) in [(AuxiliaryKind::NONE, NO_DIM), (DIM, GLOBAL), (CPC, GLOBAL)] {
+        let wanted = format!("take {} out of learner.update", kind.name());
         for own in ["= 0.01", "= { tanh_clip = 5.0 }", "= {}"] {
-            let settings = LearnerSettings {
-                own: format!("{name} {own}").parse().unwrap(),
-                ..with(kind, lambda, false, None)
-            };
-            let said = settings.validate().unwrap_err().to_string();
-            assert!(
-                said.contains(&format!("take {name} out of learner.update")),
-                "{said}"
-            );
+            let said = said(kind, lambda, false, &format!("{} {own}", kind.name()));
+            assert!(said.contains(&wanted), "{said}");
         }
     }
-    let curl = |key_tau| with(CURL, GLOBAL, false, key_tau).validate();
-    let missing = curl(None).unwrap_err().to_string();
-    assert!(
-        missing.contains("--set learner.update.curl.key_tau="),
-        "{missing}"
-    );
-    for out in [0.0, -0.1, 1.1, f64::NAN] {
-        let said = curl(Some(out)).unwrap_err().to_string();
-        assert!(said.starts_with(&format!("curl.key_tau = {out}")), "{said}");
+    let missing = said(CURL, GLOBAL, false, "");
+    let wanted = "--set learner.update.curl.key_tau=";
+    assert!(missing.contains(wanted), "{missing}");
+    for out in ["0.0", "-0.1", "1.1", "nan"] {
+        let said = said(CURL, GLOBAL, false, &format!("curl.key_tau = {out}"));
+        assert!(said.starts_with("curl.key_tau = "), "{said}");
     }
-    curl(Some(1.0)).unwrap();
+    with(CURL, GLOBAL, false, "curl.key_tau = 1.0")
+        .validate()
+        .unwrap();
 }
 
 #[test]
