@@ -127,21 +127,18 @@ impl ModelConfig {
     /// convolution or stage, a setting of another torso.
     pub fn validate(&self) -> Result<()> {
         let fail = |what: String| Err(ModelError::Config(what));
-        let sizes = [
-            ("height", self.height),
-            ("width", self.width),
-            ("input_channels", self.input_channels),
-            ("num_actions", self.num_actions),
-            ("atoms", self.atoms),
-            ("hidden", self.hidden),
-            ("embedding_dim", self.embedding_dim),
-            ("action_embed", self.action_embed),
-        ];
-        for (name, size) in sizes {
-            if size == 0 || size > DIMENSION_MAX {
-                return fail(format!("{name} is {size}, must be 1 to {DIMENSION_MAX}"));
-            }
-        }
+        let check = |name: &str, size: usize| match size {
+            1..=DIMENSION_MAX => Ok(()),
+            _ => fail(format!("{name} is {size}, must be 1 to {DIMENSION_MAX}")),
+        };
+        check("height", self.height)?;
+        check("width", self.width)?;
+        check("input_channels", self.input_channels)?;
+        check("num_actions", self.num_actions)?;
+        check("atoms", self.atoms)?;
+        check("hidden", self.hidden)?;
+        check("embedding_dim", self.embedding_dim)?;
+        check("action_embed", self.action_embed)?;
         if self.num_actions > ACTIONS_MAX {
             return fail(format!(
                 "num_actions is {}, must be 1 to {ACTIONS_MAX}",
@@ -167,25 +164,13 @@ impl ModelConfig {
         self.head.validate()?;
         self.torso.check(&self.torso_settings())?;
         for (index, &width) in self.channels.iter().enumerate() {
-            if width == 0 || width > DIMENSION_MAX {
-                return fail(format!(
-                    "channels[{index}] is {width}, must be 1 to {DIMENSION_MAX}"
-                ));
-            }
+            check(&format!("channels[{index}]"), width)?;
         }
         let mut input = (self.height, self.width, self.input_channels);
         for (index, layer) in self.conv.iter().enumerate() {
-            for (name, size) in [
-                ("out", layer.out),
-                ("kernel", layer.kernel),
-                ("stride", layer.stride),
-            ] {
-                if size == 0 || size > DIMENSION_MAX {
-                    return fail(format!(
-                        "conv[{index}].{name} is {size}, must be 1 to {DIMENSION_MAX}"
-                    ));
-                }
-            }
+            check(&format!("conv[{index}].out"), layer.out)?;
+            check(&format!("conv[{index}].kernel"), layer.kernel)?;
+            check(&format!("conv[{index}].stride"), layer.stride)?;
             let Some(shape) = ConvShape::new(input, *layer) else {
                 let (height, width, _) = input;
                 return fail(format!(
