@@ -132,47 +132,28 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelC
 
 #[test]
 fn heads_that_are_left_out_are_not_there() {
-    let config = ModelConfig {
-        dim: DimHeads {
-            psi3: false,
-            phi4: false,
-            ..small().dim
-        },
-        ..small()
+    let without = |change: fn(&mut DimHeads)| {
+        let mut config = small();
+        change(&mut config.dim);
+        config
     };
-    let parameters = parameters(&config, 1);
-    assert!(
-        parameters
-            .iter()
-            .all(|(name, _)| !name.starts_with("dim.psi3") && !name.starts_with("dim.phi4"))
-    );
-    let network = Network::new(&config, &parameters).unwrap();
+    let has = |config: &ModelConfig, layer: &str| {
+        let mut shapes = config.parameter_shapes().into_iter();
+        shapes.any(|(name, _)| name.starts_with(layer))
+    };
+    let config = without(|dim| (dim.psi3, dim.phi4) = (false, false));
+    assert!(!has(&config, "dim.psi3") && !has(&config, "dim.phi4"));
+    let network = Network::new(&config, &parameters(&config, 1)).unwrap();
     let features = network.features(&frames(&config, 2, &mut rng(5))).unwrap();
     let actions = Tensor::zeros(2, DType::I64, &Device::Cpu).unwrap();
-    assert!(matches!(
-        network.psi3(features.local().unwrap(), &actions),
-        Err(ModelError::NoHead("psi3"))
-    ));
-    assert!(matches!(
-        network.phi4(&features.f4),
-        Err(ModelError::NoHead("phi4"))
-    ));
+    let psi3 = network.psi3(features.local().unwrap(), &actions);
+    assert!(matches!(psi3, Err(ModelError::NoHead("psi3"))));
+    let phi4 = network.phi4(&features.f4);
+    assert!(matches!(phi4, Err(ModelError::NoHead("phi4"))));
     assert!(network.psi4(&features.f4, &actions).is_ok());
 
-    let without_psi = ModelConfig {
-        dim: DimHeads {
-            psi3: false,
-            psi4: false,
-            ..small().dim
-        },
-        ..small()
-    };
-    assert!(
-        without_psi
-            .parameter_shapes()
-            .iter()
-            .all(|(name, _)| !name.starts_with("dim.action"))
-    );
+    let without_psi = without(|dim| (dim.psi3, dim.psi4) = (false, false));
+    assert!(!has(&without_psi, "dim.action"));
 }
 
 #[test]
@@ -181,13 +162,10 @@ fn inputs_that_do_not_fit_are_errors() {
     let network = Network::new(&config, &parameters(&config, 1)).unwrap();
     let batch = frames(&config, 2, &mut rng(6));
     let features = network.features(&batch).unwrap();
-    assert!(
-        network
-            .features(&batch.to_dtype(DType::F32).unwrap())
-            .is_err()
-    );
-    assert!(network.features(&batch.narrow(1, 0, 35).unwrap()).is_err());
-    assert!(network.features(&batch.get(0).unwrap()).is_err());
+    let floats = batch.to_dtype(DType::F32);
+    for bad in [floats, batch.narrow(1, 0, 35), batch.get(0)] {
+        assert!(network.features(&bad.unwrap()).is_err());
+    }
     for wrong in [5i64, -1] {
         let actions = Tensor::new(&[0, wrong], &Device::Cpu).unwrap();
         assert!(matches!(
@@ -196,15 +174,10 @@ fn inputs_that_do_not_fit_are_errors() {
         ));
     }
     let actions = Tensor::new(&[0i64, 1, 2], &Device::Cpu).unwrap();
-    assert!(
-        network.psi4(&features.f4, &actions).is_err(),
-        "three actions for two rows"
-    );
-    assert!(
-        network
-            .logits(&features.f4.narrow(1, 0, 5).unwrap())
-            .is_err()
-    );
+    let of_three = network.psi4(&features.f4, &actions);
+    assert!(of_three.is_err(), "three actions for two rows");
+    let narrow = features.f4.narrow(1, 0, 5).unwrap();
+    assert!(network.logits(&narrow).is_err());
 }
 
 #[test]

@@ -198,24 +198,12 @@ fn assert_rejected(config: &ModelConfig, file: &[u8], what: &str) {
 fn broken_files_are_errors() {
     let config = small().without_dim();
     let file = parameters(&config, 2).to_safetensors(|_| true).unwrap();
-    for len in [
-        0,
-        1,
-        7,
-        8,
-        9,
-        100,
-        file.len() / 2,
-        file.len() - 4,
-        file.len() - 1,
-    ] {
+    let from_end = [file.len() / 2, 4, 1].map(|less| file.len() - less);
+    for len in [0, 1, 7, 8, 9, 100].into_iter().chain(from_end) {
         assert_rejected(&config, &file[..len], &format!("cut to {len} bytes"));
     }
-    assert_rejected(
-        &config,
-        &[&file[..], &[0; 4]].concat(),
-        "four bytes too many",
-    );
+    let longer = [&file[..], &[0; 4]].concat();
+    assert_rejected(&config, &longer, "four bytes too many");
     assert_rejected(&config, &[0xff; 64], "a header length beyond all memory");
 
     let missing = parameters(&config, 2)
@@ -226,11 +214,8 @@ fn broken_files_are_errors() {
         hidden: 20,
         ..config.clone()
     };
-    assert_rejected(
-        &config,
-        &parameters(&other, 2).to_safetensors(|_| true).unwrap(),
-        "another width",
-    );
+    let other = parameters(&other, 2).to_safetensors(|_| true).unwrap();
+    assert_rejected(&config, &other, "another width");
 
     let mut not_finite = file.clone();
     let last = not_finite.len() - 4;
