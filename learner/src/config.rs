@@ -124,16 +124,14 @@ impl AffinityConfig {
         let estimator = match self.estimator {
             EstimatorKind::Exact => {
                 let settings = self.exact.ok_or_else(|| missing("exact"))?;
-                AffinityEstimator::Exact(ExactAffinity::new(alphabet, settings).map_err(bad)?)
+                ExactAffinity::new(alphabet, settings).map(AffinityEstimator::Exact)
             }
             _ => {
                 let settings = self.learned.ok_or_else(|| missing("learned"))?;
-                AffinityEstimator::Learned(
-                    LearnedAffinity::new(alphabet, settings, rng).map_err(bad)?,
-                )
+                LearnedAffinity::new(alphabet, settings, rng).map(AffinityEstimator::Learned)
             }
         };
-        Ok(Some(estimator))
+        estimator.map(Some).map_err(bad)
     }
 }
 
@@ -143,34 +141,19 @@ impl Config {
     /// # Errors
     /// The first field that cannot work, and why.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        for (key, value, most) in [
-            ("batch_size", u64::from(self.batch_size), 65_536),
-            ("batches_in_flight", u64::from(self.batches_in_flight), 64),
-            (
-                "publish_period_updates",
-                self.publish_period_updates,
-                u64::MAX,
-            ),
-            (
-                "checkpoint_period_updates",
-                self.checkpoint_period_updates,
-                u64::MAX,
-            ),
-            (
-                "checkpoints_kept",
-                u64::from(self.checkpoints_kept),
-                1_000_000,
-            ),
-            ("unreachable_max_ms", self.unreachable_max_ms, 86_400_000),
-        ] {
-            let why = || format!("it must lie between 1 and {most}");
-            check(
-                (1..=most).contains(&value),
-                &format!("learner.{key}"),
-                value,
-                why,
-            )?;
-        }
+        let within = |key: &str, value: u64, most: u64| {
+            let (key, is_fine) = (format!("learner.{key}"), (1..=most).contains(&value));
+            check(is_fine, &key, value, || {
+                format!("it must lie between 1 and {most}")
+            })
+        };
+        let (publish, checkpoint) = (self.publish_period_updates, self.checkpoint_period_updates);
+        within("batch_size", self.batch_size.into(), 65_536)?;
+        within("batches_in_flight", self.batches_in_flight.into(), 64)?;
+        within("publish_period_updates", publish, u64::MAX)?;
+        within("checkpoint_period_updates", checkpoint, u64::MAX)?;
+        within("checkpoints_kept", self.checkpoints_kept.into(), 1_000_000)?;
+        within("unreachable_max_ms", self.unreachable_max_ms, 86_400_000)?;
         if let Some(augment) = &self.augment {
             augment.validate()?;
         }
