@@ -198,16 +198,12 @@ impl LossInputs<'_> {
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
-        key.keys(&self.tensor(self.batch.states_k)?)
+        key.keys(&states(self.model, self.batch.states_k, self.device)?)
     }
 
     /// a_t [B], on the CPU, where the network looks at them.
     pub fn action(&self) -> Result<Tensor, UpdateError> {
         let action = self.batch.action;
         Ok(Tensor::from_slice(action, action.len(), &Device::Cpu)?)
-    }
-
-    fn tensor<'s>(&self, bytes: impl Into<Cow<'s, [u8]>>) -> Result<Tensor, UpdateError> {
-        Ok(states(self.model, bytes, self.device)?)
     }
 }
