@@ -134,16 +134,21 @@ fn states_that_rows_do_not_have_may_be_left_out() {
 }
 
 #[test]
-fn without_any_positive_cpc_learns_the_return() {
-    let rows = random_batch(5, 5);
+fn without_two_positives_the_return_alone_is_learned() {
+    let mut rows = random_batch(5, 5);
     let states_k = later(&rows);
     for there in 0..2 {
         let mut valid = [0; 5 * POSITIVES];
         valid[..there].fill(1);
-        let mut agent = agent(CPC, GLOBAL);
-        let report = agent.update(&cpc(&rows, &states_k, &valid)).unwrap();
-        assert_eq!(report.losses, [("cpc_4t4", 0.0)]);
-        assert_eq!(report.total, report.c51_kl);
+        rows.positive_valid = valid[..5].to_vec();
+        for (kind, name, batch) in [
+            (CPC, "cpc_4t4", cpc(&rows, &states_k, &valid)),
+            (DIM, "dim_4t4", rows.batch()),
+        ] {
+            let report = agent(kind, GLOBAL).update(&batch).unwrap();
+            assert_eq!(report.losses, [(name, 0.0)]);
+            assert_eq!(report.total, report.c51_kl);
+        }
     }
 }
 

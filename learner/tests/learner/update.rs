@@ -29,49 +29,6 @@ fn repeated_updates_on_one_batch_bring_the_losses_down() {
 }
 
 #[test]
-fn without_dim_no_positives_are_needed_and_no_heads_are_built() {
-    let (mut agent, rows) = (agent(NO_DIM, 5), random_batch(6, 6));
-    assert!(
-        agent
-            .online()
-            .iter()
-            .all(|(name, _)| !name.starts_with("dim."))
-    );
-    let mut batch = rows.batch();
-    (batch.positives, batch.states_k, batch.positive_valid) = (0, &[], &[]);
-    let report = agent.update(&batch).unwrap();
-    assert_eq!(report.losses, []);
-    assert_eq!(report.total, report.c51_kl);
-}
-
-#[test]
-fn one_valid_positive_or_none_gives_dim_losses_of_zero() {
-    for valid in 0..2 {
-        let mut rows = random_batch(7, 7);
-        rows.positive_valid = (0..7).map(|row| u8::from(row < valid)).collect();
-        let with_dim = agent(ALL_DIM, 8);
-        let evaluation = with_dim.evaluate(&rows.batch()).unwrap();
-        let losses = ["dim_3t3", "dim_3t4", "dim_4t3", "dim_4t4"].map(|name| (name, 0.0));
-        assert_eq!(evaluation.losses, losses);
-        assert_eq!(evaluation.total, evaluation.c51_kl);
-        for (name, _) in with_dim
-            .online()
-            .iter()
-            .filter(|(name, _)| name.starts_with("dim."))
-        {
-            let gradient = evaluation
-                .gradients
-                .get(name)
-                .map(|g| g.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-            assert!(
-                gradient.is_none_or(|g| g.iter().all(|&g| g == 0.0)),
-                "{name}"
-            );
-        }
-    }
-}
-
-#[test]
 fn rows_without_a_bootstrap_ignore_what_comes_after() {
     for ended in [&[0, 1, 2, 3, 4, 5][..], &[1, 4]] {
         let mut rows = random_batch(6, 9);
