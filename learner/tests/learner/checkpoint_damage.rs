@@ -123,9 +123,6 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
             "{said}: {text}"
         );
     };
-    let array = |state: &mut serde_json::Value, name: &str| -> Vec<serde_json::Value> {
-        state["affinity"][name].as_array().unwrap().clone()
-    };
     let kinds: [(AffinityEstimator, &[&str]); 2] = [
         (
             learned,
@@ -139,9 +136,7 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
         for name in arrays {
             let change = |change: fn(&mut Vec<serde_json::Value>)| {
                 move |state: &mut serde_json::Value| {
-                    let mut values = array(state, name);
-                    change(&mut values);
-                    state["affinity"][*name] = values.into();
+                    change(state["affinity"][*name].as_array_mut().unwrap());
                 }
             };
             refused(&run, &change(|values| values.truncate(1)), name);
