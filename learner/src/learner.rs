@@ -204,26 +204,20 @@ impl Learner {
 
     /// Whether the actors are due newer weights after this many updates.
     pub const fn publication_is_due(&self) -> bool {
-        self.state
-            .agent
-            .updates()
-            .is_multiple_of(self.config.learner.publish_period_updates)
+        let period = self.config.learner.publish_period_updates;
+        self.updates().is_multiple_of(period)
     }
 
     /// Whether a checkpoint is due after this many updates.
     pub const fn checkpoint_is_due(&self) -> bool {
-        self.updates() > 0
-            && self
-                .updates()
-                .is_multiple_of(self.config.learner.checkpoint_period_updates)
+        let period = self.config.learner.checkpoint_period_updates;
+        self.updates() > 0 && self.updates().is_multiple_of(period)
     }
 
     /// The present weights as a new version.
     pub fn next_weights(&mut self) -> Result<Weights, LearnerError> {
-        let safetensors = self
-            .state
-            .agent
-            .weights_as(self.config.learner.publish_dtype)?;
+        let dtype = self.config.learner.publish_dtype;
+        let safetensors = self.agent().weights_as(dtype)?;
         self.state.weights_version += 1;
         let header = WeightsHeader::new(self.state.weights_version, self.updates(), &safetensors);
         Ok(Weights {
