@@ -266,15 +266,18 @@ mod tests {
         keep: 0.9,
     };
 
+    fn of_three_actions() -> (LearnedAffinity, ChaCha8Rng) {
+        let (alphabet, mut rng) = (Alphabet::raw(3).unwrap(), ChaCha8Rng::seed_from_u64(3));
+        let learned = LearnedAffinity::new(alphabet, SETTINGS, &mut rng);
+        (learned.unwrap(), rng)
+    }
+
     #[test]
     fn the_gradient_is_the_slope() {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut learned =
-            LearnedAffinity::new(Alphabet::raw(3).unwrap(), SETTINGS, &mut rng).unwrap();
-        learned
-            .parameters
-            .iter_mut()
-            .for_each(|p| *p = rng.random_range(-1.0..1.0));
+        let (mut learned, mut rng) = of_three_actions();
+        for parameter in &mut learned.parameters {
+            *parameter = rng.random_range(-1.0..1.0);
+        }
         let by_q: Vec<f64> = (0..9).map(|i| f64::from(i) - 4.5).collect();
         let gradient = learned.gradient(&by_q);
         for (at, slope) in gradient.iter().enumerate() {
@@ -294,15 +297,12 @@ mod tests {
     /// By 2^24 updates 0.999^t is 0 beside 1, and bias corrections are 1 from there on.
     #[test]
     fn updates_beyond_32_bits_are_counted() {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let learned = LearnedAffinity::new(Alphabet::raw(3).unwrap(), SETTINGS, &mut rng).unwrap();
         let after = |updates| {
-            let (mut learned, mut rng) = (learned.clone(), rng.clone());
+            let (mut learned, mut rng) = of_three_actions();
             learned.updates = updates;
             for _ in 0..20 {
-                learned
-                    .observe(&[(0, 1), (1, 2), (2, 0)], &mut rng)
-                    .unwrap();
+                let pairs = [(0, 1), (1, 2), (2, 0)];
+                learned.observe(&pairs, &mut rng).unwrap();
             }
             learned.matrix()
         };
