@@ -26,26 +26,21 @@ impl ConvLayer {
     }
 }
 
-/// Sizes of one convolution with a square kernel and without padding.
+/// Sizes of one convolution with a square kernel and without padding; height and width are the input's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ConvShape {
-    /// Rows of the input.
-    pub height: usize,
-    /// Columns of the input.
-    pub width: usize,
-    /// Channels of the input.
-    pub channels_in: usize,
-    /// Channels of the output.
-    pub channels_out: usize,
-    /// Side of the kernel.
-    pub kernel: usize,
+pub(crate) struct ConvShape {
+    pub(crate) height: usize,
+    pub(crate) width: usize,
+    pub(crate) channels_in: usize,
+    pub(crate) channels_out: usize,
+    pub(crate) kernel: usize,
     /// Step between two windows, the same in both directions.
-    pub stride: usize,
+    pub(crate) stride: usize,
 }
 
 impl ConvShape {
     /// The sizes of `layer` on an input of (height, width, channels); `None` if the kernel does not fit or a size is 0.
-    pub fn new(
+    pub(crate) fn new(
         (height, width, channels_in): (usize, usize, usize),
         layer: ConvLayer,
     ) -> Option<Self> {
@@ -82,48 +77,37 @@ impl ConvShape {
         }
     }
 
-    /// Rows of the output.
-    pub fn out_height(&self) -> usize {
+    pub(crate) fn out_height(&self) -> usize {
         (self.height - self.kernel) / self.stride + 1
     }
 
-    /// Columns of the output.
-    pub fn out_width(&self) -> usize {
+    pub(crate) fn out_width(&self) -> usize {
         (self.width - self.kernel) / self.stride + 1
     }
 
     /// Height, width and channels of the output.
-    pub fn output(&self) -> (usize, usize, usize) {
+    pub(crate) fn output(&self) -> (usize, usize, usize) {
         (self.out_height(), self.out_width(), self.channels_out)
     }
 
     /// Windows in one image, which are the locations of the output map.
-    pub fn locations(&self) -> usize {
+    pub(crate) fn locations(&self) -> usize {
         self.out_height() * self.out_width()
     }
 
-    /// Scalars in one window.
-    pub fn patch_len(&self) -> usize {
-        self.kernel * self.kernel * self.channels_in
-    }
-
-    /// Scalars in one input image.
-    pub fn image_len(&self) -> usize {
+    pub(crate) fn image_len(&self) -> usize {
         self.height * self.width * self.channels_in
     }
 
-    /// Scalars in one output map.
-    pub fn map_len(&self) -> usize {
+    pub(crate) fn map_len(&self) -> usize {
         self.locations() * self.channels_out
     }
 
-    /// Scalars in the weight.
-    pub fn weight_len(&self) -> usize {
-        self.patch_len() * self.channels_out
+    pub(crate) fn weight_len(&self) -> usize {
+        self.kernel * self.kernel * self.channels_in * self.channels_out
     }
 
-    /// Scalars in weight and bias.
-    pub fn parameters_len(&self) -> usize {
+    pub(crate) fn parameters_len(&self) -> usize {
         self.weight_len() + self.channels_out
     }
 }

@@ -54,7 +54,7 @@ pub use config::{DimHeads, LossLayer, ModelConfig};
 pub use cost::LayerCost;
 pub use encoder::Encoder;
 pub use error::{ModelError, Result};
-pub use geometry::{ConvLayer, ConvShape};
+pub use geometry::ConvLayer;
 pub use gradients::Backward;
 pub use heads::c51::EXPECTED_RETURN_ERROR;
 pub use heads::config::HeadConfig;
