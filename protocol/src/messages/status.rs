@@ -172,30 +172,17 @@ impl ReplayStatus {
 
     /// Adds another shard's account, but for the mean age. Every shard has the whole run's warm-up.
     fn add(&mut self, it: &Self) {
-        for (sum, n) in [
-            (&mut self.transitions_inserted, it.transitions_inserted),
-            (&mut self.transitions_refilled, it.transitions_refilled),
-            (&mut self.transitions_held, it.transitions_held),
-            (&mut self.frame_bytes_held, it.frame_bytes_held),
-            (&mut self.transitions_lost, it.transitions_lost),
-            (&mut self.transitions_duplicated, it.transitions_duplicated),
-            (&mut self.chunks_retried, it.chunks_retried),
-            (&mut self.batches_retried, it.batches_retried),
-            (&mut self.messages_refused, it.messages_refused),
-            (&mut self.rows_sampled, it.rows_sampled),
-            (&mut self.rows_unlearned, it.rows_unlearned),
-            (&mut self.episodes, it.episodes),
-            (&mut self.returns.known, it.returns.known),
-        ] {
-            *sum = sum.saturating_add(n);
+        macro_rules! add {
+            ($($count:ident)+) => {
+                $(self.$count = self.$count.saturating_add(it.$count);)+
+            };
         }
-        for (sum, n) in [
-            (&mut self.actors, it.actors),
-            (&mut self.actors_acting, it.actors_acting),
-            (&mut self.actors_waiting, it.actors_waiting),
-        ] {
-            *sum = sum.saturating_add(n);
+        add! {
+            transitions_inserted transitions_refilled transitions_held frame_bytes_held transitions_lost transitions_duplicated
+            chunks_retried batches_retried messages_refused rows_sampled rows_unlearned episodes
+            actors actors_acting actors_waiting
         }
+        self.returns.known = self.returns.known.saturating_add(it.returns.known);
         for (sums, counts) in [
             (&mut self.k_histogram, &it.k_histogram),
             (&mut self.action_histogram, &it.action_histogram),
