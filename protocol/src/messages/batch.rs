@@ -29,7 +29,7 @@ pub struct Batch {
     /// What it says of itself.
     pub header: BatchHeader,
     payload: Buffer,
-    /// Of a merged batch, who drew its rows by priority: so many at a time.
+    /// Who drew its rows by priority: so many at a time.
     origins: Vec<(Origin, usize)>,
 }
 
@@ -63,7 +63,7 @@ impl Batch {
         Self {
             header,
             payload,
-            origins: Vec::new(),
+            origins: Vec::from_iter(header.origin.map(|origin| (origin, header.rows as usize))),
         }
     }
 
@@ -94,8 +94,7 @@ impl Batch {
                 }
             }
         }
-        let origin = |part: &Self| Some((part.header.origin?, part.rows()));
-        merged.origins = parts.iter().filter_map(origin).collect();
+        merged.origins = parts.iter().flat_map(|it| it.origins.clone()).collect();
         merged
     }
 
@@ -272,12 +271,8 @@ impl Batch {
         number: u64,
         priorities: &[f32],
     ) -> Option<PriorityUpdate> {
-        let whole = [(self.header.origin?, self.rows())];
+        self.header.origin?;
         assert_eq!(priorities.len(), self.rows(), "a priority a row");
-        let origins = match self.origins.as_slice() {
-            [] => &whole[..],
-            origins => origins,
-        };
         let (mut transitions, mut priorities) = (&self.transitions()[..], priorities);
         let part = |&(origin, rows): &(Origin, usize)| {
             let (own, rest) = transitions.split_at(rows);
@@ -293,7 +288,7 @@ impl Batch {
         Some(PriorityUpdate {
             learner,
             number,
-            parts: origins.iter().map(part).collect(),
+            parts: self.origins.iter().map(part).collect(),
         })
     }
 
