@@ -122,19 +122,13 @@ impl Chunk {
         let bytes = header
             .payload_bytes()
             .expect("an actor's chunk is far below the address space");
-        Self {
-            header,
-            payload: Buffer::zeroed(bytes),
-        }
+        Self::in_memory(header, Buffer::zeroed(bytes))
     }
 
     /// A chunk in memory that may hold anything: every row is to be written.
     pub fn in_memory(header: ChunkHeader, payload: Buffer) -> Self {
-        assert_eq!(
-            Some(payload.len()),
-            header.payload_bytes(),
-            "memory for a chunk"
-        );
+        let bytes = header.payload_bytes();
+        assert_eq!(Some(payload.len()), bytes, "memory for a chunk");
         Self { header, payload }
     }
 
@@ -220,9 +214,8 @@ impl Chunk {
         if let Some(end) = chunk.ends().iter().find(|&&e| End::from_byte(e).is_none()) {
             return Err(CodecError::Header(format!("end {end} is none that exists")));
         }
-        if let Some(row) =
-            (0..chunk.header.transitions()).find(|&row| !chunk.reward(row).is_finite())
-        {
+        let mut rows = 0..header.transitions();
+        if let Some(row) = rows.find(|&row| !chunk.reward(row).is_finite()) {
             return Err(CodecError::Header(format!(
                 "the reward of row {row} is not finite"
             )));
