@@ -76,7 +76,7 @@ pub fn open_as(
             "[\"quic\", \"unixsock-stream\"]".into(),
         ),
     ];
-    if credentials.role() == Role::ReplayServer {
+    if credentials.role == Role::ReplayServer {
         settings.push(("access_control", tls::rules(keys)));
     }
     open_with(endpoints, message_bytes_max, &settings)

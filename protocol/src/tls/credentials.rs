@@ -37,16 +37,18 @@ pub fn authority_path(folder: &Path) -> PathBuf {
 /// A process's certificate and key, and the authority that it trusts. [`Credentials::read`] has checked them.
 #[derive(Debug)]
 pub struct Credentials {
-    role: Role,
+    /// What this process is.
+    pub role: Role,
     authority: PathBuf,
     certificate: PathBuf,
-    key: PathBuf,
+    /// The key's file.
+    pub key: PathBuf,
     /// Until when the certificate is good, seconds since 1970.
     expires: i64,
     /// The same, for a person.
-    expires_on: String,
-    /// The names and addresses that it is for: a replay server's.
-    hosts: Vec<String>,
+    pub expires_on: String,
+    /// The names and addresses that it is for: clients connect to the replay server by one of them.
+    pub hosts: Vec<String>,
 }
 
 impl Credentials {
@@ -131,26 +133,6 @@ impl Credentials {
             expires_on,
             hosts,
         })
-    }
-
-    /// What this process is.
-    pub const fn role(&self) -> Role {
-        self.role
-    }
-
-    /// Until when the certificate is good, for a person.
-    pub fn expires_on(&self) -> &str {
-        &self.expires_on
-    }
-
-    /// The names and addresses that the certificate is for: clients connect to the replay server by one of them.
-    pub fn hosts(&self) -> &[String] {
-        &self.hosts
-    }
-
-    /// The key's file.
-    pub fn key_path(&self) -> &Path {
-        &self.key
     }
 
     /// Whether other users of this machine can read the key, and so act in this role.

@@ -68,7 +68,7 @@ fn what(role: Role) -> String {
 
 /// What is to be done about a certificate that is good.
 fn complaint(credentials: &Credentials) -> Option<String> {
-    let (role, key) = (credentials.role(), credentials.key_path().display());
+    let (role, key) = (credentials.role, credentials.key.display());
     let left = credentials.expires_in();
     if credentials.is_key_open() {
         Some(format!(
@@ -80,7 +80,7 @@ fn complaint(credentials: &Credentials) -> Option<String> {
              start that process again",
             left.as_secs() / DAY_S
         ))
-    } else if role == Role::ReplayServer && credentials.hosts().is_empty() {
+    } else if role == Role::ReplayServer && credentials.hosts.is_empty() {
         Some(format!(
             "it is for no name or address, so no client can connect: remove {role}.pem and {role}.key, and `deploy/certs.sh DIR --host \
              NAME_OR_ADDRESS` makes one"
@@ -98,7 +98,7 @@ fn fact(role: Role, credentials: &Credentials) -> Fact {
     if role == Role::ReplayServer {
         text += &format!(
             ", for {}: connect to one of these names",
-            credentials.hosts().join(", ")
+            credentials.hosts.join(", ")
         );
     }
     Fact::ok(&what(role), text)
@@ -106,7 +106,7 @@ fn fact(role: Role, credentials: &Credentials) -> Fact {
 
 fn good_until(credentials: &Credentials) -> String {
     let days = credentials.expires_in().as_secs() / DAY_S;
-    format!("good until {} ({days} days)", credentials.expires_on())
+    format!("good until {} ({days} days)", credentials.expires_on)
 }
 
 /// The actors of which nothing is to be said each.
