@@ -107,6 +107,24 @@ pub struct RunSpec {
 }
 
 impl RunSpec {
+    /// Frames of one byte, two actions, returns of one step and no positives: for tests, benches and checks.
+    pub fn smallest() -> Self {
+        Self {
+            world: "counter".into(),
+            agent: "c51".into(),
+            seed: 1,
+            frame_height: 1,
+            frame_width: 1,
+            frame_channels: 1,
+            frame_stack: 1,
+            num_actions: 2,
+            n_step: 1,
+            gamma: 0.99,
+            horizon: Horizon::None {},
+            timeout: TimeoutRule::Terminal,
+        }
+    }
+
     /// Bytes of one frame as it travels: neither stacked nor enlarged.
     pub const fn frame_bytes(&self) -> usize {
         self.frame_height as usize * self.frame_width as usize * self.frame_channels as usize

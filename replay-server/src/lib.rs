@@ -9,22 +9,12 @@
 //! by that, and [`Replay::set_priorities`] takes what it found. Of several shards each gives rows in proportion to what it holds.
 //!
 //! ```
-//! use driml_protocol::{ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, TimeoutRule};
+//! use driml_protocol::{ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec};
 //! use driml_replay_server::{Config, Replay};
 //!
 //! let spec = RunSpec {
-//!     world: "counter".into(),
-//!     agent: "c51".into(),
-//!     seed: 1,
-//!     frame_height: 1,
-//!     frame_width: 1,
-//!     frame_channels: 1,
-//!     frame_stack: 1,
-//!     num_actions: 2,
-//!     n_step: 1,
-//!     gamma: 0.99,
 //!     horizon: Horizon::Fixed { k: 2 },
-//!     timeout: TimeoutRule::Terminal,
+//!     ..RunSpec::smallest()
 //! };
 //! let config = Config {
 //!     replay_ratio: 8.0,

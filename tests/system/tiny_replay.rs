@@ -2,9 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_protocol::{
-    ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec, TimeoutRule,
-};
+use driml_protocol::{ActorJoin, Buffer, Chunk, ChunkHeader, Horizon, RequestId, RunSpec};
 use driml_replay_server::{Config, Replay};
 
 /// Frames of 4 x 4 bytes that are not stacked.
@@ -12,16 +10,11 @@ pub(crate) fn spec(agent: &str, horizon: Horizon) -> RunSpec {
     RunSpec {
         world: "chain".into(),
         agent: agent.into(),
-        seed: 1,
         frame_height: 4,
         frame_width: 4,
-        frame_channels: 1,
-        frame_stack: 1,
         num_actions: 3,
-        n_step: 1,
-        gamma: 0.99,
         horizon,
-        timeout: TimeoutRule::Terminal,
+        ..RunSpec::smallest()
     }
 }
 

@@ -7,8 +7,8 @@ use std::{
 };
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, Horizon, InsertReply, Learned,
-    LearnerJoin, Leave, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, InsertReply, Learned, LearnerJoin, Leave,
+    RunSpec, Sampling,
 };
 
 use super::{PersistArgs, PersistError};
@@ -19,20 +19,6 @@ fn open(dir: &Path) -> Result<(Replay, Vec<String>), PersistError> {
 }
 
 fn open_drawn_by(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), PersistError> {
-    let spec = RunSpec {
-        world: "counter".into(),
-        agent: "c51".into(),
-        seed: 1,
-        frame_height: 1,
-        frame_width: 1,
-        frame_channels: 1,
-        frame_stack: 1,
-        num_actions: 2,
-        n_step: 1,
-        gamma: 0.99,
-        horizon: Horizon::None {},
-        timeout: TimeoutRule::Terminal,
-    };
     let config = Config {
         sampling,
         ..Config::unlimited(2_000)
@@ -43,7 +29,7 @@ fn open_drawn_by(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>)
         segment_bytes: Some(4_000),
         mark: None,
     };
-    let (replay, recovery) = Replay::open(&args, &spec, &config, 4)?;
+    let (replay, recovery) = Replay::open(&args, &RunSpec::smallest(), &config, 4)?;
     Ok((replay, recovery.warnings))
 }
 

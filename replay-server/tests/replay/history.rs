@@ -48,8 +48,6 @@ pub(crate) fn spec(
     horizon: Horizon,
 ) -> RunSpec {
     RunSpec {
-        world: "test".into(),
-        agent: "test".into(),
         seed: 7,
         frame_height: 4,
         frame_width: 3,
@@ -59,7 +57,7 @@ pub(crate) fn spec(
         n_step,
         gamma: 0.9,
         horizon,
-        timeout: TimeoutRule::Terminal,
+        ..RunSpec::smallest()
     }
 }
 

@@ -56,18 +56,14 @@ impl Numbers<'_> {
 /// A run whose frames are of so many bytes.
 pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     RunSpec {
-        world: "counter".into(),
         agent: "driml-ada".into(),
-        seed: 1,
-        frame_height: 1,
-        frame_width: 1,
         frame_channels: frame_bytes,
         frame_stack: 2,
         num_actions: ACTIONS,
         n_step: 2,
-        gamma: 0.99,
         horizon: Horizon::Nhg { k_max: 3 },
         timeout: TimeoutRule::Bootstrap,
+        ..RunSpec::smallest()
     }
 }
 
