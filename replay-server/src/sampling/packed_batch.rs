@@ -68,7 +68,8 @@ impl PackedFrames {
         match ring.frames() {
             Frames::Plain(frames) => {
                 for (index, place) in row {
-                    places.frame(place).copy_from_slice(frames.frame(index));
+                    let frame = frames.frame(ring.slot(index));
+                    places.frame(place).copy_from_slice(frame);
                 }
             }
             Frames::Compressed(frames) => {

@@ -129,7 +129,7 @@ impl Ring {
     pub(crate) fn start_at(&mut self, first: u64) {
         self.steps.clear();
         (self.first, self.oldest, self.inserted) = (first, first, first);
-        self.frames.start_at(first);
+        self.frames.clear();
     }
 
     pub(crate) const fn first(&self) -> u64 {
@@ -152,7 +152,8 @@ impl Ring {
     ) -> Link {
         let inserted = self.inserted + steps.len() as u64;
         let oldest = inserted.saturating_sub(self.capacity).max(self.oldest);
-        self.oldest = self.frames.push(frames, oldest);
+        let slot = self.slot(self.inserted);
+        self.oldest = self.frames.push(frames, slot, oldest);
         for step in steps {
             link = Link::following(self.push(step, link), step.end);
         }
@@ -188,7 +189,7 @@ impl Ring {
         index
     }
 
-    fn slot(&self, index: u64) -> usize {
+    pub(crate) fn slot(&self, index: u64) -> usize {
         ((index - self.first) % self.capacity) as usize
     }
 

@@ -31,11 +31,12 @@ impl Frames {
         }
     }
 
-    /// Stores the frames of the next transitions; those before `oldest` are no longer wanted. Gives the oldest that is held.
-    pub(crate) fn push(&mut self, run: Run<'_>, oldest: u64) -> u64 {
+    /// Stores the frames of the next transitions, the first of which has this slot; those before `oldest` are no longer wanted. Gives
+    /// the oldest that is held.
+    pub(crate) fn push(&mut self, run: Run<'_>, slot: usize, oldest: u64) -> u64 {
         match (self, run) {
             (Self::Plain(frames), Run::Plain(run)) => {
-                frames.push(run);
+                frames.push(run, slot);
                 oldest
             }
             (Self::Compressed(frames), Run::Packed(run)) => frames.push(run, oldest),
@@ -50,10 +51,10 @@ impl Frames {
         }
     }
 
-    /// Lets go of all frames; the next one is that of transition `first`.
-    pub(crate) fn start_at(&mut self, first: u64) {
+    /// Lets go of all frames; the next one has the first slot.
+    pub(crate) fn clear(&mut self) {
         match self {
-            Self::Plain(frames) => frames.start_at(first),
+            Self::Plain(frames) => frames.bytes.clear(),
             // A block begins where the last ended, the first one at what `push` is told.
             Self::Compressed(frames) => frames.forget_before(u64::MAX),
         }
@@ -81,13 +82,10 @@ impl Frames {
     }
 }
 
-/// The newest `capacity` frames as they came, in one buffer: number `i` since the start lies in slot `(i - first) % capacity`.
+/// The newest `capacity` frames as they came, in one buffer, each in the slot of its transition.
 pub(crate) struct PlainFrames {
     capacity: u64,
     frame_bytes: usize,
-    first: u64,
-    /// Where the next frame goes.
-    next: usize,
     /// Grows into its reservation, so that memory is taken only as transitions come.
     bytes: Vec<u8>,
 }
@@ -102,36 +100,27 @@ impl PlainFrames {
         Ok(Self {
             capacity,
             frame_bytes,
-            first: 0,
-            next: 0,
             bytes,
         })
     }
 
-    /// Lets go of all frames; the next one has the number `first`.
-    pub(crate) fn start_at(&mut self, first: u64) {
-        self.bytes.clear();
-        (self.first, self.next) = (first, 0);
-    }
-
-    /// Stores frames, over the oldest ones once the buffer is full.
-    pub(crate) fn push(&mut self, mut frames: &[u8]) {
+    /// Stores frames from `slot` on, over the oldest ones once the buffer is full.
+    pub(crate) fn push(&mut self, mut frames: &[u8], slot: usize) {
         let capacity_bytes = self.capacity as usize * self.frame_bytes;
+        let mut at = slot * self.frame_bytes;
         while !frames.is_empty() {
-            let (now, rest) = frames.split_at(frames.len().min(capacity_bytes - self.next));
-            if self.next == self.bytes.len() {
+            let (now, rest) = frames.split_at(frames.len().min(capacity_bytes - at));
+            if at == self.bytes.len() {
                 self.bytes.extend_from_slice(now);
             } else {
-                self.bytes[self.next..][..now.len()].copy_from_slice(now);
+                self.bytes[at..][..now.len()].copy_from_slice(now);
             }
-            self.next = (self.next + now.len()) % capacity_bytes;
-            frames = rest;
+            (frames, at) = (rest, 0);
         }
     }
 
-    /// Frame `index`, which must be held.
-    pub(crate) fn frame(&self, index: u64) -> &[u8] {
-        let at = ((index - self.first) % self.capacity) as usize * self.frame_bytes;
-        &self.bytes[at..at + self.frame_bytes]
+    /// The frame in a slot, which must be held.
+    pub(crate) fn frame(&self, slot: usize) -> &[u8] {
+        &self.bytes[slot * self.frame_bytes..][..self.frame_bytes]
     }
 }
