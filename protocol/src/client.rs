@@ -33,22 +33,12 @@ pub struct RunClient {
 }
 
 /// A message of type `M` as it travels; it may be sent several times.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Sealed<M> {
     bytes: ZBytes,
     /// The actor that it speaks for.
     actor: Option<u32>,
     message: PhantomData<fn() -> M>,
-}
-
-impl<M> Clone for Sealed<M> {
-    fn clone(&self) -> Self {
-        Self {
-            bytes: self.bytes.clone(),
-            actor: self.actor,
-            message: PhantomData,
-        }
-    }
 }
 
 impl<M: Message> Sealed<M> {

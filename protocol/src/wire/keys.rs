@@ -128,20 +128,20 @@ pub struct Alive {
 }
 
 impl Alive {
+    /// The life of a process that has this number.
+    pub fn of(process: ProcessName, number: u64) -> Self {
+        let mark = mark(number);
+        Self { process, mark }
+    }
+
     /// This life of an actor.
     pub fn actor(actor: u32, incarnation: u64) -> Self {
-        Self {
-            process: ProcessName::Actor(actor),
-            mark: mark(incarnation),
-        }
+        Self::of(ProcessName::Actor(actor), incarnation)
     }
 
     /// The learner of this number.
     pub fn learner(learner: u64) -> Self {
-        Self {
-            process: ProcessName::Learner,
-            mark: mark(learner),
-        }
+        Self::of(ProcessName::Learner, learner)
     }
 }
 

@@ -7,7 +7,7 @@ use zenoh::qos::Priority;
 use super::error::CodecError;
 
 /// A message: the header that bincode writes. A few have a payload, raw bytes that follow the header.
-pub trait Message: Serialize + DeserializeOwned {
+pub trait Message: Clone + Serialize + DeserializeOwned {
     /// Its number on the wire.
     const KIND: u16;
     /// Its name in logs.

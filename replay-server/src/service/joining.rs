@@ -94,13 +94,10 @@ impl State {
     /// Whether this incarnation of a process is the one that has joined.
     fn takes_part(&self, who: Alive) -> bool {
         let known = match who.process {
-            ProcessName::Actor(actor) => {
-                let life = self.replay.actor_incarnation(actor);
-                life.map(|life| Alive::actor(actor, life))
-            }
-            ProcessName::Learner => self.replay.learner().map(Alive::learner),
+            ProcessName::Actor(actor) => self.replay.actor_incarnation(actor),
+            ProcessName::Learner => self.replay.learner(),
         };
-        known == Some(who)
+        known.is_some_and(|number| Alive::of(who.process, number) == who)
     }
 
     /// Checks that `learner` is the one that is served; if not, the error says to a person what happened.
