@@ -3,10 +3,7 @@
 use std::collections::HashMap;
 
 use driml_protocol::{AffinityUpdate, Horizon};
-use driml_replay_server::{
-    Config, Replay,
-    horizon::{Affinity, draw_k},
-};
+use driml_replay_server::{Config, Replay, horizon::Affinity};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -30,12 +27,6 @@ fn random_affinity(num_actions: u32, spread: f32, rng: &mut ChaCha8Rng) -> Affin
     affinity(1, num_actions, matrix)
 }
 
-fn taken(update: &AffinityUpdate) -> Affinity {
-    let mut affinity = Affinity::uniform(update.num_actions);
-    affinity.update(update).unwrap();
-    affinity
-}
-
 /// P(k = 1), .., P(k = H): (1 - A_i) prod_{j<i} A_j for i < H, and prod_{j<H} A_j.
 fn nhg_law(update: &AffinityUpdate, actions: &[u8]) -> Vec<f64> {
     let n = update.num_actions as usize;
@@ -45,27 +36,6 @@ fn nhg_law(update: &AffinityUpdate, actions: &[u8]) -> Vec<f64> {
     let reached = |i: usize| (1..i).map(a).product::<f64>();
     let stops = |i: usize| if i < h { 1.0 - a(i) } else { 1.0 };
     (1..=h).map(|i| stops(i) * reached(i)).collect()
-}
-
-#[test]
-fn every_rule_stays_within_k_max_and_the_episode() {
-    let affinity = taken(&affinity(1, 1, vec![1.0]));
-    let rng = &mut ChaCha8Rng::seed_from_u64(14);
-    let mut draw = |horizon, steps_left| draw_k(horizon, &affinity, &vec![0; steps_left], rng);
-    for (k_max, steps_left, expected) in [(1, 1, 1), (1, 7, 1), (4, 9, 4), (4, 4, 4), (4, 1, 1)] {
-        for horizon in [
-            Horizon::Fixed { k: k_max },
-            Horizon::All { k_max },
-            Horizon::Nhg { k_max },
-        ] {
-            assert_eq!(draw(horizon, steps_left), Some(expected), "{horizon:?}");
-        }
-        for _ in 0..20 {
-            let drawn = draw(Horizon::Uniform { k_max }, steps_left).unwrap();
-            assert!((1..=expected).contains(&drawn));
-        }
-    }
-    assert_eq!(draw(Horizon::None {}, 3), None);
 }
 
 #[test]
