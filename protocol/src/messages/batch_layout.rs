@@ -10,29 +10,17 @@ use super::{batch_frames::StackedFrames, batch_header::BatchHeader};
 /// Where states are stacks of frames, each frame is there once, and the columns of states say which of them each is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Column {
-    /// The frames of all states, where states are stacks of them.
     Frames,
-    /// s_t, the state of the anchor.
     StatesT,
-    /// s_{t+k}, of each positive.
     StatesK,
-    /// s_{t+n}, from which the return bootstraps.
     StatesN,
-    /// The n-step return, f32.
     NStepReturn,
-    /// The discount of what is bootstrapped, f32.
     BootstrapDiscount,
-    /// a_t, the action in it.
     Action,
-    /// a_{t+1}, the action in the next state.
     NextAction,
-    /// 1 where the row has this positive.
     PositiveValid,
-    /// k of each positive.
     K,
-    /// The transition's number since the start of the replay, u64; where rows are drawn by priority.
     Transition,
-    /// The chance with which the row was drawn, f32; where rows are drawn by priority.
     Probability,
 }
 

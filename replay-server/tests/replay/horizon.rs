@@ -1,4 +1,4 @@
-//! The k that are drawn, against the closed form of each rule, alone and as served.
+//! The k that are drawn, against the closed form of each rule, as served.
 
 use std::collections::HashMap;
 
