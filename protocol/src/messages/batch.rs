@@ -235,9 +235,6 @@ impl Batch {
     }
 
     /// Writes of each row which transition it is, and the chance with which it was drawn.
-    ///
-    /// # Panics
-    /// If these are not as many as the rows, or the rows are drawn uniformly.
     pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
@@ -262,9 +259,6 @@ impl Batch {
 
     /// What `learner` says back of rows that were drawn by priority: update `number`, with the `priorities` [B]; none where rows
     /// are drawn uniformly.
-    ///
-    /// # Panics
-    /// If these are not as many as the rows.
     pub fn priority_update(
         &self,
         learner: u64,

@@ -56,9 +56,6 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
 /// As [`open`], with certificates where there are any: then endpoints are `quic/HOST:PORT` or unix sockets, and a replay server
 /// gives each role of the run with these keys what it needs and no more. Messages of more than `message_bytes_max` bytes, which no
 /// peer of this run sends, are dropped while they come in.
-///
-/// # Errors
-/// As [`open`]; one side rejects the other's certificate.
 pub fn open_as(
     endpoints: &Endpoints,
     keys: &Keys,

@@ -26,9 +26,6 @@ pub(crate) struct PendingBytes {
 }
 
 /// Sends one question; questions of one priority arrive in the order in which they were sent.
-///
-/// # Errors
-/// zenoh refused. It may be tried again.
 pub(crate) fn send(
     session: &Session,
     key: &str,

@@ -95,9 +95,6 @@ pub fn encode<M: Message>(
 /// Checks a message in one piece and gives it and its payload.
 ///
 /// `spec_hash` is the hash of this process's run, or `None` where any run is accepted (a process that joins to learn it).
-///
-/// # Errors
-/// Anything that is not a whole, undamaged message of this kind, version and run.
 pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[u8]), CodecError> {
     let prefix = Prefix::read(bytes.first_chunk(), bytes.len())?;
     let (header, payload) = bytes[PREFIX_BYTES..].split_at(prefix.header_len());

@@ -16,9 +16,6 @@ pub struct Keys {
 
 impl Keys {
     /// Keys under `namespace`; runs that share a router need different ones.
-    ///
-    /// # Errors
-    /// A namespace with other characters than letters, digits, `-`, `_` and `/`.
     pub fn new(namespace: &str) -> Result<Self, String> {
         let good = |c: char| c.is_ascii_alphanumeric() || "-_/".contains(c);
         let chunks_filled = !namespace.split('/').any(str::is_empty);

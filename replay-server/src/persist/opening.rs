@@ -62,9 +62,6 @@ pub struct KeptReplay {
 
 impl KeptReplay {
     /// Takes the folder and looks whose replay is in it, if any: at once, however much there is.
-    ///
-    /// # Errors
-    /// A folder that cannot be written, is in use, or holds the replay of another run.
     pub fn find(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Result<Self, PersistError> {
         let folder = LogFolder::open(&args.dir)?;
         let ours = LogId {

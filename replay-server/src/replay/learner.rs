@@ -138,9 +138,6 @@ impl Replay {
     }
 
     /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.
-    ///
-    /// # Errors
-    /// A matrix of another size or with an entry that is not a probability, or a version that no run reaches; the reason, for a person.
     pub fn set_affinity(&mut self, update: &AffinityUpdate) -> Result<(), String> {
         // A version is a count of updates, each of at least one row.
         let rows = self.limiter.rows_sampled_total();

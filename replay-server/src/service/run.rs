@@ -75,9 +75,6 @@ pub struct RunArgs {
 }
 
 /// Runs the replay server until its run is over, `args.ending` or `shutdown`.
-///
-/// # Errors
-/// Settings that cannot work, memory that the system does not grant, an endpoint that cannot be listened on.
 pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let settings = Settings::parse(&args.config_toml)?;
     let spec: RunSpec = settings.table("run")?;
