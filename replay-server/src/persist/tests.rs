@@ -10,15 +10,12 @@ use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, End, EpisodesRequest, InsertReply, Learned, LearnerJoin, Leave,
     RunSpec, Sampling,
 };
+use tempfile::TempDir;
 
 use super::{PersistArgs, PersistError};
 use crate::{Config, Replay, ledger::actors::ACTORS_MAX};
 
-fn open(dir: &Path) -> Result<(Replay, Vec<String>), PersistError> {
-    open_drawn_by(dir, Sampling::default())
-}
-
-fn open_drawn_by(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), PersistError> {
+fn open(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>), PersistError> {
     let config = Config {
         sampling,
         ..Config::unlimited(2_000)
@@ -33,17 +30,16 @@ fn open_drawn_by(dir: &Path, sampling: Sampling) -> Result<(Replay, Vec<String>)
     Ok((replay, recovery.warnings))
 }
 
-/// What an actor says at its end, before it has sent a chunk.
-const fn leave(actor: u32) -> Leave {
-    Leave {
-        actor,
-        incarnation: 1,
-        produced: 0,
-    }
-}
-
 const fn join(actor: u32, incarnation: u64) -> ActorJoin {
     ActorJoin { actor, incarnation }
+}
+
+/// A replay in its folder, which an actor has joined.
+fn begin(sampling: Sampling) -> (TempDir, Replay) {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut replay, _) = open(folder.path(), sampling).unwrap();
+    replay.join_actor(join(0, 1)).unwrap();
+    (folder, replay)
 }
 
 /// The segment that is written refuses, as on a full disk; gives what to put back.
@@ -82,23 +78,25 @@ fn save_checkpoint(replay: &mut Replay) {
 fn check_comes_back(replay: Replay, dir: &Path) {
     let stored = replay.stored_bytes().unwrap();
     drop(replay);
-    let (replay, warnings) = open(dir).unwrap();
+    let (replay, warnings) = open(dir, Sampling::default()).unwrap();
     assert_eq!(warnings, [""; 0]);
     assert!(replay.stored_bytes().unwrap() == stored);
 }
 
 #[test]
 fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut replay, _) = open(folder.path()).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    let (folder, mut replay) = begin(Sampling::default());
     let learner = LearnerJoin {
         learner: 7,
         ..LearnerJoin::default()
     };
     replay.join_learner(learner).unwrap();
     let file = refuse(&mut replay);
-    replay.leave(&leave(0));
+    replay.leave(&Leave {
+        actor: 0,
+        incarnation: 1,
+        produced: 0,
+    });
     assert!(replay.is_refused_by_disk());
     replay.log.as_mut().unwrap().file = file;
     // The learner's checkpoint is the first that there is room for.
@@ -109,8 +107,7 @@ fn a_segment_that_begins_after_the_disk_refused_loses_nothing() {
 
 #[test]
 fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut replay, _) = open(folder.path()).unwrap();
+    let (folder, mut replay) = begin(Sampling::default());
     for actor in 0..ACTORS_MAX as u32 {
         replay.join_actor(join(actor, 1)).unwrap();
     }
@@ -121,16 +118,14 @@ fn an_actor_that_took_the_place_of_a_forgotten_one_comes_back() {
 
 #[test]
 fn what_cannot_be_read_is_refused_until_it_is_removed() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut replay, _) = open(folder.path()).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    let (folder, replay) = begin(Sampling::default());
     drop(replay);
     let segment = folder.path().join("segment-000000000000.log");
     let mut bytes = fs::read(&segment).unwrap();
     bytes[40] ^= 1;
     fs::write(&segment, &bytes).unwrap();
     for _ in 0..2 {
-        let refused = open(folder.path());
+        let refused = open(folder.path(), Sampling::default());
         assert!(matches!(refused, Err(PersistError::Unusable(..))));
         assert_eq!(fs::read(&segment).unwrap(), bytes);
     }
@@ -138,9 +133,7 @@ fn what_cannot_be_read_is_refused_until_it_is_removed() {
 
 #[test]
 fn a_segment_that_cannot_be_begun_stops_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut replay, _) = open(folder.path()).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    let (folder, mut replay) = begin(Sampling::default());
     let next = folder.path().join("segment-000000000001.log");
     fs::create_dir(&next).unwrap();
     for sequence in 0..80 {
@@ -157,15 +150,13 @@ fn a_segment_that_cannot_be_begun_stops_nothing() {
 /// With priorities a state has 8 bytes for each transition held.
 #[test]
 fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
-    let folder = tempfile::tempdir().unwrap();
     let sampling = Sampling::Prioritised {
         alpha: 0.5,
         beta_start: 0.5,
         beta_end: 0.5,
         beta_updates: 1,
     };
-    let (mut replay, _) = open_drawn_by(folder.path(), sampling).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    let (_folder, mut replay) = begin(sampling);
     let mut most = 0;
     for sequence in 0..800 {
         store(&mut replay, sequence);
@@ -177,9 +168,7 @@ fn a_state_larger_than_a_segment_does_not_fill_the_disk() {
 
 #[test]
 fn where_a_launcher_records_it_alone_says_which_episodes_need_not_be_kept() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut replay, _) = open(folder.path()).unwrap();
-    replay.join_actor(join(0, 1)).unwrap();
+    let (_folder, mut replay) = begin(Sampling::default());
     store(&mut replay, 0);
     for (since, is_launcher, kept) in [(1, false, 0), (0, true, 1), (1, false, 1), (1, true, 0)] {
         replay.episodes(EpisodesRequest { since, is_launcher });
