@@ -18,7 +18,6 @@ const CONNECTED_MAX: usize = 4 * ACTORS_MAX;
 pub(super) struct Participants {
     started: Instant,
     waiting: (Waiting, Instant),
-    weights_at: Option<Instant>,
     /// Those that have not joined too.
     connected: HashSet<Alive>,
     processes: BTreeMap<ProcessName, Participant>,
@@ -40,7 +39,6 @@ impl Participants {
         Self {
             started: now,
             waiting: (Waiting::Neither, now),
-            weights_at: None,
             connected: HashSet::new(),
             processes: BTreeMap::new(),
         }
@@ -131,19 +129,14 @@ impl Participants {
         self.waiting.0 = waiting;
     }
 
-    pub(super) fn weights_came(&mut self, now: Instant) {
-        self.weights_at = Some(now);
-    }
-
     /// Who waits at the limiter, and for how many seconds.
     pub(super) fn waiting(&self, now: Instant) -> (Waiting, f64) {
         (self.waiting.0, seconds(now, self.waiting.1))
     }
 
-    /// Seconds since the server started, and since the newest weights came.
-    pub(super) fn ages(&self, now: Instant) -> (f64, Option<f64>) {
-        let weights = self.weights_at.map(|at| seconds(now, at));
-        (seconds(now, self.started), weights)
+    /// Seconds since the server started.
+    pub(super) fn up_s(&self, now: Instant) -> f64 {
+        seconds(now, self.started)
     }
 
     /// Whether the learner said that it has learned from every batch, and has saved.

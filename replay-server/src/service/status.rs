@@ -98,20 +98,19 @@ impl Service {
         let weights_version = self.weights().version();
         let (state, now) = (self.state(), Instant::now());
         let (waiting, waiting_s) = state.participants.waiting(now);
-        let (up_s, weights_age_s) = state.participants.ages(now);
         let held_since = |who| match who {
             ProcessName::Actor(actor) => state.chunks.arrived(actor),
             ProcessName::Learner => state.requests.iter().map(|it| it.arrived).min(),
         };
         let status = ProcessesStatus {
-            up_s,
+            up_s: state.participants.up_s(now),
             waiting,
             waiting_s,
             requests_waiting: state.requests.len() as u32,
             chunks_waiting: state.chunks.line.len() as u32,
             chunk_bytes_waiting: state.chunks.bytes() as u64,
             weights_version,
-            weights_age_s,
+            weights_age_s: state.timings.weights_age_s(now),
             log: state.replay.log.as_ref().map(Journal::status),
             last_warning: last_warning::get()
                 .map(|(text, age)| Warning::new(&text, age.as_secs_f64())),

@@ -85,6 +85,12 @@ impl Timings {
             .push_back((weights.version, weights.updates, now));
     }
 
+    /// Seconds since the newest weights came.
+    pub(super) fn weights_age_s(&self, now: Instant) -> Option<f64> {
+        let (_, _, came) = self.versions.back()?;
+        Some(now.saturating_duration_since(*came).as_secs_f64())
+    }
+
     /// Fills in what a status says of them.
     pub(super) fn report(&self, status: &mut ReplayStatus) {
         status.answer_ms = quantiles(&self.answers, 1e3);

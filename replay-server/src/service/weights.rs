@@ -34,10 +34,7 @@ impl Service {
                         keep();
                     }
                     let now = Instant::now();
-                    let mut state = self.state();
-                    state.timings.weights_came(&weights, now);
-                    state.participants.weights_came(now);
-                    drop(state);
+                    self.state().timings.weights_came(&weights, now);
                     let version = weights.version;
                     if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
                         tracing::warn!("weights {version} were not announced: {why}");
