@@ -25,7 +25,6 @@ pub(crate) struct PendingBytes {
     failed: Option<SessionError>,
 }
 
-/// Sends one question; questions of one priority arrive in the order in which they were sent.
 pub(crate) fn send(
     session: &Session,
     key: &str,

@@ -197,7 +197,6 @@ impl Actors {
         }
     }
 
-    /// Checks that these can be the actors of a replay that has stored `inserted` transitions; the error says why not.
     pub(crate) fn check(&self, inserted: u64) -> Result<(), &'static str> {
         let too_many = |it: &Actor| {
             it.streams.len() > STREAMS_MAX as usize || it.past.len() > PAST_INCARNATIONS_MAX
@@ -222,7 +221,6 @@ impl Actors {
         delivered.map(|(&number, _)| number)
     }
 
-    /// Whether a chunk is stored; an error says why it is not of a life that counts.
     pub(crate) fn is_stored(&self, poll: &ChunkPoll) -> Result<bool, String> {
         let actor = self.living(poll.actor, poll.incarnation)?;
         Ok(poll.sequence < actor.expected)
@@ -275,7 +273,6 @@ impl Actors {
         Ok(Difference::between(produced, stored))
     }
 
-    /// Actors that never sent a chunk and are not connected, if the run has its largest number of actors.
     pub(crate) fn absent(&self, is_connected: impl Fn(u32, u64) -> bool) -> Vec<u32> {
         if self.actors.len() < ACTORS_MAX {
             return Vec::new();

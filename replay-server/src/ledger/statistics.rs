@@ -112,7 +112,6 @@ impl Statistics {
         }
     }
 
-    /// Episodes that ended after the first `since`: the oldest that are still kept, as many as fit into one answer.
     pub(crate) fn episodes_since(&self, since: u64) -> EpisodesReply {
         let (ended, kept) = (self.counted.episodes, self.newest.len() as u64);
         let before = since.clamp(ended - kept, ended);
@@ -133,7 +132,6 @@ impl Statistics {
         }
     }
 
-    /// Checks that these can be the counts of a replay; the error says why not.
     pub(crate) fn check(&self) -> Result<(), &'static str> {
         let (ended, returns) = (self.counted.episodes, &self.counted.returns);
         let fits = self.newest.len() <= EPISODES_KEPT_MAX

@@ -44,7 +44,6 @@ pub enum PersistError {
     Config(#[from] driml_protocol::config::ConfigError),
 }
 
-/// Makes an error of the file system one that says what was done with which file.
 pub(super) fn io_error(
     doing: &'static str,
     path: &Path,

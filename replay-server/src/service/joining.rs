@@ -111,7 +111,6 @@ impl State {
         }
     }
 
-    /// Takes an actor that may take part; gives the number of its earlier lives.
     fn join_actor(&mut self, join: ActorJoin) -> Result<u32, JoinReply> {
         let ActorJoin { actor, incarnation } = join;
         let known = self.replay.actor_incarnation(actor);

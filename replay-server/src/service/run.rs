@@ -360,7 +360,6 @@ fn watch_members(
 }
 
 impl Service {
-    /// Starts the threads that deal with what was parked; they end after `shutdown`.
     fn start_working(self: Arc<Self>) -> std::io::Result<Threads> {
         let work = |name: &str, work: fn(&Self)| {
             let service = self.clone();

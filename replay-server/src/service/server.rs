@@ -132,7 +132,6 @@ pub(super) struct Admission {
 }
 
 impl Admission {
-    /// The answer to a request until the service is there, with the run's settings.
     pub(super) fn put_off(&self) -> Recovering {
         Recovering {
             progress: self.reading.progress(),

@@ -87,7 +87,6 @@ impl RowsState {
         matches!(self, Self::Prioritised { .. })
     }
 
-    /// Checks that this can be the state of a replay that held `held` transitions; the error says why not.
     pub(crate) fn check(&self, held: u64) -> Result<(), &'static str> {
         let Self::Prioritised {
             highest, masses, ..
