@@ -96,15 +96,19 @@ async fn received(signal: &mut Option<Signal>) {
 
 /// Whether SIGHUP was set to be ignored before this process started, by the kernel's own table.
 pub fn hangup_is_ignored() -> bool {
-    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-    ignored_signals(&status) & (1 << (Number::SIGHUP as u32 - 1)) != 0
+    is_set("SigIgn:", Number::SIGHUP as u32 - 1)
 }
 
-/// The mask of ignored signals in `/proc/PID/status`.
-fn ignored_signals(status: &str) -> u64 {
-    let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
-    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
-        .unwrap_or_default()
+/// Whether a bit of one of this process's masks is set, by the name of the mask in `/proc/PID/status`.
+pub(crate) fn is_set(mask: &str, bit: u32) -> bool {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    is_set_in(&status, mask, bit)
+}
+
+fn is_set_in(status: &str, mask: &str, bit: u32) -> bool {
+    let bits = status.lines().find_map(|line| line.strip_prefix(mask));
+    let bits = bits.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok());
+    bits.is_some_and(|bits| bits >> bit & 1 == 1)
 }
 
 /// Whether an output has lost its reader: the pipe's reader exited, or the terminal was closed. A file that cannot be written does not
@@ -132,11 +136,10 @@ mod tests {
     }
 
     #[test]
-    fn the_kernels_table_says_what_is_ignored() {
-        assert_eq!(
-            ignored_signals("Name:\tx\nSigIgn:\t0000000000001001\n"),
-            0x1001
-        );
-        assert_eq!(ignored_signals("Name:\tx\n"), 0);
+    fn the_kernels_table_says_which_bits_are_set() {
+        let status = "Name:\tx\nCapPrm:\t0000000000004000\nCapEff:\t000001ff00000001\n";
+        let set = (0..64).filter(|&bit| is_set_in(status, "CapEff:", bit));
+        assert!(set.eq([0_u32].into_iter().chain(32..41)));
+        assert!(!is_set_in(status, "SigIgn:", 0));
     }
 }

@@ -11,7 +11,7 @@ use nix::sys::{
     statvfs::statvfs,
 };
 
-use crate::process::lock_file;
+use crate::process::{lock_file, termination::is_set};
 
 /// Where the operating system keeps memory that the processes of a host share.
 pub const FOLDER: &str = "/dev/shm";
@@ -100,9 +100,14 @@ pub fn check_room(bytes: usize) -> Result<(), String> {
 
 /// Whether this process may make a file of so many bytes, as a piece of shared memory is one.
 pub(super) fn check_file_size(bytes: usize) -> Result<(), String> {
-    match getrlimit(Resource::RLIMIT_FSIZE) {
-        Ok((most, _)) if most < bytes as u64 => Err(format!(
-            "this process may write files of {} KiB, {} KiB are needed: raise `ulimit -f`",
+    let most = getrlimit(Resource::RLIMIT_FSIZE).ok().map(|it| it.0);
+    check_limit(most, bytes, "write files of", "-f")
+}
+
+fn check_limit(most: Option<u64>, bytes: usize, to: &str, option: &str) -> Result<(), String> {
+    match most {
+        Some(most) if most < bytes as u64 => Err(format!(
+            "this process may {to} {} KiB, {} KiB are needed: raise `ulimit {option}`",
             most >> 10,
             bytes >> 10
         )),
@@ -142,20 +147,12 @@ pub(super) fn take_room<T>(
 
 /// Whether this process may lock `bytes` bytes, as zenoh does with the shared memory that it makes and that it reads.
 pub fn check_lockable(bytes: usize) -> Result<(), String> {
-    match lockable_bytes() {
-        Some(most) if most < bytes as u64 => Err(format!(
-            "this process may lock {} KiB of memory, {} KiB are needed: raise `ulimit -l`",
-            most >> 10,
-            bytes >> 10
-        )),
-        _ => Ok(()),
-    }
+    check_limit(lockable_bytes(), bytes, "lock memory of", "-l")
 }
 
 /// Bytes that this process may lock; none if there is no limit.
 pub fn lockable_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    if may_lock_all(&status) {
+    if is_set("CapEff:", CAP_IPC_LOCK) {
         return None;
     }
     // A system without the limit refuses in its own words when memory is locked.
@@ -166,13 +163,6 @@ pub fn lockable_bytes() -> Option<u64> {
         Err(_) => soft,
     };
     (most != nix::sys::resource::RLIM_INFINITY).then_some(most)
-}
-
-/// Whether a process with this `/proc/PID/status` has [`CAP_IPC_LOCK`].
-fn may_lock_all(status: &str) -> bool {
-    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
-    let bits = effective.and_then(|it| u64::from_str_radix(it.trim(), 16).ok());
-    bits.is_some_and(|bits| bits >> CAP_IPC_LOCK & 1 == 1)
 }
 
 #[cfg(test)]
@@ -192,14 +182,5 @@ mod tests {
         assert!(trust.ask(), "one loss, as something arrived in between");
         trust.lost();
         assert_eq!((0..10 * AVOID_COUNT).filter(|_| trust.ask()).count(), 0);
-    }
-
-    #[test]
-    fn the_right_to_lock_all_memory_is_a_bit_of_the_effective_set() {
-        let status = |bits| format!("Name:\tx\nCapPrm:\t0000000000004000\nCapEff:\t{bits}\n");
-        assert!(may_lock_all(&status("0000000000004000")));
-        assert!(may_lock_all(&status("000001ffffffffff")));
-        assert!(!may_lock_all(&status("00000000a80425fb")));
-        assert!(!may_lock_all("Name:\tx\n"));
     }
 }
