@@ -209,15 +209,8 @@ mod tests {
         let maze = Maze::new();
         let places = maze.items.len();
         assert!((0..places as u16).all(|place| maze.distance(maze.agent_start, place) < u8::MAX));
-        assert_eq!(places, 196);
-        assert_eq!(maze.pellets, 187);
-        assert_eq!(
-            maze.items
-                .iter()
-                .filter(|&&item| item == Item::Boost)
-                .count(),
-            4
-        );
+        let boosts = maze.items.iter().filter(|&&item| item == Item::Boost);
+        assert_eq!((places, maze.pellets, boosts.count()), (196, 187, 4));
         assert_eq!(maze.walls().iter().filter(|&&wall| !wall).count(), places);
     }
 
@@ -236,27 +229,19 @@ mod tests {
         let maze = Maze::new();
         let house = maze.ghost_starts;
         for place in 0..maze.items.len() as u16 {
-            assert!(
-                maze.open(place).count_ones() >= 2 || house.contains(&place),
-                "pixel {}",
-                maze.pixel(place)
-            );
+            let a = maze.pixel(place);
+            let is_dead_end = maze.open(place).count_ones() < 2;
+            assert!(!is_dead_end || house.contains(&place), "pixel {a}");
             for direction in 0..4 {
                 let there = maze.next(place, direction);
-                assert!(
-                    there == place || maze.next(there, direction ^ 1) == place,
-                    "moves can be undone"
-                );
-                let (a, b) = (maze.pixel(place), maze.pixel(there));
-                assert!(
-                    a.abs_diff(b) <= WIDTH && (a / WIDTH == b / WIDTH || a % WIDTH == b % WIDTH)
-                );
-                let around = a / WIDTH == b / WIDTH && a.abs_diff(b) > 1;
-                assert!(
-                    !around || a / WIDTH == 9,
-                    "a second tunnel in row {}",
-                    a / WIDTH
-                );
+                let is_undone = maze.next(there, direction ^ 1) == place;
+                assert!(there == place || is_undone, "pixel {a}");
+                let b = maze.pixel(there);
+                let (row, is_in_row) = (a / WIDTH, a / WIDTH == b / WIDTH);
+                let is_in_line = is_in_row || a % WIDTH == b % WIDTH;
+                assert!(a.abs_diff(b) <= WIDTH && is_in_line, "pixel {a}");
+                let around = is_in_row && a.abs_diff(b) > 1;
+                assert!(!around || row == 9, "a second tunnel in row {row}");
             }
         }
     }

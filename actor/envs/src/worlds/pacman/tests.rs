@@ -73,14 +73,8 @@ fn the_first_frame_shows_everything() {
     let mut world = PacmanWorld::new(&config(), 1, 0).unwrap();
     let frame = frames(&mut world);
     let count = |colour: render::Colour| frame.chunks_exact(3).filter(|&p| p == colour).count();
-    assert_eq!(
-        (
-            count(render::AGENT),
-            count(render::PELLET),
-            count(render::BOOST)
-        ),
-        (1, 187, 4)
-    );
+    let counts = [render::AGENT, render::PELLET, render::BOOST].map(count);
+    assert_eq!(counts, [1, 187, 4]);
     assert_eq!(render::GHOST.map(count), [1; 4]);
     assert_eq!(count(render::WALL), 21 * 19 - 196);
 }
@@ -102,11 +96,8 @@ fn food_is_eaten_once() {
     let mut world = duel(&harmless(), 3);
     assert_eq!(step(&mut world, 3).0, 1.0);
     assert_eq!(world.envs[0].pellets_left, 186);
-    assert_eq!(
-        step(&mut world, 4).0,
-        1.0,
-        "the pellet on which the agent was put"
-    );
+    // The pellet on which the agent was put.
+    assert_eq!(step(&mut world, 4).0, 1.0);
     assert_eq!(step(&mut world, 3).0, 0.0);
     let pixel = world.maze.pixel(at(&world, 19, 9));
     assert_eq!(world.envs[0].background[pixel * 3..][..3], render::FLOOR);
@@ -136,28 +127,18 @@ fn the_game_starts_again_after_an_end() {
     assert_ne!(frames(&mut world), start);
     assert_eq!(step(&mut world, 0).1, StepEnd::Terminal);
     assert_eq!(frames(&mut world), start);
-    assert_eq!(
-        (world.envs[0].pellets_left, world.envs[0].episode_step),
-        (187, 0)
-    );
+    let game = &world.envs[0];
+    assert_eq!((game.pellets_left, game.episode_step), (187, 0));
 }
 
 #[test]
 fn contact_with_a_harmless_ghost_is_nothing() {
-    let mut world = duel(
-        &PacmanConfig {
-            lethal: [false, true, true, true],
-            ..config()
-        },
-        1,
-    );
+    let lethal = [false, true, true, true];
+    let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
     assert_eq!(step(&mut world, 0), (1.0, StepEnd::Running));
     assert_eq!(world.envs[0].ghosts[0].place, world.envs[0].agent);
-    assert_eq!(
-        step(&mut world, 0),
-        (0.0, StepEnd::Running),
-        "it stays, and still does nothing"
-    );
+    // It stays, and still does nothing.
+    assert_eq!(step(&mut world, 0), (0.0, StepEnd::Running));
 }
 
 #[test]
@@ -166,11 +147,9 @@ fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
         let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
         world.envs[0].boost_left = 5;
         assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
+        // Back at its start, wandering.
         let home = Ghost::at(world.maze.ghost_starts[0]);
-        assert_eq!(
-            world.envs[0].ghosts[0], home,
-            "back at its start, wandering"
-        );
+        assert_eq!(world.envs[0].ghosts[0], home);
     }
 }
 
@@ -182,33 +161,18 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
     world.envs[0].agent = beside;
     world.envs[0].ghosts = [boost, away, away, away].map(Ghost::at);
     world.envs[0].ghosts[0].mode = Mode::Follow;
-    assert_eq!(
-        step(&mut world, 3),
-        (5.0 + 20.0, StepEnd::Running),
-        "protected while taking it"
-    );
-    for protected in 1..=11 {
-        let pixel = world.maze.pixel(boost) * 3;
-        let colour = if protected <= 10 {
-            render::AGENT_BOOSTED
-        } else {
-            render::AGENT
+    // In the step in which it is taken.
+    assert_eq!(step(&mut world, 3), (5.0 + 20.0, StepEnd::Running));
+    let pixel = world.maze.pixel(boost) * 3;
+    for after in 1..=11 {
+        let (colour, expected) = match after {
+            11 => (render::AGENT, (-100.0, StepEnd::Terminal)),
+            _ => (render::AGENT_BOOSTED, (20.0, StepEnd::Running)),
         };
-        assert_eq!(frames(&mut world)[pixel..][..3], colour);
-        world.envs[0].ghosts[0] = Ghost {
-            mode: Mode::Follow,
-            ..Ghost::at(beside)
-        };
-        let expected = if protected <= 10 {
-            (20.0, StepEnd::Running)
-        } else {
-            (-100.0, StepEnd::Terminal)
-        };
-        assert_eq!(
-            step(&mut world, 0),
-            expected,
-            "step {protected} after the boost"
-        );
+        assert_eq!(frames(&mut world)[pixel..][..3], colour, "{after}");
+        world.envs[0].ghosts[0] = Ghost::at(beside);
+        world.envs[0].ghosts[0].mode = Mode::Follow;
+        assert_eq!(step(&mut world, 0), expected, "{after}");
     }
 }
 
@@ -295,21 +259,18 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
         temperature: 0.4,
         sweeps_per_step: 1,
     };
-    let noisy = PacmanConfig {
-        ising: Some(overlay),
-        step_limit: 40,
-        ..config()
-    };
-    let plain = PacmanConfig {
-        ising: None,
-        ..noisy.clone()
-    };
-    let seen = |config: &PacmanConfig| {
-        let mut world = PacmanWorld::new(config, 1, 8).unwrap();
+    let seen = |ising| {
+        let config = PacmanConfig {
+            ising,
+            step_limit: 40,
+            ..config()
+        };
+        let mut world = PacmanWorld::new(&config, 1, 8).unwrap();
         play(&mut world, 400, &mut ChaCha8Rng::seed_from_u64(2))
     };
     let (mut starts, mut is_start) = (vec![], true);
-    for ((a, rewards, ends), (b, bare_rewards, _)) in seen(&noisy).into_iter().zip(seen(&plain)) {
+    let both = seen(Some(overlay)).into_iter().zip(seen(None));
+    for ((a, rewards, ends), (b, bare_rewards, _)) in both {
         assert_eq!(rewards, bare_rewards);
         let mut fuchsia = 0;
         for (a, b) in a.chunks_exact(3).zip(b.chunks_exact(3)) {
@@ -321,18 +282,14 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
             }
         }
         if is_start {
-            assert!(
-                (60..140).contains(&fuchsia),
-                "half of 203 walls, more or less: {fuchsia}"
-            );
+            // Half of 203 walls, more or less.
+            assert!((60..140).contains(&fuchsia), "{fuchsia}");
             starts.push(a);
         }
         is_start = ends[0] != StepEnd::Running;
     }
-    assert!(
-        starts.windows(2).all(|pair| pair[0] != pair[1]),
-        "each start is another draw"
-    );
+    // Each start is another draw.
+    assert!(starts.windows(2).all(|pair| pair[0] != pair[1]));
 }
 
 /// The returns of 1000 episodes of uniformly random actions, mean and its standard error.

@@ -8,6 +8,11 @@ use rand_chacha::ChaCha8Rng;
 use super::tests::{alone, config, draw, engine, step};
 use super::*;
 
+fn redraw(world: &mut ProcgenWorld, env: usize) {
+    let levels = world.levels.as_mut().unwrap();
+    levels.redraw(&mut world.game, env).unwrap();
+}
+
 #[test]
 fn completed_levels_are_followed_by_levels_of_the_set() {
     let Some(_engine) = engine() else { return };
@@ -27,17 +32,13 @@ fn completed_levels_are_followed_by_levels_of_the_set() {
         for _ in 0..1000 {
             let (_, rewards, ends) = step(&mut world, &draw(&mut rng, 16));
             let set = start_level as i32..(start_level + num_levels) as i32;
-            assert!(
-                world.levels().iter().all(|level| set.contains(level)),
-                "{game}"
-            );
+            let mut levels = world.levels().iter();
+            assert!(levels.all(|level| set.contains(level)), "{game}");
             for (end, reward) in ends.into_iter().zip(rewards) {
                 if end == StepEnd::LevelChange {
                     changes += 1;
-                    assert_eq!(
-                        reward, 10.0,
-                        "{game}: the step that completed the level keeps its reward"
-                    );
+                    // The step that completed the level keeps its reward.
+                    assert_eq!(reward, 10.0, "{game}");
                 }
             }
         }
@@ -68,39 +69,23 @@ fn a_redrawn_level_is_the_level_itself() {
                 (actions, last_move) = draw();
                 step(&mut world, &actions);
             }
-            let others = (world.game.state(0).unwrap(), world.game.state(2).unwrap());
-            world
-                .levels
-                .as_mut()
-                .unwrap()
-                .redraw(&mut world.game, 1)
-                .unwrap();
-            assert!(
-                others == (world.game.state(0).unwrap(), world.game.state(2).unwrap()),
-                "{game}"
-            );
+            let others = [0, 2].map(|env| world.game.state(env).unwrap());
+            redraw(&mut world, 1);
+            let unchanged = [0, 2].map(|env| world.game.state(env).unwrap());
+            assert!(others == unchanged, "{game}");
             let mut alone = alone(engine, &config, world.levels()[1], last_move);
-            let frame = FRAME_BYTES..2 * FRAME_BYTES;
-            assert!(
-                world.game.frames()[frame.clone()] == *alone.frames(),
-                "{game}, round {round}"
-            );
+            let frame = |frames: &[u8]| frames[FRAME_BYTES..2 * FRAME_BYTES].to_vec();
+            let at = format!("{game}, round {round}");
+            assert!(frame(world.game.frames()) == alone.frames(), "{at}");
             for t in 0..40 {
                 let (actions, _) = draw();
                 let (frames, rewards, ends) = step(&mut world, &actions);
                 alone.act(&[i32::from(actions[1])]).unwrap();
-                assert_eq!(
-                    rewards[1],
-                    alone.rewards()[0],
-                    "{game}, round {round}, step {t}"
-                );
+                assert_eq!(rewards[1], alone.rewards()[0], "{at}, step {t}");
                 if ends[1] != StepEnd::Running {
                     break;
                 }
-                assert!(
-                    frames[frame.clone()] == *alone.frames(),
-                    "{game}, round {round}, step {t}"
-                );
+                assert!(frame(&frames) == alone.frames(), "{at}, step {t}");
             }
         }
     }
@@ -118,12 +103,7 @@ fn redrawn_levels_are_uniform_over_the_set_after_each_level() {
     let mut counts = [[0.0; 5]; 5];
     for _ in 0..2500 {
         let before = world.levels()[0] as usize;
-        world
-            .levels
-            .as_mut()
-            .unwrap()
-            .redraw(&mut world.game, 0)
-            .unwrap();
+        redraw(&mut world, 0);
         counts[before][world.levels()[0] as usize] += 1.0;
     }
     let chi_square_of = |row: &[f64; 5]| {
@@ -133,8 +113,5 @@ fn redrawn_levels_are_uniform_over_the_set_after_each_level() {
     };
     let chi_square: f64 = counts.iter().map(chi_square_of).sum();
     // The 99.9 % quantile of chi-square with 20 degrees of freedom.
-    assert!(
-        chi_square < 45.31,
-        "chi-square {chi_square}, counts {counts:?}"
-    );
+    assert!(chi_square < 45.31, "{chi_square}, counts {counts:?}");
 }
