@@ -262,10 +262,8 @@ mod tests {
 
     /// The actions of a life's first chunk.
     fn actions(settings: ActorSettings, incarnation: Incarnation) -> Vec<u8> {
-        let chunk = collector(settings, incarnation)
-            .unwrap()
-            .collect(0, STEPS)
-            .unwrap();
+        let mut collector = collector(settings, incarnation).unwrap();
+        let chunk = collector.collect(0, STEPS).unwrap();
         assert_eq!(chunk.actions().len(), (ENVS * STEPS) as usize);
         chunk.actions().to_vec()
     }
@@ -325,11 +323,8 @@ mod tests {
         };
         assert_ne!(actions(ladder(0.999, 8), FIRST), greedy);
         assert_eq!(actions(ladder(1e-12, 8), FIRST), greedy);
-        let said = collector(ladder(0.5, 3), FIRST).map(|_| ()).unwrap_err();
-        assert!(
-            said.to_string()
-                .contains("--set actor.epsilon_ladder.actors=4"),
-            "{said}"
-        );
+        let said = collector(ladder(0.5, 3), FIRST).err().unwrap().to_string();
+        let what_to_do = "--set actor.epsilon_ladder.actors=4";
+        assert!(said.contains(what_to_do), "{said}");
     }
 }

@@ -156,17 +156,10 @@ mod tests {
         assert_eq!(chunks[1].frames(), [3, 4, 5, 103, 104, 105]);
         assert_eq!(chunks[1].actions(), [3, 4, 5, 3, 4, 5]);
         assert_eq!((chunks[1].reward(0), chunks[1].reward(3)), (0.5, -1.0));
-        assert_eq!(
-            (chunks[1].end(0), chunks[1].end(3)),
-            (End::Running, End::Terminal)
-        );
-        let numbers = chunks.iter().map(|c| {
-            (
-                c.header.sequence,
-                c.header.first_transition,
-                c.header.weights_version,
-            )
-        });
+        let ends = [0, 3].map(|row| chunks[1].end(row));
+        assert_eq!(ends, [End::Running, End::Terminal]);
+        let headers = chunks.iter().map(|chunk| chunk.header);
+        let numbers = headers.map(|it| (it.sequence, it.first_transition, it.weights_version));
         assert_eq!(numbers.collect::<Vec<_>>(), [(0, 0, 0), (1, 6, 3)]);
     }
 }

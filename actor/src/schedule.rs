@@ -168,10 +168,8 @@ mod tests {
             (said(|ladder| ladder.actors = 1), "actors = 1 "),
             (said(|ladder| ladder.actors = 65_537), "actors = 65537 "),
         ] {
-            assert!(
-                said.starts_with(&format!("actor.epsilon_ladder.{key}")),
-                "{said}"
-            );
+            let place = format!("actor.epsilon_ladder.{key}");
+            assert!(said.starts_with(&place), "{said}");
         }
     }
 }

@@ -302,43 +302,27 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut cache = cache_in(folder.path());
         let unpack = |_: &Path, _: Option<&Path>| Err(ProcgenError::Fetch("no route".to_owned()));
-        let said = |cache: &Cache, lines| {
+        let says = |cache: &Cache, lines, words: &str| {
             let mut told = 0;
             let error = Engine::install_in(cache, LIBRARY_SHA256, &mut |_| told += 1, unpack);
             let text = error.unwrap_err().to_string();
+            assert!(text.contains(words), "{text}");
             assert!(text.ends_with(WITHOUT_ENGINE) && told == lines, "{text}");
-            text
         };
         cache.offline = true;
-        let text = said(&cache, 0);
-        assert!(
-            text.contains("it is not installed, and DRIML_OFFLINE=1 forbids"),
-            "{text}"
-        );
-        assert!(
-            text.contains("pip download procgen==0.10.7 --no-deps"),
-            "{text}"
-        );
+        let forbidden = "it is not installed, and DRIML_OFFLINE=1 forbids";
+        says(&cache, 0, forbidden);
+        says(&cache, 0, "pip download procgen==0.10.7 --no-deps");
         cache.offline = false;
-        let text = said(&cache, 1);
-        assert!(
-            text.starts_with("fetching procgen's engine: no route"),
-            "{text}"
-        );
+        says(&cache, 1, "fetching procgen's engine: no route");
         let error = install(&cache, LIBRARY_SHA256).unwrap_err().to_string();
         assert!(error.contains("libenv.so: its SHA-256 is"), "{error}");
         fs::write(cache.folder.join(WHEEL_NAME), b"no wheel").unwrap();
-        let text = said(&cache, 1);
-        let expected = format!("expected {WHEEL_SHA256}");
-        assert!(text.contains(&expected), "{text}");
+        says(&cache, 1, &format!("expected {WHEEL_SHA256}"));
         assert_eq!(left(&cache), ["install.lock"]);
         // A cache folder that cannot be written: a file is in its place.
         cache.folder = cache.folder.join("install.lock");
-        let text = said(&cache, 0);
-        assert!(
-            text.contains("installing procgen's engine: making "),
-            "{text}"
-        );
+        says(&cache, 0, "installing procgen's engine: making ");
     }
 
     #[test]

@@ -47,18 +47,10 @@ fn every_game_steps() {
     let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let mut envs = VecGame::new(engine, &options(game)).unwrap();
-        assert_eq!(
-            envs.first(),
-            [1; 4],
-            "{game}: the first frame is a first one"
-        );
-        assert_eq!(envs.rewards(), [0.0; 4], "{game}");
-        assert!(
-            envs.level_seed()
-                .iter()
-                .all(|level| (0..500).contains(level)),
-            "{game}"
-        );
+        let at_first = (envs.first(), envs.rewards());
+        assert_eq!(at_first, (&[1; 4][..], &[0.0; 4][..]), "{game}");
+        let mut levels = envs.level_seed().iter();
+        assert!(levels.all(|level| (0..500).contains(level)), "{game}");
         let start = envs.frames().to_vec();
         for t in 0..50 {
             envs.act(&actions(t, 4)).unwrap();
@@ -86,15 +78,11 @@ fn wrong_actions_are_refused_and_step_nothing() {
 #[test]
 fn settings_that_would_end_the_process_are_errors() {
     let Some(engine) = engine() else { return };
-    let memory = Options {
-        distribution_mode: DistributionMode::Memory,
-        ..options(Game::Bigfish)
-    };
+    let mut memory = options(Game::Bigfish);
+    memory.distribution_mode = DistributionMode::Memory;
     let text = VecGame::new(engine, &memory).err().unwrap().to_string();
-    assert!(
-        text.contains("bigfish has no distribution mode \"memory\""),
-        "{text}"
-    );
+    let why = "bigfish has no distribution mode \"memory\"";
+    assert!(text.contains(why), "{text}");
 }
 
 #[test]
@@ -102,15 +90,12 @@ fn a_state_put_back_repeats_the_trajectory_in_any_environment() {
     let Some(engine) = engine() else { return };
     for game in Game::ALL {
         let mut envs = VecGame::new(engine, &options(game)).unwrap();
-        let mut other = VecGame::new(
-            engine,
-            &Options {
-                num_envs: 1,
-                rand_seed: 99,
-                ..options(game)
-            },
-        )
-        .unwrap();
+        let alone = Options {
+            num_envs: 1,
+            rand_seed: 99,
+            ..options(game)
+        };
+        let mut other = VecGame::new(engine, &alone).unwrap();
         for t in 0..20 {
             envs.act(&actions(t, 4)).unwrap();
         }
@@ -119,16 +104,10 @@ fn a_state_put_back_repeats_the_trajectory_in_any_environment() {
         other.set_state(0, &state).unwrap();
         let size = other.frames().len();
         for t in 20..60 {
-            assert!(
-                other.frames() == &envs.frames()[2 * size..3 * size],
-                "{game}, step {t}"
-            );
-            assert_eq!(
-                other.level_seed()[0],
-                envs.level_seed()[2],
-                "{game}, step {t}"
-            );
-            assert_eq!(other.first()[0], envs.first()[2], "{game}, step {t}");
+            let frame = &envs.frames()[2 * size..3 * size];
+            let expected = (frame, envs.level_seed()[2], envs.first()[2]);
+            let found = (other.frames(), other.level_seed()[0], other.first()[0]);
+            assert!(found == expected, "{game}, step {t}");
             let actions = actions(t, 4);
             envs.act(&actions).unwrap();
             other.act(&actions[2..3]).unwrap();
@@ -234,10 +213,8 @@ fn time_limits_are_the_engines() {
     let Some(engine) = engine() else { return };
     use DistributionMode::{Easy, Extreme, Hard, Memory};
     for game in Game::ALL {
-        for mode in [Easy, Hard, Extreme, Memory]
-            .into_iter()
-            .filter(|mode| game.has(*mode))
-        {
+        let modes = [Easy, Hard, Extreme, Memory].into_iter();
+        for mode in modes.filter(|mode| game.has(*mode)) {
             let options = Options {
                 num_envs: 1,
                 distribution_mode: mode,
@@ -245,17 +222,11 @@ fn time_limits_are_the_engines() {
             };
             let mut envs = VecGame::new(engine, &options).unwrap();
             let limit = i32::try_from(game.time_limit_steps(mode)).unwrap();
-            assert_eq!(
-                time_limit_and_time(&envs.state(0).unwrap()),
-                (limit, 0),
-                "{game} {mode}"
-            );
+            let first = time_limit_and_time(&envs.state(0).unwrap());
             envs.act(&[4]).unwrap();
-            assert_eq!(
-                time_limit_and_time(&envs.state(0).unwrap()),
-                (limit, 1),
-                "{game} {mode}"
-            );
+            let second = time_limit_and_time(&envs.state(0).unwrap());
+            let expected = [(limit, 0), (limit, 1)];
+            assert_eq!([first, second], expected, "{game} {mode}");
         }
     }
 }

@@ -151,10 +151,7 @@ mod tests {
         let lines = wrap(text, 12.0, 120.0);
         assert!(lines.len() > 2);
         assert_eq!(lines.join(" "), text);
-        assert!(
-            lines
-                .iter()
-                .all(|line| width(line, 12.0, Weight::Bold) <= 120.0)
-        );
+        let mut widths = lines.iter().map(|line| width(line, 12.0, Weight::Bold));
+        assert!(widths.all(|width| width <= 120.0));
     }
 }
