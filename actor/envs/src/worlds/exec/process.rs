@@ -6,7 +6,7 @@ use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStderr, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -102,15 +102,13 @@ impl WorldProcess {
         let (to, from) = (child.stdin.take(), child.stdout.take().expect(pipe));
         let words = Arc::new(Mutex::new(VecDeque::new()));
         let (speaks, spoken) = channel();
-        let log = Log {
-            stderr: child.stderr.take().expect(pipe),
-            words: Arc::clone(&words),
-            level,
-            _speaks: speaks,
-        };
-        thread::Builder::new()
-            .name("world-stderr".into())
-            .spawn(move || log.keep())?;
+        let (stderr, log) = (child.stderr.take().expect(pipe), Arc::clone(&words));
+        let keeper = thread::Builder::new().name("world-stderr".into());
+        keeper.spawn(move || {
+            keep(stderr, &log, level);
+            // There is nothing more to say.
+            drop(speaks);
+        })?;
         Ok(Self {
             command: command.into(),
             guard,
@@ -290,40 +288,30 @@ fn describe(status: ExitStatus) -> String {
     }
 }
 
-struct Log {
-    stderr: ChildStderr,
-    words: Arc<Mutex<VecDeque<String>>>,
-    level: Level,
-    /// Dropped when there is nothing more to say.
-    _speaks: Sender<()>,
-}
-
-impl Log {
-    /// Writes every line into this process's log and keeps the last.
-    fn keep(self) {
-        let mut stderr = BufReader::new(self.stderr);
-        let mut line = Vec::new();
-        loop {
-            line.clear();
-            let limit = LINE_MAX as u64;
-            match (&mut stderr).take(limit).read_until(b'\n', &mut line) {
-                Ok(0) | Err(_) => return,
-                Ok(_) => {}
-            }
-            let text = String::from_utf8_lossy(&line);
-            let text: String = text.trim_end().chars().take(WORD_LENGTH_MAX).collect();
-            if text.is_empty() {
-                continue;
-            }
-            match self.level {
-                Level::INFO => tracing::info!("world: {text}"),
-                _ => tracing::debug!("world: {text}"),
-            }
-            let mut words = self.words.lock().unwrap_or_else(PoisonError::into_inner);
-            if words.len() == WORDS_MAX {
-                words.pop_front();
-            }
-            words.push_back(text);
+/// Writes every line of a world's stderr into this process's log and keeps the last ones.
+fn keep(stderr: ChildStderr, words: &Mutex<VecDeque<String>>, level: Level) {
+    let mut stderr = BufReader::new(stderr);
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        let limit = LINE_MAX as u64;
+        match (&mut stderr).take(limit).read_until(b'\n', &mut line) {
+            Ok(0) | Err(_) => return,
+            Ok(_) => {}
         }
+        let text = String::from_utf8_lossy(&line);
+        let text: String = text.trim_end().chars().take(WORD_LENGTH_MAX).collect();
+        if text.is_empty() {
+            continue;
+        }
+        match level {
+            Level::INFO => tracing::info!("world: {text}"),
+            _ => tracing::debug!("world: {text}"),
+        }
+        let mut words = words.lock().unwrap_or_else(PoisonError::into_inner);
+        if words.len() == WORDS_MAX {
+            words.pop_front();
+        }
+        words.push_back(text);
     }
 }

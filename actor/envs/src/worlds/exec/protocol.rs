@@ -171,15 +171,11 @@ impl Block {
 
     /// Reads rewards [N] and the numbers of ends [N].
     pub(super) fn read_results(&mut self, rewards: &mut [f32]) -> io::Result<&[u8]> {
-        self.file
-            .read_exact_at(&mut self.results, self.layout.rewards as u64)?;
-        let (numbers, ends) = self
-            .results
-            .split_at(self.layout.ends - self.layout.rewards);
-        for (reward, bytes) in rewards
-            .iter_mut()
-            .zip(numbers.chunks_exact(size_of::<f32>()))
-        {
+        let (first, ends) = (self.layout.rewards, self.layout.ends);
+        self.file.read_exact_at(&mut self.results, first as u64)?;
+        let (numbers, ends) = self.results.split_at(ends - first);
+        let numbers = numbers.chunks_exact(size_of::<f32>());
+        for (reward, bytes) in rewards.iter_mut().zip(numbers) {
             *reward = f32::from_ne_bytes(bytes.try_into().expect("four bytes"));
         }
         Ok(&ends[..self.copies])

@@ -205,18 +205,11 @@ impl Field {
                 *pixel = (bits >> bit & 1) as u8 * 255;
             }
         }
-        let (top, left) = self.now.origin;
-        for (row, spins) in self
-            .patch
-            .spins()
-            .chunks_exact(config.patch_size)
-            .enumerate()
-        {
+        let ((top, left), side) = (self.now.origin, config.patch_size);
+        for (row, spins) in self.patch.spins().chunks_exact(side).enumerate() {
             let start = (top + row) * config.lattice_size + left;
-            for (pixel, &spin) in self.now.frame[start..start + config.patch_size]
-                .iter_mut()
-                .zip(spins)
-            {
+            let pixels = &mut self.now.frame[start..start + side];
+            for (pixel, &spin) in pixels.iter_mut().zip(spins) {
                 *pixel = if spin > 0 { 255 } else { 0 };
             }
         }
