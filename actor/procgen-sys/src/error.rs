@@ -1,5 +1,6 @@
 //! What can go wrong with the engine, and what to do about it.
 
+use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -30,13 +31,8 @@ pub enum ProcgenError {
     #[error("fetching procgen's engine: {0} {WITHOUT_ENGINE}")]
     Fetch(String),
     /// The wheel, or the library in it, is not the pinned one.
-    #[error("unpacking {}: {reason}; delete it and fetch it again {WITHOUT_ENGINE}", .path.display())]
-    Wheel {
-        /// The wheel's file, or the one from it.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
+    #[error("unpacking {0}; delete it and fetch it again {WITHOUT_ENGINE}")]
+    Wheel(String),
     /// The file system reports an error, such as a full disk.
     #[error("installing procgen's engine: {doing} {}: {source} {WITHOUT_ENGINE}", .path.display())]
     Io {
@@ -51,13 +47,8 @@ pub enum ProcgenError {
     #[error("procgen's engine cannot run here: {0} {WITHOUT_ENGINE}")]
     Machine(String),
     /// The library is missing, or the loader rejects it.
-    #[error("loading procgen's engine from {}: {reason} {WITHOUT_ENGINE}", .path.display())]
-    Library {
-        /// The library's file.
-        path: PathBuf,
-        /// What is wrong with it and what to do.
-        reason: String,
-    },
+    #[error("loading procgen's engine from {0} {WITHOUT_ENGINE}")]
+    Library(String),
     /// The engine would end the process with these settings; what to do instead.
     #[error("procgen settings: {0}")]
     Options(String),
@@ -73,11 +64,8 @@ pub enum ProcgenError {
 }
 
 impl ProcgenError {
-    pub(crate) fn library(path: &Path, reason: impl Into<String>) -> ProcgenError {
-        ProcgenError::Library {
-            path: path.to_owned(),
-            reason: reason.into(),
-        }
+    pub(crate) fn library(path: &Path, reason: impl Display) -> ProcgenError {
+        ProcgenError::Library(format!("{}: {reason}", path.display()))
     }
 
     /// Adds to an error of the file system what was being done, and with which file.

@@ -67,8 +67,8 @@ impl Engine {
     pub fn other(library: &Path) -> Result<Engine, ProcgenError> {
         library::check_machine()?;
         // The loader takes a name without a folder for one of the system's.
-        let library = fs::canonicalize(library)
-            .map_err(|error| ProcgenError::library(library, error.to_string()))?;
+        let library =
+            fs::canonicalize(library).map_err(|error| ProcgenError::library(library, error))?;
         let mut folders = library.ancestors().skip(1).take(2);
         let assets =
             folders.find_map(|folder| Some(folder.join("assets")).filter(|it| it.is_dir()));

@@ -75,7 +75,7 @@ fn open(path: &Path) -> Result<Api, ProcgenError> {
     let library = library.map_err(|error| explain(path, &error.to_string()))?;
     // SAFETY: the types are those of gym3's `libenv.h`, and the version is checked before any other function is called.
     let found = unsafe { functions(&library) };
-    let (version, api) = found.map_err(|error| ProcgenError::library(path, error.to_string()))?;
+    let (version, api) = found.map_err(|error| ProcgenError::library(path, error))?;
     // Keep it loaded for the rest of the process, so that the function pointers stay valid.
     std::mem::forget(library);
     // SAFETY: `libenv_version` takes nothing and returns a constant.

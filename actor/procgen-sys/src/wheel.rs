@@ -120,11 +120,10 @@ pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError
     if actual == expected {
         return Ok(());
     }
-    let reason = format!("its SHA-256 is {actual}, expected {expected}");
-    Err(ProcgenError::Wheel {
-        path: path.to_owned(),
-        reason,
-    })
+    let path = path.display();
+    Err(ProcgenError::Wheel(format!(
+        "{path}: its SHA-256 is {actual}, expected {expected}"
+    )))
 }
 
 /// Makes a folder, and those above it, in which other users can change nothing.
