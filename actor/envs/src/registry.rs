@@ -200,18 +200,17 @@ impl WorldName {
             let Variants { names, is_open, .. } = variants();
             let one = (names.is_empty() && !is_open).then_some(None);
             let variants = one.into_iter().chain(names.iter().copied().map(Some));
-            variants.map(|variant| WorldName {
-                kind,
-                variant,
-                library: None,
-            })
+            variants.map(|variant| Self::of(kind, variant))
         });
-        let own = plugin::kinds().map(|kind| WorldName {
+        ours.chain(plugin::kinds().map(|kind| Self::of(kind, None)))
+    }
+
+    const fn of(kind: &'static str, variant: Option<&'static str>) -> Self {
+        Self {
             kind,
-            variant: None,
+            variant,
             library: None,
-        });
-        ours.chain(own)
+        }
     }
 
     /// A name with something of a person's own in it, such as a command.
@@ -228,17 +227,18 @@ impl WorldName {
         let (kind, _) = KINDS
             .iter()
             .find(|(kind, variants)| *kind == first && variants().is_open)?;
-        (!rest.trim().is_empty()).then(|| Self {
-            kind,
-            variant: Some(kept(rest)),
-            library: None,
-        })
+        (!rest.trim().is_empty()).then(|| Self::of(kind, Some(kept(rest))))
     }
 
     /// The command that makes the world, if it runs in its own process.
     pub fn command(self) -> Option<&'static str> {
-        let (_, variants) = KINDS.iter().find(|(kind, _)| *kind == self.kind)?;
-        self.variant.filter(|_| variants().is_open)
+        self.variant.filter(|_| self.variants().is_open)
+    }
+
+    /// What distinguishes worlds of its kind.
+    fn variants(self) -> Variants {
+        let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
+        known.map_or(Variants::NONE, |(_, variants)| variants())
     }
 
     /// The world's code outside this program: a command, or a library by its path.
@@ -266,8 +266,7 @@ impl WorldName {
 
     /// The settings and their values that say which of several worlds of one kind it is.
     pub fn settings(self) -> impl Iterator<Item = (&'static str, &'static str)> {
-        let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
-        let variant = known.and_then(|(_, variants)| Some((variants().key, self.variant?)));
+        let variant = self.variant.map(|name| (self.variants().key, name));
         let library = self.library.map(|path| ("library", path));
         variant.into_iter().chain(library)
     }
