@@ -19,23 +19,13 @@ const RING_RADIUS: f64 = 5.0;
 /// Share of an axis's range that is left free at its ends.
 const SLACK: f64 = 0.05;
 
-/// How an axis spreads its values.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) enum Scale {
-    /// Equal steps are equally long.
-    #[default]
-    Linear,
-    /// By their logarithm; values of 0 and below are left out.
-    Log,
-}
-
-/// One axis of a chart: its name, its scale and what it must span.
+/// One axis of a chart: its name, how it spreads values and what it must span.
 #[derive(Clone, Debug, Default)]
 pub struct Axis {
     /// What it counts, with its unit.
     pub label: String,
-    /// How it spreads its values.
-    pub(super) scale: Scale,
+    /// Whether it spreads values by their logarithm; those of 0 and below are left out.
+    is_log: bool,
     /// Values that it shows whatever the series have.
     pub shows: Vec<f64>,
     /// Names of 0, 1, 2, ... instead of numbers; empty for numbers.
@@ -63,7 +53,7 @@ impl Axis {
     /// A logarithmic axis.
     pub fn log(label: &str) -> Self {
         Self {
-            scale: Scale::Log,
+            is_log: true,
             ..Self::linear(label)
         }
     }
@@ -75,14 +65,14 @@ impl Axis {
     }
 
     fn keeps(&self, value: f64) -> bool {
-        value.is_finite() && (self.scale == Scale::Linear || value > 0.0)
+        value.is_finite() && (!self.is_log || value > 0.0)
     }
 
     /// The value where equal steps are equally long: itself or its logarithm.
     fn spread(&self, value: f64) -> f64 {
-        match self.scale {
-            Scale::Linear => value,
-            Scale::Log => value.log10(),
+        match self.is_log {
+            true => value.log10(),
+            false => value,
         }
     }
 
@@ -102,9 +92,9 @@ impl Axis {
         if !self.names.is_empty() {
             return (0..self.names.len()).map(|place| place as f64).collect();
         }
-        match self.scale {
-            Scale::Linear => ticks::linear(low, high, (length / each).max(2.0) as usize),
-            Scale::Log => ticks::log(10f64.powf(low), 10f64.powf(high)),
+        match self.is_log {
+            true => ticks::log(10f64.powf(low), 10f64.powf(high)),
+            false => ticks::linear(low, high, (length / each).max(2.0) as usize),
         }
     }
 }
