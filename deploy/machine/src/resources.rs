@@ -182,42 +182,27 @@ mod tests {
     #[test]
     fn control_groups_leave_what_the_tightest_leaves_and_cached_files_are_free() {
         let root = tempfile::tempdir().unwrap();
-        let group = |path: &str, files: &[(&str, &str)]| {
+        let group = |path: &str, files: &str| {
             let folder = root.path().join(path);
             fs::create_dir_all(&folder).unwrap();
-            for (name, text) in files {
+            for (name, text) in files.split(", ").filter_map(|it| it.split_once(' ')) {
                 fs::write(folder.join(name), format!("{text}\n")).unwrap();
             }
         };
         let left = |groups| left_by_groups(root.path(), groups);
         assert_eq!(left("0::/\n"), None);
         let stat = "anon 500\nfile 450\nactive_file 200\ninactive_file 100";
-        group(
-            "job",
-            &[
-                ("memory.max", "1000"),
-                ("memory.current", "900"),
-                ("memory.stat", stat),
-            ],
-        );
-        group(
-            "job/step",
-            &[("memory.max", "max"), ("memory.current", "800")],
-        );
+        let files = format!("memory.max 1000, memory.current 900, memory.stat {stat}");
+        group("job", &files);
+        group("job/step", "memory.max max, memory.current 800");
         // The parent's limit holds, less what is in use beside 300 bytes of files.
         assert_eq!(left("0::/job/step\n"), Some(400));
-        group("", &[("memory.max", "700"), ("memory.current", "600")]);
+        group("", "memory.max 700, memory.current 600");
         assert_eq!(left("0::/job/step\n"), Some(100));
         assert_eq!(left("0::/of/the/host\n"), Some(100));
         let stat = "active_file 1\ntotal_active_file 30\ntotal_inactive_file 20";
-        let limits = [
-            ("memory.limit_in_bytes", "90"),
-            ("memory.usage_in_bytes", "80"),
-        ];
-        group(
-            "memory/job",
-            &[&limits[..], &[("memory.stat", stat)]].concat(),
-        );
+        let limits = "memory.limit_in_bytes 90, memory.usage_in_bytes 80";
+        group("memory/job", &format!("{limits}, memory.stat {stat}"));
         assert_eq!(left("4:cpu,cpuacct:/job\n3:memory:/job\n"), Some(60));
         assert_eq!(left("4:cpu,cpuacct:/job\n"), None);
     }
