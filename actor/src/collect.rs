@@ -91,19 +91,10 @@ impl Collector {
         let world = world.map_err(no_world)?;
         let shape = world.frame_shape();
         let sent = (spec.frame_height as usize, spec.frame_width as usize);
-        let (whole_height, whole_width) = settings.input.whole_frame(sent);
-        let promised = (
-            whole_height as u32,
-            whole_width as u32,
-            spec.frame_channels,
-            spec.num_actions,
-        );
-        let given = (
-            shape.height as u32,
-            shape.width as u32,
-            shape.channels as u32,
-            actions.len() as u32,
-        );
+        let (height, width) = settings.input.whole_frame(sent);
+        let (channels, num_actions) = (spec.frame_channels as usize, spec.num_actions as usize);
+        let promised = (height, width, channels, num_actions);
+        let given = (shape.height, shape.width, shape.channels, actions.len());
         if promised != given {
             return Err(ActError::Other(format!(
                 "the world {} gives (height, width, channels, actions) {given:?}, the run spec promises {promised:?}: \

@@ -114,12 +114,8 @@ impl ActorSettings {
     /// # Errors
     /// Too many, or chunks that are longer than those of this run may be; what to do.
     pub fn set_envs(&mut self, envs: u32) -> Result<(), ConfigError> {
-        let Config {
-            steps_per_chunk,
-            round_transitions_max,
-            ..
-        } = self.actor;
-        let most = transitions_max(self.actor.envs, steps_per_chunk, round_transitions_max);
+        let (steps, round) = (self.actor.steps_per_chunk, self.actor.round_transitions_max);
+        let most = transitions_max(self.actor.envs, steps, round);
         self.actor.envs = envs;
         self.actor.validate()?;
         self.check_chunk()?;
@@ -152,17 +148,12 @@ impl ActorSettings {
 
     /// Checks that the longest chunk fits a message.
     pub fn check_chunk(&self) -> Result<(), ConfigError> {
-        let Config {
-            envs,
-            steps_per_chunk,
-            ..
-        } = self.actor;
-        let steps = self.actor.chunk_steps(1);
-        let bytes = u64::from(envs) * u64::from(steps) * self.transition_bytes() as u64;
+        let transitions = u64::from(self.actor.envs) * u64::from(self.actor.chunk_steps(1));
+        let bytes = transitions * self.transition_bytes() as u64;
         check(
             bytes <= PAYLOAD_BYTES_MAX as u64,
             "actor.steps_per_chunk",
-            steps_per_chunk,
+            self.actor.steps_per_chunk,
             || "a chunk of so many steps of so many environments (actor.envs) is larger than a message may be, 512 MiB: use fewer",
         )
     }

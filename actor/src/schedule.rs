@@ -61,11 +61,7 @@ impl Schedule {
 
 /// `base^(1 + alpha * i / (N - 1))` for actor i of N.
 fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, ActError> {
-    let EpsilonLadder {
-        base,
-        alpha,
-        actors,
-    } = *ladder;
+    let actors = ladder.actors;
     if actor >= actors {
         return Err(ActError::Other(format!(
             "actor {actor} is beyond the {actors} of actor.epsilon_ladder.actors, whose numbers begin at 0: start it with another --id, or \
@@ -74,7 +70,7 @@ fn ladder_epsilon(ladder: &EpsilonLadder, actor: u32) -> Result<f64, ActError> {
         )));
     }
     let down = f64::from(actor) / f64::from(actors - 1);
-    Ok(base.powf(1.0 + alpha * down))
+    Ok(ladder.base.powf(1.0 + ladder.alpha * down))
 }
 
 #[cfg(test)]
