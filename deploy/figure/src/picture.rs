@@ -97,13 +97,8 @@ impl Picture {
     /// Bars that stand on the lower edge of `area` beside each other, of these heights in 0..=1; and a line across at `mark`, a place in
     /// 0..=1 from left to right.
     pub fn bars(&mut self, area: Area, heights: &[f64], mark: Option<f64>) {
-        let Rect {
-            x,
-            y,
-            width,
-            height,
-            ..
-        } = area.rect();
+        let sides = [area.x, area.y, area.width, area.height];
+        let [x, y, width, height] = sides.map(|length| length as f64);
         let step = width / heights.len().max(1) as f64;
         let gap = if step > 3.0 { 1.0 } else { 0.0 };
         let bars = heights.iter().enumerate().map(|(i, share)| {
@@ -162,14 +157,6 @@ impl Picture {
         let pixels = self.0.pixels().iter();
         // A card lies under everything, so nothing is transparent.
         pixels.map(|it| [it.red(), it.green(), it.blue()]).collect()
-    }
-}
-
-impl Area {
-    fn rect(self) -> Rect {
-        let [x, y, width, height] =
-            [self.x, self.y, self.width, self.height].map(|length| length as f64);
-        Rect::new(x, y, width, height)
     }
 }
 

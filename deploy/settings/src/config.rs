@@ -61,10 +61,7 @@ impl EvaluationConfig {
     }
 
     fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
-        let Self {
-            every_updates,
-            episodes,
-        } = *self;
+        let (every_updates, episodes) = (self.every_updates, self.episodes);
         if every_updates == 0 || !every_updates.is_multiple_of(checkpoint_period_updates) {
             return Err(usage!(
                 "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every \

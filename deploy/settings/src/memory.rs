@@ -50,18 +50,14 @@ pub(crate) fn fit(
         return fit_compressed(table, &run, &replay, &room);
     }
     let bytes_each = replay_bytes_each(&run) + sampling_bytes_each(&replay);
-    let Room {
-        free,
-        bytes,
-        bytes_max,
-    } = &room;
+    let (free, bytes, bytes_max) = (&room.free, room.bytes, room.bytes_max);
     let asked = replay.capacity_transitions;
     let capacity = bytes / bytes_each;
     if capacity_set && asked > bytes_max / bytes_each {
         return Err(usage!(
             "replay.capacity_transitions = {asked} needs {}, and may take {}, as {free} are free: --set replay.capacity_transitions={capacity}",
             gib(asked.saturating_mul(bytes_each)),
-            gib(*bytes_max),
+            gib(bytes_max),
         ));
     }
     if capacity_set || asked <= capacity {

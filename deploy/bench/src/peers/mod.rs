@@ -215,19 +215,15 @@ fn describe(comparison: &Comparison) -> String {
     let mut text = aligned(&cells, &[1, 2, 5, 6]);
     text.extend(skipped);
     let (rounds, threads) = (comparison.rounds, comparison.threads);
-    let MachineNote {
-        processor,
-        cores,
-        load,
-        ..
-    } = &comparison.machine;
+    let machine = &comparison.machine;
+    let (processor, cores, load) = (&machine.processor, machine.cores, machine.load);
     text.push_str(&format!(
         "Medians of {rounds} rounds of ours, theirs; the ratio is the median of the rounds' ratios. {threads} threads; {processor}, {cores} cores.\n"
     ));
-    if *load > LOAD_MAX {
+    if load > LOAD_MAX {
         text.push_str(&format!(
             "The machine was not idle before: {} tasks wanted a core. These figures are not reliable.\n",
-            number(*load)
+            number(load)
         ));
     }
     if comparison.quick {
