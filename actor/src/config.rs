@@ -245,11 +245,7 @@ impl Config {
 
 impl EpsilonLadder {
     fn validate(&self) -> Result<(), ConfigError> {
-        let Self {
-            base,
-            alpha,
-            actors,
-        } = *self;
+        let (base, alpha, actors) = (self.base, self.alpha, self.actors);
         check(
             base > 0.0 && base < 1.0,
             "actor.epsilon_ladder.base",

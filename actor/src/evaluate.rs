@@ -43,15 +43,10 @@ pub fn episode_returns(
     rng: ChaCha8Rng,
     watch: Watch<'_>,
 ) -> Result<Vec<f64>, ActError> {
-    let Evaluation {
-        frame_stack,
-        epsilon,
-        episodes,
-        steps_max,
-    } = evaluation;
+    let (episodes, steps_max) = (evaluation.episodes, evaluation.steps_max);
     let envs = world.num_envs();
     let quota = |env: usize| episodes / envs + usize::from(env < episodes % envs);
-    let mut acting = Acting::new(world, frame_stack, rng)?;
+    let mut acting = Acting::new(world, evaluation.frame_stack, rng)?;
     let mut running = vec![0.0; envs];
     let mut ended = vec![0; envs];
     let mut returns = Vec::with_capacity(episodes);
@@ -59,7 +54,7 @@ pub fn episode_returns(
         if returns.len() == episodes {
             return Ok(returns);
         }
-        let step = acting.step(policy, epsilon)?;
+        let step = acting.step(policy, evaluation.epsilon)?;
         for env in 0..envs {
             running[env] += f64::from(step.rewards[env]);
             if matches!(step.ends[env], StepEnd::Terminal | StepEnd::TimedOut) {

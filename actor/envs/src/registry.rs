@@ -323,19 +323,15 @@ impl fmt::Display for WorldNameError {
         let mut names = Vec::new();
         let mut variants = String::new();
         for (kind, of) in KINDS {
-            let Variants {
-                key,
-                names: of,
-                is_open,
-            } = of();
-            if is_open {
-                names.push(format!("{kind}:{}", key.to_uppercase()));
-            } else if of.is_empty() {
+            let of = of();
+            let key = of.key.to_uppercase();
+            if of.is_open {
+                names.push(format!("{kind}:{key}"));
+            } else if of.names.is_empty() {
                 names.push((*kind).to_owned());
             } else {
-                let key = key.to_uppercase();
                 names.push(format!("{kind}:{key}"));
-                variants += &format!("; {key} is one of {}", of.join(", "));
+                variants += &format!("; {key} is one of {}", of.names.join(", "));
             }
         }
         names.push(format!("{LIBENV}:PATH:GAME"));

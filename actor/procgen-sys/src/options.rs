@@ -48,15 +48,9 @@ pub struct Options {
 impl Options {
     /// Says why the engine could not take these settings.
     pub fn validate(&self) -> Result<(), ProcgenError> {
-        let Options {
-            game,
-            num_envs,
-            num_levels,
-            start_level,
-            num_threads,
-            distribution_mode: mode,
-            ..
-        } = *self;
+        let (num_envs, num_threads) = (self.num_envs, self.num_threads);
+        let (num_levels, start_level) = (self.num_levels, self.start_level);
+        let (game, mode) = (self.game, self.distribution_mode);
         let text = if num_envs == 0 || num_envs > NUM_ENVS_MAX {
             format!("{num_envs} environments; 1 to {NUM_ENVS_MAX} are possible")
         } else if num_threads > NUM_THREADS_MAX {

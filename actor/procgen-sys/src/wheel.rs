@@ -72,10 +72,8 @@ fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), P
         return Ok(());
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let lines: Vec<&str> = said
-        .lines()
-        .filter(|line| !line.trim().is_empty())
-        .collect();
+    let lines = said.lines().filter(|line| !line.trim().is_empty());
+    let lines: Vec<&str> = lines.collect();
     let last = &lines[lines.len().saturating_sub(OUTPUT_LINES_MAX)..];
     Err(ProcgenError::Fetch(format!(
         "`{python} -m pip install` failed ({}); check the network and which package index pip uses. Its output:\n  {}\n",

@@ -144,11 +144,7 @@ impl Chunks<'_> {
     }
 
     pub(super) fn next_chunk(&mut self) -> Chunk {
-        let Recording {
-            frame_bytes,
-            frames,
-            steps: recorded,
-        } = self.recording;
+        let recording = self.recording;
         let bytes = self.next.payload_bytes();
         let bytes = bytes.expect("a chunk of a bench is far below the address space");
         let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
@@ -157,9 +153,10 @@ impl Chunks<'_> {
         for row in 0..streams * steps {
             let step = first_step + row % steps;
             let from = step % STEPS * STREAMS + row / steps;
-            let frame = &frames[from * frame_bytes..(from + 1) * frame_bytes];
+            let frame = &recording.frames[from * recording.frame_bytes..];
+            let frame = &frame[..recording.frame_bytes];
             chunk.frame_mut(row).copy_from_slice(frame);
-            let (action, reward, end) = recorded[from];
+            let (action, reward, end) = recording.steps[from];
             chunk.set(row, action, reward, end);
         }
         self.next.sequence += 1;

@@ -60,10 +60,8 @@ pub(super) fn measure(args: &BenchReplayArgs, effort: &Effort) -> anyhow::Result
     let mut samples = Samples::default();
     for _ in 0..args.rounds.unwrap_or(rounds) {
         for wire in &wires {
-            let on_disk = args
-                .replay_dir
-                .as_deref()
-                .filter(|_| wire.name == "on disk");
+            let dir = args.replay_dir.as_deref();
+            let on_disk = dir.filter(|_| wire.name == "on disk");
             on_disk.map_or(Ok(()), empty)?;
             let mut server = Server::start(wire, folder.path())?;
             samples.add(rates(&mut server, &recording, effort)?);
@@ -114,10 +112,8 @@ fn restart(server: Server, logs: &Path, dir: &Path) -> anyhow::Result<[Measureme
     let wire = server.end(ManagedProcess::kill);
     let started = Instant::now();
     let server = Server::start(&wire, logs)?;
-    let seconds = started
-        .elapsed()
-        .max(Duration::from_millis(1))
-        .as_secs_f64();
+    let took = started.elapsed().max(Duration::from_millis(1));
+    let seconds = took.as_secs_f64();
     server.end(ManagedProcess::kill);
     Ok([
         Measurement::found("log", megabytes, "MB"),

@@ -109,11 +109,8 @@ impl Figure {
         let rows = self.panels.len().div_ceil(columns);
         let (panel_width, panel_height) = self.panel_size;
         let width = MARGIN + columns as f64 * (panel_width + MARGIN);
-        let notes: Vec<String> = self
-            .notes
-            .iter()
-            .flat_map(|note| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN))
-            .collect();
+        let lines = |note: &String| font::wrap(note, NOTE_SIZE, width - 2.0 * MARGIN);
+        let notes: Vec<String> = self.notes.iter().flat_map(lines).collect();
         let head = match look {
             Look::Card => MARGIN + TITLE_SIZE + 16.0 + notes.len() as f64 * NOTE_LEADING,
             Look::Plain => MARGIN,
@@ -218,11 +215,9 @@ mod tests {
                 bytes.into_iter().map(char::from).collect()
             };
             let text = write();
-            assert!(
-                text.starts_with(start) && text.contains(inside),
-                "{extension}"
-            );
-            assert!(!text.contains("NaN") && text == write(), "{extension}");
+            let is_whole = text.starts_with(start) && text.contains(inside);
+            assert!(is_whole && !text.contains("NaN"), "{extension}");
+            assert!(text == write(), "{extension}");
         }
     }
 

@@ -67,11 +67,8 @@ fn assert_samples_law(height: usize, width: usize, temperature: f64, boundary: B
             lattice.sweep(&mut rng);
         }
         if sample >= 100 {
-            let state = lattice
-                .spins()
-                .iter()
-                .rev()
-                .fold(0, |x, &s| x << 1 | usize::from(s == 1));
+            let spins = lattice.spins().iter().rev();
+            let state = spins.fold(0, |x, &s| x << 1 | usize::from(s == 1));
             counts[state] += 1;
             energies.push(lattice.energy() as f64);
             ms.push(lattice.magnetisation().abs() as f64);
@@ -233,10 +230,8 @@ fn energy_of_a_torus(side: usize, temperature: f64) -> f64 {
             product(0, f64::sinh),
         ];
         let largest = products[0].0;
-        let sum: f64 = products
-            .iter()
-            .map(|(log, sign)| sign * (log - largest).exp())
-            .sum();
+        let terms = products.map(|(log, sign)| sign * (log - largest).exp());
+        let sum: f64 = terms.iter().sum();
         (side * side) as f64 / 2.0 * (2.0 * (2.0 * k).sinh()).ln() + largest + (sum / 2.0).ln()
     };
     let (k, step) = (1.0 / temperature, 1e-5);

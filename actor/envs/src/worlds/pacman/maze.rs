@@ -149,10 +149,8 @@ impl Maze {
 
     /// [H * W]: whether each pixel is wall.
     pub(crate) fn walls(&self) -> Vec<bool> {
-        LAYOUT
-            .iter()
-            .flat_map(|row| row.map(|c| c == b'#'))
-            .collect()
+        let rows = LAYOUT.iter();
+        rows.flat_map(|row| row.map(|c| c == b'#')).collect()
     }
 }
 
@@ -171,16 +169,9 @@ fn beside(pixel: usize) -> [usize; DIRECTIONS] {
 /// The pixel in which the run of open cells through `pixel` begins: along its row, and along its column.
 fn runs(pixel: usize) -> (u16, u16) {
     let (row, column) = (pixel / WIDTH, pixel % WIDTH);
-    let left = (0..column)
-        .rev()
-        .take_while(|&c| LAYOUT[row][c] != b'#')
-        .last()
-        .unwrap_or(column);
-    let top = (0..row)
-        .rev()
-        .take_while(|&r| LAYOUT[r][column] != b'#')
-        .last()
-        .unwrap_or(row);
+    let left = (0..column).rev().find(|&c| LAYOUT[row][c] == b'#');
+    let top = (0..row).rev().find(|&r| LAYOUT[r][column] == b'#');
+    let [left, top] = [left, top].map(|wall| wall.map_or(0, |wall| wall + 1));
     ((row * WIDTH + left) as u16, (top * WIDTH + column) as u16)
 }
 
