@@ -202,9 +202,8 @@ impl VecGame {
         // SAFETY: the handle is open, `index` is one of its environments, and `bytes` is longer than `len`.
         let used =
             unsafe { (self.api.get_state)(self.handle, index, bytes.as_mut_ptr().cast(), len) };
-        let used = usize::try_from(used)
-            .ok()
-            .filter(|used| *used < bytes.len());
+        let used = usize::try_from(used).ok();
+        let used = used.filter(|used| *used < bytes.len());
         let used = used.ok_or_else(|| {
             ProcgenError::Unexpected("it wrote a state of an impossible size".to_owned())
         })?;
@@ -277,10 +276,9 @@ impl VecGame {
             // SAFETY: the engine writes as many types as it just counted, and there is room for them.
             unsafe { (self.api.get_tensortypes)(self.handle, space, types.as_mut_ptr()) };
             let found: Vec<_> = types.iter().map(LibenvTensortype::describe).collect();
-            let expected: Vec<_> = expected
-                .iter()
-                .map(|(name, dtype, shape)| ffi::describe(name, *dtype, shape))
-                .collect();
+            let expected = expected.iter();
+            let expected = expected.map(|(name, dtype, shape)| ffi::describe(name, *dtype, shape));
+            let expected: Vec<_> = expected.collect();
             if found != expected {
                 let (found, expected) = (found.join(", "), expected.join(", "));
                 return Err(ProcgenError::Unexpected(format!(

@@ -94,10 +94,11 @@ pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measure
         Box::new(|| learned_from.learn()),
     ];
     let figures = names.into_iter().zip(effort.rates_in_turn(&mut works)?);
-    let name = |what| format!("{rows} rows of {held} transitions {what}");
-    Ok(figures
-        .map(|(what, rate)| Measurement::found(name(what), rate, "batches/s"))
-        .collect())
+    let figures = figures.map(|(what, rate)| {
+        let what = format!("{rows} rows of {held} transitions {what}");
+        Measurement::found(what, rate, "batches/s")
+    });
+    Ok(figures.collect())
 }
 
 /// A replay that is full, and what its learner finds.

@@ -139,11 +139,9 @@ fn left_by_groups(mount: &Path, groups: &str) -> Option<u64> {
         let number = |file| text(file)?.trim().parse::<u64>().ok();
         let stat = text("memory.stat").unwrap_or_default();
         let of_files = ["active_file", "inactive_file"].map(|list| {
-            let line = stat
-                .lines()
-                .find_map(|it| it.strip_prefix(cache)?.strip_prefix(list));
-            line.and_then(|bytes| bytes.trim().parse().ok())
-                .unwrap_or(0)
+            let mut lines = stat.lines();
+            let bytes = lines.find_map(|it| it.strip_prefix(cache)?.strip_prefix(list));
+            bytes.and_then(|it| it.trim().parse().ok()).unwrap_or(0)
         });
         let used = number(used)?.saturating_sub(of_files.iter().sum());
         Some(number(max)?.saturating_sub(used))

@@ -39,11 +39,9 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
     let steps_right = (config.cells - 1 - START_CELL) as u32;
     let left = f64::from(config.reward_left);
     let right = gamma.powi(steps_right as i32 - 1) * f64::from(config.reward_right);
-    let reachable = steps_right <= config.step_limit;
-    if reachable {
-        left.max(right).max(0.0)
-    } else {
-        left.max(0.0)
+    match steps_right <= config.step_limit {
+        true => left.max(right).max(0.0),
+        false => left.max(0.0),
     }
 }
 

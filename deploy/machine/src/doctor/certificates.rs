@@ -24,9 +24,8 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     // By the certificate or the key alone, too: then the other one is missing.
     let name = |entry: fs::DirEntry| {
         let path = entry.path();
-        let is_one = path
-            .extension()
-            .is_some_and(|it| it == "pem" || it == "key");
+        let extension = path.extension();
+        let is_one = extension.is_some_and(|it| it == "pem" || it == "key");
         let name = path.file_stem().filter(|it| is_one && *it != "ca")?;
         name.to_str().map(str::to_owned)
     };

@@ -51,7 +51,6 @@ fn count() -> Result<usize, String> {
     Err(TO_BUILD.to_owned())
 }
 
-/// How many devices the driver finds, at least one; else why there is none.
 #[cfg(feature = "cuda")]
 fn count() -> Result<usize, String> {
     use candle_core::cuda_backend::cudarc::driver::CudaContext;
@@ -69,7 +68,6 @@ pub(crate) fn describe(_ordinal: usize) -> Result<String, String> {
     Err(TO_BUILD.to_owned())
 }
 
-/// A device's name, compute capability and memory; an error if it cannot be asked or this program was not built for it.
 #[cfg(feature = "cuda")]
 pub(crate) fn describe(ordinal: usize) -> Result<String, String> {
     use candle_core::cuda_backend::cudarc::driver::{CudaContext, DriverError};

@@ -148,10 +148,8 @@ impl IsingLattice {
     }
 
     fn field(&self, site: usize) -> i32 {
-        self.neighbours[site]
-            .iter()
-            .map(|&n| i32::from(self.spins[n as usize]))
-            .sum()
+        let beside = self.neighbours[site].iter();
+        beside.map(|&n| i32::from(self.spins[n as usize])).sum()
     }
 
     /// Flips `site` with probability min(1, exp(-dE / T)), dE = 2 s h, h the sum of its neighbours.

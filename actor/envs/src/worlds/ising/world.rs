@@ -269,10 +269,8 @@ pub(crate) mod tests {
             let (_, ends) = step(&mut world, &[0]);
             assert_eq!(ends, [StepEnd::TimedOut]);
         }
-        let chi: f64 = counts
-            .iter()
-            .map(|c| f64::from(c - 1000).powi(2) / 1000.0)
-            .sum();
+        let squares = counts.map(|count| f64::from(count - 1000).powi(2));
+        let chi = squares.iter().sum::<f64>() / 1000.0;
         // On 15 degrees of freedom, p = 0.001.
         assert!(chi < 37.7, "chi-square {chi}");
         let mut world = IsingWorld::new(&paper(), 1, 8).unwrap();

@@ -195,10 +195,8 @@ mod tests {
             ghost.step(&maze, 0, false, chance(1.0, 0.0), &mut rng);
             counts[usize::from(ghost.heading.unwrap())] += 1;
         }
-        let chi: f64 = counts
-            .iter()
-            .map(|c| f64::from(c - 10_000).powi(2) / 10_000.0)
-            .sum();
+        let squares = counts.map(|count| f64::from(count - 10_000).powi(2));
+        let chi = squares.iter().sum::<f64>() / 10_000.0;
         // On 3 degrees of freedom, p = 0.001.
         assert!(chi < 16.3, "chi-square {chi}");
     }
