@@ -129,9 +129,8 @@ impl ChunkRecorder {
 }
 
 fn fresh(pool: &BufferPool, header: ChunkHeader) -> Chunk {
-    let bytes = header
-        .payload_bytes()
-        .expect("an actor's chunk is far below the address space");
+    let bytes = header.payload_bytes();
+    let bytes = bytes.expect("an actor's chunk is far below the address space");
     Chunk::in_memory(header, pool.take(bytes))
 }
 

@@ -83,9 +83,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     };
     // Before it joins, so that no other process can take its place from then on.
     let client = RunClient::new(session, keys, spec_hash);
-    let alive = client
-        .declare_alive(who.alive())
-        .map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
+    let alive = client.declare_alive(who.alive());
+    let alive = alive.map_err(|e| anyhow::anyhow!("declaring actor {} alive: {e}", args.actor))?;
     let Some(welcome) = join::take_part(&client, &join, shutdown)? else {
         return Ok(());
     };
@@ -167,11 +166,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         produced - unwanted
     );
     drop(alive);
-    client
-        .session()
-        .close()
-        .wait()
-        .map_err(|e| anyhow::anyhow!("closing the session: {e}"))
+    let closed = client.session().close().wait();
+    closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))
 }
 
 /// Plays and queues what was played until `shutdown`, or until the run needs no more. `chunk_steps` says how many steps a chunk has,

@@ -90,14 +90,12 @@ impl NewestWeights {
     /// Takes the newest weights, if they came since the last call, and asks for newer ones; those that were announced are waited
     /// for, at most for `wait_max`.
     pub(crate) fn take_within(&self, wait_max: Duration) -> Option<Weights> {
-        let mut state = self.state();
+        let (mut state, changed) = (self.state(), &self.shared.1);
         state.is_wanted = true;
-        self.shared.1.notify_all();
-        let changed = &self.shared.1;
+        changed.notify_all();
         let coming = |state: &mut State| state.announced > state.pulled;
-        let (mut state, _) = changed
-            .wait_timeout_while(state, wait_max, coming)
-            .unwrap_or_else(PoisonError::into_inner);
+        let waited = changed.wait_timeout_while(state, wait_max, coming);
+        let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
         state.slot.take()
     }
 
@@ -110,11 +108,9 @@ impl NewestWeights {
     /// Waits until newer weights are to be pulled, at most for `wait_max`; the version that they are to be newer than.
     fn wait_until_wanted(&self, wait_max: Duration) -> Option<u64> {
         let idle = |state: &mut State| !(state.is_wanted && state.announced > state.pulled);
-        let (mut state, waited) = self
-            .shared
-            .1
-            .wait_timeout_while(self.state(), wait_max, idle)
-            .unwrap_or_else(PoisonError::into_inner);
+        let changed = &self.shared.1;
+        let waited = changed.wait_timeout_while(self.state(), wait_max, idle);
+        let (mut state, waited) = waited.unwrap_or_else(PoisonError::into_inner);
         if waited.timed_out() {
             return None;
         }
