@@ -104,8 +104,7 @@ impl RunFolder {
             self.lock_file(),
         ];
         let has_frames = |path: &PathBuf| {
-            let text = fs::read(path).unwrap_or_default();
-            let frames = Table::parse(&text).ok().and_then(|it| it.last("frames"));
+            let frames = Table::read(path).ok().and_then(|it| it.last("frames"));
             frames.is_some_and(|frames: u64| frames > 0)
         };
         let entries: Vec<_> = entries.flatten().collect();

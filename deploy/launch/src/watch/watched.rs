@@ -2,12 +2,11 @@
 //! It asks for no more than the episodes that it records.
 
 use std::{
-    fs,
     path::PathBuf,
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use driml_machine::{error::usage, units::duration};
 use driml_protocol::{RunSpec, Waiting};
 use driml_settings::config::RunConfig;
@@ -185,9 +184,7 @@ fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
 
 /// Which of the rows that are there stay.
 fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoint> {
-    let path = folder.metrics();
-    let text = fs::read(&path).unwrap_or_default();
-    let rows = Table::parse(&text).with_context(|| format!("reading {}", path.display()))?;
+    let rows = Table::read(&folder.metrics())?;
     let last = |name| rows.last::<u64>(name).unwrap_or(0);
     let (frames, updates) = (last("frames"), last("updates"));
     let now = view.replay.transitions_inserted;
