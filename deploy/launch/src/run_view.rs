@@ -1,7 +1,10 @@
-//! A run as its processes describe it: their last answers, and how long ago each came.
+//! A run as its processes describe it: their last answers, how long ago each came, and how fast it is.
 //! It asks no process: the poller and the lockstep mode feed it.
 
-use std::time::Instant;
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
 
 use driml_actor::Schedule;
 use driml_protocol::{
@@ -9,8 +12,6 @@ use driml_protocol::{
 };
 use driml_settings::config::RunConfig;
 use serde::Serialize;
-
-use crate::rates::{Rates, Speed};
 
 /// What the settings say of a run.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -125,6 +126,45 @@ pub(crate) struct ServerAnswer {
     pub(crate) is_gone: bool,
     /// It answers, and for a run with other settings.
     pub(crate) is_another_run: bool,
+}
+
+/// Frames and updates a second.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Speed {
+    pub(crate) frames: f64,
+    pub(crate) updates: f64,
+}
+
+const RATE_WINDOW: Duration = Duration::from_secs(20);
+
+/// When counts were taken, and how many frames and updates they were.
+type Sample = (Instant, u64, u64);
+
+#[derive(Clone, Debug, Default)]
+struct Rates(VecDeque<Sample>);
+
+impl Rates {
+    fn add(&mut self, now: Instant, frames: u64, updates: u64) {
+        self.0.push_back((now, frames, updates));
+        while self.0.len() > 2 && now - self.0[1].0 >= RATE_WINDOW {
+            self.0.pop_front();
+        }
+    }
+
+    /// Each since the last time at which nothing of it had happened yet; 0 before the second sample.
+    fn speed(&self) -> Speed {
+        let rate = |count: fn(&Sample) -> u64| {
+            let (first, last) = (self.0.front()?, self.0.back()?);
+            let mut newest_first = self.0.iter().rev();
+            let idle = newest_first.find(|it| count(it) == count(first))?;
+            let seconds = (last.0 - idle.0).as_secs_f64();
+            (seconds > 0.0).then(|| count(last).saturating_sub(count(idle)) as f64 / seconds)
+        };
+        Speed {
+            frames: rate(|it| it.1).unwrap_or(0.0),
+            updates: rate(|it| it.2).unwrap_or(0.0),
+        }
+    }
 }
 
 /// What is known of a run.
@@ -336,5 +376,24 @@ mod tests {
         let mut resumed = RunView::beginning(Plan::default(), 0, 70);
         resumed.take_learner(None);
         assert_eq!(resumed.learner.updates, 70, "before it has answered");
+    }
+
+    fn rates(samples: impl IntoIterator<Item = (u64, u64, u64)>) -> Rates {
+        let (mut rates, start) = (Rates::default(), Instant::now());
+        for (second, frames, updates) in samples {
+            rates.add(start + Duration::from_secs(second), frames, updates);
+        }
+        rates
+    }
+
+    #[test]
+    fn rates_forget_what_is_long_ago_and_a_warm_up_does_not_dilute_them() {
+        assert_eq!(rates([]).speed(), Speed::default());
+        let frames_after_50_s = |second: u64| (second, second.saturating_sub(50) * 10, 0);
+        let long = rates((0..100).map(frames_after_50_s));
+        assert_eq!(long.speed().frames, 10.0);
+        assert!(long.0.len() <= 22);
+        let warmed_up = rates([(0, 0, 7), (10, 10, 7), (12, 12, 47)]).speed();
+        assert_eq!((warmed_up.frames, warmed_up.updates), (1.0, 20.0));
     }
 }

@@ -154,8 +154,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        rates::Speed,
-        run_view::{Episodes, Plan, Recorded, Spread},
+        run_view::{Episodes, Plan, Recorded, Speed, Spread},
         testing::with,
     };
 
