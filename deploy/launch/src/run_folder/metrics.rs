@@ -30,13 +30,16 @@ pub struct ResumePoint {
 const LAST_ROW_BYTES: u64 = 1 << 16;
 
 /// The rows of an interrupted run up to `resume_point`, under this header; none where there is no such file. The others, which
-/// contradict what the run will do, are set aside.
+/// contradict what the run will do, are set aside. And the seconds that the run has taken, with those that are set aside.
 pub(super) fn rows_up_to(
     path: &Path,
     header: Vec<String>,
     resume_point: ResumePoint,
-) -> anyhow::Result<Table> {
+) -> anyhow::Result<(Table, f64)> {
     let mut found = Table::read(path)?;
+    let seconds = found.rows.iter();
+    let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
+    let seconds = seconds.fold(0.0, f64::max);
     found.keep(path, |found, row| {
         let count = |name| found.value::<u64>(row, name);
         let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
@@ -54,15 +57,7 @@ pub(super) fn rows_up_to(
         places.iter().map(cell).collect()
     });
     let rows = rows.collect();
-    Ok(Table { header, rows })
-}
-
-/// Seconds that the run in `folder` has taken by its metrics, those rows included that a resumption makes again.
-pub(super) fn seconds_of(folder: &RunFolder) -> f64 {
-    let found = Table::read(&folder.metrics()).unwrap_or_default();
-    let seconds = found.rows.iter();
-    let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
-    seconds.fold(0.0, f64::max)
+    Ok((Table { header, rows }, seconds))
 }
 
 /// How far a run is.

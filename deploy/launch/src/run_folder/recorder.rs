@@ -15,7 +15,7 @@ use super::{
     episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    metrics::{ResumePoint, rows_up_to, seconds_of},
+    metrics::{ResumePoint, rows_up_to},
     summary::{Outcome, Summary},
     table::{AppendLog, Table, csv_row},
 };
@@ -70,8 +70,7 @@ impl RunRecorder {
                 (Table { header, rows }, episodes, 0.0)
             }
             Some(point) => {
-                let seconds = seconds_of(folder);
-                let rows = rows_up_to(&folder.metrics(), header, point)?;
+                let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
                 let is_known = point.replay_is_kept;
                 let episodes = TrainingEpisodes::go_on(folder, point.frames, is_known)?;
                 (rows, episodes, seconds)

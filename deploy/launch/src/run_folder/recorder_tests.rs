@@ -182,7 +182,7 @@ fn a_resumed_run_continues_in_its_metrics() {
             frames_max,
             ..point(99)
         };
-        rows_up_to(&path, header.clone(), all).unwrap()
+        rows_up_to(&path, header.clone(), all).unwrap().0
     };
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
