@@ -89,7 +89,7 @@ struct Patience {
 impl Patience {
     fn begin() -> Self {
         Self {
-            silence: Silence::begin(),
+            silence: Silence::default(),
             silence_said: LogLimiter::default(),
             recovery_said: LogLimiter::default(),
         }

@@ -168,7 +168,7 @@ impl Rates {
 }
 
 /// What is known of a run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct RunView {
     pub(crate) plan: Plan,
     /// Updates after which it was resumed; none before that is known.
@@ -197,18 +197,7 @@ impl RunView {
     pub fn new(plan: Plan) -> Self {
         Self {
             plan,
-            after_updates: None,
-            servers: Vec::new(),
-            shards: Vec::new(),
-            replay: ReplayStatus::default(),
-            learner: LearnerStatus::default(),
-            learner_answers: false,
-            replay_silence: Silence::begin(),
-            learner_silence: Silence::begin(),
-            is_learner_known: false,
-            recorded: None,
-            rates: Rates::default(),
-            speed: Speed::default(),
+            ..Self::default()
         }
     }
 

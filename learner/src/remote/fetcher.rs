@@ -162,7 +162,7 @@ impl Fetcher {
     }
 
     pub(super) fn run(mut self, sender: &mpsc::SyncSender<Fetched>) {
-        let mut silence = Silence::begin();
+        let mut silence = Silence::default();
         while !self.shared.shutdown.is_set() {
             fail_point::reach("batches");
             let fetched = match self.fetch() {

@@ -238,7 +238,7 @@ impl PartialBatch {
             parts: Vec::new(),
             from: Vec::new(),
             all_in: false,
-            since_whole: Silence::begin(),
+            since_whole: Silence::default(),
         }
     }
 }

@@ -17,12 +17,14 @@ pub struct Silence {
     look_max: Duration,
 }
 
-impl Silence {
-    /// A silence that begins now; a try waits for its answer for no more than 10 s.
-    pub fn begin() -> Self {
+/// A silence that begins now; a try waits for its answer for no more than 10 s.
+impl Default for Silence {
+    fn default() -> Self {
         Self::with_tries_of(Duration::ZERO)
     }
+}
 
+impl Silence {
     /// A silence that begins now; a try may wait for its answer as long as this.
     pub fn with_tries_of(try_max: Duration) -> Self {
         Self {

@@ -239,7 +239,7 @@ impl Launch<'_> {
 
     /// Asks, shows and records once a second until the run is over.
     fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
-        let (mut standstill, mut counts_before) = (Silence::begin(), (0, 0));
+        let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
         loop {
             if self.shutdown.ending.wait_timeout(POLL) {
                 return Ok(Outcome::Interrupted);
