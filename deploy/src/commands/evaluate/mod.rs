@@ -26,7 +26,7 @@ use driml_launch::{
     stats::mean_and_deviation,
     view::TEMPLATE,
 };
-use driml_machine::error::{EXIT_INTERRUPTED, usage};
+use driml_machine::error::{Interrupted, usage};
 use driml_protocol::Shutdown;
 
 use self::recording::{RecordArgs, Recording};
@@ -103,8 +103,12 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         .into());
     }
     if args.keep {
-        end_when_asked(args.exit_with_parent)?;
-        let judged = keep(&folder, which, args.episodes, &|| false)?;
+        let shutdown = Shutdown::on_signals(args.exit_with_parent);
+        let shutdown = shutdown.context("listening for signals")?;
+        let episodes = args.episodes;
+        let play = move || keep(&folder, which, episodes, &|| false);
+        let judged = shutdown.unless_set("evaluation", play);
+        let judged = judged.context("starting a thread")?.ok_or(Interrupted)??;
         let earned = judged.earned.describe();
         return print(&format!("{earned}{}\n", verdict(&judged)));
     }
@@ -198,19 +202,6 @@ fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
         bytes.len() / 1000,
         path.display()
     ))
-}
-
-/// Ends this process at a signal or when its reader is gone, and leaves no partial file.
-fn end_when_asked(parent: Option<u32>) -> anyhow::Result<()> {
-    let shutdown = Shutdown::on_signals(parent).context("listening for signals")?;
-    std::thread::Builder::new()
-        .name("end".into())
-        .spawn(move || {
-            shutdown.wait();
-            std::process::exit(i32::from(EXIT_INTERRUPTED));
-        })
-        .context("starting a thread")?;
-    Ok(())
 }
 
 /// What an evaluation says of the run's best checkpoint.
