@@ -1,4 +1,4 @@
-//! `driml evaluate`: what it prints, and what it says of folders and checkpoints that cannot be used.
+//! `driml evaluate`: what it prints and films, and what it says of folders, checkpoints and films that cannot be.
 //! Whether an agent has learned is in `lockstep`.
 
 use std::fs;
@@ -9,7 +9,7 @@ use driml_tests::{TestSystem, updates_of, wait_until};
 use crate::{SHORT, system};
 
 /// A system with a run in `run`.
-pub(crate) fn with_run() -> TestSystem {
+fn with_run() -> TestSystem {
     with_run_of("")
 }
 
@@ -266,6 +266,31 @@ fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it() {
     ));
 }
 
+#[test]
+fn a_film_changes_nothing_that_is_played() {
+    let system = system();
+    system
+        .run_ok("local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --run-dir run");
+    let plain = system.run_ok("evaluate run --episodes 3");
+    let film =
+        "evaluate run --episodes 3 --record play.gif --overlay --record-steps 40 --record-envs 2";
+    let filmed = system.run_ok(film);
+    let said: Vec<_> = filmed.stdout.lines().collect();
+    assert_eq!(said[1], "filmed 40 steps: play.gif");
+    let rest: Vec<_> = said
+        .iter()
+        .filter(|line| !line.starts_with("filmed"))
+        .copied()
+        .collect();
+    assert_eq!(rest, plain.stdout.lines().collect::<Vec<_>>());
+    let bytes = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes.starts_with(b"GIF89a") && bytes.ends_with(b";"));
+    system.run_ok(film);
+    let again = fs::read(system.path("play.gif")).unwrap();
+    assert!(bytes == again, "the same play is the same film");
+    assert!(!system.path("play.gif.tmp").exists());
+}
+
 /// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
 #[test]
 fn it_plays_in_the_precision_of_the_run() {
@@ -300,10 +325,18 @@ fn a_folder_that_is_no_run_s() {
     system.refuses("evaluate --run empty", "config.toml that driml wrote");
 }
 
-/// That every file's damage is found is the learner's own test.
+/// That every file's damage is found is the learner's own test. Films that cannot be are refused before anything is played.
 #[test]
-fn a_damaged_checkpoint_and_one_of_another_run_are_named_and_not_used() {
+fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named() {
     let system = with_run();
+    system.refuses_each(
+        "
+        evaluate run --record play.mp4 => use one that ends in .gif
+        evaluate run --record none/play.gif => --record none/play.gif: No such file or directory
+        evaluate run --overlay => --record <FILE.gif>
+        evaluate run --record play.gif --record-steps 0 => 0 is not in 1..=10000
+        ",
+    );
     let newest = system.run_folder("run").newest_checkpoint();
     let name = newest.file_name().unwrap().to_str().unwrap();
     let path = newest.join("online.safetensors");
@@ -330,4 +363,6 @@ fn a_damaged_checkpoint_and_one_of_another_run_are_named_and_not_used() {
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     system.refuses(call, "has no checkpoint yet");
+    system.refuses("evaluate run --record play.gif", "has no checkpoint yet");
+    assert!(!system.names(".").iter().any(|name| name.contains("play")));
 }

@@ -15,7 +15,6 @@ mod durable;
 mod evaluate;
 mod experiments;
 mod failures;
-mod films;
 mod frozen;
 mod leftovers;
 mod limits;
