@@ -31,11 +31,6 @@ pub struct Client {
     pub config_toml: String,
 }
 
-const NOTHING: ShardCounts = ShardCounts {
-    inserted: 0,
-    rows_sampled: 0,
-};
-
 /// A session with the process that listens at an endpoint, in one try.
 pub fn connect(endpoint: &str) -> Session {
     session::open(&Endpoints::to(vec![endpoint.to_owned()])).unwrap()
@@ -51,13 +46,13 @@ pub fn listen(endpoint: &str) -> Session {
 }
 
 /// How a learner joins that has learned nothing yet.
-pub const fn new_learner(learner: u64) -> LearnerJoin {
+pub fn new_learner(learner: u64) -> LearnerJoin {
     LearnerJoin {
         learner,
         run: learner,
         updates: 0,
-        counts: NOTHING,
-        other_shards: NOTHING,
+        counts: ShardCounts::default(),
+        other_shards: ShardCounts::default(),
         restart: false,
     }
 }

@@ -275,6 +275,19 @@ impl TestSystem {
         self.survivors().into_iter().find(is_process)
     }
 
+    /// Kills every process that the program has started here, launchers first.
+    pub fn kill_all(&self) {
+        // A child that a dying launcher started while the list was made is in the next list.
+        for _ in 0..10 {
+            let mut left = self.survivors();
+            if left.is_empty() {
+                return;
+            }
+            left.sort_by_key(|it| it.pid);
+            left.iter().for_each(|it| it.signal(Signal::SIGKILL));
+        }
+    }
+
     /// Waits until no process that the program has started here is left.
     pub fn wait_until_all_have_ended(&self) {
         wait_for("the end of all processes", || {
@@ -288,22 +301,10 @@ impl Survivor {
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);
     }
-
-    /// Kills each of them.
-    pub fn kill_all(processes: &[Self]) {
-        processes.iter().for_each(|it| it.signal(Signal::SIGKILL));
-    }
 }
 
 impl Drop for TestSystem {
     fn drop(&mut self) {
-        // A child that a dying launcher started while the list was made is in the next list.
-        for _ in 0..10 {
-            let left = self.survivors();
-            if left.is_empty() {
-                return;
-            }
-            Survivor::kill_all(&left);
-        }
+        self.kill_all();
     }
 }

@@ -13,13 +13,13 @@ use driml_tests::{Outcome, Process, TestSystem, succeeds, wait_for, wait_until};
 use crate::{LONG, SHORT, system};
 
 /// A small disk. Dropping it takes it away.
-pub(crate) struct Disk {
+struct Disk {
     folder: PathBuf,
 }
 
 impl Disk {
     /// One of so many KiB at `folder`; none, and a line that the test is skipped, if it cannot be mounted.
-    pub(crate) fn mount(folder: PathBuf, kib: u32) -> Option<Self> {
+    fn mount(folder: PathBuf, kib: u32) -> Option<Self> {
         fs::create_dir(&folder).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]);
@@ -30,7 +30,7 @@ impl Disk {
     }
 
     /// Takes all room that there is.
-    pub(crate) fn fill(&self) -> Filler {
+    fn fill(&self) -> Filler {
         let path = self.folder.join("filler");
         let mut file = File::create(&path).unwrap();
         while file.write_all(&[0; 4096]).is_ok() {}
@@ -48,12 +48,12 @@ impl Drop for Disk {
 }
 
 /// A file that takes all room of a disk.
-pub(crate) struct Filler {
+struct Filler {
     path: PathBuf,
 }
 
 impl Filler {
-    pub(crate) fn remove(self) {
+    fn remove(self) {
         fs::remove_file(&self.path).unwrap();
     }
 }

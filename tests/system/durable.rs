@@ -9,7 +9,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    PROCESSES, chain, launched_with,
+    chain, launched_with,
     numbered::{KILLS, ROWS, SAMPLED, WARMUP, kill_after_rows},
     system,
 };
@@ -172,12 +172,10 @@ fn a_resumed_run_continues_with_its_replay() {
     let process = launched_with(&system, "--durable --agent driml-ada", 1_000);
     let client = system.connect();
     // All at once, as when the machine stops; but the actor first, so that nothing is made after the last look.
-    let processes = PROCESSES.map(|role| system.find_process(role));
-    processes[2].signal(Signal::SIGSTOP);
+    system.find_process("actor").signal(Signal::SIGSTOP);
     let before = client.replay().unwrap();
     drop(client);
-    process.signal(Signal::SIGKILL);
-    Survivor::kill_all(&processes);
+    system.kill_all();
     process.wait();
 
     let frames = before.transitions_inserted + 2_000;

@@ -43,8 +43,7 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();
     let (process, processes) = started(&system);
     let segments = all_shared_memory_of(&processes);
-    process.signal(Signal::SIGKILL);
-    Survivor::kill_all(&processes);
+    system.kill_all();
     process.wait();
     system.wait_until_all_have_ended();
     assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
@@ -64,7 +63,7 @@ fn shared_memory_of_killed_processes_is_removed() {
     let process = launched(&system, 100);
     let processes = PROCESSES.map(|role| system.find_process(role));
     let segments = all_shared_memory_of(&processes);
-    Survivor::kill_all(&processes);
+    processes.iter().for_each(|it| it.signal(Signal::SIGKILL));
     process.wait().expect_code(1);
     check_gone(&segments);
 }

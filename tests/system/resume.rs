@@ -3,10 +3,9 @@
 use std::fs;
 
 use driml_settings::config::RunConfig;
-use driml_tests::{Outcome, Summary, Survivor, TestSystem};
-use nix::sys::signal::Signal;
+use driml_tests::{Outcome, Summary, TestSystem};
 
-use crate::{PROCESSES, SHORT, launched, system};
+use crate::{SHORT, launched, system};
 
 /// Updates that a resumed run makes: more than are left for the 256 transitions of slack, a chunk that is on its way and one that
 /// fills the memory again.
@@ -94,9 +93,7 @@ fn a_run_with_whole_frames_continues_and_is_evaluated() {
 fn a_run_whose_processes_were_all_killed_continues() {
     let system = system();
     let process = launched(&system, 200);
-    let processes = PROCESSES.map(|role| system.find_process(role));
-    process.signal(Signal::SIGKILL);
-    Survivor::kill_all(&processes);
+    system.kill_all();
     process.wait();
     // A save may have been cut off; what it leaves is not a checkpoint.
     for entry in fs::read_dir(system.path("run/checkpoints")).unwrap() {

@@ -4,7 +4,7 @@
 
 use std::{fmt::Write as _, fs, time::Duration};
 
-use driml_tests::{Outcome, RunFolder, Survivor, TestSystem, check_nothing_lost, wait_until};
+use driml_tests::{Outcome, RunFolder, TestSystem, check_nothing_lost, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
@@ -237,7 +237,7 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
             system.wait_until_all_have_ended();
         }
         Stop::KillAll => {
-            Survivor::kill_all(&system.survivors());
+            system.kill_all();
             process.wait();
         }
     }

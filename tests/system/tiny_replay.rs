@@ -47,10 +47,10 @@ pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Ch
         sequence,
         first_transition: sequence * u64::from(steps),
         weights_version: 1,
-        leaving: false,
         streams: 1,
         steps,
         frame_bytes: spec.frame_bytes() as u32,
+        ..ChunkHeader::default()
     })
 }
 
