@@ -9,40 +9,26 @@ use crate::{LONG, PRIORITISED, system};
 /// The launcher itself, after whose death the other processes exit.
 const LAUNCHER: &str = "launcher";
 
-/// The process's name in the launcher, the point that one of its threads passes, and the flags of a run that has this thread. Where
-/// several processes have it, any may be the first.
-static THREADS: [(&str, &str, &str); 31] = [
-    ("replay-server", "insert", ""),
-    ("replay-server", "poll", ""),
-    ("replay-server", "admit", ""),
-    ("replay-server", "request", ""),
-    ("replay-server", "sample", ""),
-    ("replay-server", "affinity", ""),
-    ("replay-server", "run-info", ""),
-    ("replay-server", "join-actor", ""),
-    ("replay-server", "join-learner", ""),
-    ("replay-server", "leave", ""),
-    ("replay-server", "weights-upload", ""),
-    ("replay-server", "weights", ""),
-    ("replay-server", "status", ""),
-    ("replay-server", "report", ""),
-    ("replay-server", "episodes", ""),
-    ("replay-server", "missing", ""),
-    ("replay-server", "members", ""),
-    ("learner", "batches", ""),
-    ("learner", "weights-sender", ""),
-    ("learner", "affinity-sender", ""),
-    ("learner", "learner-status", ""),
-    ("actor-0", "weights-watch", ""),
-    ("actor-0", "delivery", ""),
+/// The process's name in the launcher, the points that its threads pass, and the flags of a run that has these threads. Where several
+/// processes have them, any may be the first.
+static THREADS: [(&str, &str, &str); 8] = [
+    (
+        "replay-server",
+        "insert, poll, admit, request, sample, affinity, run-info, join-actor, join-learner, leave, weights-upload, weights, status, \
+         report, episodes, missing, members",
+        "",
+    ),
     ("replay-server", "priorities", PRIORITISED),
-    ("learner", "priorities-sender", PRIORITISED),
     ("replay-server", "replay-fsync", "--durable"),
-    ("", "signals", ""),
-    ("", "reporter", ""),
-    ("", "connecting", ""),
-    (LAUNCHER, "interrupts", ""),
-    (LAUNCHER, "log of learner", ""),
+    (
+        "learner",
+        "batches, weights-sender, affinity-sender, learner-status",
+        "",
+    ),
+    ("learner", "priorities-sender", PRIORITISED),
+    ("actor-0", "weights-watch, delivery", ""),
+    ("", "signals, reporter, connecting", ""),
+    (LAUNCHER, "interrupts, log of learner", ""),
 ];
 
 /// A run with a panic at `point`, to the end.
@@ -85,9 +71,14 @@ fn a_panic_in_any_thread_ends_the_run_and_is_named() {
     if !cfg!(debug_assertions) {
         return driml_tests::skip("a release build");
     }
+    let threads = THREADS.iter().flat_map(|(process, points, flags)| {
+        let points = points.split(", ");
+        points.map(move |point| (*process, point, *flags))
+    });
+    let threads: Vec<_> = threads.collect();
     // These runs wait for each other's ends more than they compute.
     std::thread::scope(|scope| {
-        for some in THREADS.chunks(6) {
+        for some in threads.chunks(6) {
             scope.spawn(|| some.iter().copied().for_each(ends_the_run));
         }
     });
