@@ -120,18 +120,14 @@ fn procgen_without_the_engine() {
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data(&folder);
-    let table = String::from_utf8(first["table.csv"].clone()).unwrap();
-    let lines: Vec<Vec<&str>> = table.lines().map(|it| it.split(',').collect()).collect();
+    let table = || system.run_folder("experiments/procgen").table("table.csv");
+    let before = table();
     let header = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
-    assert_eq!(lines[0].join(","), header);
-    assert_eq!(lines.len() - 1, 2 * 2 * 2, "worlds, agents, seeds");
-    for line in &lines[1..] {
-        assert_eq!(
-            [line[2], line[4], line[8]],
-            ["nature", "2016", ""],
-            "{line:?}"
-        );
-        assert!(!line[7].is_empty() && !line[10].is_empty(), "{line:?}");
+    assert_eq!(before.header.join(","), header);
+    assert_eq!(before.rows.len(), 2 * 2 * 2, "worlds, agents, seeds");
+    for row in &before.rows {
+        assert_eq!([&row[2], &row[4], &row[8]], ["nature", "2016", ""]);
+        assert!(!row[7].is_empty() && !row[10].is_empty(), "{row:?}");
     }
     assert!(page.contains("| chain | "), "{page}");
     assert!(!page.contains("Interquartile"), "of two seeds: {page}");
@@ -161,18 +157,17 @@ fn procgen_without_the_engine() {
     assert!(summary("chain-c51-seed2.unfinished-1").exists());
     let again = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
     assert!(again.contains(": \"finished\""), "{again}");
-    let table = String::from_utf8(data(&folder)["table.csv"].clone()).unwrap();
-    let line = |game: &str, agent: &str, seed: &str| {
-        let of = |it: &Vec<&str>| [it[0], it[1], it[3]] == [game, agent, seed];
-        let mut lines = table.lines().map(|it| it.split(',').collect::<Vec<_>>());
-        lines.find(of).unwrap().join(",")
+    let after = table();
+    let row = |game: &str, agent: &str, seed: &str| {
+        let mut rows = after.rows.iter();
+        let found = rows.find(|it| [&it[0], &it[1], &it[3]] == [game, agent, seed]);
+        found.unwrap()
     };
-    let untouched = line("mspacman", "driml-ada", "2");
-    assert!(lines.iter().any(|it| it.join(",") == untouched));
+    assert!(before.rows.contains(row("mspacman", "driml-ada", "2")));
     // Of the same weights it is kept, of others it is not.
-    let is_kept = |seed: &str| line("chain", "c51", seed).contains(",777.0,");
+    let is_kept = |seed: &str| row("chain", "c51", seed).iter().any(|it| it == "777.0");
     assert!(is_kept("1") && !is_kept("2"));
-    assert!(line("chain", "c51", "1").ends_with(','), "no commit");
+    assert_eq!(&row("chain", "c51", "1")[10], "", "no commit");
 
     // More agents can be added; another length cannot.
     system.run_ok(&format!("{call} --agents c51,cpc --report"));
@@ -183,11 +178,9 @@ fn procgen_without_the_engine() {
     // Runs that lie there beside their calls, and nothing else, are reported.
     fs::remove_dir_all(&pieces).unwrap();
     system.run_ok(&format!("{call} --report"));
-    let table = String::from_utf8(data(&folder)["table.csv"].clone()).unwrap();
-    assert!(
-        table.lines().count() == 9 && !table.contains(",777.0,"),
-        "{table}"
-    );
+    let table = table();
+    let is_anew = table.rows.iter().flatten().all(|it| it != "777.0");
+    assert!(table.rows.len() == 8 && is_anew, "{table:?}");
 }
 
 #[test]
@@ -310,7 +303,7 @@ fn killed_and_resumed() {
         summary.outcome == Outcome::Finished && summary.resumed_after_updates > 0,
         "{summary:#?}"
     );
-    let page = fs::read_to_string(system.path("x/README.md")).unwrap();
+    let page = system.read("x/README.md");
     assert!(page.contains("* 1 of 1 runs are finished"), "{page}");
 }
 
@@ -329,13 +322,11 @@ fn a_grid_makes_every_combination_once() {
     let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;
     let folder = system.path("experiments/grid");
     assert!(printed.ends_with("grid.svg\n"), "{printed}");
-    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
-    let rows: Vec<Vec<&str>> = table.lines().map(|row| row.split(',').collect()).collect();
-    assert_eq!(
-        rows[0][..4],
-        ["env", "agent", "learner.update.adam.lr", "seeds"]
-    );
-    let cells: Vec<&[&str]> = rows[1..].iter().map(|row| &row[1..4]).collect();
+    let table = || system.run_folder("experiments/grid").table("grid.csv");
+    let columns = ["env", "agent", "learner.update.adam.lr", "seeds"];
+    assert_eq!(table().header[..4], columns);
+    let rows = table().rows;
+    let cells: Vec<_> = rows.iter().map(|row| [&row[1], &row[2], &row[3]]).collect();
     let expected = [
         ["c51", "1e-4", "1"],
         ["c51", "1e-3", "1"],
@@ -350,13 +341,11 @@ fn a_grid_makes_every_combination_once() {
     let before = made();
     system.run_ok(&format!("{call} --seeds 2 --jobs 2"));
     assert_eq!(made(), before);
-    let table = fs::read_to_string(folder.join("grid.csv")).unwrap();
-    let mut seeds = table.lines().skip(1).map(|row| row.split(',').nth(3));
-    assert!(seeds.all(|seeds| seeds == Some("2")), "{table}");
+    let made = table().rows;
+    assert!(made.iter().all(|row| &row[3] == "2"), "{made:?}");
     // A report of the folder has all that is there.
     system.run_ok("grid --report");
-    let reported = fs::read_to_string(folder.join("grid.csv")).unwrap();
-    assert_eq!(reported, table);
+    assert_eq!(table().rows, made);
     // Another grid does not mix with it.
     system.refuses(&format!("{fixed} --frames 352"), "other settings");
 }
