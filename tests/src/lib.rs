@@ -22,7 +22,7 @@ mod waiting;
 pub use certificates::{Certificates, Valid};
 pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
 pub use network::Network;
-pub use process::{Ended, Process};
+pub use process::{Ended, Process, check_has};
 pub use run_folder::{EpisodeRow, Outcome, RunFolder, Summary, Table, updates_of};
 pub use skipped::{is_offline, note, skip, skipped_offline, succeeds};
 pub use slow_machine::SlowMachine;

@@ -68,6 +68,14 @@ impl Output {
     }
 }
 
+/// Checks that a text has all of these words.
+#[track_caller]
+pub fn check_has(text: &str, all: &[&str]) {
+    for words in all {
+        assert!(text.contains(words), "wanted {words:?} in:\n{text}");
+    }
+}
+
 /// What a command prints that is not the program.
 pub(crate) fn run(command: &mut Command) -> String {
     let output = command.output().unwrap();
@@ -209,16 +217,14 @@ impl Ended {
     /// Checks that standard error holds `words`.
     #[track_caller]
     pub fn expect_said(self, words: &str) -> Self {
-        let said = &self.stderr;
-        assert!(said.contains(words), "wanted {words:?} in:\n{said}");
+        check_has(&self.stderr, &[words]);
         self
     }
 
     /// Checks that standard output holds `words`.
     #[track_caller]
     pub fn expect_printed(self, words: &str) -> Self {
-        let said = &self.stdout;
-        assert!(said.contains(words), "wanted {words:?} in:\n{said}");
+        check_has(&self.stdout, &[words]);
         self
     }
 }

@@ -8,7 +8,7 @@ use std::{
     process::Command,
 };
 
-use driml_tests::{Outcome, Process, TestSystem, succeeds, wait_for, wait_until};
+use driml_tests::{Outcome, Process, TestSystem, check_has, succeeds, wait_for, wait_until};
 
 use crate::{LONG, SHORT, system};
 
@@ -118,10 +118,7 @@ fn the_first_error_is_the_one_shown() {
     let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
     let last = &ended.stderr[errors..];
     assert!(last.contains("learner exited with code 1"), "{ended:#?}");
-    assert!(
-        ended.stderr.contains("summary.json: No space left"),
-        "{ended:#?}"
-    );
+    check_has(&ended.stderr, &["summary.json: No space left"]);
     let lost = ended.stderr.lines().filter(|it| it.contains("are lost: "));
     let lost: Vec<_> = lost.collect();
     assert!(

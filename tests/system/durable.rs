@@ -3,7 +3,9 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{Outcome, RunFolder, Survivor, TestSystem, check_nothing_lost, note, wait_until};
+use driml_tests::{
+    Outcome, RunFolder, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
+};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -199,10 +201,7 @@ fn a_resumed_run_continues_with_its_replay() {
     );
     assert_eq!(episodes.last().unwrap().episode, summary.episodes);
     let log = run.log("replay-server");
-    assert!(
-        log.contains("continues with the replay in run/replay"),
-        "{log}"
-    );
+    check_has(&log, &["continues with the replay in run/replay"]);
     // The log may know of updates that no checkpoint holds.
     let warns = |line: &&str| line.contains("WARN") && !line.contains("to be learned again");
     assert_eq!(log.lines().find(warns), None, "{log}");

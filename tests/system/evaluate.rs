@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_launch::evaluator::SELECTION_SEED;
-use driml_tests::{TestSystem, updates_of, wait_until};
+use driml_tests::{TestSystem, check_has, updates_of, wait_until};
 
 use crate::{SHORT, system};
 
@@ -51,10 +51,7 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
     let table = system.read("returns.csv");
     for policy in ["driml-fix", "random"] {
         let mean = told["policies"][policy]["mean_return"].as_f64().unwrap();
-        assert!(
-            said.contains(&format!("{policy:12} mean return {mean:8.3}")),
-            "{said}"
-        );
+        check_has(&said, &[&format!("{policy:12} mean return {mean:8.3}")]);
         let rows = table
             .lines()
             .filter_map(|row| row.strip_prefix(&format!("{policy},")));
@@ -117,10 +114,7 @@ fn an_exported_network_is_played_without_its_run() {
     fs::rename(system.path("run"), system.path("moved")).unwrap();
     let net = system.run_ok("evaluate net.safetensors --episodes 3 --record play.gif --overlay");
     let lines: Vec<_> = net.stdout.lines().collect();
-    assert!(
-        lines[0].contains("averaged f16 weights after 540 updates"),
-        "{lines:?}"
-    );
+    check_has(lines[0], &["averaged f16 weights after 540 updates"]);
     assert_eq!(lines.last(), run.stdout.lines().last().as_ref());
     let online = system.run_folder("moved").newest_checkpoint();
     let online = online.join("online.safetensors").display().to_string();

@@ -3,7 +3,7 @@
 
 use std::{collections::BTreeMap, fs, path::Path};
 
-use driml_tests::Outcome;
+use driml_tests::{Outcome, check_has};
 
 use crate::system;
 
@@ -40,9 +40,8 @@ fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
         "**Got.**",
         "**Differences from the paper.**",
     ];
-    for part in of_all.iter().chain(sections) {
-        assert!(page.contains(part), "{part}\n{page}");
-    }
+    check_has(&page, &of_all);
+    check_has(&page, sections);
     let found = data(folder);
     assert_eq!(names(&found), files);
     for (file, bytes) in &found {
@@ -196,11 +195,8 @@ fn pacman() {
     };
     assert!(config("epsilon0.25-seed1").contains("epsilon = 0.25"));
     let noise = config("noise-driml-fix-seed1");
-    assert!(
-        noise.contains("episodes_per_task = 8"),
-        "32 among 4 environments: {noise}"
-    );
-    assert!(noise.contains("[world.ising]"), "{noise}");
+    // 32 among 4 environments.
+    check_has(&noise, &["episodes_per_task = 8", "[world.ising]"]);
     assert!(!config("ghosts-c51-seed1").contains("[world.ising]"));
 }
 
@@ -214,10 +210,7 @@ fn tradeoff() {
     };
     let folder = system.path("t");
     let planned = call("--dials learner.precision --plan");
-    assert!(
-        planned.contains("level       learner.precision = bf16: about"),
-        "{planned}"
-    );
+    check_has(&planned, &["level       learner.precision = bf16: about"]);
     assert!(
         !folder.join("runs/c51-seed1").exists(),
         "a plan runs nothing"
@@ -227,11 +220,11 @@ fn tradeoff() {
     let summary = |run: &str| fs::read(folder.join("runs").join(run).join("summary.json"));
     let first = summary("c51-seed1").unwrap();
     let planned = call("--dials learner.precision,DIM --plan --budget 0");
-    assert!(
-        planned.contains("learner.precision = bf16: finished\n")
-            && planned.contains("DIM = driml-fix: does not fit"),
-        "{planned}"
-    );
+    let said = [
+        "learner.precision = bf16: finished\n",
+        "DIM = driml-fix: does not fit",
+    ];
+    check_has(&planned, &said);
     call("--dials DIM");
     assert_eq!(summary("c51-seed1").unwrap(), first, "it was not run again");
     let files = data(&folder);
@@ -246,21 +239,16 @@ fn tradeoff() {
     let page = fs::read_to_string(folder.join("README.md")).unwrap();
     let is_shown = page.contains("at equal wall-clock time");
     assert_eq!(is_shown, at_equal_time > 0, "{page}");
-    for part in [
+    let parts = [
         "smoke length",
         "| learner.precision | bf16 | c51 |",
         "| DIM | driml-ada | driml-ada |",
         "against f32 by candle's operations",
         "over 1 seed of a level and 2 of a base",
         "--dials learner.precision`, then `driml tradeoff --env chain",
-    ] {
-        assert!(page.contains(part), "{part}\n{page}");
-    }
-    let again = call("--report");
-    assert!(
-        again.contains("learner.precision = bf16 (c51): x"),
-        "{again}"
-    );
+    ];
+    check_has(&page, &parts);
+    check_has(&call("--report"), &["learner.precision = bf16 (c51): x"]);
     assert_eq!(data(&folder), files);
 
     // Seeds of another call are on the page, and a report of one dial has that alone.

@@ -1,7 +1,7 @@
 //! Rows drawn by priority, in whole runs: of one replay server and of several, and of one that dies. Those in lockstep are in `lockstep`.
 //! The law of the draws is tested beside the code.
 
-use driml_tests::Outcome;
+use driml_tests::{Outcome, check_has};
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, SHORT, chain, system};
@@ -67,9 +67,6 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
     let run = system.run_folder("run");
     run.check(Outcome::Finished);
     let log = run.log("replay-server");
-    assert!(
-        log.contains("priorities are those of the last checkpoint"),
-        "{log}"
-    );
+    check_has(&log, &["priorities are those of the last checkpoint"]);
     assert!(said(&log)[0] > 0, "{log}");
 }

@@ -2,7 +2,7 @@
 //! With `DRIML_OFFLINE=1` each test here is skipped and says so; what each game does is tested beside the worlds.
 
 use driml_settings::config::RunConfig;
-use driml_tests::skipped_offline;
+use driml_tests::{check_has, skipped_offline};
 
 use crate::system;
 
@@ -86,17 +86,13 @@ fn an_experiment_of_three_seeds_has_scores_over_games() {
     system
         .run_ok("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table");
     let page = system.read("table/README.md");
-    for line in [
+    let lines = [
         "| game | random | c51 training | c51 greedy | c51 paper |",
         "| 4.45 |\n",
         "* Interquartile mean of `driml-ada` over 1 games: 0.",
         "* Probability that `driml-ada` trains better than `c51`: ",
-    ] {
-        assert!(page.contains(line), "{line}\n{page}");
-    }
+    ];
+    check_has(&page, &lines);
     let table = system.read("table/table.csv");
-    assert!(
-        table.contains("\nbigfish,driml-ada,nature,3,608,"),
-        "{table}"
-    );
+    check_has(&table, &["\nbigfish,driml-ada,nature,3,608,"]);
 }

@@ -9,7 +9,7 @@ use driml_protocol::{
     session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, SlowMachine, TestSystem, connect, new_learner, wait_for};
+use driml_tests::{Process, SlowMachine, TestSystem, check_has, connect, new_learner, wait_for};
 use serde_json::Value;
 
 use crate::{system, tls::TlsSystem};
@@ -193,14 +193,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let endpoint = system.endpoint();
     let status = format!("status --connect {endpoint}");
     let said = system.run_ok(&status).stdout;
-    for words in [
+    let words = [
         "chain, c51: frames ?/",
         "replay-server  reads its replay back",
         "reads its replay back from disk (",
         "no action needed",
-    ] {
-        assert!(said.contains(words), "{words:?}: {said}");
-    }
+    ];
+    check_has(&said, &words);
     system
         .run(&format!("watch --once --connect {endpoint}"))
         .expect_code(1)

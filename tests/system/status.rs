@@ -1,7 +1,7 @@
 //! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
 //! What processes log while they wait is here too.
 
-use driml_tests::{TestSystem, wait_for, wait_until};
+use driml_tests::{TestSystem, check_has, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, system};
@@ -25,13 +25,11 @@ fn missing_processes_are_named_with_what_to_do() {
     let endpoint = system.endpoint();
     let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let _client = system.connect();
-    let said = status(&system);
-    assert!(said.contains("chain, c51: frames 0/"), "{said}");
     let learn =
         format!("no learner has joined: start `driml learner --connect {endpoint} --run-dir DIR`");
-    assert!(said.contains(&learn), "{said}");
     let act = format!("no actor has joined: start `driml actor --connect {endpoint} --id N`");
-    assert!(said.contains(&act), "{said}");
+    let words = ["chain, c51: frames 0/", &learn, &act];
+    check_has(&status(&system), &words);
     // It says so itself.
     server.wait_for_stderr("no learner has joined yet, waiting since");
 

@@ -177,11 +177,9 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     );
     assert_eq!(said["losses"].as_object().unwrap().len(), 1);
     // The page for persons is that of `driml status`.
-    let page = system.run_ok(&look).stdout;
-    assert!(
-        page.contains("the run is over: everything is learned and saved"),
-        "{page}"
-    );
+    system
+        .run_ok(&look)
+        .expect_printed("the run is over: everything is learned and saved");
 
     let samples = parse_prometheus(&system.read("run.prom"));
     let of = |name: &str| samples.iter().find(|(it, ..)| it == name).unwrap();
