@@ -4,7 +4,7 @@
 use std::{
     fs::{self, File},
     io::Write,
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::Command,
 };
 
@@ -28,14 +28,6 @@ impl Disk {
         }
         Some(Self { folder })
     }
-
-    /// Takes all room that there is.
-    fn fill(&self) -> Filler {
-        let path = self.folder.join("filler");
-        let mut file = File::create(&path).unwrap();
-        while file.write_all(&[0; 4096]).is_ok() {}
-        Filler { path }
-    }
 }
 
 impl Drop for Disk {
@@ -47,15 +39,10 @@ impl Drop for Disk {
     }
 }
 
-/// A file that takes all room of a disk.
-struct Filler {
-    path: PathBuf,
-}
-
-impl Filler {
-    fn remove(self) {
-        fs::remove_file(&self.path).unwrap();
-    }
+/// Takes all room that there is, with a file.
+pub(crate) fn fill(file: impl AsRef<Path>) {
+    let mut file = File::create(file).unwrap();
+    while file.write_all(&[0; 4096]).is_ok() {}
 }
 
 /// Updates between two checkpoints of a run that ends before the first.
@@ -80,16 +67,17 @@ fn times(said: &str, words: &str) -> usize {
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
     let system = system();
-    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
+    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
-    let filler = disk.fill();
+    let filler = system.path("disk/filler");
+    fill(&filler);
     process.wait_for_stderr("cannot be written: No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
     client.wait_for_updates(then + 200);
-    filler.remove();
+    fs::remove_file(filler).unwrap();
     let run = system.run_folder("disk/run");
     let now = client.learner().unwrap().updates;
     run.wait_for_updates(now);
@@ -107,11 +95,12 @@ fn a_run_continues_while_the_disk_is_full() {
 #[test]
 fn the_first_error_is_the_one_shown() {
     let system = system();
-    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
+    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, NEVER);
-    let filler = disk.fill();
+    let filler = system.path("disk/filler");
+    fill(&filler);
     process.wait_for_stderr("cannot be written: No space left");
     let ended = process.interrupt().expect_code(1);
     // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
@@ -131,23 +120,24 @@ fn the_first_error_is_the_one_shown() {
             "a cause is logged once: {line}"
         );
     }
-    filler.remove();
+    fs::remove_file(filler).unwrap();
     check_nothing_is_left(&system);
 }
 
 #[test]
 fn a_checkpoint_that_finds_no_room_is_tried_again() {
     let system = system();
-    let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
+    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
     let mut process = started(&system, 200);
-    let filler = disk.fill();
+    let filler = system.path("disk/filler");
+    fill(&filler);
     process.wait_for_stderr("No space left");
     let client = system.connect();
     let then = client.learner().unwrap().updates;
     client.wait_for_updates(then + 600);
-    filler.remove();
+    fs::remove_file(filler).unwrap();
     let now = client.learner().unwrap().updates;
     wait_until("a checkpoint after that", || {
         let names = system.names("disk/run/checkpoints");
@@ -176,7 +166,7 @@ const IN_FLIGHT: u64 = 8;
 #[test]
 fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let system = system();
-    let Some(disk) = Disk::mount(system.path("disk"), 20_000) else {
+    let Some(_disk) = Disk::mount(system.path("disk"), 20_000) else {
         return;
     };
     let flags = format!("--agent c51 {LONG} --replay-dir disk/replay");
@@ -184,7 +174,8 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
     let client = system.connect();
     client.wait_for_updates(100);
-    let filler = disk.fill();
+    let filler = system.path("disk/filler");
+    fill(&filler);
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
     let ask = format!("status --connect {}", system.endpoint());
@@ -199,7 +190,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         let said = system.run(&ask).stdout;
         words.iter().all(|it| said.contains(it))
     });
-    filler.remove();
+    fs::remove_file(filler).unwrap();
     client.wait_for_replay("more frames", |replay| {
         replay.transitions_inserted > stopped.transitions_inserted + 1_000
     });

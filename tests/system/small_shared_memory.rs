@@ -1,12 +1,12 @@
 //! Shared memory of which there is too little, at the start or later: a run says so once, goes through sockets, and ends well.
 //! A small `/dev/shm` takes root's rights to mount; without them a line says what is skipped.
 
-use std::{fs::File, io::Write, process::Command};
+use std::process::Command;
 
 use driml_tests::{Ended, succeeds};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, chain, system};
+use crate::{LONG, chain, disk_full::fill, system};
 
 /// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that the test is skipped, if
 /// that is not permitted.
@@ -69,8 +69,7 @@ fn a_run_continues_when_others_fill_it_up() {
     client.wait_for_updates(100);
     // One that starts when it is full warns, too.
     client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
-    let mut filler = File::create(format!("/proc/{}/root/dev/shm/filler", process.pid())).unwrap();
-    while filler.write_all(&[0; 4096]).is_ok() {}
+    fill(format!("/proc/{}/root/dev/shm/filler", process.pid()));
     let then = client.learner().unwrap().updates;
     client.wait_for_updates(then + 200);
     // A process that starts now finds no room.
