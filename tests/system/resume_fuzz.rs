@@ -213,34 +213,23 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
     let settings = run.path().join("config.toml");
     wait_until("the run's settings", || settings.exists());
     std::thread::sleep(moment);
+    // There is none before the launcher has started it, and after the run's end.
+    let kill = |role| {
+        let found = system.find_process_now(role);
+        found.iter().for_each(|it| it.signal(Signal::SIGKILL));
+    };
     match stop {
         Stop::End => {}
-        Stop::Interrupt => {
-            let ended = process.interrupt();
-            assert!(matches!(ended.code, Some(0 | 130)), "{ended:?}");
-        }
-        Stop::KillLauncher => {
-            process.signal(Signal::SIGKILL);
-            process.wait();
-            system.wait_until_all_have_ended();
-        }
-        Stop::KillLearner | Stop::KillServer => {
-            let role = match stop {
-                Stop::KillLearner => "learner",
-                _ => "replay-server",
-            };
-            // There is none before the launcher has started it, and after the run's end.
-            if let Some(role) = system.find_process_now(role) {
-                role.signal(Signal::SIGKILL);
-            }
-            process.wait();
-            system.wait_until_all_have_ended();
-        }
-        Stop::KillAll => {
-            system.kill_all();
-            process.wait();
-        }
+        Stop::Interrupt => process.signal(Signal::SIGINT),
+        Stop::KillLauncher => process.signal(Signal::SIGKILL),
+        Stop::KillAll => system.kill_all(),
+        Stop::KillLearner => kill("learner"),
+        Stop::KillServer => kill("replay-server"),
     }
+    let ended = process.wait();
+    let in_order = matches!(ended.code, Some(0 | 130));
+    assert!(in_order || stop != Stop::Interrupt, "{ended:?}");
+    system.wait_until_all_have_ended();
 }
 
 /// The last 32 of 1,280 frames are too few for another update, and the last update has a checkpoint already.

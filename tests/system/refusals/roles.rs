@@ -93,17 +93,16 @@ fn an_actor_asks_for_nothing_but_its_own() {
     // At its own keys, messages that speak for another.
     let before = run.refused();
     let chunk = Chunk::zeroed(chunk_header(one, other, incarnation));
-    let rows = [
-        (keys.of_actor::<ChunkHeader>(1), one.seal(&chunk)),
-        (keys.of_actor::<Leave>(1), sealed(one, &leave)),
-        (keys.of_actor::<ActorJoin>(1), sealed(one, &join)),
-        (keys.of_actor::<ChunkPoll>(1), sealed(one, &poll)),
-    ];
-    let expected = ["speaks for actor 0 at the key", SILENCE, SILENCE, SILENCE];
-    let rows = rows.into_iter().zip(expected);
+    let chunks = keys.of_actor::<ChunkHeader>(1);
+    let said = "speaks for actor 0 at the key";
     send(
         one,
-        rows.map(|((key, bytes), expected)| Row::new(key, bytes, expected)),
+        [
+            Row::new(chunks, one.seal(&chunk), said),
+            Row::new(keys.of_actor::<Leave>(1), sealed(one, &leave), SILENCE),
+            Row::new(keys.of_actor::<ActorJoin>(1), sealed(one, &join), SILENCE),
+            Row::new(keys.of_actor::<ChunkPoll>(1), sealed(one, &poll), SILENCE),
+        ],
     );
     assert_eq!(run.refused(), before + 4);
     run.continues();
