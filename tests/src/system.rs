@@ -297,6 +297,15 @@ impl TestSystem {
 }
 
 impl Survivor {
+    /// A number of the process's status in `/proc`, such as `VmRSS`.
+    pub fn status(&self, name: &str) -> u64 {
+        let text = fs::read_to_string(format!("/proc/{}/status", self.pid)).unwrap();
+        let mut lines = text.lines();
+        let found = lines.find_map(|line| line.strip_prefix(name)?.strip_prefix(':'));
+        let number = found.and_then(|rest| rest.split_whitespace().next());
+        number.unwrap().parse().unwrap()
+    }
+
     /// Sends a signal; a process that has ended meanwhile is ignored.
     pub fn signal(&self, signal: Signal) {
         let _ = kill(Pid::from_raw(self.pid), signal);

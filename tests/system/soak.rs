@@ -25,16 +25,12 @@ struct Held {
 }
 
 fn held(system: &TestSystem, process: &str) -> Held {
-    let pid = system.find_process(process).pid;
-    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-    let number = |name: &str| -> u64 {
-        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse().unwrap()
-    };
+    let process = system.find_process(process);
+    let descriptors = fs::read_dir(format!("/proc/{}/fd", process.pid));
     Held {
-        rss_kib: number("VmRSS:"),
-        descriptors: fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count(),
-        threads: number("Threads:"),
+        rss_kib: process.status("VmRSS"),
+        descriptors: descriptors.unwrap().count(),
+        threads: process.status("Threads"),
     }
 }
 

@@ -1,12 +1,9 @@
 //! Well-formed lies: a second client that knows the run's hash and sends impossible content in each kind of message.
 //! Each is rejected, counted, and logged at a bounded rate; the run continues. Malformed messages are in `messages`.
 
-use std::{
-    fs,
-    sync::{
-        Arc,
-        atomic::{AtomicUsize, Ordering},
-    },
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
 };
 
 use driml_protocol::{
@@ -274,13 +271,8 @@ fn of_priorities() {
 fn of_half_a_gigabyte() {
     let lied = lied();
     let client = &lied.client;
-    let server = lied.system.find_process("replay-server").pid;
-    let peak_mib = || {
-        let status = fs::read_to_string(format!("/proc/{server}/status")).unwrap();
-        let mut lines = status.lines();
-        let peak = lines.find_map(|line| line.strip_prefix("VmHWM:")?.strip_suffix(" kB"));
-        peak.unwrap().trim().parse::<u64>().unwrap() / 1024
-    };
+    let server = lied.system.find_process("replay-server");
+    let peak_mib = || server.status("VmHWM") / 1024;
     let (keys, peak_before) = (&client.keys, peak_mib());
     let long: [String; 4] = [
         keys.of_actor::<ChunkHeader>(0),
