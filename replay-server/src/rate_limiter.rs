@@ -121,11 +121,8 @@ impl RateLimiter {
 
     /// Whether all transitions of the run are in.
     pub fn all_in(&self) -> bool {
-        self.counts.refill_left == 0
-            && self
-                .config
-                .transitions_max
-                .is_some_and(|max| self.inserted_total() >= max)
+        let max = self.config.transitions_max;
+        self.counts.refill_left == 0 && max.is_some_and(|max| self.inserted_total() >= max)
     }
 
     /// Whether all transitions are in and no further batch of `rows` is allowed.

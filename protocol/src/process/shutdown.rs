@@ -38,11 +38,9 @@ impl Shutdown {
 
     /// Sleeps for `timeout`, or until the flag is raised; returns whether it is.
     pub fn wait_timeout(&self, timeout: Duration) -> bool {
-        let (flag, _) = self
-            .state
-            .1
-            .wait_timeout_while(self.flag(), timeout, |set| !*set)
-            .expect("no thread panics while holding the flag");
+        let (_, raised) = &*self.state;
+        let waited = raised.wait_timeout_while(self.flag(), timeout, |set| !*set);
+        let (flag, _) = waited.expect("no thread panics while holding the flag");
         *flag
     }
 
@@ -52,10 +50,8 @@ impl Shutdown {
     }
 
     fn flag(&self) -> std::sync::MutexGuard<'_, bool> {
-        self.state
-            .0
-            .lock()
-            .expect("no thread panics while holding the flag")
+        let flag = self.state.0.lock();
+        flag.expect("no thread panics while holding the flag")
     }
 
     /// The result of `work`, run on a thread of this `name`; `None` if the flag is raised first. The thread is then left alone.

@@ -7,7 +7,7 @@
 use std::{
     fmt,
     ops::{Deref, DerefMut},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
 use zenoh::{
@@ -34,6 +34,12 @@ struct Pool {
     spare: Mutex<Vec<Vec<u8>>>,
     spare_max: usize,
     shared: Option<Shared>,
+}
+
+impl Pool {
+    fn spare(&self) -> MutexGuard<'_, Vec<Vec<u8>>> {
+        self.spare.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 struct Shared {
@@ -73,13 +79,7 @@ impl BufferPool {
 
     /// `bytes` bytes of this process's own memory, with whatever was in them before.
     pub fn take_own(&self, bytes: usize) -> Buffer {
-        let spare = self
-            .0
-            .spare
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .pop();
-        let mut vec = spare.unwrap_or_default();
+        let mut vec = self.0.spare().pop().unwrap_or_default();
         vec.resize(bytes, 0);
         Buffer(Memory::Own(vec, Some(self.0.clone())))
     }
@@ -109,7 +109,7 @@ impl BufferPool {
 }
 
 impl Shared {
-    fn trust(&self) -> std::sync::MutexGuard<'_, Trust> {
+    fn trust(&self) -> MutexGuard<'_, Trust> {
         self.trust.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -118,11 +118,8 @@ impl Shared {
         if !self.trust().ask() {
             return None;
         }
-        let taken = self
-            .provider
-            .alloc(bytes)
-            .with_policy::<Defragment<GarbageCollect>>()
-            .wait();
+        let piece = self.provider.alloc(bytes);
+        let taken = piece.with_policy::<Defragment<GarbageCollect>>().wait();
         if let Err(e) = &taken {
             tracing::debug!("{bytes} bytes of shared memory are not free: {e:?}");
         }
@@ -176,7 +173,7 @@ impl From<Vec<u8>> for Buffer {
 impl Drop for Buffer {
     fn drop(&mut self) {
         if let Memory::Own(bytes, Some(pool)) = &mut self.0 {
-            let mut spare = pool.spare.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut spare = pool.spare();
             if spare.len() < pool.spare_max {
                 spare.push(std::mem::take(bytes));
             }

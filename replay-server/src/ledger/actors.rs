@@ -231,10 +231,8 @@ impl Actors {
     /// A new life starts with fresh streams. Where the counts differ, the streams are cut: what follows does not continue
     /// what was stored.
     pub(crate) fn accept(&mut self, header: &ChunkHeader) -> (&mut [Stream], Difference) {
-        let actor = self
-            .actors
-            .get_mut(&header.actor)
-            .expect("a chunk of an actor that has not joined is never judged Next");
+        let actor = self.actors.get_mut(&header.actor);
+        let actor = actor.expect("a chunk of an actor that has not joined is never judged Next");
         let difference = Difference::between(header.first_transition, actor.current.produced);
         if header.sequence == 0 || actor.streams.is_empty() {
             let start = || Stream {

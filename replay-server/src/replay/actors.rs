@@ -93,11 +93,8 @@ impl Replay {
         if !(self.limiter.may_insert() || self.state.starving || is_leaving) {
             return self.wait(false);
         }
-        match self
-            .log
-            .as_mut()
-            .map_or(Ok(true), |log| log.append_chunk(packed))
-        {
+        let log = self.log.as_mut();
+        match log.map_or(Ok(true), |log| log.append_chunk(packed)) {
             Ok(true) => {}
             Ok(false) => return self.wait(false),
             Err(why) => return InsertReply::Refused { why },

@@ -152,18 +152,16 @@ impl History {
 
     /// The first step of the level that step `t` belongs to.
     fn level_start(records: &[Record], t: usize) -> usize {
-        (0..t)
-            .rev()
-            .find(|&i| records[i].end != End::Running)
-            .map_or(0, |i| i + 1)
+        let ended = (0..t).rev().find(|&i| records[i].end != End::Running);
+        ended.map_or(0, |i| i + 1)
     }
 
     /// The steps whose frames make the state of step `t`, oldest first.
     fn stack_steps(&self, key: StreamKey, t: usize) -> Vec<usize> {
         let start = Self::level_start(&self.streams[&key], t);
         let stack = self.spec.frame_stack as usize;
-        (0..stack)
-            .rev()
+        let backs = (0..stack).rev();
+        backs
             .map(|back| t.saturating_sub(back).max(start))
             .collect()
     }
@@ -201,10 +199,8 @@ impl History {
             return false;
         }
         let reach = self.spec.n_step.max(self.spec.horizon.k_max()) as usize;
-        let ends = records[t..]
-            .iter()
-            .take(reach)
-            .any(|record| record.end.is_episode_end());
+        let mut within = records[t..].iter().take(reach);
+        let ends = within.any(|record| record.end.is_episode_end());
         ends || t + reach < records.len()
     }
 
@@ -234,10 +230,8 @@ impl History {
                 break;
             }
         }
-        let in_level = records[t..]
-            .iter()
-            .take_while(|record| record.end == End::Running)
-            .count();
+        let follow = records[t..].iter();
+        let in_level = follow.take_while(|it| it.end == End::Running).count();
         Row {
             action: records[t].action,
             next_action: if records[t].end == End::Running {

@@ -33,10 +33,10 @@ impl ChiSquare {
         if pooled.1 >= 5.0 {
             cells.push(pooled);
         }
-        self.statistic += cells
+        let terms = cells
             .iter()
-            .map(|(have, want)| (have - want).powi(2) / want)
-            .sum::<f64>();
+            .map(|(have, want)| (have - want).powi(2) / want);
+        self.statistic += terms.sum::<f64>();
         self.degrees += cells.len().saturating_sub(1) as f64;
     }
 

@@ -163,10 +163,8 @@ impl Setup {
                 assert!(near || may_hide, "{chance}, {expected}");
             }
         }
-        let (counts, chances): (Vec<u64>, Vec<f64>) = law
-            .iter()
-            .map(|(index, chance)| (counts[index], *chance))
-            .unzip();
+        let both = law.iter().map(|(index, chance)| (counts[index], *chance));
+        let (counts, chances): (Vec<u64>, Vec<f64>) = both.unzip();
         let mut chi = ChiSquare::default();
         chi.add(&counts, &chances);
         chi.check(&what);
