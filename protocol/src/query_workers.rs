@@ -51,10 +51,8 @@ pub struct Incoming<R> {
 impl<R: Request> Incoming<R> {
     /// Reads a request without payload.
     pub fn read(&self) -> Result<R, CodecError> {
-        let bytes = self.query.payload().map(ZBytes::to_bytes);
-        let (request, _) = codec::decode(&bytes.unwrap_or_default(), Some(self.spec_hash))?;
-        self.check_actor(&request)?;
-        Ok(request)
+        let read = self.receive(&BufferPool::new(0));
+        read.map(|(request, _)| request)
     }
 
     /// Reads a request and copies its payload into own memory of `pool`.
@@ -210,12 +208,8 @@ impl<R: Request + 'static> QueryWorkers<R> {
                 tracing::debug!("more queries than can wait; the sender retries");
             }
         };
-        client
-            .session()
-            .declare_queryable(client.keys().of::<R>())
-            .complete(true)
-            .callback(take)
-            .wait()
+        let queryable = client.session().declare_queryable(client.keys().of::<R>());
+        queryable.complete(true).callback(take).wait()
     }
 
     /// The threads, to be waited for.
