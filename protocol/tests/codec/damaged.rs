@@ -107,13 +107,8 @@ fn each_mismatch_has_its_own_error() {
     );
     assert_eq!(read(&good, Some(SPEC)), Ok(()));
 
-    let newer = forge(
-        PROTOCOL_VERSION + 1,
-        Kind::WeightsVersion as u16,
-        (1, 0),
-        &header,
-        &[],
-    );
+    let own = Kind::WeightsVersion as u16;
+    let newer = forge(PROTOCOL_VERSION + 1, own, (1, 0), &header, &[]);
     let version = CodecError::Version {
         theirs: PROTOCOL_VERSION + 1,
         ours: PROTOCOL_VERSION,
@@ -145,13 +140,8 @@ fn each_mismatch_has_its_own_error() {
 #[test]
 fn huge_lengths_are_refused_without_taking_memory() {
     let read = |lengths| {
-        let bytes = forge(
-            PROTOCOL_VERSION,
-            Kind::WeightsVersion as u16,
-            lengths,
-            &[5],
-            &[],
-        );
+        let kind = Kind::WeightsVersion as u16;
+        let bytes = forge(PROTOCOL_VERSION, kind, lengths, &[5], &[]);
         codec::decode::<WeightsVersion>(&bytes, Some(SPEC)).unwrap_err()
     };
     let too_large = |have, max| CodecError::TooLarge { have, max };

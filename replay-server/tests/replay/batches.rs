@@ -119,11 +119,8 @@ fn check_frames(batch: &Batch, spec: &RunSpec) {
         };
         frames.extend((0..stack).map(|slot| frame(slot).copied().collect::<Vec<u8>>()));
     }
-    assert_eq!(
-        stacked.frames as usize,
-        frames.len(),
-        "each frame is another"
-    );
+    let sent = stacked.frames as usize;
+    assert_eq!(sent, frames.len(), "each frame is another");
 }
 
 fn horizons() -> impl Strategy<Value = Horizon> {

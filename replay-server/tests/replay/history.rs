@@ -85,12 +85,9 @@ pub(crate) fn frame(spec: &RunSpec, key: StreamKey, step: usize) -> Vec<u8> {
 /// The identity of the newest frame of a state.
 pub(crate) fn identity(spec: &RunSpec, state: &[u8]) -> (StreamKey, usize) {
     let (channels, stack) = (spec.frame_channels as usize, spec.frame_stack as usize);
-    let newest: Vec<u8> = state
-        .chunks(channels * stack)
-        .flat_map(|pixel| &pixel[channels * (stack - 1)..])
-        .copied()
-        .collect();
-    let id = &newest[..6];
+    let pixels = state.chunks(channels * stack);
+    let newest = pixels.flat_map(|pixel| &pixel[channels * (stack - 1)..]);
+    let id: Vec<u8> = newest.take(6).copied().collect();
     (
         (id[0], id[1], id[2], id[3]),
         usize::from(id[4]) + 256 * usize::from(id[5]),
@@ -160,19 +157,14 @@ impl History {
     fn stack_steps(&self, key: StreamKey, t: usize) -> Vec<usize> {
         let start = Self::level_start(&self.streams[&key], t);
         let stack = self.spec.frame_stack as usize;
-        let backs = (0..stack).rev();
-        backs
-            .map(|back| t.saturating_sub(back).max(start))
-            .collect()
+        let step = |slot: usize| t.saturating_sub(stack - 1 - slot).max(start);
+        (0..stack).map(step).collect()
     }
 
     pub(crate) fn state(&self, key: StreamKey, t: usize) -> Vec<u8> {
         let channels = self.spec.frame_channels as usize;
-        let frames: Vec<_> = self
-            .stack_steps(key, t)
-            .into_iter()
-            .map(|step| frame(&self.spec, key, step))
-            .collect();
+        let steps = self.stack_steps(key, t).into_iter();
+        let frames: Vec<_> = steps.map(|step| frame(&self.spec, key, step)).collect();
         let pixels = 0..self.spec.frame_bytes() / channels;
         pixels
             .flat_map(|p| {

@@ -70,11 +70,8 @@ fn the_k_served_follow_the_law() {
         assert_eq!(status.affinity_version, 1);
         assert_eq!(status.k_histogram.iter().sum::<u64>(), status.rows_sampled);
     }
-    let (mut replay, history) = filled(
-        Horizon::Uniform { k_max: 5 },
-        &Config::unlimited(150),
-        &mut rng,
-    );
+    let (horizon, config) = (Horizon::Uniform { k_max: 5 }, Config::unlimited(150));
+    let (mut replay, history) = filled(horizon, &config, &mut rng);
     let equal = |actions: &[u8]| vec![1.0 / actions.len() as f64; actions.len()];
     check_ks(&mut replay, &history, equal);
 }

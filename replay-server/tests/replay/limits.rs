@@ -384,10 +384,8 @@ fn each_fault_names_its_key_and_a_way_out() {
 fn the_least_capacity_works_and_a_smaller_one_is_refused() {
     let rng = &mut ChaCha8Rng::seed_from_u64(5);
     for (n_step, stack) in [(1, 1), (1, 4), (2, 2), (7, 1), (8, 4), (1000, 4)] {
-        let (spec, least) = (
-            spec(3, stack, n_step, Horizon::None {}),
-            u64::from(n_step + stack),
-        );
+        let spec = spec(3, stack, n_step, Horizon::None {});
+        let least = u64::from(n_step + stack);
         let said = refusal(&Config::unlimited(least - 1), &spec, 4);
         let named = format!("replay.capacity_transitions = {} ", least - 1);
         assert!(said.starts_with(&named), "{said}");

@@ -33,12 +33,8 @@ struct Kept {
 impl Kept {
     fn new(capacity: u64) -> Self {
         let root = tempfile::tempdir().unwrap();
-        let mut life = StoredReplay::begin(
-            &root.path().join("log"),
-            Config::unlimited(capacity),
-            4_000,
-            3,
-        );
+        let (dir, config) = (root.path().join("log"), Config::unlimited(capacity));
+        let mut life = StoredReplay::begin(&dir, config, 4_000, 3);
         // Until the newest has some, too.
         let (mut newest, mut in_newest) = (None, 0);
         while life.history.inserted < 800 || in_newest < 5 {
