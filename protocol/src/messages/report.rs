@@ -155,12 +155,8 @@ mod tests {
             assert!(bad.checked(&[]).is_err(), "{bad:?}");
         }
         assert!(report("plays", 1.0, None).checked(&[1]).is_err());
-        let cut = Report::new(
-            Participant::Learner(1),
-            &long,
-            0.0,
-            Some(Warning::new(&long, 0.0)),
-        );
+        let warning = Some(Warning::new(&long, 0.0));
+        let cut = Report::new(Participant::Learner(1), &long, 0.0, warning);
         assert!(cut.checked(&[]).is_ok());
     }
 }

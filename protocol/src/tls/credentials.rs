@@ -84,12 +84,9 @@ impl Credentials {
         let secret = PrivateKeyDer::from_pem_slice(&read(&key, role)?);
         let secret = secret.map_err(|_| not_pem(&key))?;
         let own = parsed(&chain[0], &certificate)?;
-        let names: Vec<_> = own
-            .subject()
-            .iter_common_name()
-            .map(|name| name.as_str().unwrap_or_default().to_owned())
-            .collect();
-        if names != [role.to_string()] {
+        let names = own.subject().iter_common_name();
+        let names: Vec<_> = names.map(|it| it.as_str().unwrap_or_default()).collect();
+        if names != [role.to_string().as_str()] {
             return Err(TlsError(format!(
                 "{} is the certificate of {:?}, not of {:?}: each process has its own; `deploy/certs.sh {}` makes it",
                 certificate.display(),

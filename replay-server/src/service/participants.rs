@@ -226,12 +226,8 @@ mod tests {
         participants.seen(actor(9), Some(8), at(7));
         let report = |incarnation| {
             let (actor, warning) = (3, Some(Warning::new("late", 1.0)));
-            Report::new(
-                Participant::Actor { actor, incarnation },
-                "plays",
-                2.0,
-                warning,
-            )
+            let who = Participant::Actor { actor, incarnation };
+            Report::new(who, "plays", 2.0, warning)
         };
         assert!(participants.reported(report(1), at(8)));
         assert!(!participants.reported(report(9), at(8)));

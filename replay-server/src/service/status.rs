@@ -175,9 +175,7 @@ impl Service {
 
     pub(super) fn episodes(&self, incoming: Incoming<EpisodesRequest>) {
         if let Some(request) = self.read(&incoming) {
-            let mut state = self.state();
-            let reply = state.replay.episodes(request);
-            drop(state);
+            let reply = self.state().replay.episodes(request);
             incoming.into_responder().reply(&reply);
         }
     }
