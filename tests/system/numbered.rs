@@ -60,12 +60,11 @@ fn learn(run: &RunClient, learner: u64) -> u64 {
             learner,
             id,
             rows: ROWS,
-            shared_memory: false,
             learned: Learned {
                 rows_received: batches * u64::from(ROWS),
                 ..Learned::default()
             },
-            other_shards: None,
+            ..BatchRequest::default()
         };
         let asked = run.send(run.seal(&request)?, Duration::from_secs(2))?;
         asked.receive(&pool)

@@ -4,8 +4,8 @@
 use std::{borrow::Cow, fs, path::Path, time::Duration};
 
 use driml_protocol::{
-    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Keys, Learned, ReplayStatus,
-    RequestId, RunClient, RunInfo, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
+    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Keys, ReplayStatus, RequestId,
+    RunClient, RunInfo, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
     session::SessionError,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
@@ -141,9 +141,7 @@ fn check_put_off(system: &TestSystem, spec: &RunSpec) {
         learner: 99,
         id: RequestId::first(1),
         rows: 16,
-        shared_memory: false,
-        learned: Learned::default(),
-        other_shards: None,
+        ..BatchRequest::default()
     };
     let upload = WeightsUpload {
         learner: 99,

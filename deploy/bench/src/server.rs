@@ -16,8 +16,7 @@ use driml_learner::{
 };
 use driml_machine::effort::Effort;
 use driml_protocol::{
-    ActorJoin, Alive, JoinReply, Keys, LearnerJoin, Request, RunClient, ShardCounts, Shutdown,
-    join,
+    ActorJoin, Alive, JoinReply, Keys, LearnerJoin, Request, RunClient, Shutdown, join,
     session::{self, Endpoints, MESSAGE_BYTES_MAX},
     tls::{Credentials, Role},
 };
@@ -140,10 +139,7 @@ impl Server {
         let join = LearnerJoin {
             learner: LEARNER,
             run: LEARNER,
-            updates: 0,
-            counts: ShardCounts::default(),
-            other_shards: ShardCounts::default(),
-            restart: false,
+            ..LearnerJoin::default()
         };
         let _alive = take_part(&client, Alive::learner(LEARNER), &join)?;
         let requests = Requests {

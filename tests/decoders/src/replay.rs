@@ -67,7 +67,7 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     }
 }
 
-pub(crate) fn config(shards: u32, sampling: Sampling) -> Config {
+fn config(shards: u32, sampling: Sampling) -> Config {
     Config {
         shards,
         sampling,

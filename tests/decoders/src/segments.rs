@@ -10,7 +10,7 @@ use std::{
 
 use driml_protocol::{
     ActorJoin, AffinityUpdate, Buffer, Chunk, ChunkHeader, End, InsertReply, LearnerJoin, Leave,
-    RequestId, RunSpec, Sampling, ShardCounts, codec,
+    RequestId, RunSpec, codec,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
 
@@ -51,14 +51,9 @@ fn spec() -> RunSpec {
 
 fn config() -> Config {
     Config {
-        capacity_transitions: CAPACITY,
         // Without a thread.
         fsync_ms: Some(0),
-        replay_ratio: 1e6,
-        warmup_transitions: 0,
-        slack_transitions: 1 << 40,
-        transitions_max: None,
-        ..replay::config(1, Sampling::Uniform {})
+        ..Config::unlimited(CAPACITY)
     }
 }
 
@@ -296,10 +291,7 @@ fn log(chunks: u64) -> Vec<u8> {
     let join = LearnerJoin {
         learner: 7,
         run: 7,
-        updates: 0,
-        counts: ShardCounts::default(),
-        other_shards: ShardCounts::default(),
-        restart: false,
+        ..LearnerJoin::default()
     };
     replay.join_learner(join).unwrap();
     let mut affinity = AffinityUpdate {

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply,
-    Keyed, Learned, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply,
-    WeightsUpload, codec, session,
+    Keyed, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload,
+    codec, session,
 };
 use driml_tests::Client;
 use zenoh::qos::Priority;
@@ -66,9 +66,7 @@ fn batch_request(learner: u64, rows: u32) -> BatchRequest {
         learner,
         id: RequestId::first(7),
         rows,
-        shared_memory: false,
-        learned: Learned::default(),
-        other_shards: None,
+        ..BatchRequest::default()
     }
 }
 
