@@ -9,12 +9,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_540),
-    ("actor", 12_440),
-    ("replay-server", 11_580),
-    ("learner", 25_360),
-    ("deploy", 33_920),
-    ("tests", 11_710),
+    ("protocol", 8_030),
+    ("actor", 11_670),
+    ("replay-server", 11_300),
+    ("learner", 24_450),
+    ("deploy", 32_540),
+    ("tests", 11_370),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
