@@ -47,6 +47,10 @@ pub struct Config {
     pub replay_ratio: f64,
     /// Transitions stored before the replay ratio starts to count and the first row is sampled.
     pub warmup_transitions: u64,
+    /// New transitions stored before the first row is sampled when a run is resumed without its replay: no more than it had stored and
+    /// than fit, no fewer than the warm-up. Settings of earlier versions do not have it: as many as the warm-up.
+    #[serde(default)]
+    pub refill_transitions: u64,
     /// Transitions that inserts may run ahead of sampling, after the warm-up, before they have to wait.
     pub slack_transitions: u64,
     /// Transitions of the whole run, warm-up included: once that many are stored, no more are taken. None runs on.
@@ -94,6 +98,7 @@ impl Config {
             compressed_bytes_max: None,
             replay_ratio: 1e6,
             warmup_transitions: 0,
+            refill_transitions: 0,
             slack_transitions: 1 << 40,
             transitions_max: None,
             disk_bytes_max: None,

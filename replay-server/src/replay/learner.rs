@@ -80,8 +80,13 @@ impl Replay {
         if join.updates == 0 || self.ring.inserted() > 0 {
             return;
         }
-        let shards = u64::from(self.config.shards);
-        let refill = self.config.warmup_transitions.div_ceil(shards);
+        let config = &self.config;
+        let stored = (join.counts + join.other_shards).inserted;
+        let refill = config.refill_transitions.min(stored);
+        let refill = refill
+            .min(config.capacity_transitions)
+            .max(config.warmup_transitions);
+        let refill = refill.div_ceil(config.shards.into());
         // All shards' credit decides whether anything is left to fill it for.
         self.limiter.counts.other_shards = join.other_shards;
         self.limiter

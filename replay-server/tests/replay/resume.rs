@@ -51,10 +51,18 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         replay_ratio: 2.0,
         ..larger.clone()
     };
+    let refills = |refill_transitions, capacity_transitions| Config {
+        refill_transitions,
+        capacity_transitions,
+        ..config()
+    };
+    let (fuller, full) = (refills(1 << 40, 1000), refills(1 << 40, 96));
     let at = |updates, inserted| learner(1, updates, 8 * updates, inserted);
     let cases = [
         ("from the start", &unchanged, at(0, 0), 8, (30, 60), 0),
         ("same settings", &unchanged, at(29, 120), 8, (20, 31), 60),
+        ("all it had", &fuller, at(29, 120), 8, (30, 31), 120),
+        ("all that fits", &full, at(29, 120), 8, (26, 31), 96),
         ("all frames", &unchanged, at(55, 180), 8, (10, 5), 60),
         ("nothing left", &unchanged, at(60, 180), 8, (0, 0), 0),
         ("fewer frames", &shorter, at(30, 120), 8, (0, 0), 0),
@@ -74,7 +82,8 @@ fn a_resumed_run_counts_on_and_fills_its_replay_first() {
         assert_eq!(status.transitions_inserted, inserted, "{what}");
         let served = join.counts.rows_sampled + expected.1 * u64::from(rows);
         assert_eq!(status.rows_sampled, served, "{what}");
-        assert_eq!(status.transitions_held, stored, "{what}");
+        let held = stored.min(config.capacity_transitions);
+        assert_eq!(status.transitions_held, held, "{what}");
         assert_eq!(replay.resumed_after(), join.updates, "{what}");
     }
 }
