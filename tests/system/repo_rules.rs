@@ -9,12 +9,12 @@ use std::{
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_030),
+    ("protocol", 8_000),
     ("actor", 11_670),
-    ("replay-server", 11_300),
+    ("replay-server", 11_260),
     ("learner", 24_450),
     ("deploy", 32_540),
-    ("tests", 11_370),
+    ("tests", 11_360),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;
