@@ -1,22 +1,21 @@
 //! Brings chunks to the replay server, each exactly once and in order, and says when the actor leaves.
 //! It does not drop: a chunk leaves the line when the replay server says that it is stored or no longer wanted.
 
+mod state;
 mod worker;
 
 use std::{
-    sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
-        mpsc,
-    },
+    sync::{Arc, PoisonError, atomic::Ordering, mpsc},
     thread::JoinHandle,
     time::Duration,
 };
 
-use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, session::SessionError};
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 
-use crate::config::Config;
+use state::DeliveryState;
 use worker::DeliveryWorker;
+
+pub use state::{DeliveryError, DeliveryLimits};
 
 /// How long an actor whose chunks wait may wait for newer weights.
 const FRESH_WEIGHTS_MAX: Duration = Duration::from_millis(200);
@@ -118,70 +117,4 @@ impl Delivery {
         let panicked = |_| DeliveryError::Failed("the delivery thread panicked".into());
         self.thread.join().map_err(panicked)?
     }
-}
-
-/// Limits of one delivery.
-#[derive(Clone, Copy, Debug)]
-pub struct DeliveryLimits {
-    /// Chunks waiting to be acknowledged; at this many `send` waits.
-    pub chunks_in_flight_max: usize,
-    /// How long the replay server may be silent about a chunk that it was sent; a chunk that has to wait is answered meanwhile.
-    pub ack_timeout: Duration,
-    /// All tries for one chunk without any answer.
-    pub unreachable_max: Duration,
-}
-
-impl DeliveryLimits {
-    /// The limits that an actor's settings ask for.
-    pub const fn of(config: &Config) -> Self {
-        Self {
-            chunks_in_flight_max: config.chunks_in_flight_max as usize,
-            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
-            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
-        }
-    }
-}
-
-/// What the sending side and the thread tell each other beside the chunks.
-#[derive(Debug, Default)]
-struct DeliveryState {
-    inserted_total: AtomicU64,
-    actors: AtomicU32,
-    finished: AtomicBool,
-    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
-    is_held: AtomicBool,
-    /// Chunks that were sent and are not yet settled.
-    waiting: Mutex<usize>,
-    settled: Condvar,
-}
-
-impl DeliveryState {
-    fn waiting(&self) -> MutexGuard<'_, usize> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn settle(&self) {
-        *self.waiting() -= 1;
-        self.settled.notify_all();
-    }
-
-    fn is_held(&self) -> bool {
-        self.is_held.load(Ordering::Relaxed)
-    }
-}
-
-/// Why chunks could not be delivered.
-#[derive(Debug, thiserror::Error)]
-pub enum DeliveryError {
-    /// No answer for too long.
-    #[error("the replay server was out of reach for {within:?}")]
-    OutOfReach {
-        /// How long it was tried.
-        within: Duration,
-        /// The last try's error.
-        source: SessionError,
-    },
-    /// Anything else: a chunk was refused, or not stored in the time that an actor has which was told to stop.
-    #[error("{0}")]
-    Failed(String),
 }

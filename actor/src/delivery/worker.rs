@@ -14,7 +14,7 @@ use driml_protocol::{
 };
 use zenoh::bytes::ZBytes;
 
-use super::{DeliveryError, DeliveryLimits, DeliveryState};
+use super::state::{DeliveryError, DeliveryLimits, DeliveryState};
 
 /// After `Shutdown`, how long the chunks at hand may take to be stored.
 const DRAIN_MAX: Duration = Duration::from_secs(20);

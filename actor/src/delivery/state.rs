@@ -1,0 +1,80 @@
+//! What the sending side and the delivering thread tell each other, and the limits that both keep.
+//! The chunks themselves go through a queue.
+
+use std::{
+    sync::{
+        Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use driml_protocol::session::SessionError;
+
+use crate::config::Config;
+
+/// Limits of one delivery.
+#[derive(Clone, Copy, Debug)]
+pub struct DeliveryLimits {
+    /// Chunks waiting to be acknowledged; at this many `send` waits.
+    pub chunks_in_flight_max: usize,
+    /// How long the replay server may be silent about a chunk that it was sent; a chunk that has to wait is answered meanwhile.
+    pub ack_timeout: Duration,
+    /// All tries for one chunk without any answer.
+    pub unreachable_max: Duration,
+}
+
+impl DeliveryLimits {
+    /// The limits that an actor's settings ask for.
+    pub const fn of(config: &Config) -> Self {
+        Self {
+            chunks_in_flight_max: config.chunks_in_flight_max as usize,
+            ack_timeout: Duration::from_millis(config.ack_timeout_ms),
+            unreachable_max: Duration::from_millis(config.unreachable_max_ms),
+        }
+    }
+}
+
+/// What the sending side and the thread tell each other beside the chunks.
+#[derive(Debug, Default)]
+pub(super) struct DeliveryState {
+    pub(super) inserted_total: AtomicU64,
+    pub(super) actors: AtomicU32,
+    pub(super) finished: AtomicBool,
+    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
+    pub(super) is_held: AtomicBool,
+    /// Chunks that were sent and are not yet settled.
+    pub(super) waiting: Mutex<usize>,
+    pub(super) settled: Condvar,
+}
+
+impl DeliveryState {
+    pub(super) fn waiting(&self) -> MutexGuard<'_, usize> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn settle(&self) {
+        *self.waiting() -= 1;
+        self.settled.notify_all();
+    }
+
+    pub(super) fn is_held(&self) -> bool {
+        self.is_held.load(Ordering::Relaxed)
+    }
+}
+
+/// Why chunks could not be delivered.
+#[derive(Debug, thiserror::Error)]
+pub enum DeliveryError {
+    /// No answer for too long.
+    #[error("the replay server was out of reach for {within:?}")]
+    OutOfReach {
+        /// How long it was tried.
+        within: Duration,
+        /// The last try's error.
+        source: SessionError,
+    },
+    /// Anything else: a chunk was refused, or not stored in the time that an actor has which was told to stop.
+    #[error("{0}")]
+    Failed(String),
+}
