@@ -36,6 +36,7 @@ pub mod panics;
 pub mod plan;
 pub mod pretrained;
 mod process_log;
+mod processes;
 pub mod rendezvous;
 pub mod resume;
 pub mod run_folder;

@@ -22,14 +22,13 @@ use crate::{
     last_play,
     managed_process::ManagedProcess,
     open_files,
+    processes::{Processes, stop},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView, updates_served},
     view::{Display, Poller, Reached, TEMPLATE},
 };
-
-use self::processes::{Processes, stop};
 
 const POLL: Duration = Duration::from_secs(1);
 /// How long a process may leave questions unanswered, from its start too, before the run is given up.

@@ -1,17 +1,13 @@
-//! The launcher's processes: the words that start each, those that are started again when they have died, and how some end.
-//! When the first are started, and in which order all end, is in `mod`.
+//! The launcher's processes: the words that start each, and those that are started again when they have died.
+//! When the first are started, and how all end, is in `mod`.
 
 use std::{
     ffi::{OsStr, OsString},
-    os::unix::process::ExitStatusExt,
     process::ExitStatus,
-    time::{Duration, Instant},
 };
 
 use anyhow::bail;
-use driml_machine::units::duration;
 use driml_protocol::session;
-use nix::sys::signal::Signal;
 
 use super::{Launch, Outside};
 use crate::managed_process::ManagedProcess;
@@ -22,56 +18,6 @@ const RESTARTS_MAX: u32 = 8;
 const ACTOR_RESTARTS_MAX: u32 = 16;
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
-const KILLED_MAX: Duration = Duration::from_secs(30);
-
-#[derive(Default)]
-pub(super) struct Processes {
-    pub(super) replay_servers: Vec<ManagedProcess>,
-    pub(super) learner: Option<ManagedProcess>,
-    pub(super) actors: Vec<ManagedProcess>,
-}
-
-impl Processes {
-    /// Replay servers, learner, actors, in the order of their names.
-    pub(super) fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
-        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
-        first.chain(&mut self.actors)
-    }
-}
-
-/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
-/// asked before it listens for signals dies of the request, and has nothing to save.
-pub(super) fn stop(
-    processes: &mut [ManagedProcess],
-    ask: bool,
-    drain_max: Duration,
-    abort: &impl Fn() -> bool,
-) -> Vec<String> {
-    if ask {
-        processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
-    }
-    let deadline = Instant::now() + drain_max;
-    let mut late = Vec::new();
-    for process in processes {
-        match process.wait_until(deadline, abort) {
-            Some(status) if status.success() => {}
-            Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
-            Some(_) => late.push(process.exit_report()),
-            None => {
-                if !abort() {
-                    late.push(format!(
-                        "{} did not end within {} and was killed",
-                        process.name,
-                        duration(drain_max)
-                    ));
-                }
-                process.kill();
-                process.wait_until(Instant::now() + KILLED_MAX, || false);
-            }
-        }
-    }
-    late
-}
 
 fn call<'a>(
     command: &'a str,
@@ -212,28 +158,5 @@ impl Launch<'_> {
     fn note_restart(&self, report: &str, how: &str) {
         self.screen.line(&format!("{report}\n{how}"));
         session::sweep_shared_memory();
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_process_that_dies_of_the_request_to_stop_has_stopped() {
-        let logs = tempfile::tempdir().unwrap();
-        let stopped = |script: &str, ask| {
-            let process = ManagedProcess::of_script(script, logs.path());
-            stop(&mut [process], ask, Duration::from_secs(60), &|| false)
-        };
-        assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
-        let killed = stopped("kill -TERM $$", false);
-        assert!(killed[0].contains("signal 15 SIGTERM"), "{killed:?}");
-        let failed = stopped("echo 'error: no room' >&2; exit 3", false);
-        let said = "script exited with code 3";
-        assert!(
-            failed[0].starts_with(said) && failed[0].ends_with(".log): no room"),
-            "{failed:?}"
-        );
     }
 }
