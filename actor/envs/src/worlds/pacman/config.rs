@@ -3,12 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::PacmanWorld;
-use super::maze::{GHOSTS, HEIGHT, WIDTH};
-use super::render::CHANNELS;
-use crate::environment::{Environment, FrameShape};
+use super::maze::GHOSTS;
 use crate::error::EnvError;
-use crate::settings::WorldSettings;
 use crate::worlds::ising::check_temperature;
 
 /// The settings of Ms. PacMan. Ghosts 0 to 3 are red, cyan, orange and green.
@@ -68,8 +64,9 @@ pub struct IsingOverlay {
     pub sweeps_per_step: u32,
 }
 
-impl WorldSettings for PacmanConfig {
-    fn validate(&self) -> Result<(), EnvError> {
+impl PacmanConfig {
+    /// Whether every value is within its range.
+    pub(super) fn check(&self) -> Result<(), EnvError> {
         for (name, value) in [
             ("epsilon", self.epsilon),
             ("switch_probability", self.switch_probability),
@@ -107,31 +104,6 @@ impl WorldSettings for PacmanConfig {
             .map_or(Ok(()), LethalSchedule::validate)
     }
 
-    /// 21 x 19 x 3.
-    fn frame_shape(&self) -> FrameShape {
-        FrameShape::new(HEIGHT, WIDTH, CHANNELS)
-    }
-
-    fn action_names(&self) -> Vec<&str> {
-        PacmanWorld::ACTION_NAMES.to_vec()
-    }
-
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
-        Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
-    }
-
-    fn is_resumable(&self) -> bool {
-        // Which ghost is lethal depends on how many episodes were played.
-        self.lethal_schedule.is_none()
-    }
-}
-
-impl PacmanConfig {
     /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
     pub(super) fn lethal_in(&self, episode: u64) -> [bool; GHOSTS] {
         let Some(schedule) = &self.lethal_schedule else {

@@ -26,7 +26,7 @@ use ghost::Chance;
 use maze::{HEIGHT, Maze, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
-use crate::environment::StepEnd;
+use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved::check;
@@ -46,6 +46,35 @@ pub struct PacmanWorld {
     /// The spins in the walls of each game, where walls flicker. Their generators are their own, so that the ghosts do the same with
     /// and without them.
     walls: Vec<(IsingLattice, ChaCha8Rng)>,
+}
+
+impl WorldSettings for PacmanConfig {
+    fn validate(&self) -> Result<(), EnvError> {
+        self.check()
+    }
+
+    /// 21 x 19 x 3.
+    fn frame_shape(&self) -> FrameShape {
+        FrameShape::new(HEIGHT, WIDTH, render::CHANNELS)
+    }
+
+    fn action_names(&self) -> Vec<&str> {
+        PacmanWorld::ACTION_NAMES.to_vec()
+    }
+
+    fn build(
+        &self,
+        num_envs: usize,
+        seed: u64,
+        _threads: usize,
+    ) -> Result<Box<dyn Environment>, EnvError> {
+        Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
+    }
+
+    fn is_resumable(&self) -> bool {
+        // Which ghost is lethal depends on how many episodes were played.
+        self.lethal_schedule.is_none()
+    }
 }
 
 impl PacmanWorld {
