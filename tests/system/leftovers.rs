@@ -58,6 +58,23 @@ fn the_next_run_sweeps_what_killed_processes_left() {
 }
 
 #[test]
+fn processes_started_by_hand_leave_no_shared_memory() {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let learner = system.start_learner("run");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_updates(100);
+    let segments = all_shared_memory_of(&PROCESSES.map(|role| system.find_process(role)));
+    // A client may hold what it has seen.
+    drop(client);
+    for process in [actor, learner, server] {
+        process.stop().expect_code(0);
+    }
+    check_gone(&segments);
+}
+
+#[test]
 fn shared_memory_of_killed_processes_is_removed() {
     let system = system();
     let process = launched(&system, 100);
