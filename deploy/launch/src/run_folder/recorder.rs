@@ -65,6 +65,8 @@ impl RunRecorder {
         let header = header(config, &processes);
         let (rows, episodes, seconds) = match resumed {
             None => {
+                // First: by its settings a folder in which nothing was learned is known as a run's.
+                folder.write_config(config)?;
                 let rows = Vec::new();
                 let episodes = TrainingEpisodes::create(folder)?;
                 (Table { header, rows }, episodes, 0.0)
@@ -73,11 +75,11 @@ impl RunRecorder {
                 let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
                 let is_known = point.replay_is_kept;
                 let episodes = TrainingEpisodes::go_on(folder, point.frames, is_known)?;
+                folder.write_config(config)?;
                 (rows, episodes, seconds)
             }
         };
         Summary::remove(folder)?;
-        folder.write_config(config)?;
         let resume_point = resumed.unwrap_or_default();
         // A replay that was kept knows of all the run's episodes and k.
         let is_kept = resume_point.replay_is_kept;
