@@ -124,7 +124,12 @@ pub(super) struct WorldBase {
 }
 
 #[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 struct File {
+    #[serde(rename = "full")]
+    _full: toml::Table,
+    #[serde(rename = "smoke")]
+    _smoke: toml::Table,
     /// By a world's name or its kind.
     world: BTreeMap<String, WorldBase>,
     dial: Vec<Dial>,
