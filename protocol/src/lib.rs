@@ -71,7 +71,6 @@ pub use process::{
     log_limiter::{LogLimiter, LogLimiters},
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
-    termination::hangup_is_ignored,
 };
 pub use query_workers::{Incoming, QueryWorkers, Responder};
 pub use run_spec::{FRAME_STACK_MAX, Horizon, POSITIVES_MAX, RunSpec, TimeoutRule};

@@ -95,7 +95,7 @@ async fn received(signal: &mut Option<Signal>) {
 }
 
 /// Whether SIGHUP was set to be ignored before this process started, by the kernel's own table.
-pub fn hangup_is_ignored() -> bool {
+fn hangup_is_ignored() -> bool {
     is_set("SigIgn:", Number::SIGHUP as u32 - 1)
 }
 
