@@ -48,7 +48,7 @@ pub struct Config {
     /// Transitions stored before the replay ratio starts to count and the first row is sampled.
     pub warmup_transitions: u64,
     /// New transitions stored before the first row is sampled when a run is resumed without its replay: no more than it had stored and
-    /// than fit, no fewer than the warm-up. Settings of earlier versions do not have it: as many as the warm-up.
+    /// than `capacity_transitions`, no fewer than the warm-up. Settings of earlier versions do not have it: as many as the warm-up.
     #[serde(default)]
     pub refill_transitions: u64,
     /// Transitions that inserts may run ahead of sampling, after the warm-up, before they have to wait.

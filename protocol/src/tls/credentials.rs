@@ -45,7 +45,7 @@ pub struct Credentials {
     pub key: PathBuf,
     /// Until when the certificate is good, seconds since 1970.
     expires: i64,
-    /// The same, for a person.
+    /// Until when the certificate is good, for a person.
     pub expires_on: String,
     /// The names and addresses that it is for: clients connect to the replay server by one of them.
     pub hosts: Vec<String>,

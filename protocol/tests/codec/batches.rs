@@ -28,6 +28,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     // The origin: a byte of the shard, nine of the incarnation.
     assert_eq!(sent[1] - sent[0], 3 * 12 + 10);
     assert_eq!(plain.priority_update(5, 9, &[0.0; 3]), None);
+    assert_eq!(received(&sealed(plain.clone())), plain);
 
     let bytes = sealed(prioritised.clone());
     let mut back = received(&bytes);

@@ -114,7 +114,11 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         shards: 3,
         ..config()
     };
-    for (shard, refill) in [(0, 20), (2, 20)] {
+    for (shard, refill_transitions, refill) in [(0, 0, 20), (2, 0, 20), (2, 1 << 40, 40)] {
+        let config = Config {
+            refill_transitions,
+            ..config.clone()
+        };
         let mut replay = Replay::shard(&small_spec(), &config, 8, shard).unwrap();
         let counted = 30 + u64::from(shard);
         let join = LearnerJoin {
@@ -124,12 +128,12 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         };
         replay.join_learner(join).unwrap();
         assert_eq!(replay.inserted_total(), 120);
-        for sequence in 0..4 {
+        for sequence in 0..8 {
             insert(&mut replay, header(0, 1, sequence, 6 * sequence));
         }
         let status = replay.status();
         assert_eq!(status.transitions_refilled, refill);
-        assert_eq!(status.transitions_inserted, counted + 24 - refill);
+        assert_eq!(status.transitions_inserted, counted + 48 - refill);
     }
 }
 

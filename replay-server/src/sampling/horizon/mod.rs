@@ -14,7 +14,7 @@ pub use affinity::Affinity;
 /// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left), at least one. Result in 1..=H, of several positives the
 /// furthest; `None` where none is served.
 /// Source: Mazoure et al. 2020, Deep Reinforcement and InfoMax Learning.
-pub fn draw_k(
+pub(crate) fn draw_k(
     horizon: Horizon,
     affinity: &Affinity,
     actions: &[u8],

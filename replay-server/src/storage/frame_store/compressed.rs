@@ -90,7 +90,7 @@ impl CompressedFrames {
             bytes += held.block.bytes.len() as u64;
         }
         assert_eq!(next, inserted, "every transition has a frame");
-        assert_eq!(bytes, self.bytes, "of all blocks");
+        assert_eq!(bytes, self.bytes, "the bytes of all blocks");
         if let Some(held) = self.blocks.front() {
             let holds_oldest = (held.first..held.end()).contains(&oldest);
             assert!(holds_oldest, "what is overwritten is gone");
