@@ -133,6 +133,9 @@ impl fmt::Debug for PolicyNetwork {
 }
 
 /// The action of largest value, the lowest on a tie, of `values` [A] as a valid configuration has them.
+///
+/// # Panics
+/// If an action beyond 255 is best.
 pub fn greedy(values: &[f32]) -> u8 {
     let better = |best: usize, at: usize| if values[at] > values[best] { at } else { best };
     let best = (1..values.len()).fold(0, better);
@@ -207,6 +210,7 @@ impl<S: Simd> UnitWeights<S> {
     }
 }
 
+/// A layer of weight [in, out].
 fn dense<S: Simd>(simd: S, layer: &Layer<Vec<f32>>) -> Dense<S> {
     Dense::new(simd, &layer.weight, layer.bias.clone())
 }

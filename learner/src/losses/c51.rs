@@ -169,9 +169,16 @@ mod tests {
                 let loss = kl_loss(&logits, TARGET.to_vec(), weights.clone(), kernels)?;
                 let grads = loss.affine(3.0, 0.0)?.backward()?;
                 let found = grads.get(&logits).expect("a gradient").flatten_all()?;
-                let error = f64::from(loss.to_scalar::<f32>()?) - expected;
+                let (loss, found) = (loss.to_scalar::<f32>()?, found.to_vec1::<f32>()?);
+                if kernels == Kernels::FUSED {
+                    assert_eq!(
+                        (loss, &found[..]),
+                        (expected as f32, &slopes.map(|it| it * 3.0)[..])
+                    );
+                }
+                let error = f64::from(loss) - expected;
                 assert!(error.abs() <= 1e-6 * expected, "{kernels:?}: {error}");
-                for (found, slope) in found.to_vec1::<f32>()?.iter().zip(slopes) {
+                for (found, slope) in found.iter().zip(slopes) {
                     let error = (found / 3.0 - slope).abs();
                     assert!(error < 1e-6, "{kernels:?}: {found}, {slope}");
                 }

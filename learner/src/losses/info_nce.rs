@@ -165,13 +165,18 @@ mod tests {
                 let case = format!("{kernels:?} {valid:?} {tanh_clip}");
                 let var = Var::from_slice(&dots, (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
                 let loss = info_nce_loss(&var, &valid, scores, kernels)?;
-                let error = f64::from(loss.to_scalar::<f32>()?) - expected;
-                assert!(error.abs() < 1e-5, "{case}: {error}");
                 let grads = loss.affine(2.0, 0.0)?.backward()?;
+                let loss = loss.to_scalar::<f32>()?;
+                let error = f64::from(loss) - expected;
+                assert!(error.abs() < 1e-5, "{case}: {error}");
                 let found = match grads.get(&var) {
                     Some(found) => found.flatten_all()?.to_vec1::<f32>()?,
                     None => vec![0.0; slopes.len()],
                 };
+                if kernels == Kernels::FUSED {
+                    let doubled: Vec<_> = slopes.iter().map(|it| it * 2.0).collect();
+                    assert_eq!((loss, &found), (expected as f32, &doubled), "{case}");
+                }
                 for (found, slope) in found.iter().zip(&slopes) {
                     let error = (found / 2.0 - slope).abs();
                     assert!(error < 1e-6, "{case}: {found}, {slope}");

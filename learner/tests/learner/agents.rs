@@ -1,4 +1,4 @@
-//! What holds of the agents beside C51 and DIM: CPC's offsets, CURL's two views.
+//! What holds of agents with an auxiliary loss: too few positives, CPC's offsets, CURL's two views.
 //! The arithmetic's oracle is in `parity`; a learner of each agent is in `served`.
 
 use driml_learner::{
@@ -141,12 +141,14 @@ fn without_two_positives_the_return_alone_is_learned() {
         let mut valid = [0; 5 * POSITIVES];
         valid[..there].fill(1);
         rows.positive_valid = valid[..5].to_vec();
-        for (kind, name, batch) in [
-            (CPC, "cpc_4t4", cpc(&rows, &states_k, &valid)),
-            (DIM, "dim_4t4", rows.batch()),
+        for (kind, lambda, batch) in [
+            (CPC, GLOBAL, cpc(&rows, &states_k, &valid)),
+            (DIM, ALL_DIM, rows.batch()),
         ] {
-            let report = agent(kind, GLOBAL).update(&batch).unwrap();
-            assert_eq!(report.losses, [(name, 0.0)]);
+            let report = agent(kind, lambda).update(&batch).unwrap();
+            let losses = &report.losses;
+            assert_eq!(losses.len(), if kind == CPC { 1 } else { 4 });
+            assert!(losses.iter().all(|(_, loss)| *loss == 0.0), "{losses:?}");
             assert_eq!(report.total, report.c51_kl);
         }
     }
@@ -339,7 +341,8 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
     assert!(missing.contains(wanted), "{missing}");
     for out in ["0.0", "-0.1", "1.1", "nan"] {
         let said = said(CURL, GLOBAL, false, &format!("curl.key_tau = {out}"));
-        assert!(said.starts_with("curl.key_tau = "), "{said}");
+        let wanted = format!("curl.key_tau = {}", out.parse::<f64>().unwrap());
+        assert!(said.starts_with(&wanted), "{said}");
     }
     with(CURL, GLOBAL, false, "curl.key_tau = 1.0")
         .validate()

@@ -1,4 +1,4 @@
-//! What holds for every update: zeros, and what nothing may touch.
+//! What holds for every update, and what nothing may touch.
 //! It compares with no outside numbers: `parity` does, and at extreme inputs the property "whole update" of `driml experiment stability`.
 
 use candle_core::Device;

@@ -26,7 +26,7 @@ impl ActingHead {
         }
     }
 
-    /// The layer of A * N outputs that they amount to with this noise, or without.
+    /// The layer of A * N outputs that they amount to with this noise, or without; weight [in, out].
     pub(crate) fn layer(&self, noise: Option<&HeadNoise>) -> Layer<Vec<f32>> {
         let with_noise = |(number, layer): (usize, &HeadLayer<Vec<f32>>)| {
             let mut sum = layer.mean.clone();
