@@ -68,7 +68,7 @@ pub use plugin::{CustomKind, CustomWorld, preset as custom_preset, register};
 pub use procgen_sys::{DistributionMode, Engine as ProcgenEngine, Game, ProcgenError};
 pub use registry::{WorldConfig, WorldName, WorldNameError};
 pub use restricted::{ActionSet, RestrictedWorld};
-pub use settings::{Levels, Variants, WorldSettings};
+pub use settings::{Built, Levels, Variants, WorldSettings};
 pub use worlds::chain::{ChainConfig, ChainWorld, optimal_discounted_return};
 pub use worlds::exec::{ExecConfig, ExecWorld, declaration as exec_declaration};
 pub use worlds::ising::{Boundary, IsingConfig, IsingLattice, IsingWorld};

@@ -15,6 +15,9 @@ pub enum Levels {
     Unseen,
 }
 
+/// What [`WorldSettings::build`] gives.
+pub type Built = Result<Box<dyn Environment>, EnvError>;
+
 /// The settings of one world.
 ///
 /// They are read from TOML, where unknown keys are errors, and have no defaults. A world without a seed, threads, levels or
@@ -37,12 +40,7 @@ pub trait WorldSettings {
 
     /// Builds `num_envs` environments. Environment i depends on (`seed`, i) and its actions only. `threads` is how many threads
     /// the world may start, 0 for none.
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError>;
+    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built;
 
     /// The kinds of this world that are worlds of their own on a command line, such as a suite's games.
     fn variants() -> Variants

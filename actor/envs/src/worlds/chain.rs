@@ -3,11 +3,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{FrameShape, StepEnd};
 use crate::envs::{Envs, check_num_envs};
 use crate::error::EnvError;
 use crate::saved;
-use crate::settings::WorldSettings;
+use crate::settings::{Built, WorldSettings};
 
 /// The cell in which every episode starts: beside the near end.
 const START_CELL: usize = 1;
@@ -105,12 +105,7 @@ impl WorldSettings for ChainConfig {
         ChainWorld::ACTION_NAMES.to_vec()
     }
 
-    fn build(
-        &self,
-        num_envs: usize,
-        _seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
+    fn build(&self, num_envs: usize, _seed: u64, _threads: usize) -> Built {
         Ok(Box::new(ChainWorld::new(self, num_envs)?))
     }
 }

@@ -12,7 +12,7 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::EnvError;
 use crate::saved;
-use crate::settings::{Variants, WorldSettings};
+use crate::settings::{Built, Variants, WorldSettings};
 
 /// Longest side of a frame, in pixels.
 const SIDE_MAX: usize = 4096;
@@ -255,12 +255,7 @@ impl WorldSettings for ExecConfig {
         self.actions.iter().map(String::as_str).collect()
     }
 
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
         Ok(Box::new(ExecWorld::new(self, num_envs, seed)?))
     }
 

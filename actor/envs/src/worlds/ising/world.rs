@@ -6,11 +6,11 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{FrameShape, StepEnd};
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved;
-use crate::settings::WorldSettings;
+use crate::settings::{Built, WorldSettings};
 
 /// The settings of the Ising world. The paper: lattice 84, patch 42, temperature 0.4.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -123,12 +123,7 @@ impl WorldSettings for IsingConfig {
         IsingWorld::ACTION_NAMES.to_vec()
     }
 
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
         Ok(Box::new(IsingWorld::new(self, num_envs, seed)?))
     }
 }

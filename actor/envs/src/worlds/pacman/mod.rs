@@ -26,11 +26,11 @@ use ghost::Chance;
 use maze::{HEIGHT, Maze, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
-use crate::environment::{Environment, FrameShape, StepEnd};
+use crate::environment::{FrameShape, StepEnd};
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
 use crate::error::EnvError;
 use crate::saved::check;
-use crate::settings::WorldSettings;
+use crate::settings::{Built, WorldSettings};
 use crate::worlds::ising::{Boundary, IsingLattice};
 
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
@@ -62,12 +62,7 @@ impl WorldSettings for PacmanConfig {
         PacmanWorld::ACTION_NAMES.to_vec()
     }
 
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        _threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
         Ok(Box::new(PacmanWorld::new(self, num_envs, seed)?))
     }
 

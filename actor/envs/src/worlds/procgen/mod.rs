@@ -41,7 +41,7 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
 use crate::error::EnvError;
 use crate::saved;
-use crate::settings::{Levels, Variants, WorldSettings};
+use crate::settings::{Built, Levels, Variants, WorldSettings};
 use config::whole_side;
 use shrink::Shrink;
 
@@ -203,12 +203,7 @@ impl WorldSettings for ProcgenConfig {
         ProcgenWorld::ACTION_NAMES.to_vec()
     }
 
-    fn build(
-        &self,
-        num_envs: usize,
-        seed: u64,
-        threads: usize,
-    ) -> Result<Box<dyn Environment>, EnvError> {
+    fn build(&self, num_envs: usize, seed: u64, threads: usize) -> Built {
         Ok(Box::new(ProcgenWorld::new(self, num_envs, seed, threads)?))
     }
 
