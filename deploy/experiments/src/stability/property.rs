@@ -137,6 +137,7 @@ pub(super) fn merge(rows: &mut Vec<Row>, others: Vec<Row>) {
         *rows = others;
         return;
     }
+    assert_eq!(rows.len(), others.len(), "each seed has all rows");
     for (row, other) in rows.iter_mut().zip(others) {
         row.cases += other.cases;
         if other.worst > row.worst {

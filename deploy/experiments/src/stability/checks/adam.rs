@@ -1,7 +1,5 @@
 //! Adam: steps of any gradients, ten million of them, and the bias correction of any step number.
 
-use std::slice;
-
 use driml_learner::{
     AdamSettings,
     optimiser::adam::{Rule, STEP_ERROR, moment_error, step_floor},
@@ -103,9 +101,12 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
         0.0 => 1.0,
         _ => -(t as f64 * beta.ln()).exp_m1(),
     });
-    for (it, &g) in all.iter_mut().zip(gradients) {
-        let [p, m, v] = it.found.each_mut().map(slice::from_mut);
-        let is_finite = rule.apply(p, &[g], m, v);
+    // Together, as the parameters of a tensor.
+    let [mut p, mut m, mut v] =
+        [0, 1, 2].map(|i| all.iter().map(|it| it.found[i]).collect::<Vec<_>>());
+    let is_finite = rule.apply(&mut p, gradients, &mut m, &mut v);
+    for (i, (it, &g)) in all.iter_mut().zip(gradients).enumerate() {
+        it.found = [p[i], m[i], v[i]];
         let g = f64::from(g);
         it.m = beta1 * it.m + (1.0 - beta1) * g;
         it.v = beta2 * it.v + (1.0 - beta2) * g * g;
