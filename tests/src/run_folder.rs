@@ -222,6 +222,9 @@ impl RunFolder {
         );
 
         self.check_episodes(&summary);
+        for name in ["metrics.csv", "episodes.csv"] {
+            assert!(self.text(name).ends_with('\n'), "{name} has whole rows");
+        }
 
         for (column, count) in [("frames", summary.frames), ("updates", summary.updates)] {
             let last = self.column(column).pop().expect("there is a row");

@@ -283,7 +283,9 @@ impl TestSystem {
             if left.is_empty() {
                 return;
             }
-            left.sort_by_key(|it| it.pid);
+            let is_child =
+                |first: &String| ["replay-server", "learner", "actor"].contains(&&**first);
+            left.sort_by_key(|it| it.args.first().is_some_and(is_child));
             left.iter().for_each(|it| it.signal(Signal::SIGKILL));
         }
     }

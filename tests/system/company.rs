@@ -13,10 +13,18 @@ use crate::{LONG, chain, synthetic_actor::SyntheticActor, system};
 #[test]
 fn twenty_four_actors_wait_for_one_learner() {
     let system = system();
-    let longer = chain(2_400);
-    let ended = system.run_ok(&format!(
-        "local --agent c51 {longer} --actors 24 --set replay.replay_ratio=64 --run-dir run"
-    ));
+    let flags = format!(
+        "--agent c51 {} --actors 24 --set replay.replay_ratio=64",
+        chain(2_400)
+    );
+    // However fast the machine is, the run is not over before the last actor waits.
+    system.hold_at(100);
+    let process = system.start(&system.local(&flags));
+    let client = system.connect();
+    client.wait_for_replay("24 actors that wait", |replay| replay.actors_waiting == 24);
+    drop(client);
+    system.let_go();
+    let ended = process.wait().expect_code(0);
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
     assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);

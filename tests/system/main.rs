@@ -59,7 +59,7 @@ const SHORT: &str = "--env chain --preset smoke --frames 1280 --set replay.repla
 
 /// [`SHORT`] with so many frames.
 fn chain(frames: u64) -> String {
-    SHORT.replace("1280", &frames.to_string())
+    format!("--env chain --preset smoke --frames {frames} --set replay.replay_ratio=8")
 }
 
 /// A run on the chain that is too long to finish: it is ended from outside, long before its last frame.

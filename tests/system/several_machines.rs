@@ -151,6 +151,8 @@ fn cut_cables_heal_by_themselves() {
     let before = run.inserted();
     run.wait_for_frames(before + 2_000);
     sleep(Duration::from_secs(10));
+    let learner = &wait_for("an answer", || run.status())["learner"];
+    assert!(learner["updates"].as_u64() < Some(16_000), "{learner}");
     run.network.cut("learner");
     sleep(Duration::from_secs(15));
     run.network.mend("learner");
