@@ -1,6 +1,6 @@
 //! A whole system under test: a folder, processes, a client, and a deadline on each wait.
 //! It knows nothing of any one test, sleeps only between two looks at a condition, and leaves no process behind.
-//! What is not as it is asked for, or not before the deadline, is a panic that says what there is.
+//! A wrong answer, or none before the deadline, is a panic that says what there is.
 
 #![allow(
     clippy::unwrap_used,

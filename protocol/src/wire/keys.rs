@@ -99,7 +99,7 @@ impl Keys {
 /// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum ProcessName {
-    /// The learner.
+    /// The run's only learner.
     Learner,
     /// The actor of this number.
     Actor(u32),

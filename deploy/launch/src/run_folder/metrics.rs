@@ -29,7 +29,7 @@ pub struct ResumePoint {
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 1 << 16;
 
-/// The rows of an interrupted run up to `resume_point`, under this header; none where there is no such file. The others, which
+/// The rows of an interrupted run up to `resume_point`, under this header; none without the file. The others, which
 /// contradict what the run will do, are set aside. And the seconds that the run has taken, with those that are set aside.
 pub(super) fn rows_up_to(
     path: &Path,

@@ -31,7 +31,7 @@ impl Frames {
         }
     }
 
-    /// Stores the frames of the next transitions, the first of which has this slot; those before `oldest` are no longer wanted. Gives
+    /// Stores the frames of the next transitions, the first of which has this slot, and may drop those before `oldest`. Gives
     /// the oldest that is held.
     pub(crate) fn push(&mut self, run: Run<'_>, slot: usize, oldest: u64) -> u64 {
         match (self, run) {
