@@ -140,10 +140,7 @@ impl Run {
 /// they can.
 #[test]
 fn cut_cables_heal_by_themselves() {
-    let system = system();
-    // However fast the machine is, the run is not over before the last cut.
-    system.hold_at(16_000);
-    let Some(run) = Run::start(system, 2, 34_000, 8) else {
+    let Some(run) = Run::start(system(), 2, 60_000, 8) else {
         return;
     };
     run.wait_for_frames(2_000);
@@ -151,17 +148,16 @@ fn cut_cables_heal_by_themselves() {
     let before = run.inserted();
     run.wait_for_frames(before + 2_000);
     sleep(Duration::from_secs(10));
-    let learner = &wait_for("an answer", || run.status())["learner"];
-    assert!(learner["updates"].as_u64() < Some(16_000), "{learner}");
     run.network.cut("learner");
     sleep(Duration::from_secs(15));
     run.network.mend("learner");
     sleep(Duration::from_secs(10));
+    let learner = &wait_for("an answer", || run.status())["learner"];
+    assert_eq!(learner["finished"], false, "a cut of a run that is over");
     run.network.mend("actor0");
     run.network.cut("server");
     sleep(Duration::from_secs(12));
     run.network.mend("server");
-    run.system.let_go();
     run.check_end(Duration::from_secs(120));
 }
 

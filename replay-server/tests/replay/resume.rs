@@ -114,7 +114,7 @@ fn shards_of_a_resumed_run_count_on_each_for_itself() {
         shards: 3,
         ..config()
     };
-    for (shard, refill_transitions, refill) in [(0, 0, 20), (2, 0, 20), (2, 1 << 40, 40)] {
+    for (shard, refill_transitions, refill) in [(0, 0, 20), (2, 0, 20), (2, 1 << 40, 40_u64)] {
         let config = Config {
             refill_transitions,
             ..config.clone()
