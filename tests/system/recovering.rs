@@ -33,12 +33,13 @@ const fn frames(kept: u64) -> u64 {
     WARMUP + 1024 * updates(kept)
 }
 
+/// Without shared memory: a process on a slow machine would take it for seconds, while those of other tests wait for theirs.
 fn flags(kept: u64) -> String {
     let (frames, capacity) = (frames(kept), kept + 100_000);
     format!(
         "--agent c51 --env chain --preset smoke --frames {frames} --set replay.replay_ratio=0.015625 \
          --set replay.warmup_transitions={WARMUP} --set replay.capacity_transitions={capacity} --set replay.slack_transitions=2048 \
-         --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000"
+         --set actor.unreachable_max_ms=5000 --set learner.unreachable_max_ms=5000 --set transport.shared_memory=false"
     )
 }
 

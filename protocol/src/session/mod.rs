@@ -37,6 +37,8 @@ const NOTHING_LISTENS: &str = "Unable to connect to any of";
 /// was frozen or vanished is gone before others miss an answer. It comes back, and asks again, once it is well. A message must
 /// be small enough for this: 3 MB need 3 Mbit/s.
 const STALLED_MAX: Duration = Duration::from_secs(8);
+/// How long something may take to listen: a replay server waits for shared memory first, while others take theirs.
+const START_MAX: Duration = Duration::from_secs(30);
 const CONNECT_MAX: Duration = Duration::from_secs(10);
 /// How long a first try may take to find that those who listen understand; then it is looked who they are.
 const UNDERSTOOD_MAX: Duration = Duration::from_millis(2500);
@@ -48,7 +50,7 @@ pub const SMALL_MESSAGE_BYTES_MAX: usize = 1 << 22;
 /// Opens a session. A process that listens is the run's router; one that only connects is a client.
 ///
 /// # Errors
-/// An endpoint that cannot be listened on; a client with nothing listening on its endpoint after ten seconds.
+/// An endpoint that cannot be listened on; a client with nothing listening on its endpoint after half a minute.
 pub fn open(endpoints: &Endpoints) -> Result<Session, SessionError> {
     open_with(endpoints, MESSAGE_BYTES_MAX, &[])
 }
@@ -186,7 +188,7 @@ fn open_with(
     if router {
         return open("-1").map_err(fail);
     }
-    reach::wait_for_any(&endpoints.connect, CONNECT_MAX)?;
+    reach::wait_for_any(&endpoints.connect, START_MAX)?;
     let not_driml = |what: &str| {
         let connect = endpoints.connect.join(", ");
         SessionError::Failed(match endpoints.connect.iter().any(|it| is_quic(it)) {

@@ -69,7 +69,7 @@ fn a_closed_port_differs_from_an_unknown_host() {
         (unknown, format!("the host of {unknown} is unknown: ")),
     ] {
         at_once(&COMMANDS, |command| {
-            refused(&system, &format!("{command} {endpoint}"), 10).expect_said(&said);
+            refused(&system, &format!("{command} {endpoint}"), 30).expect_said(&said);
         });
     }
     let started = Instant::now();
@@ -135,7 +135,7 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
         for signal in [Signal::SIGINT, Signal::SIGTERM] {
             // Nothing listens there.
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
-            process.wait_for_stderr("waiting for 10 s: nothing listens on ");
+            process.wait_for_stderr("waiting for 30 s: nothing listens on ");
             process.signal(signal);
             process.wait().expect_code(0);
             // Something listens, and sends nothing.
