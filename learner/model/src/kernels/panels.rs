@@ -75,9 +75,6 @@ pub(crate) enum Threads {
     Pool,
 }
 
-/// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
-const STEPS_IN_CACHE: usize = 128;
-
 /// A right operand, cut into panels of columns, each [k / DEPTH, columns, DEPTH] with zeros where it ends before they do.
 pub(crate) struct Panels<E: Element> {
     values: Buffer<E>,
@@ -137,10 +134,10 @@ impl<E: Element> Panels<E> {
         let panels = self.values.chunks_exact(self.steps * width * E::DEPTH);
         for (index, panel) in panels.enumerate() {
             let first = index * width;
-            let blocks = panel.chunks(STEPS_IN_CACHE * width * E::DEPTH);
+            let blocks = panel.chunks(S::STEPS_IN_CACHE * width * E::DEPTH);
             for (block, panel) in blocks.enumerate() {
                 let mode = if block == 0 { mode } else { Mode::Add };
-                let start = left.start + block * STEPS_IN_CACHE * left.step;
+                let start = left.start + block * S::STEPS_IN_CACHE * left.step;
                 let steps = panel.len() / (width * E::DEPTH);
                 for (row, count) in row_tiles::<S>(rows, self.vecs) {
                     let left = Left {

@@ -4,6 +4,8 @@
 #![cfg(target_arch = "x86_64")]
 
 use std::arch::asm;
+use std::cell::Cell;
+use std::mem::MaybeUninit;
 use std::sync::OnceLock;
 
 use half::bf16;
@@ -65,16 +67,27 @@ fn multiplies_right(simd: Bf16) -> bool {
 /// Of all methods: `configure` came before, pointers may be read or written as the sizes given to it say, and the processor has
 /// what the implementation needs.
 pub(super) trait Tiles {
-    /// Sizes: left operands [rows, steps], right ones [steps, cols], sums [rows, cols]; `tail` steps in the second pair of
-    /// operands, 0 if there are none. Sums are 0 afterwards.
-    unsafe fn configure(&mut self, rows: usize, cols: usize, tail: usize);
+    /// Sizes: left operands [rows, steps], right ones [steps, 16], sums [rows, 16]; `tail` steps in the second pair of operands, 0 if
+    /// there are none. Sums are 0 afterwards.
+    unsafe fn configure(&mut self, rows: usize, tail: usize);
+    /// Strides are in bytes.
     unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool);
-    /// Adds left times right to the sums of this number. Strides are in bytes.
-    unsafe fn dot(&mut self, sums: usize, right: *const bf16, stride: usize, tail: bool);
+    unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool);
+    /// Adds left times right to the sums of this number.
+    unsafe fn dot(&mut self, sums: usize, tail: bool);
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize);
 }
 
 struct Hardware;
+
+thread_local! {
+    /// Rows and tail that the thread's registers are configured for, as that takes as long as ten products.
+    static SIZES: Cell<(usize, usize)> = const { Cell::new((0, 0)) };
+}
+
+/// A row for each row of a register, none of which crosses the lines of a cache.
+#[repr(align(64))]
+struct Block<T>([[T; LANES]; ROWS]);
 
 /// What `ldtilecfg` reads.
 #[repr(C, align(64))]
@@ -86,16 +99,24 @@ struct TileConfig {
     rows: [u8; 16],
 }
 
-macro_rules! dot {
-    ($sums:literal, $left:literal, $right:literal, $at:expr, $stride:expr) => {
+macro_rules! load {
+    ($register:tt, $at:expr, $stride:expr) => {
         asm!(
-            concat!("tileloadd ", $right, ", [{at} + {stride} * 1]"),
-            concat!("tdpbf16ps ", $sums, ", ", $left, ", ", $right),
+            concat!("tileloadd ", $register, ", [{at} + {stride} * 1]"),
             at = in(reg) $at,
             stride = in(reg) $stride,
-            out("tmm5") _,
-            out("tmm7") _,
+            out($register) _,
             options(nostack, readonly)
+        )
+    };
+}
+
+macro_rules! dot {
+    ($sums:tt, $left:tt, $right:tt) => {
+        asm!(
+            concat!("tdpbf16ps ", $sums, ", ", $left, ", ", $right),
+            out($sums) _,
+            options(nostack, nomem)
         )
     };
 }
@@ -114,7 +135,14 @@ macro_rules! store {
 // SAFETY of all: the caller answers for pointers and processor. Between the calls nothing else uses tile registers: compilers
 // do not without being told to, and every user of this module configures them anew.
 impl Tiles for Hardware {
-    unsafe fn configure(&mut self, rows: usize, cols: usize, tail: usize) {
+    unsafe fn configure(&mut self, rows: usize, tail: usize) {
+        if SIZES.replace((rows, tail)) == (rows, tail) {
+            unsafe {
+                asm!("tilezero tmm0", "tilezero tmm1", "tilezero tmm2", "tilezero tmm3", options(nostack, nomem),
+                    out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _);
+            }
+            return;
+        }
         let mut config = TileConfig {
             palette: 1,
             start_row: 0,
@@ -127,13 +155,13 @@ impl Tiles for Hardware {
             (config.rows[tile], config.row_bytes[tile]) = (rows as u8, (columns * 4) as u16);
         };
         for sums in 0..SUMS {
-            set(sums, rows, cols);
+            set(sums, rows, LANES);
         }
         set(4, rows, STEPS);
-        set(5, STEPS, cols);
+        set(5, STEPS, LANES);
         if tail > 0 {
             set(6, rows, tail);
-            set(7, tail, cols);
+            set(7, tail, LANES);
         }
         unsafe {
             asm!("ldtilecfg [{config}]", config = in(reg) &raw const config, options(nostack, readonly),
@@ -145,28 +173,35 @@ impl Tiles for Hardware {
     #[inline(always)]
     unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool) {
         unsafe {
-            if tail {
-                asm!("tileloadd tmm6, [{at} + {stride} * 1]", at = in(reg) at, stride = in(reg) stride,
-                    out("tmm6") _, options(nostack, readonly));
-            } else {
-                asm!("tileloadd tmm4, [{at} + {stride} * 1]", at = in(reg) at, stride = in(reg) stride,
-                    out("tmm4") _, options(nostack, readonly));
+            match tail {
+                false => load!("tmm4", at, stride),
+                true => load!("tmm6", at, stride),
             }
         }
     }
 
     #[inline(always)]
-    unsafe fn dot(&mut self, sums: usize, right: *const bf16, stride: usize, tail: bool) {
+    unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool) {
+        unsafe {
+            match tail {
+                false => load!("tmm5", at, stride),
+                true => load!("tmm7", at, stride),
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn dot(&mut self, sums: usize, tail: bool) {
         unsafe {
             match (sums, tail) {
-                (0, false) => dot!("tmm0", "tmm4", "tmm5", right, stride),
-                (1, false) => dot!("tmm1", "tmm4", "tmm5", right, stride),
-                (2, false) => dot!("tmm2", "tmm4", "tmm5", right, stride),
-                (_, false) => dot!("tmm3", "tmm4", "tmm5", right, stride),
-                (0, true) => dot!("tmm0", "tmm6", "tmm7", right, stride),
-                (1, true) => dot!("tmm1", "tmm6", "tmm7", right, stride),
-                (2, true) => dot!("tmm2", "tmm6", "tmm7", right, stride),
-                (_, true) => dot!("tmm3", "tmm6", "tmm7", right, stride),
+                (0, false) => dot!("tmm0", "tmm4", "tmm5"),
+                (1, false) => dot!("tmm1", "tmm4", "tmm5"),
+                (2, false) => dot!("tmm2", "tmm4", "tmm5"),
+                (_, false) => dot!("tmm3", "tmm4", "tmm5"),
+                (0, true) => dot!("tmm0", "tmm6", "tmm7"),
+                (1, true) => dot!("tmm1", "tmm6", "tmm7"),
+                (2, true) => dot!("tmm2", "tmm6", "tmm7"),
+                (_, true) => dot!("tmm3", "tmm6", "tmm7"),
             }
         }
     }
@@ -212,6 +247,7 @@ impl Simd for Amx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
     const LEFT_STEPS_ADJOIN: bool = true;
+    const STEPS_IN_CACHE: usize = 1024;
 
     fn rows_max(_: usize) -> usize {
         ROWS_MAX
@@ -264,7 +300,7 @@ pub(super) unsafe fn compute<S: Simd, T: Tiles>(
     }
 }
 
-/// The product of rows whose steps lie side by side: registers of 16 rows on the left, of 16 columns on the right.
+/// The product of rows whose steps lie side by side.
 ///
 /// # Safety
 /// As for `compute`, with a step of 2.
@@ -272,36 +308,58 @@ pub(super) unsafe fn compute<S: Simd, T: Tiles>(
 unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, vecs: usize) {
     let (whole, tail) = (tile.steps / STEPS, tile.steps % STEPS);
     let width = vecs * LANES;
-    for first in (0..rows).step_by(ROWS) {
-        let count = ROWS.min(rows - first);
-        // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
-        unsafe {
-            tiles.configure(count, LANES, tail);
-            for run in 0..tile.runs {
-                let left = tile
-                    .left
-                    .add(first * tile.row_stride + run * tile.run_stride);
-                let panel = tile.panel.add(run * tile.steps * width * 2);
-                for part in 0..whole + usize::from(tail > 0) {
-                    let in_tail = part == whole;
-                    tiles.load_left(left.add(part * STEPS * 2), tile.row_stride * 2, in_tail);
-                    let panel = panel.add(part * STEPS * width * 2);
-                    for vec in 0..vecs {
-                        tiles.dot(vec, panel.add(vec * LANES * 2), width * 4, in_tail);
+    let mut first = 0;
+    while first < rows {
+        // Whole registers of rows, or what is left; as square a block of them as there are sums for.
+        let (groups, count) = match (rows - first) / ROWS {
+            0 => (1, rows - first),
+            whole => (whole.min(SUMS / vecs.min(2)), ROWS),
+        };
+        let block_vecs = SUMS / groups;
+        for first_vec in (0..vecs).step_by(block_vecs) {
+            let block_vecs = block_vecs.min(vecs - first_vec);
+            // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
+            unsafe {
+                tiles.configure(count, tail);
+                for run in 0..tile.runs {
+                    let left = tile
+                        .left
+                        .add(first * tile.row_stride + run * tile.run_stride);
+                    let panel = tile
+                        .panel
+                        .add((run * tile.steps * width + first_vec * LANES) * 2);
+                    for part in 0..whole + usize::from(tail > 0) {
+                        let in_tail = part == whole;
+                        let left = left.add(part * STEPS * 2);
+                        let panel = panel.add(part * STEPS * width * 2);
+                        for group in 0..groups {
+                            let left = left.add(group * ROWS * tile.row_stride);
+                            tiles.load_left(left, tile.row_stride * 2, in_tail);
+                            for at in 0..block_vecs {
+                                // Back and forth: a group begins with the right operand that the one before has ended with.
+                                let vec = if group % 2 == 0 {
+                                    at
+                                } else {
+                                    block_vecs - 1 - at
+                                };
+                                if group == 0 || at > 0 {
+                                    let panel = panel.add(vec * LANES * 2);
+                                    tiles.load_right(panel, width * 4, in_tail);
+                                }
+                                tiles.dot(group * block_vecs + vec, in_tail);
+                            }
+                        }
                     }
                 }
-            }
-            let mut sums = [[0; LANES]; ROWS];
-            for vec in 0..vecs {
-                tiles.store(vec, sums.as_mut_ptr().cast(), LANES * 4);
-                write_sums(tile, (first, count), vec, &sums);
+                write_sums(tiles, tile, (first, count, groups), (first_vec, block_vecs));
             }
         }
+        first += groups * count;
     }
 }
 
-/// The product of rows whose steps are apart, and which lie side by side themselves: columns of the panel on the left, turned so
-/// that their steps lie side by side, and rows on the right.
+/// The product of rows whose steps are apart, and which lie side by side themselves: blocks of 16 of both are turned, so that steps
+/// lie side by side.
 ///
 /// # Safety
 /// As for `compute`, with a row stride of 2.
@@ -317,96 +375,107 @@ unsafe fn by_columns<S: Simd, T: Tiles>(
         tile.row_stride == 2,
         "neither steps nor rows lie side by side"
     );
-    let tail = tile.steps % STEPS;
-    let width = vecs * LANES;
-    let whole_rows = rows / LANES * LANES;
-    for (first, groups, lanes) in [
-        (0, whole_rows / LANES, LANES),
-        (
-            whole_rows,
-            usize::from(whole_rows < rows),
-            rows - whole_rows,
-        ),
-    ] {
-        if groups == 0 {
-            continue;
-        }
-        for vec in 0..vecs {
-            // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
-            unsafe {
-                tiles.configure(LANES, lanes, tail);
-                for run in 0..tile.runs {
-                    for part in 0..tile.steps.div_ceil(STEPS) {
-                        let steps = STEPS.min(tile.steps - part * STEPS);
-                        let step = run * tile.steps + part * STEPS;
-                        let panel = tile.panel.add((step * width + vec * LANES) * 2);
-                        let mut block = block_of(panel.cast(), width, steps);
-                        simd.transpose(&mut block);
-                        let in_tail = steps < STEPS;
-                        tiles.load_left(block.as_ptr().cast(), STEPS * 4, in_tail);
-                        let left = tile
-                            .left
-                            .add(first * 2 + run * tile.run_stride + part * STEPS * tile.step);
-                        for group in 0..groups {
-                            tiles.dot(group, left.add(group * LANES * 2), tile.step * 2, in_tail);
-                        }
+    // Of all runs, whose steps follow each other in the panel.
+    let steps = tile.runs * tile.steps;
+    let (tail, width) = (steps % STEPS, vecs * LANES);
+    for first in (0..rows).step_by(ROWS) {
+        let count = ROWS.min(rows - first);
+        // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
+        unsafe {
+            tiles.configure(count, tail);
+            let (mut run, mut step) = (tile.left.add(first * 2), 0);
+            for part in (0..steps).step_by(STEPS) {
+                let in_part = STEPS.min(steps - part);
+                let mut block = Block([[0; ROWS]; STEPS]);
+                for block in &mut block.0[..in_part] {
+                    let pairs = run.add(step * tile.step).cast::<u32>();
+                    *block = match count {
+                        ROWS => pairs.cast::<[u32; ROWS]>().read_unaligned(),
+                        _ => std::array::from_fn(|row| match row < count {
+                            true => pairs.add(row).read_unaligned(),
+                            false => 0,
+                        }),
+                    };
+                    step += 1;
+                    if step == tile.steps {
+                        (run, step) = (run.wrapping_add(tile.run_stride), 0);
                     }
                 }
-                for group in 0..groups {
-                    let mut sums = [[0; LANES]; LANES];
-                    tiles.store(group, sums.as_mut_ptr().cast(), LANES * 4);
-                    simd.transpose(&mut sums);
-                    write_sums(tile, (first + group * LANES, lanes), vec, &sums);
+                simd.transpose(&mut block.0);
+                let in_tail = in_part < STEPS;
+                tiles.load_left(block.0.as_ptr().cast(), STEPS * 4, in_tail);
+                let panel = tile.panel.add(part * width * 2);
+                for vec in 0..vecs {
+                    tiles.load_right(panel.add(vec * LANES * 2), width * 4, in_tail);
+                    tiles.dot(vec, in_tail);
                 }
+            }
+            write_sums(tiles, tile, (first, count, 1), (0, vecs));
+        }
+    }
+}
+
+/// Writes or adds the sums of `groups` registers of `count` rows from `first` on, by `vecs` registers of columns from `first_vec` on.
+///
+/// # Safety
+/// The output has them, as far as `tile.cols` goes.
+#[inline(always)]
+unsafe fn write_sums<T: Tiles>(
+    tiles: &mut T,
+    tile: &RawTile<bf16>,
+    (first, count, groups): (usize, usize, usize),
+    (first_vec, vecs): (usize, usize),
+) {
+    let place = |sums: usize| {
+        let (row, col) = (
+            first + sums / vecs * ROWS,
+            (first_vec + sums % vecs) * LANES,
+        );
+        let cols = tile.cols.saturating_sub(col).min(LANES);
+        // Without columns it is not used.
+        (tile.out.wrapping_add(row * tile.out_stride + col), cols)
+    };
+    let is_direct = |cols| tile.mode == Mode::Replace && cols == LANES;
+    // All of them first: what was just stored is slow to read.
+    let mut blocks = [const { MaybeUninit::<Block<f32>>::uninit() }; SUMS];
+    for (sums, block) in blocks.iter_mut().enumerate().take(groups * vecs) {
+        let (out, cols) = place(sums);
+        // SAFETY: the caller's; a block has room for a register.
+        unsafe {
+            match is_direct(cols) {
+                true => tiles.store(sums, out, tile.out_stride * 4),
+                false => tiles.store(sums, block.as_mut_ptr().cast(), LANES * 4),
+            }
+        }
+    }
+    for (sums, block) in blocks.iter().enumerate().take(groups * vecs) {
+        let (out, cols) = place(sums);
+        if is_direct(cols) || cols == 0 {
+            continue;
+        }
+        for row in 0..count {
+            // SAFETY: so many rows were stored; the output is exclusively borrowed by the tile.
+            unsafe {
+                let sums = &*block.as_ptr().cast::<[f32; LANES]>().add(row);
+                let out = std::slice::from_raw_parts_mut(out.add(row * tile.out_stride), cols);
+                write_row(tile.mode, sums, out);
             }
         }
     }
 }
 
-/// The first 16 columns of `steps` rows of a panel [step, width], in pairs.
-///
-/// # Safety
-/// The panel has them.
 #[inline(always)]
-unsafe fn block_of(panel: *const u32, width: usize, steps: usize) -> [[u32; LANES]; STEPS] {
-    let mut block = [[0; LANES]; STEPS];
-    for (step, block) in block.iter_mut().enumerate().take(steps) {
-        // SAFETY: the caller's; pairs of bf16 need no alignment.
-        *block = unsafe {
-            panel
-                .add(step * width)
-                .cast::<[u32; LANES]>()
-                .read_unaligned()
-        };
-    }
-    block
-}
-
-/// Writes or adds the first of `sums` [row, column], the bits of f32, to the output's rows (first, count) and a register of columns.
-///
-/// # Safety
-/// The output has them, as far as `tile.cols` goes.
-#[inline(always)]
-unsafe fn write_sums(
-    tile: &RawTile<bf16>,
-    (first, count): (usize, usize),
-    vec: usize,
-    sums: &[[u32; LANES]; ROWS],
-) {
-    let cols = tile.cols.saturating_sub(vec * LANES).min(LANES);
-    if cols == 0 {
+fn write_row(mode: Mode, sums: &[f32; LANES], out: &mut [f32]) {
+    if let (Mode::Add, Ok(out)) = (mode, <&mut [f32; LANES]>::try_from(&mut *out)) {
+        for (out, sum) in out.iter_mut().zip(sums) {
+            *out += sum;
+        }
         return;
     }
-    for (row, sums) in sums.iter().enumerate().take(count) {
-        let at = (first + row) * tile.out_stride + vec * LANES;
-        // SAFETY: the caller's; the output is exclusively borrowed by the tile.
-        let out = unsafe { std::slice::from_raw_parts_mut(tile.out.add(at), cols) };
-        for (out, &sum) in out.iter_mut().zip(sums) {
-            let sum = f32::from_bits(sum);
-            *out = match tile.mode {
-                Mode::Add => *out + sum,
-                Mode::Replace => sum,
-            };
-        }
+    for (out, sum) in out.iter_mut().zip(sums) {
+        *out = match mode {
+            Mode::Add => *out + sum,
+            Mode::Replace => *sum,
+        };
     }
 }

@@ -13,9 +13,9 @@ use super::{
 #[derive(Clone, Copy, Default)]
 struct Registers {
     rows: usize,
-    cols: usize,
     tail: usize,
     left: [[[u32; STEPS]; ROWS]; 2],
+    right: [[[u32; LANES]; STEPS]; 2],
     sums: [[[f32; LANES]; ROWS]; SUMS],
 }
 
@@ -26,36 +26,51 @@ fn pair(pair: u32) -> [f32; 2] {
     ]
 }
 
+impl Registers {
+    const fn steps(&self, tail: bool) -> usize {
+        if tail { self.tail } else { STEPS }
+    }
+}
+
+/// Rows of as many pairs as `to` has columns, so many bytes apart.
+unsafe fn load<const N: usize>(at: *const bf16, stride: usize, to: &mut [[u32; N]], cols: usize) {
+    for (row, to) in to.iter_mut().enumerate() {
+        for (col, to) in to.iter_mut().enumerate().take(cols) {
+            let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
+            *to = unsafe { at.cast::<u32>().read_unaligned() };
+        }
+    }
+}
+
 impl Tiles for Registers {
-    unsafe fn configure(&mut self, rows: usize, cols: usize, tail: usize) {
-        assert!(rows <= ROWS && cols <= LANES && tail < STEPS);
+    unsafe fn configure(&mut self, rows: usize, tail: usize) {
+        assert!(rows <= ROWS && tail < STEPS);
         *self = Self {
             rows,
-            cols,
             tail,
             ..Self::default()
         };
     }
 
     unsafe fn load_left(&mut self, at: *const bf16, stride: usize, tail: bool) {
-        let steps = if tail { self.tail } else { STEPS };
-        for row in 0..self.rows {
-            for step in 0..steps {
-                let at = at.cast::<u8>().wrapping_add(row * stride + step * 4);
-                self.left[usize::from(tail)][row][step] =
-                    unsafe { at.cast::<u32>().read_unaligned() };
-            }
-        }
+        let steps = self.steps(tail);
+        let to = &mut self.left[usize::from(tail)][..self.rows];
+        unsafe { load(at, stride, to, steps) }
     }
 
-    unsafe fn dot(&mut self, sums: usize, right: *const bf16, stride: usize, tail: bool) {
-        let steps = if tail { self.tail } else { STEPS };
+    unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool) {
+        let steps = self.steps(tail);
+        let to = &mut self.right[usize::from(tail)][..steps];
+        unsafe { load(at, stride, to, LANES) }
+    }
+
+    unsafe fn dot(&mut self, sums: usize, tail: bool) {
+        let (operands, steps) = (usize::from(tail), self.steps(tail));
         for row in 0..self.rows {
             for step in 0..steps {
-                let left = pair(self.left[usize::from(tail)][row][step]);
-                for col in 0..self.cols {
-                    let at = right.cast::<u8>().wrapping_add(step * stride + col * 4);
-                    let right = pair(unsafe { at.cast::<u32>().read_unaligned() });
+                let left = pair(self.left[operands][row][step]);
+                for col in 0..LANES {
+                    let right = pair(self.right[operands][step][col]);
                     self.sums[sums][row][col] += left[0] * right[0] + left[1] * right[1];
                 }
             }
@@ -64,7 +79,7 @@ impl Tiles for Registers {
 
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize) {
         for row in 0..self.rows {
-            for col in 0..self.cols {
+            for col in 0..LANES {
                 let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
                 unsafe { at.cast::<f32>().write_unaligned(self.sums[sums][row][col]) };
             }

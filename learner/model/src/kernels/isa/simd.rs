@@ -40,6 +40,9 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     /// Most registers of columns in a tile.
     const VECS_MAX: usize;
 
+    /// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
+    const STEPS_IN_CACHE: usize = 128;
+
     /// Whether steps of a left operand are best side by side, even where copying them so means to transpose it.
     const LEFT_STEPS_ADJOIN: bool = false;
 
