@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, ModelConfig, Network, Parameters, StoredAs};
+use driml_model::{Compute, DimHeads, Kernels, ModelConfig, Network, Parameters, StoredAs};
 use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
 
@@ -145,10 +145,11 @@ impl Agent {
         })
     }
 
-    /// The same; `deduplicate` says whether equal states of a batch are computed once. Without this each is computed.
+    /// The same; `deduplicate` says whether equal states of a batch are computed once. Without this each is computed, and always on other
+    /// devices than the CPU, whose arithmetic takes less time than the CPU's checksums.
     #[must_use]
     pub const fn with_deduplication(mut self, deduplicate: bool) -> Self {
-        self.deduplicate = deduplicate;
+        self.deduplicate = deduplicate && matches!(self.compute.kernels, Kernels::Fused(_));
         self
     }
 

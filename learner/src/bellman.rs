@@ -1,15 +1,13 @@
 //! What C51 learns to predict: distributions one Bellman step earlier, of the actions that are greedy in s_{t+n}.
 //! It has no graph, and nothing here learns.
 
-use std::borrow::Cow;
-
 use candle_core::Tensor;
 use driml_model::{Compute, HeadNoise, ModelConfig, Network, greedy};
 use driml_protocol::NO_ACTION;
 
 use crate::{
     batch::Batch,
-    deduplicate::{self, Distinct, State, one_after_another},
+    deduplicate::{PassInput, State},
     error::UpdateError,
     losses::{c51::softmax, projection::project},
     noise::UpdateNoise,
@@ -97,14 +95,9 @@ impl Bellman<'_> {
         } = *self.model;
         let len = self.model.frame_len();
         let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
-        let once = deduplicate::applies(self.deduplicate, self.compute.kernels);
-        let distinct = once.then(|| Distinct::of(&frames)).flatten();
-        let states_n = match &distinct {
-            Some(distinct) => Cow::Owned(distinct.gather(&frames, len)),
-            None if batch.states_n.len() == frames.len() * len => Cow::Borrowed(batch.states_n),
-            None => Cow::Owned(one_after_another(frames.iter().copied(), len)),
-        };
-        let states_n = states(self.model, states_n, &self.compute.device)?;
+        let PassInput { bytes, places } =
+            PassInput::of(&frames, batch.states_n, len, self.deduplicate);
+        let states_n = states(self.model, bytes, &self.compute.device)?;
         let target_logits = distribution(self.target, &states_n, noise.target.as_ref())?;
         let (network, values) = if self.double_dqn {
             let logits = distribution(self.online, &states_n, noise.choice.as_ref())?;
@@ -122,9 +115,7 @@ impl Bellman<'_> {
         let logits = flat(&target_logits)?;
         let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
         for row in 0..frames.len() {
-            let state = distinct
-                .as_ref()
-                .map_or(row, |it| it.places()[row] as usize);
+            let state = places.as_ref().map_or(row, |it| it[row] as usize);
             let action = of_state[state];
             let at = (state * num_actions + usize::from(action)) * atoms;
             chosen.extend_from_slice(&logits[at..at + atoms]);

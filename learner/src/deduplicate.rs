@@ -6,9 +6,8 @@
 //! first to last, where the products would have summed them among others: gradients differ in their last bits, and are the same
 //! for any number of threads.
 
-use std::collections::HashMap;
+use std::{borrow::Cow, collections::HashMap};
 
-use driml_model::Kernels;
 use rayon::prelude::*;
 
 /// A pass is made shorter where at least one of this many states repeats another: below, what is saved is less than what it costs
@@ -19,24 +18,52 @@ const TASK_STATES: usize = 16;
 /// The bytes of a state; none of a blank one, which stands where there is no state.
 pub(crate) type State<'a> = Option<&'a [u8]>;
 
-/// Whether equal states are looked for where a network computes with `kernels`, if the setting is `on`. Another device's arithmetic
-/// takes less time than the CPU's checksums.
-pub(crate) fn applies(on: bool, kernels: Kernels) -> bool {
-    on && matches!(kernels, Kernels::Fused(_))
+/// The states of a pass as a network takes them: all, or the distinct ones alone where that pays.
+pub(crate) struct PassInput<'a> {
+    pub(crate) bytes: Cow<'a, [u8]>,
+    /// Of each state its place among those that pass; none where all do.
+    pub(crate) places: Option<Vec<u32>>,
+}
+
+impl<'a> PassInput<'a> {
+    /// That of `states` of this length; `plane`, if it is as long as all of them, holds them one after the other. `once` says whether equal
+    /// ones may pass once.
+    pub(crate) fn of(
+        states: &[State<'_>],
+        plane: &'a [u8],
+        state_bytes: usize,
+        once: bool,
+    ) -> Self {
+        if once && let Some(distinct) = Distinct::of(states) {
+            return Self {
+                bytes: Cow::Owned(distinct.gather(states, state_bytes)),
+                places: Some(distinct.places),
+            };
+        }
+        let bytes = if plane.len() == states.len() * state_bytes {
+            Cow::Borrowed(plane)
+        } else {
+            Cow::Owned(one_after_another(states.iter().copied(), state_bytes))
+        };
+        Self {
+            bytes,
+            places: None,
+        }
+    }
 }
 
 /// The distinct states of a pass, and which of them each of its states is.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Distinct {
+struct Distinct {
     /// Of each distinct state its first place in the pass, ascending.
     firsts: Vec<usize>,
     /// Of each state its place among the distinct ones.
-    of_state: Vec<u32>,
+    places: Vec<u32>,
 }
 
 impl Distinct {
     /// That of `states`, if it pays to compute the distinct ones alone.
-    pub(crate) fn of(states: &[State<'_>]) -> Option<Self> {
+    fn of(states: &[State<'_>]) -> Option<Self> {
         let distinct = Self::find(states);
         let repeats = distinct.repeats();
         (repeats > 0 && repeats * PAYS_ONE_IN >= states.len()).then_some(distinct)
@@ -50,35 +77,30 @@ impl Distinct {
             .collect();
         let mut distinct = Self {
             firsts: Vec::with_capacity(states.len()),
-            of_state: Vec::with_capacity(states.len()),
+            places: Vec::with_capacity(states.len()),
         };
         // By checksum. Of two different states with the same checksum, the second never counts as a repeat, nor do its copies.
-        let mut places = HashMap::with_capacity(states.len());
+        let mut known_places = HashMap::with_capacity(states.len());
         for (at, (state, sum)) in states.iter().zip(sums).enumerate() {
             let new = distinct.firsts.len() as u32;
-            let place = *places.entry(sum).or_insert(new);
+            let place = *known_places.entry(sum).or_insert(new);
             let known = place < new && states[distinct.firsts[place as usize]] == *state;
             if !known {
                 distinct.firsts.push(at);
             }
-            distinct.of_state.push(if known { place } else { new });
+            distinct.places.push(if known { place } else { new });
         }
         distinct
     }
 
     /// States that are equal to one before them.
-    pub(crate) fn repeats(&self) -> usize {
-        self.of_state.len() - self.firsts.len()
+    fn repeats(&self) -> usize {
+        self.places.len() - self.firsts.len()
     }
 
     /// The distinct ones of the pass's `states`, one after the other.
-    pub(crate) fn gather(&self, states: &[State<'_>], state_bytes: usize) -> Vec<u8> {
+    fn gather(&self, states: &[State<'_>], state_bytes: usize) -> Vec<u8> {
         one_after_another(self.firsts.iter().map(|&first| states[first]), state_bytes)
-    }
-
-    /// Of each state of the pass its place among the distinct ones.
-    pub(crate) fn places(&self) -> &[u32] {
-        &self.of_state
     }
 }
 
@@ -109,7 +131,7 @@ mod tests {
             .collect();
         let distinct = Distinct::of(&states).unwrap();
         assert_eq!(distinct.firsts, [0, 1, 2]);
-        assert_eq!(distinct.places(), [0, 1, 2, 0, 1]);
+        assert_eq!(distinct.places, [0, 1, 2, 0, 1]);
         assert_eq!(distinct.repeats(), 2);
         assert_eq!(distinct.gather(&states, 2), [1, 1, 0, 0, 2, 2]);
     }
@@ -121,7 +143,7 @@ mod tests {
         let states = [a, b, a, b];
         assert_eq!(crc32fast::hash(b"plumless"), crc32fast::hash(b"buckeroo"));
         let distinct = Distinct::of(&states).unwrap();
-        assert_eq!(distinct.places(), [0, 1, 0, 2]);
+        assert_eq!(distinct.places, [0, 1, 0, 2]);
         assert_eq!(distinct.gather(&states, 8), *b"plumlessbuckeroobuckeroo");
     }
 

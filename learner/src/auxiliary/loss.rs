@@ -1,7 +1,7 @@
 //! What every auxiliary loss is: the trait that a file of this folder implements, what it is given, and what it gives back.
 //! It names no loss; the menu is in `super`.
 
-use std::{borrow::Cow, fmt};
+use std::{fmt, ops::Range};
 
 use candle_core::{Device, Tensor};
 use driml_model::{DimHeads, Features, LossLayer, ModelConfig, Network};
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     batch::Batch,
-    deduplicate::{self, Distinct, State, one_after_another},
+    deduplicate::{PassInput, State},
     error::UpdateError,
     losses::scores::Dots,
     tensors::states,
@@ -138,39 +138,20 @@ impl OnlineFeatures {
         let anchors = all.len() - batch.rows;
         all.extend(loss.later_states(batch, len));
 
-        if anchors == 0
-            && deduplicate::applies(deduplicate, network.kernels())
-            && let Some(distinct) = Distinct::of(&all)
-        {
-            let features = network.features(&states(model, distinct.gather(&all, len), device)?)?;
-            let (now, later) = distinct.places().split_at(batch.rows);
-            let now = features.select(now)?;
-            let later = (!later.is_empty()).then(|| features.select(later));
-            return Ok(Self {
-                anchors: now.clone(),
-                now,
-                later: later.transpose()?,
-            });
-        }
-        let bytes = if all.len() == batch.rows {
-            Cow::Borrowed(batch.states_t)
-        } else {
-            Cow::Owned(one_after_another(all.iter().copied(), len))
-        };
+        let once = deduplicate && anchors == 0;
+        let PassInput { bytes, places } = PassInput::of(&all, batch.states_t, len, once);
         let features = network.features(&states(model, bytes, device)?)?;
-        let mut first = 0;
-        let mut cut = |rows: usize| -> candle_core::Result<Option<Features>> {
-            let start = first;
-            first += rows;
-            (rows > 0).then(|| features.narrow(start, rows)).transpose()
+        let of = |states: Range<usize>| match &places {
+            Some(places) => features.select(&places[states]),
+            None => features.narrow(states.start, states.len()),
         };
-        let later = all.len() - anchors - batch.rows;
-        let [now, anchors, later] = [cut(batch.rows)?, cut(anchors)?, cut(later)?];
-        let now = now.unwrap_or(features.clone());
+        let some = |states: Range<usize>| (!states.is_empty()).then(|| of(states)).transpose();
+        let (first_anchor, first_later) = (batch.rows, batch.rows + anchors);
+        let now = of(0..first_anchor)?;
         Ok(Self {
-            anchors: anchors.unwrap_or_else(|| now.clone()),
+            anchors: some(first_anchor..first_later)?.unwrap_or_else(|| now.clone()),
+            later: some(first_later..all.len())?,
             now,
-            later,
         })
     }
 }
