@@ -1,4 +1,4 @@
-//! One update: C51 plus the auxiliary loss, clipped, through Adam; then the target network's turn.
+//! One update: the gradients of a batch, clipped, through Adam; then the target network's turn.
 //! It does not fetch batches, publish weights or keep checkpoints, and knows no process but its own.
 
 use std::collections::HashMap;
@@ -9,15 +9,10 @@ use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    auxiliary::{
-        key_encoder::KeyEncoder,
-        loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
-    },
+    auxiliary::key_encoder::KeyEncoder,
     batch::Batch,
-    bellman::{Bellman, BellmanTarget, distribution},
     error::UpdateError,
-    evaluation::{Evaluation, UpdateReport},
-    losses::c51::{kl_loss, row_kls},
+    evaluation::{Evaluation, Networks, UpdateReport, distribution},
     noise::UpdateNoise,
     optimiser::{
         adam::Adam,
@@ -25,7 +20,7 @@ use crate::{
         target,
     },
     settings::LearnerSettings,
-    tensors::{finite, flat, states},
+    tensors::{flat, states},
 };
 
 /// The parameters of all networks that a learner has.
@@ -42,21 +37,13 @@ pub struct NetworkParameters {
 /// The learner: online and target network, CURL's key encoder, optimiser, count of updates.
 #[derive(Debug)]
 pub struct Agent {
-    model: ModelConfig,
-    settings: LearnerSettings,
-    compute: Compute,
-    deduplicate: bool,
-    noise_seed: [u8; 32],
-    auxiliary: Box<dyn AuxiliaryLoss>,
-    pub(crate) online: Parameters,
-    pub(crate) target: Parameters,
-    online_network: Network,
-    target_network: Network,
-    key: Option<KeyEncoder>,
+    networks: Networks,
+    target: Parameters,
     /// Torso and head of the averaged network, if the settings ask for one.
     average: Option<Parameters>,
+    noise_seed: [u8; 32],
     pub(crate) adam: Adam,
-    pub(crate) updates: u64,
+    updates: u64,
 }
 
 impl Agent {
@@ -129,18 +116,20 @@ impl Agent {
         let average = settings.average_tau.map(|_| online.without_dim());
         Ok(Self {
             average: average.transpose()?,
-            online_network: Network::with_kernels(&model, &online, kernels)?,
-            target_network: Network::with_kernels(&model.without_dim(), &target, kernels)?,
-            key,
-            adam: Adam::new(settings.adam, &online, kernels)?,
-            compute: compute.clone(),
-            deduplicate: false,
             noise_seed: [0; 32],
-            auxiliary,
+            adam: Adam::new(settings.adam, &online, kernels)?,
             updates: 0,
-            model,
-            settings,
-            online,
+            networks: Networks {
+                online: Network::with_kernels(&model, &online, kernels)?,
+                target: Network::with_kernels(&model.without_dim(), &target, kernels)?,
+                compute: compute.clone(),
+                deduplicate: false,
+                auxiliary,
+                parameters: online,
+                key,
+                model,
+                settings,
+            },
             target,
         })
     }
@@ -149,7 +138,8 @@ impl Agent {
     /// devices than the CPU, whose arithmetic takes less time than the CPU's checksums.
     #[must_use]
     pub const fn with_deduplication(mut self, deduplicate: bool) -> Self {
-        self.deduplicate = deduplicate && matches!(self.compute.kernels, Kernels::Fused(_));
+        let kernels = self.networks.compute.kernels;
+        self.networks.deduplicate = deduplicate && matches!(kernels, Kernels::Fused(_));
         self
     }
 
@@ -162,12 +152,12 @@ impl Agent {
 
     /// The online network's sizes, its auxiliary heads included.
     pub const fn model(&self) -> &ModelConfig {
-        &self.model
+        &self.networks.model
     }
 
     /// The settings of its updates.
     pub const fn settings(&self) -> &LearnerSettings {
-        &self.settings
+        &self.networks.settings
     }
 
     /// Updates taken since the run began, those before a restart included.
@@ -177,7 +167,7 @@ impl Agent {
 
     /// The online network's parameters.
     pub const fn online(&self) -> &Parameters {
-        &self.online
+        &self.networks.parameters
     }
 
     /// The target network's parameters.
@@ -187,7 +177,7 @@ impl Agent {
 
     /// The parameters of CURL's key encoder, if that is the auxiliary loss.
     pub fn key(&self) -> Option<&Parameters> {
-        self.key.as_ref().map(KeyEncoder::parameters)
+        self.networks.key.as_ref().map(KeyEncoder::parameters)
     }
 
     /// The averaged network's parameters, torso and head, if the settings ask for one: after each update they move
@@ -199,7 +189,7 @@ impl Agent {
     /// Puts the averaged weights, if there are any, into torso and head of the online network, to play with. Says whether there were.
     pub fn take_average(&mut self) -> Result<bool, UpdateError> {
         for (name, var) in self.average.iter().flat_map(Parameters::iter) {
-            if let Some(online) = self.online.get(name) {
+            if let Some(online) = self.online().get(name) {
                 online.set(var)?;
             }
         }
@@ -220,7 +210,7 @@ impl Agent {
     /// As there, and a weight that is too large for the type.
     pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
         let acting = |name: &str| !name.starts_with(target::AUXILIARY_PREFIX);
-        Ok(self.online.to_safetensors_as(stored, acting)?)
+        Ok(self.online().to_safetensors_as(stored, acting)?)
     }
 
     /// Learns from one batch.
@@ -235,7 +225,7 @@ impl Agent {
             let evaluation = self.evaluate(batch)?;
             let grad_norm = self.apply(&evaluation.gradients)?;
             let taken = evaluation.taken_logits.unsqueeze(1)?;
-            let q_sum: f32 = flat(&self.online_network.q_values(&taken)?)?.iter().sum();
+            let q_sum: f32 = flat(&self.networks.online.q_values(&taken)?)?.iter().sum();
             Ok(UpdateReport {
                 c51_kl: evaluation.c51_kl,
                 row_kls: evaluation.row_kls,
@@ -249,12 +239,12 @@ impl Agent {
 
     /// Checks that `batch` is one of this network's and auxiliary loss's.
     pub(crate) fn check(&self, batch: &Batch<'_>) -> Result<(), UpdateError> {
-        batch.validate(&self.model, self.settings.auxiliary_loss.positives())
+        batch.validate(self.model(), self.settings().auxiliary_loss.positives())
     }
 
     /// The noise of the next update's noisy layers.
     pub fn noise(&self) -> UpdateNoise {
-        UpdateNoise::draw(&self.model, self.noise_seed, self.updates)
+        UpdateNoise::draw(self.model(), self.noise_seed, self.updates)
     }
 
     /// Losses and gradients of one batch at the present parameters, with the noise of the next update.
@@ -275,122 +265,47 @@ impl Agent {
         noise: &UpdateNoise,
     ) -> Result<Evaluation, UpdateError> {
         self.check(batch)?;
-        // Neither needs the other: what one does on a single thread falls into the other's products.
-        let (target, features) = rayon::join(
-            || self.bellman().target(batch, noise),
-            || {
-                OnlineFeatures::new(
-                    &self.online_network,
-                    &self.model,
-                    &*self.auxiliary,
-                    batch,
-                    self.deduplicate,
-                    &self.compute.device,
-                )
-            },
-        );
-        let BellmanTarget {
-            next_greedy_action,
-            projection: target_projection,
-        } = target?;
-        let features = features?;
-        let taken_logits = self.online_network.taken_logits(
-            &features.now.f4,
-            batch.action,
-            noise.online.as_ref(),
-        )?;
-        let kl = kl_loss(
-            &taken_logits,
-            target_projection.clone(),
-            batch.importance_weight.map(<[f32]>::to_vec),
-            self.compute.kernels,
-        )?;
-        let auxiliary = self.auxiliary.losses(&LossInputs {
-            online: &self.online_network,
-            model: &self.model,
-            batch,
-            features: &features,
-            key: self.key.as_ref(),
-            device: &self.compute.device,
-        })?;
-        let mut total = kl.clone();
-        for WeightedLoss { loss, weight, .. } in &auxiliary {
-            total = (total + loss.affine(*weight, 0.0)?)?;
-        }
-        // Before any number is read: reading waits for a GPU, which should have all its work by then.
-        let gradients = Gradients::of(&self.online, &total)?;
-        let c51_kl = finite("the C51 loss", &kl)?;
-        let mut losses = Vec::with_capacity(auxiliary.len());
-        for WeightedLoss { name, loss, .. } in &auxiliary {
-            losses.push((*name, finite(name, loss)?));
-        }
-        let taken_logits = taken_logits.detach();
-        let row_kls = match batch.importance_weight {
-            None => Vec::new(),
-            Some(_) => {
-                let kls = row_kls(&flat(&taken_logits)?, &target_projection, self.model.atoms);
-                kls.into_iter().map(|kl| kl as f32).collect()
-            }
-        };
-        Ok(Evaluation {
-            c51_kl,
-            row_kls,
-            losses,
-            total: finite("the total loss", &total)?,
-            taken_logits,
-            next_greedy_action,
-            target_projection,
-            gradients,
-        })
+        self.networks.evaluate(batch, noise)
     }
 
     /// Online values [B, A] of the batch's s_t, by a pass of their own: an update needs those of the actions taken alone. Without noise:
     /// of noisy layers the means serve.
     pub fn q_values_t(&self, batch: &Batch<'_>) -> Result<Vec<f32>, UpdateError> {
-        let states = states(&self.model, batch.states_t, &self.compute.device)?;
-        let logits = distribution(&self.online_network, &states, None)?;
-        Ok(flat(&self.online_network.q_values(&logits)?)?)
+        let networks = &self.networks;
+        let states = states(self.model(), batch.states_t, &networks.compute.device)?;
+        let logits = distribution(&networks.online, &states, None)?;
+        Ok(flat(&networks.online.q_values(&logits)?)?)
     }
 
     /// Clips `gradients` and takes one step with them; moves the slow networks whose turn it is.
     /// Returns their global norm before clipping.
     pub fn apply(&mut self, gradients: &Gradients) -> Result<f64, UpdateError> {
-        let norm = gradients.norm(self.compute.kernels)?;
-        self.adam.step(
-            &self.online,
-            gradients,
-            clip_factor(norm, self.settings.max_grad_norm),
-        )?;
+        let Networks {
+            settings,
+            compute,
+            parameters: online,
+            key,
+            ..
+        } = &self.networks;
+        let kernels = compute.kernels;
+        let norm = gradients.norm(kernels)?;
+        let factor = clip_factor(norm, settings.max_grad_norm);
+        self.adam.step(online, gradients, factor)?;
         self.updates += 1;
-        if let Some(key) = &self.key {
-            key.follow(&self.online)?;
+        if let Some(key) = key {
+            key.follow(online)?;
         }
-        if let (Some(average), Some(tau)) = (&self.average, self.settings.average_tau) {
-            target::follow(average, &self.online, tau, self.compute.kernels)?;
+        if let (Some(average), Some(tau)) = (&self.average, settings.average_tau) {
+            target::follow(average, online, tau, kernels)?;
         }
-        if self
-            .updates
-            .is_multiple_of(self.settings.target_period_updates)
-        {
-            let (tau, kernels) = (self.settings.target_tau, self.compute.kernels);
-            target::follow(&self.target, &self.online, tau, kernels)?;
+        if self.updates.is_multiple_of(settings.target_period_updates) {
+            target::follow(&self.target, online, settings.target_tau, kernels)?;
         }
         Ok(norm)
     }
 
     pub(crate) fn restore_average(&mut self, average: Parameters) {
         self.average = Some(average);
-    }
-
-    const fn bellman(&self) -> Bellman<'_> {
-        Bellman {
-            model: &self.model,
-            compute: &self.compute,
-            online: &self.online_network,
-            target: &self.target_network,
-            double_dqn: self.settings.double_dqn,
-            deduplicate: self.deduplicate,
-        }
     }
 
     /// Puts back a state that [`Agent::online`], [`Agent::target`] and [`Adam`] had after `updates` updates.
@@ -400,8 +315,8 @@ impl Agent {
         adam_step: u64,
         moments: HashMap<String, Tensor>,
     ) -> Result<(), UpdateError> {
-        self.adam
-            .restore(adam_step, moments, &self.compute.device)?;
+        let device = &self.networks.compute.device;
+        self.adam.restore(adam_step, moments, device)?;
         self.updates = updates;
         Ok(())
     }

@@ -1,9 +1,27 @@
-//! What a batch's evaluation gives, and what remains of it after an update.
-//! It computes nothing: `agent` does.
+//! From a checked batch to the gradients of its losses: what the networks make of it, what C51 is to predict, and both losses.
+//! It takes no step: `agent` does.
 
 use candle_core::Tensor;
+use driml_model::{Compute, HeadNoise, ModelConfig, Network, Parameters, greedy};
+use driml_protocol::NO_ACTION;
 
-use crate::optimiser::gradients::Gradients;
+use crate::{
+    auxiliary::{
+        key_encoder::KeyEncoder,
+        loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
+    },
+    batch::Batch,
+    deduplicate::{PassInput, State},
+    error::UpdateError,
+    losses::{
+        c51::{kl_loss, row_kls, softmax},
+        projection::project,
+    },
+    noise::UpdateNoise,
+    optimiser::gradients::Gradients,
+    settings::LearnerSettings,
+    tensors::{finite, flat, states},
+};
 
 /// What one update did: the numbers of a row of metrics.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,11 +53,208 @@ pub struct Evaluation {
     pub total: f32,
     /// Online logits [B, N] of the actions taken in s_t, without a graph.
     pub taken_logits: Tensor,
-    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`](driml_protocol::NO_ACTION) where the row does not bootstrap, as nothing is
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap, as nothing is
     /// computed of that state.
     pub next_greedy_action: Vec<u8>,
     /// Projected target distributions [B, N].
     pub target_projection: Vec<f32>,
     /// Gradients of the total, before clipping.
     pub gradients: Gradients,
+}
+
+/// The networks that a batch passes through, and how.
+#[derive(Debug)]
+pub(crate) struct Networks {
+    pub(crate) model: ModelConfig,
+    pub(crate) settings: LearnerSettings,
+    pub(crate) compute: Compute,
+    /// Whether equal states of a batch are computed once.
+    pub(crate) deduplicate: bool,
+    pub(crate) auxiliary: Box<dyn AuxiliaryLoss>,
+    /// Those of the online network.
+    pub(crate) parameters: Parameters,
+    pub(crate) online: Network,
+    pub(crate) target: Network,
+    pub(crate) key: Option<KeyEncoder>,
+}
+
+/// What C51 is to predict.
+struct BellmanTarget {
+    /// Greedy action in s_{t+n} [B]; [`NO_ACTION`] where the row does not bootstrap.
+    next_greedy_action: Vec<u8>,
+    /// Distributions on the support, one Bellman step earlier [B, N].
+    projection: Vec<f32>,
+}
+
+impl Networks {
+    /// Losses and gradients of `batch`, which is checked, with this noise of noisy layers.
+    pub(crate) fn evaluate(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<Evaluation, UpdateError> {
+        // Neither needs the other: what one does on a single thread falls into the other's products.
+        let (target, features) = rayon::join(
+            || self.bellman_target(batch, noise),
+            || {
+                OnlineFeatures::new(
+                    &self.online,
+                    &self.model,
+                    &*self.auxiliary,
+                    batch,
+                    self.deduplicate,
+                    &self.compute.device,
+                )
+            },
+        );
+        let target = target?;
+        let features = features?;
+        let taken_logits =
+            self.online
+                .taken_logits(&features.now.f4, batch.action, noise.online.as_ref())?;
+        let kl = kl_loss(
+            &taken_logits,
+            target.projection.clone(),
+            batch.importance_weight.map(<[f32]>::to_vec),
+            self.compute.kernels,
+        )?;
+        let auxiliary = self.auxiliary.losses(&LossInputs {
+            online: &self.online,
+            model: &self.model,
+            batch,
+            features: &features,
+            key: self.key.as_ref(),
+            device: &self.compute.device,
+        })?;
+        let mut total = kl.clone();
+        for WeightedLoss { loss, weight, .. } in &auxiliary {
+            total = (total + loss.affine(*weight, 0.0)?)?;
+        }
+        // Before any number is read: reading waits for a GPU, which should have all its work by then.
+        let gradients = Gradients::of(&self.parameters, &total)?;
+        let c51_kl = finite("the C51 loss", &kl)?;
+        let mut losses = Vec::with_capacity(auxiliary.len());
+        for WeightedLoss { name, loss, .. } in &auxiliary {
+            losses.push((*name, finite(name, loss)?));
+        }
+        let taken_logits = taken_logits.detach();
+        let row_kls = match batch.importance_weight {
+            None => Vec::new(),
+            Some(_) => {
+                let kls = row_kls(&flat(&taken_logits)?, &target.projection, self.model.atoms);
+                kls.into_iter().map(|kl| kl as f32).collect()
+            }
+        };
+        Ok(Evaluation {
+            c51_kl,
+            row_kls,
+            losses,
+            total: finite("the total loss", &total)?,
+            taken_logits,
+            next_greedy_action: target.next_greedy_action,
+            target_projection: target.projection,
+            gradients,
+        })
+    }
+
+    /// Distributions one Bellman step earlier, of the actions that are greedy in s_{t+n}, without a graph.
+    ///
+    /// Rows without a bootstrap are left out of the pass: whatever s_{t+n} is, all of their mass goes to their return.
+    fn bellman_target(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<BellmanTarget, UpdateError> {
+        let ModelConfig {
+            atoms,
+            v_min,
+            v_max,
+            ..
+        } = self.model;
+        let mut next_greedy_action = vec![NO_ACTION; batch.rows];
+        let mut probs = vec![0f32; batch.rows * atoms];
+        for probs in probs.chunks_exact_mut(atoms) {
+            probs[0] = 1.0;
+        }
+        let bootstraps: Vec<usize> = batch.bootstraps().collect();
+        if !bootstraps.is_empty() {
+            let (actions, logits) = self.next_greedy(batch, noise)?;
+            for ((&row, action), logits) in bootstraps
+                .iter()
+                .zip(actions)
+                .zip(logits.chunks_exact(atoms))
+            {
+                next_greedy_action[row] = action;
+                softmax(logits, &mut probs[row * atoms..][..atoms]);
+            }
+        }
+        if !probs.iter().all(|p| p.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: "the target network's distribution".to_owned(),
+            });
+        }
+        let mut projection = vec![0f32; probs.len()];
+        project(
+            &probs,
+            batch.n_step_return,
+            batch.bootstrap_discount,
+            v_min,
+            v_max,
+            &mut projection,
+        );
+        Ok(BellmanTarget {
+            next_greedy_action,
+            projection,
+        })
+    }
+
+    /// Greedy actions in s_{t+n} of the rows that bootstrap [n], and the target network's logits [n, N] of them.
+    fn next_greedy(
+        &self,
+        batch: &Batch<'_>,
+        noise: &UpdateNoise,
+    ) -> Result<(Vec<u8>, Vec<f32>), UpdateError> {
+        let ModelConfig {
+            num_actions, atoms, ..
+        } = self.model;
+        let len = self.model.frame_len();
+        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
+        let PassInput { bytes, places } =
+            PassInput::of(&frames, batch.states_n, len, self.deduplicate);
+        let states_n = states(&self.model, bytes, &self.compute.device)?;
+        let target_logits = distribution(&self.target, &states_n, noise.target.as_ref())?;
+        let (network, values) = if self.settings.double_dqn {
+            let logits = distribution(&self.online, &states_n, noise.choice.as_ref())?;
+            ("online", self.online.q_values(&logits)?)
+        } else {
+            ("target", self.target.q_values(&target_logits)?)
+        };
+        let values = flat(&values)?;
+        if !values.iter().all(|q| q.is_finite()) {
+            return Err(UpdateError::NonFinite {
+                what: format!("the {network} network's value of an s_{{t+n}}"),
+            });
+        }
+        let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
+        let logits = flat(&target_logits)?;
+        let (mut actions, mut chosen) = (Vec::new(), Vec::with_capacity(frames.len() * atoms));
+        for row in 0..frames.len() {
+            let state = places.as_ref().map_or(row, |it| it[row] as usize);
+            let action = of_state[state];
+            let at = (state * num_actions + usize::from(action)) * atoms;
+            chosen.extend_from_slice(&logits[at..at + atoms]);
+            actions.push(action);
+        }
+        Ok((actions, chosen))
+    }
+}
+
+/// Logits [B, A, N] of `frames`, cut off from any graph.
+pub(crate) fn distribution(
+    network: &Network,
+    frames: &Tensor,
+    noise: Option<&HeadNoise>,
+) -> Result<Tensor, UpdateError> {
+    let f4 = network.features(frames)?.f4;
+    Ok(network.noisy_logits(&f4, noise)?.detach())
 }

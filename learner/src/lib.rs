@@ -39,6 +39,7 @@
 //!
 //! [`Learner`] is an agent in a run: it takes the replay server's batches, enlarges and augments states, estimates the action
 //! affinity ([`affinity`]), counts versions of the weights and keeps [`checkpoint`]s; lockstep mode runs it unchanged.
+//! A batch's way to new weights, in the order of reading: `learner`, `prepare`, `agent`, `evaluation`, `auxiliary::loss`, [`optimiser`].
 //! [`run`] is the process around a learner; what it says to other processes stands in [`remote`], and nothing else here knows
 //! zenoh.
 //!
@@ -52,7 +53,6 @@ mod agent;
 pub mod augment;
 pub mod auxiliary;
 mod batch;
-mod bellman;
 pub mod checkpoint;
 mod config;
 pub mod cost;
