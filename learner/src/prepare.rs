@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use crate::{
     augment::Augment, auxiliary::positives::Positives, batch::Batch, config::LearnerConfig,
-    importance::importance_weights,
+    deduplicate::one_after_another, importance::importance_weights,
 };
 
 /// The columns of a batch that do not lie in it as an update reads them.
@@ -113,8 +113,8 @@ impl Preparation {
             augment.apply(states_t, seen_t, rng);
             // Draws for every positive, also for those that rows do not have: a run's views do not depend on which came.
             if batch.states_k.len() < batch.positive_valid.len() * self.state_bytes {
-                let spread = spread(batch.states_k, batch.positive_valid, self.state_bytes);
-                augment.apply(&spread, seen_k, rng);
+                let each = batch.positive_states(self.state_bytes).into_iter();
+                augment.apply(&one_after_another(each, self.state_bytes), seen_k, rng);
             } else {
                 augment.apply(batch.states_k, seen_k, rng);
             }
@@ -123,17 +123,6 @@ impl Preparation {
         }
         batch
     }
-}
-
-/// `states`, those that are `there`, each in its place among blank ones.
-fn spread(states: &[u8], there: &[u8], state_bytes: usize) -> Vec<u8> {
-    let mut all = vec![0; there.len() * state_bytes];
-    let places = all.chunks_exact_mut(state_bytes).zip(there);
-    let places = places.filter(|(_, there)| **there != 0);
-    for ((place, _), state) in places.zip(states.chunks_exact(state_bytes)) {
-        place.copy_from_slice(state);
-    }
-    all
 }
 
 /// Enlarges all `states` into `larger`, spread over the threads.
