@@ -8,7 +8,7 @@ use crate::{
     agent::Agent,
     auxiliary::dim::{DIM, Dim, Vectors, dots_of},
     error::UpdateError,
-    losses::c51::softmax,
+    losses::{c51::softmax, scores::Scores},
     settings::LearnerSettings,
     tensors::{flat, states},
 };
@@ -110,7 +110,7 @@ impl Insight {
             return Ok(None);
         };
         let dots = dots_of(vectors.kernels, psi, phi)?;
-        let scores = dim.scores(dots.width);
+        let scores = Scores::new(dots.width, dim.tanh_clip);
         let (locations, rows, _) = dots.dots.dims3()?;
         let dots = flat(&dots.dots)?;
         let mut matches = vec![0.0; rows * locations];

@@ -12,7 +12,10 @@ use super::{
     positives::Positives,
 };
 use crate::{
-    batch::Batch, deduplicate::State, error::UpdateError, losses::info_nce::info_nce_loss,
+    batch::Batch,
+    deduplicate::State,
+    error::UpdateError,
+    losses::{info_nce::info_nce_loss, scores::Dots},
 };
 
 /// Its line of the menu.
@@ -59,43 +62,20 @@ impl AuxiliaryLoss for Cpc {
     /// Source: van den Oord et al. 2018, section 2.3, with the heads of Mazoure et al. 2020 ("exactly the same networks
     /// for measuring similarity").
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let (online, batch) = (inputs.online, inputs.batch);
-        let (anchors, wanted) = (&inputs.features.anchors, self.pairs.lambda.wanted());
-        let mut sums = [const { None::<Tensor> }; 4];
-        let mut all_dots = [const { Vec::new() }; 4];
-        if let Some(later) = &inputs.features.later {
-            let vectors = Vectors::new(online, anchors, later, &inputs.action()?, wanted)?;
-            let mut first = 0;
-            for valid in batch.positive_valid.chunks_exact(batch.rows) {
-                let there = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
-                let rows: Vec<u32> = there.map(|(row, _)| row).collect();
-                let candidates = first..first + rows.len();
-                first = candidates.end;
-                if rows.len() < 2 {
-                    continue;
-                }
-                let all = vec![1; rows.len()];
-                let here = of_offset(&vectors, batch.rows, &rows, candidates)?;
-                let sums = sums.iter_mut().zip(&mut all_dots);
-                for ((sum, all_dots), dots) in sums.zip(here.dots(wanted)?) {
-                    let Some(dots) = dots else { continue };
-                    let scores = self.pairs.scores(dots.width);
-                    let loss = info_nce_loss(&dots.dots, &all, scores, online.kernels())?;
-                    *sum = Some(match sum.take() {
-                        Some(sum) => (sum + loss)?,
-                        None => loss,
-                    });
-                    all_dots.push(dots);
-                }
-            }
-        }
-        let lambda = self.pairs.lambda.values();
+        let mut offsets = self.dots_of_offsets(inputs)?;
+        let (kernels, tanh_clip) = (inputs.online.kernels(), self.pairs.tanh_clip);
+        let pairs = NAMES.into_iter().zip(self.pairs.lambda.values());
         let mut losses = Vec::new();
-        for (((name, weight), sum), dots) in NAMES.into_iter().zip(lambda).zip(sums).zip(all_dots) {
-            let loss = match sum {
-                Some(sum) => sum.affine(1.0 / batch.positives as f64, 0.0)?,
-                None if weight > 0.0 => Tensor::new(0f32, anchors.f4.device())?,
-                None => continue,
+        for (pair, (name, weight)) in pairs.enumerate().filter(|(_, (_, weight))| *weight > 0.0) {
+            let dots = offsets.iter_mut().filter_map(|offset| offset[pair].take());
+            let dots: Vec<Dots> = dots.collect();
+            let each = dots.iter().map(|dots| {
+                let all = vec![1; dots.dots.dim(1)?];
+                info_nce_loss(dots, &all, tanh_clip, kernels)
+            });
+            let loss = match each.reduce(|sum, loss| sum? + loss?) {
+                Some(sum) => sum?.affine(1.0 / inputs.batch.positives as f64, 0.0)?,
+                None => Tensor::new(0f32, inputs.features.anchors.f4.device())?,
             };
             losses.push(WeightedLoss {
                 name,
@@ -105,6 +85,33 @@ impl AuxiliaryLoss for Cpc {
             });
         }
         Ok(losses)
+    }
+}
+
+impl Cpc {
+    /// Of each offset at which two rows or more have a positive, the dot products of those rows, pair by pair.
+    fn dots_of_offsets(
+        &self,
+        inputs: &LossInputs<'_>,
+    ) -> Result<Vec<[Option<Dots>; 4]>, UpdateError> {
+        let Some(later) = &inputs.features.later else {
+            return Ok(Vec::new());
+        };
+        let (batch, wanted) = (inputs.batch, self.pairs.lambda.wanted());
+        let (anchors, action) = (&inputs.features.anchors, inputs.action()?);
+        let vectors = Vectors::new(inputs.online, anchors, later, &action, wanted)?;
+        let (mut offsets, mut first) = (Vec::new(), 0);
+        for valid in batch.positive_valid.chunks_exact(batch.rows) {
+            let there = (0..).zip(valid).filter(|(_, valid)| **valid != 0);
+            let rows: Vec<u32> = there.map(|(row, _)| row).collect();
+            let candidates = first..first + rows.len();
+            first = candidates.end;
+            if rows.len() >= 2 {
+                let here = of_offset(&vectors, batch.rows, &rows, candidates)?;
+                offsets.push(here.dots(wanted)?);
+            }
+        }
+        Ok(offsets)
     }
 }
 

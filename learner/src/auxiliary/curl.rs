@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     error::UpdateError,
-    losses::{info_nce::info_nce_loss, scores::Scores},
+    losses::info_nce::info_nce_loss,
     ranges::{TAU, check_range},
 };
 
@@ -101,10 +101,10 @@ impl AuxiliaryLoss for Curl {
         let keys = inputs.keys()?;
         let anchors = &inputs.features.anchors;
         let query = inputs.online.psi4(&anchors.f4, &inputs.action()?)?;
-        let dots = dim::dots_of(inputs.online.kernels(), &query, &keys)?;
+        let kernels = inputs.online.kernels();
+        let dots = dim::dots_of(kernels, &query, &keys)?;
         let all = vec![1; inputs.batch.rows];
-        let scores = Scores::new(dots.width, self.tanh_clip);
-        let loss = info_nce_loss(&dots.dots, &all, scores, inputs.online.kernels())?;
+        let loss = info_nce_loss(&dots, &all, self.tanh_clip, kernels)?;
         Ok(vec![WeightedLoss {
             name: "curl",
             weight: self.weight,

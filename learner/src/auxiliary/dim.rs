@@ -13,10 +13,7 @@ use crate::{
     batch::Batch,
     deduplicate::State,
     error::UpdateError,
-    losses::{
-        info_nce::info_nce_loss,
-        scores::{Dots, Scores},
-    },
+    losses::{info_nce::info_nce_loss, scores::Dots},
 };
 
 /// Its line of the menu.
@@ -52,7 +49,7 @@ impl Dim {
         }
     }
 
-    /// Losses of the pairs with a weight above 0, each a scalar, before their weights.
+    /// Losses of the pairs with a weight above 0.
     ///
     /// `features_t` of s_t, `features_k` of s_{t+k}, `action` [B], `valid` [B]: a row with 0 is neither anchor nor
     /// candidate. Source: Mazoure et al. 2020, section 4; InfoNCE, scale and clip are `losses::info_nce`'s.
@@ -63,30 +60,22 @@ impl Dim {
         features_k: &Features,
         action: &Tensor,
         valid: &[u8],
-    ) -> Result<[Option<Tensor>; 4], UpdateError> {
+    ) -> Result<Vec<WeightedLoss>, UpdateError> {
         let wanted = self.lambda.wanted();
-        let dots = dots(network, features_t, features_k, action, wanted)?;
-        let mut losses = [const { None }; 4];
-        for (loss, dots) in losses.iter_mut().zip(&dots) {
+        let vectors = Vectors::new(network, features_t, features_k, action, wanted)?;
+        let pairs = NAMES.into_iter().zip(self.lambda.values());
+        let mut losses = Vec::new();
+        for ((name, weight), dots) in pairs.zip(vectors.dots(wanted)?) {
             if let Some(dots) = dots {
-                *loss = Some(self.info_nce(dots, valid, network)?);
+                losses.push(WeightedLoss {
+                    name,
+                    weight,
+                    loss: info_nce_loss(&dots, valid, self.tanh_clip, network.kernels())?,
+                    dots: vec![dots],
+                });
             }
         }
         Ok(losses)
-    }
-
-    fn info_nce(
-        &self,
-        Dots { dots, width }: &Dots,
-        valid: &[u8],
-        network: &Network,
-    ) -> candle_core::Result<Tensor> {
-        info_nce_loss(dots, valid, self.scores(*width), network.kernels())
-    }
-
-    /// How dot products of vectors of `width` numbers become scores.
-    pub fn scores(&self, width: usize) -> Scores {
-        Scores::new(width, self.tanh_clip)
     }
 }
 
@@ -105,38 +94,17 @@ impl AuxiliaryLoss for Dim {
     }
 
     fn losses(&self, inputs: &LossInputs<'_>) -> Result<Vec<WeightedLoss>, UpdateError> {
-        let (online, batch) = (inputs.online, inputs.batch);
         let Some(later) = &inputs.features.later else {
             return Ok(Vec::new());
         };
-        let (anchors, wanted) = (&inputs.features.anchors, self.lambda.wanted());
-        let dots = dots(online, anchors, later, &inputs.action()?, wanted)?;
-        let mut losses = Vec::new();
-        for ((name, weight), dots) in NAMES.into_iter().zip(self.lambda.values()).zip(dots) {
-            if let Some(dots) = dots {
-                losses.push(WeightedLoss {
-                    name,
-                    weight,
-                    loss: self.info_nce(&dots, batch.positive_valid, online)?,
-                    dots: vec![dots],
-                });
-            }
-        }
-        Ok(losses)
+        self.pair_losses(
+            inputs.online,
+            &inputs.features.anchors,
+            later,
+            &inputs.action()?,
+            inputs.batch.positive_valid,
+        )
     }
-}
-
-/// Dot products for the `wanted` pairs, in the order of `settings::PAIRS`.
-///
-/// Local features meet local ones at the same location; a global feature meets every location.
-pub fn dots(
-    network: &Network,
-    features_t: &Features,
-    features_k: &Features,
-    action: &Tensor,
-    wanted: [bool; 4],
-) -> Result<[Option<Dots>; 4], UpdateError> {
-    Ok(Vectors::new(network, features_t, features_k, action, wanted)?.dots(wanted)?)
 }
 
 /// What the heads make of anchors (psi) and candidates (phi), each of local features, [B, L, R], and of global ones, [B, R]; there
@@ -181,6 +149,8 @@ impl Vectors {
     }
 
     /// Dot products for the `wanted` pairs whose vectors are there, in the order of `settings::PAIRS`; as many anchors as candidates.
+    ///
+    /// Local features meet local ones at the same location; a global feature meets every location.
     pub fn dots(&self, wanted: [bool; 4]) -> candle_core::Result<[Option<Dots>; 4]> {
         let mut dots = [const { None }; 4];
         for pair in (0..4).filter(|&pair| wanted[pair]) {

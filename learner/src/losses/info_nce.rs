@@ -5,7 +5,11 @@ use candle_core::{Result, Tensor, bail};
 use driml_model::{Kernels, exp_below, soft_clip};
 use rayon::prelude::*;
 
-use super::{candle, scalar_op::scalar_op, scores::Scores};
+use super::{
+    candle,
+    scalar_op::scalar_op,
+    scores::{Dots, Scores},
+};
 
 /// Largest error of the loss, as a share of 10 plus the largest score, in nats.
 pub const LOSS_ERROR: f64 = 2e-14;
@@ -114,16 +118,17 @@ fn anchor_loss(
     sum.ln() + max - positive
 }
 
-/// [`info_nce`] as a candle operation: `dots` [L, B, B] to a scalar.
+/// [`info_nce`] as a candle operation: `dots` [L, B, B], whose scores are clipped to `tanh_clip`, to a scalar.
 ///
 /// # Errors
 /// Dots that are not [L, B, B] f32 with the B of `valid`.
 pub fn info_nce_loss(
-    dots: &Tensor,
+    Dots { dots, width }: &Dots,
     valid: &[u8],
-    scores: Scores,
+    tanh_clip: f64,
     kernels: Kernels,
 ) -> Result<Tensor> {
+    let scores = Scores::new(*width, tanh_clip);
     let (_, anchors, candidates) = dots.dims3()?;
     if anchors != valid.len() || candidates != valid.len() {
         bail!(
@@ -148,6 +153,7 @@ mod tests {
 
     const LOCATIONS: usize = 2;
     const ROWS: usize = 3;
+    const WIDTH: usize = 16;
 
     /// Also at the bounds that the clip's setting may have. The function's loss and slopes are in the table of properties of
     /// `driml experiment stability`.
@@ -158,13 +164,17 @@ mod tests {
         let cases = [[1, 1, 1], [1, 0, 1], [0, 1, 0], [0, 0, 0]].map(|valid| (valid, 20.0));
         let clips = [1e-30, 1e-6, 1e6, 1e15, 1e30].map(|tanh_clip| ([1; ROWS], tanh_clip));
         for (valid, tanh_clip) in cases.into_iter().chain(clips) {
-            let scores = Scores::new(16, tanh_clip);
+            let scores = Scores::new(WIDTH, tanh_clip);
             let mut slopes = vec![f32::NAN; dots.len()];
             let expected = info_nce(&dots, &valid, scores, &mut slopes);
             for kernels in [Kernels::FUSED, Kernels::Candle] {
                 let case = format!("{kernels:?} {valid:?} {tanh_clip}");
                 let var = Var::from_slice(&dots, (LOCATIONS, ROWS, ROWS), &Device::Cpu)?;
-                let loss = info_nce_loss(&var, &valid, scores, kernels)?;
+                let of_var = Dots {
+                    dots: var.as_tensor().clone(),
+                    width: WIDTH,
+                };
+                let loss = info_nce_loss(&of_var, &valid, tanh_clip, kernels)?;
                 let grads = loss.affine(2.0, 0.0)?.backward()?;
                 let loss = loss.to_scalar::<f32>()?;
                 let error = f64::from(loss) - expected;

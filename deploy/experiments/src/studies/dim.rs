@@ -5,7 +5,8 @@ use anyhow::Context;
 use candle_core::{DType, Device, Tensor};
 use driml_learner::{
     AdamSettings,
-    auxiliary::dim::{Dim, dots},
+    auxiliary::dim::{Dim, Vectors},
+    losses::scores::Scores,
     optimiser::{
         adam::Adam,
         gradients::{Gradients, clip_factor},
@@ -47,8 +48,8 @@ impl DimLearner {
         let action = Tensor::zeros(rows, DType::U8, &Device::Cpu)?;
         let (network, valid) = (&self.network, vec![1; rows]);
         let losses = self.dim.pair_losses(network, now, next, &action, &valid)?;
-        let loss = losses.into_iter().flatten().next();
-        let loss = loss.context("no pair of DIM has a weight")?;
+        let loss = losses.into_iter().next();
+        let loss = loss.context("no pair of DIM has a weight")?.loss;
         let gradients = Gradients::of(&self.parameters, &loss)?;
         let factor = clip_factor(gradients.norm(Kernels::FUSED)?, self.max_grad_norm);
         self.adam.step(&self.parameters, &gradients, factor)?;
@@ -59,10 +60,10 @@ impl DimLearner {
     pub(super) fn scores(&self, now: &Features, next: &Features) -> anyhow::Result<Vec<f64>> {
         let action = Tensor::zeros(now.f4.dim(0)?, DType::U8, &Device::Cpu)?;
         let wanted = self.dim.lambda.wanted();
-        let found = dots(&self.network, now, next, &action, wanted)?;
-        let found = found.into_iter().flatten().next();
+        let vectors = Vectors::new(&self.network, now, next, &action, wanted)?;
+        let found = vectors.dots(wanted)?.into_iter().flatten().next();
         let found = found.expect("a pair has a weight");
-        let scores = self.dim.scores(found.width);
+        let scores = Scores::new(found.width, self.dim.tanh_clip);
         let values = found.dots.flatten_all()?.to_vec1::<f32>()?;
         Ok(values.iter().map(|&dot| scores.score(dot)).collect())
     }
