@@ -4,12 +4,13 @@
 use std::collections::HashMap;
 
 use candle_core::Tensor;
-use driml_model::{Compute, DimHeads, Kernels, ModelConfig, Network, Parameters, StoredAs};
+use driml_model::{
+    Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, StoredAs,
+};
 use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    auxiliary::key_encoder::KeyEncoder,
     batch::Batch,
     error::UpdateError,
     evaluation::{Evaluation, Networks, UpdateReport, distribution},
@@ -39,6 +40,7 @@ pub struct NetworkParameters {
 pub struct Agent {
     networks: Networks,
     target: Parameters,
+    key: Option<Parameters>,
     /// Torso and head of the averaged network, if the settings ask for one.
     average: Option<Parameters>,
     noise_seed: [u8; 32],
@@ -59,7 +61,7 @@ impl Agent {
     ) -> Result<Self, UpdateError> {
         let online = Parameters::init(&model, rng, &compute.device)?;
         let key = settings.auxiliary()?.key_tau();
-        let key = key.map(|_| KeyEncoder::copy_of(&online));
+        let key = key.map(|_| online.copy_part(Encoder::has));
         let parameters = NetworkParameters {
             target: online.without_dim()?,
             key: key.transpose()?,
@@ -102,9 +104,9 @@ impl Agent {
                 "the auxiliary_loss uses the layers {needed:?}, the model builds {built:?}"
             )));
         }
-        let key = match (auxiliary.key_tau(), key) {
+        let encoder = match (auxiliary.key_tau(), &key) {
             (None, None) => None,
-            (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
+            (Some(_), Some(key)) => Some(Encoder::new(&model, key, kernels)?),
             (wanted, _) => {
                 let there = if wanted.is_some() { "missing" } else { "there" };
                 let auxiliary_loss = settings.auxiliary_loss.name();
@@ -126,11 +128,12 @@ impl Agent {
                 deduplicate: false,
                 auxiliary,
                 parameters: online,
-                key,
+                key: encoder,
                 model,
                 settings,
             },
             target,
+            key,
         })
     }
 
@@ -176,8 +179,8 @@ impl Agent {
     }
 
     /// The parameters of CURL's key encoder, if that is the auxiliary loss.
-    pub fn key(&self) -> Option<&Parameters> {
-        self.networks.key.as_ref().map(KeyEncoder::parameters)
+    pub const fn key(&self) -> Option<&Parameters> {
+        self.key.as_ref()
     }
 
     /// The averaged network's parameters, torso and head, if the settings ask for one: after each update they move
@@ -284,7 +287,7 @@ impl Agent {
             settings,
             compute,
             parameters: online,
-            key,
+            auxiliary,
             ..
         } = &self.networks;
         let kernels = compute.kernels;
@@ -292,8 +295,8 @@ impl Agent {
         let factor = clip_factor(norm, settings.max_grad_norm);
         self.adam.step(online, gradients, factor)?;
         self.updates += 1;
-        if let Some(key) = key {
-            key.follow(online)?;
+        if let (Some(key), Some(tau)) = (&self.key, auxiliary.key_tau()) {
+            target::follow(key, online, tau, kernels)?;
         }
         if let (Some(average), Some(tau)) = (&self.average, settings.average_tau) {
             target::follow(average, online, tau, kernels)?;

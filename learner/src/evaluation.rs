@@ -2,14 +2,11 @@
 //! It takes no step: `agent` does.
 
 use candle_core::Tensor;
-use driml_model::{Compute, HeadNoise, ModelConfig, Network, Parameters, greedy};
+use driml_model::{Compute, Encoder, HeadNoise, ModelConfig, Network, Parameters, greedy};
 use driml_protocol::NO_ACTION;
 
 use crate::{
-    auxiliary::{
-        key_encoder::KeyEncoder,
-        loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
-    },
+    auxiliary::loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     batch::Batch,
     deduplicate::{PassInput, State},
     error::UpdateError,
@@ -75,7 +72,8 @@ pub(crate) struct Networks {
     pub(crate) parameters: Parameters,
     pub(crate) online: Network,
     pub(crate) target: Network,
-    pub(crate) key: Option<KeyEncoder>,
+    /// The key encoder of a loss that has one.
+    pub(crate) key: Option<Encoder>,
 }
 
 /// What C51 is to predict.

@@ -4,10 +4,9 @@
 use std::{fmt, ops::Range};
 
 use candle_core::{Device, Tensor};
-use driml_model::{DimHeads, Features, LossLayer, ModelConfig, Network};
+use driml_model::{DimHeads, Encoder, Features, LossLayer, ModelConfig, Network};
 
 use super::{
-    key_encoder::KeyEncoder,
     positives::Positives,
     settings::{AuxiliarySettings, Lambda},
 };
@@ -167,7 +166,7 @@ pub struct LossInputs<'a> {
     /// The online network's features of the batch's states.
     pub features: &'a OnlineFeatures,
     /// The key encoder of a loss with a [`AuxiliaryLoss::key_tau`].
-    pub key: Option<&'a KeyEncoder>,
+    pub key: Option<&'a Encoder>,
     /// Where the states go.
     pub device: &'a Device,
 }
@@ -179,7 +178,8 @@ impl LossInputs<'_> {
     /// If the loss has no [`AuxiliaryLoss::key_tau`].
     pub fn keys(&self) -> Result<Tensor, UpdateError> {
         let key = self.key.expect("a loss with key_tau is given its encoder");
-        key.keys(&states(self.model, self.batch.states_k, self.device)?)
+        let positives = states(self.model, self.batch.states_k, self.device)?;
+        Ok(key.encode(&positives)?)
     }
 
     /// a_t [B], on the CPU, where the network looks at them.

@@ -7,7 +7,6 @@
 pub mod cpc;
 pub mod curl;
 pub mod dim;
-pub mod key_encoder;
 pub mod loss;
 pub mod none;
 pub mod positives;

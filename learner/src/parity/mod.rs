@@ -22,7 +22,6 @@ use crate::{
     auxiliary::{
         AuxiliaryKind,
         dim::DIM,
-        key_encoder::KeyEncoder,
         loss::{LossInputs, OnlineFeatures},
         settings::{AuxiliarySettings, Lambda},
     },
@@ -300,10 +299,9 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     let named = case.parameters("online.", &model);
     let parameters = Parameters::from_tensors(&model, named, device)?;
     let online = Network::with_kernels(&model, &parameters, kernels)?;
-    let key = match (loss.key_tau(), key_parameters(case, &model, compute)?) {
-        (Some(tau), Some(key)) => Some(KeyEncoder::new(&model, tau, kernels, key)?),
-        _ => None,
-    };
+    let key = key_parameters(case, &model, compute)?;
+    let key = key.map(|key| Encoder::new(&model, &key, kernels));
+    let key = key.transpose()?;
     let batch = case.batch();
     let features = OnlineFeatures::new(&online, &model, &*loss, &batch, false, device)?;
     let losses = loss.losses(&LossInputs {
