@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use candle_core::Tensor;
 use driml_model::{
-    Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, StoredAs,
+    Compute, DimHeads, Encoder, Kernels, ModelConfig, Network, Parameters, StoredAs, is_dim,
 };
 use driml_protocol::fail_point;
 use rand_chacha::ChaCha8Rng;
@@ -212,8 +212,9 @@ impl Agent {
     /// # Errors
     /// As there, and a weight that is too large for the type.
     pub fn weights_as(&self, stored: StoredAs) -> Result<Vec<u8>, UpdateError> {
-        let acting = |name: &str| !name.starts_with(target::AUXILIARY_PREFIX);
-        Ok(self.online().to_safetensors_as(stored, acting)?)
+        Ok(self
+            .online()
+            .to_safetensors_as(stored, |name| !is_dim(name))?)
     }
 
     /// Learns from one batch.

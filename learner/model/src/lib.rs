@@ -66,7 +66,7 @@ pub use kernels::isa::{describe_kernels, is_bf16_fast, multiply_in_first_cache};
 pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
 pub use network::{Features, Network};
-pub use parameters::Parameters;
+pub use parameters::{Parameters, is_dim};
 pub use policy::{PolicyNetwork, greedy};
 pub use stored::StoredAs;
 pub use torso::TorsoName;

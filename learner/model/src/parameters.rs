@@ -221,7 +221,7 @@ impl Parameters {
 type Shaped = (Vec<usize>, Vec<f32>);
 
 /// Whether a parameter belongs to the DIM heads or a loss's own layers.
-pub(crate) fn is_dim(name: &str) -> bool {
+pub fn is_dim(name: &str) -> bool {
     name.starts_with("dim.")
 }
 

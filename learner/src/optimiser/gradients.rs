@@ -1,5 +1,5 @@
 //! The gradients of one loss: of a backward pass, their global norm, and the clipping that follows from it.
-//! It changes no parameter; `optim` does.
+//! It changes no parameter; `adam` does.
 
 use std::collections::BTreeMap;
 

@@ -1,5 +1,5 @@
 //! Slow copies of the online network, such as the target network: how they follow it.
-//! When they do is for `update` to say.
+//! When they do is for `agent` to say.
 
 use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
 use driml_model::{Kernels, Parameters};
@@ -8,9 +8,6 @@ use crate::{
     error::UpdateError,
     tensors::{slice, slice_mut},
 };
-
-/// Names of the parameters that only the auxiliary loss uses begin so.
-pub const AUXILIARY_PREFIX: &str = "dim.";
 
 /// Parameters up to this size can be followed: the difference of two is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
