@@ -27,18 +27,8 @@ pub(crate) fn flat(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
     tensor.flatten_all()?.to_vec1()
 }
 
-/// The f32 values of a contiguous tensor on the CPU.
-pub(crate) fn slice<'a>(
-    storage: &'a CpuStorage,
-    layout: &Layout,
-) -> candle_core::Result<&'a [f32]> {
-    match layout.contiguous_offsets() {
-        Some((start, end)) => Ok(&storage.as_slice::<f32>()?[start..end]),
-        None => bail!("a tensor of shape {:?} is not contiguous", layout.shape()),
-    }
-}
-
-pub(crate) fn slice_mut<'a>(
+/// As [`floats`](driml_model::floats), to write.
+pub(crate) fn floats_mut<'a>(
     storage: &'a mut CpuStorage,
     layout: &Layout,
 ) -> candle_core::Result<&'a mut [f32]> {

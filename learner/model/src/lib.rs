@@ -65,6 +65,7 @@ pub use kernels::exponentials::{exp_below, soft_clip};
 pub use kernels::isa::{describe_kernels, is_bf16_fast, multiply_in_first_cache};
 pub use kernels::linear::{linear, relu};
 pub use kernels::precision::{Precision, UnknownPrecision};
+pub use kernels::tensors::{Values, floats, values_of};
 pub use network::{Features, Network};
 pub use parameters::{Parameters, is_dim};
 pub use policy::{PolicyNetwork, greedy};

@@ -4,8 +4,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
-
-use crate::tensors::slice;
+use driml_model::floats;
 
 /// The scalar `loss(input)`, differentiable in `input`.
 ///
@@ -36,7 +35,7 @@ impl<F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync> CustomOp1 for ScalarOp<F> {
     }
 
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let input = slice(storage, layout)?;
+        let input = floats(storage, layout)?;
         let mut gradient = vec![0f32; input.len()];
         let value = (self.loss)(input, &mut gradient);
         *self.gradient.lock().unwrap_or_else(PoisonError::into_inner) = Some(gradient);

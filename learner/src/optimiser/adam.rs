@@ -11,16 +11,12 @@ use std::{
 };
 
 use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
-use driml_model::{Kernels, Parameters};
+use driml_model::{Kernels, Parameters, floats};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::gradients::Gradients;
-use crate::{
-    error::UpdateError,
-    ranges::check_range,
-    tensors::{slice, slice_mut},
-};
+use crate::{error::UpdateError, ranges::check_range, tensors::floats_mut};
 
 /// Elements a thread takes at a time.
 const CHUNK: usize = 1 << 14;
@@ -393,8 +389,8 @@ impl InplaceOp2 for Step<'_> {
         gradient: &CpuStorage,
         l2: &Layout,
     ) -> candle_core::Result<()> {
-        let parameter = slice_mut(parameter, l1)?;
-        let gradient = slice(gradient, l2)?;
+        let parameter = floats_mut(parameter, l1)?;
+        let gradient = floats(gradient, l2)?;
         let mut moments = self
             .moments
             .lock()

@@ -3,11 +3,11 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::{DType, Storage, Tensor, bail};
-use driml_model::{Backward, Kernels, Parameters};
+use candle_core::{DType, Tensor};
+use driml_model::{Backward, Kernels, Parameters, values_of};
 use rayon::prelude::*;
 
-use crate::{error::UpdateError, tensors::slice};
+use crate::error::UpdateError;
 
 /// Elements a thread sums at a time.
 const CHUNK: usize = 1 << 14;
@@ -70,15 +70,10 @@ impl Gradients {
 
 /// Sum of the squares of a tensor on the CPU.
 fn squares_on_cpu(tensor: &Tensor) -> candle_core::Result<f64> {
-    let (storage, layout) = tensor.storage_and_layout();
-    let Storage::Cpu(storage) = &*storage else {
-        bail!("this sum is the CPU's");
-    };
-    let parts: Vec<f64> = slice(storage, layout)?
-        .par_chunks(CHUNK)
-        .map(sum_of_squares)
-        .collect();
-    Ok(parts.iter().sum())
+    let values = values_of(tensor)?;
+    let parts = values.par_chunks(CHUNK).map(sum_of_squares);
+    // Summed in order, whatever the threads did.
+    Ok(parts.collect::<Vec<f64>>().iter().sum())
 }
 
 /// Sum of squares in f64, in eight interleaved parts so that it runs at the speed of memory.

@@ -2,12 +2,9 @@
 //! When they do is for `agent` to say.
 
 use candle_core::{CpuStorage, InplaceOp2, Layout, bail};
-use driml_model::{Kernels, Parameters};
+use driml_model::{Kernels, Parameters, floats};
 
-use crate::{
-    error::UpdateError,
-    tensors::{slice, slice_mut},
-};
+use crate::{error::UpdateError, tensors::floats_mut};
 
 /// Parameters up to this size can be followed: the difference of two is then finite.
 pub const FOLLOWED_MAX: f32 = f32::MAX / 2.0;
@@ -69,7 +66,7 @@ impl InplaceOp2 for Follow {
         online: &CpuStorage,
         l2: &Layout,
     ) -> candle_core::Result<()> {
-        let (target, online) = (slice_mut(target, l1)?, slice(online, l2)?);
+        let (target, online) = (floats_mut(target, l1)?, floats(online, l2)?);
         if target.len() != online.len() {
             bail!(
                 "a target of {} values follows {}",

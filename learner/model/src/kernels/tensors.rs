@@ -5,7 +5,7 @@ use std::ops::{Deref, Range};
 use candle_core::{CpuStorage, Layout, Result, Storage, StorageRef, Tensor, bail};
 
 /// The scalars of a contiguous f32 storage.
-pub(crate) fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
+pub fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     Ok(&storage.as_slice::<f32>()?[range(layout)?])
 }
 
@@ -25,13 +25,13 @@ fn range(layout: &Layout) -> Result<Range<usize>> {
 }
 
 /// The scalars of a tensor, which is locked as long as they are held.
-pub(crate) struct Values<'a> {
+pub struct Values<'a> {
     storage: StorageRef<'a>,
     range: Range<usize>,
 }
 
 /// The scalars of a contiguous f32 tensor on the CPU.
-pub(crate) fn values_of(tensor: &Tensor) -> Result<Values<'_>> {
+pub fn values_of(tensor: &Tensor) -> Result<Values<'_>> {
     let (storage, layout) = tensor.storage_and_layout();
     cpu(&storage)?.as_slice::<f32>()?;
     let range = range(layout)?;
