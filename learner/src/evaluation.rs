@@ -254,5 +254,5 @@ pub(crate) fn distribution(
     noise: Option<&HeadNoise>,
 ) -> Result<Tensor, UpdateError> {
     let f4 = network.features(frames)?.f4;
-    Ok(network.noisy_logits(&f4, noise)?.detach())
+    Ok(network.logits(&f4, noise)?.detach())
 }

@@ -69,7 +69,7 @@ impl Insight {
         let features = self
             .network
             .features(&states(&self.model, bytes, &self.compute.device)?)?;
-        let logits = self.network.logits(&features.f4)?;
+        let logits = self.network.logits(&features.f4, None)?;
         let q_values = self.network.q_values(&logits)?;
         let logits = flat(&logits)?;
         let mut probabilities = vec![0.0; logits.len()];

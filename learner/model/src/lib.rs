@@ -24,7 +24,7 @@
 //! let network = Network::new(&config, &parameters)?;
 //! // Two states of 8 x 8 x 1 bytes, channels last.
 //! let states = Tensor::zeros((2, 8, 8, 1), candle_core::DType::U8, &Device::Cpu)?;
-//! let logits = network.logits(&network.features(&states)?.f4)?;
+//! let logits = network.logits(&network.features(&states)?.f4, None)?;
 //! assert_eq!(network.q_values(&logits)?.dims(), [2, 3]);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

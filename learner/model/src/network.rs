@@ -121,18 +121,14 @@ impl Network {
         Ok(Features { f3, f4 })
     }
 
-    /// Logits [B, A, atoms] of `f4` [B, hidden] as [`Features`] has it, before its ReLU.
-    pub fn logits(&self, f4: &Tensor) -> Result<Tensor> {
-        self.head.logits(f4, None)
-    }
-
-    /// [`Network::logits`] with the noise of the head's noisy layers; without noise their means serve.
-    pub fn noisy_logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
+    /// Logits [B, A, atoms] of `f4` [B, hidden] as [`Features`] has it, before its ReLU, with the noise of the head's noisy layers; without
+    /// noise their means serve.
+    pub fn logits(&self, f4: &Tensor, noise: Option<&HeadNoise>) -> Result<Tensor> {
         self.head.logits(f4, noise)
     }
 
     /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
-    /// are not computed. With the noise of the head's noisy layers; without noise their means serve.
+    /// are not computed.
     pub fn taken_logits(
         &self,
         f4: &Tensor,
@@ -150,32 +146,25 @@ impl Network {
 
     /// Psi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c] and `actions` [B] (integers; ignored if Psi does not see the action).
     pub fn psi3(&self, f3: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let head = self.psi3.as_ref().ok_or(ModelError::NoHead("psi3"))?;
+        let head = there(self.psi3.as_ref(), "psi3")?;
         by_location(head.forward(f3, self.embedded(actions)?.as_ref())?)
     }
 
     /// Phi_3 [B, h * w, embedding_dim] of `f3` [B, h, w, c].
     pub fn phi3(&self, f3: &Tensor) -> Result<Tensor> {
-        by_location(
-            self.phi3
-                .as_ref()
-                .ok_or(ModelError::NoHead("phi3"))?
-                .forward(f3, None)?,
-        )
+        let head = there(self.phi3.as_ref(), "phi3")?;
+        by_location(head.forward(f3, None)?)
     }
 
     /// Psi_4 [B, embedding_dim] of `f4` [B, hidden] and `actions` [B] (integers; ignored if Psi does not see the action).
     pub fn psi4(&self, f4: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        let head = self.psi4.as_ref().ok_or(ModelError::NoHead("psi4"))?;
+        let head = there(self.psi4.as_ref(), "psi4")?;
         head.forward(f4, self.embedded(actions)?.as_ref())
     }
 
     /// Phi_4 [B, embedding_dim] of `f4` [B, hidden].
     pub fn phi4(&self, f4: &Tensor) -> Result<Tensor> {
-        self.phi4
-            .as_ref()
-            .ok_or(ModelError::NoHead("phi4"))?
-            .forward(f4, None)
+        there(self.phi4.as_ref(), "phi4")?.forward(f4, None)
     }
 
     /// W x + b [.., outputs] of `x` [.., inputs], by the loss's own layer of this name.
@@ -193,6 +182,10 @@ impl Network {
             .map(|action| action.forward(actions))
             .transpose()
     }
+}
+
+fn there<'a>(head: Option<&'a Head>, name: &'static str) -> Result<&'a Head> {
+    head.ok_or(ModelError::NoHead(name))
 }
 
 /// [B, h, w, embedding_dim] as [B, h * w, embedding_dim].

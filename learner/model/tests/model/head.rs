@@ -21,7 +21,7 @@ fn a_noisy_layer_starts_with_its_sigma() {
     let noise = HeadNoise::draw(&noisy, &mut rng(5));
     let plain = Network::new(&small(), &parameters(&small(), 1)).unwrap();
     let f4 = floats(&[6, 19], &mut rng(4));
-    assert!(plain.noisy_logits(&f4, noise.as_ref()).is_err());
+    assert!(plain.logits(&f4, noise.as_ref()).is_err());
 }
 
 /// An offset of the support is one of the values, whatever computes them.

@@ -22,7 +22,7 @@ fn outputs_and_gradients(
     let features = network.features(&frames(config, 6, &mut rng(1))).unwrap();
     let actions = Tensor::new(&[0u32, 4, 2, 2, 1, 3], &Device::Cpu)?;
     let noise = HeadNoise::draw(config, &mut rng(3));
-    let logits = network.noisy_logits(&features.f4, noise.as_ref()).unwrap();
+    let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
     let outputs = vec![
         network.q_values(&logits).unwrap(),
         logits,
@@ -108,7 +108,7 @@ fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelC
             .unwrap();
         pool.install(|| {
             let features = network.features(&batch).unwrap();
-            let logits = network.noisy_logits(&features.f4, noise.as_ref()).unwrap();
+            let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
             let phi3 = network.phi3(features.local().unwrap()).unwrap();
             let loss = (logits.sqr().unwrap().sum_all().unwrap()
                 + phi3.sqr().unwrap().sum_all().unwrap())
@@ -177,7 +177,7 @@ fn inputs_that_do_not_fit_are_errors() {
     let of_three = network.psi4(&features.f4, &actions);
     assert!(of_three.is_err(), "three actions for two rows");
     let narrow = features.f4.narrow(1, 0, 5).unwrap();
-    assert!(network.logits(&narrow).is_err());
+    assert!(network.logits(&narrow, None).is_err());
 }
 
 #[test]
@@ -238,7 +238,7 @@ fn gradients_that_are_summed_in_place_are_candle_s() -> Result<()> {
     // Every parameter twice, once through each half of the batch.
     let features = network.features(&batch).unwrap();
     let halves = [features.narrow(0, 4)?, features.narrow(4, 5)?];
-    let losses = halves.map(|half| network.logits(&half.f4).unwrap().sqr()?.sum_all());
+    let losses = halves.map(|half| network.logits(&half.f4, None).unwrap().sqr()?.sum_all());
     let [first, second] = losses;
     let loss = (first? + second?)?;
     let (wanted, mut found) = (loss.backward()?, Backward::of(&loss)?);

@@ -32,7 +32,7 @@ fn it_agrees_with_the_network(config: ModelConfig) {
         let noise = HeadNoise::draw(&config, &mut rng(7 + batch as u64));
         policy.set_noise(noise.as_ref());
         let f4 = network.features(&tensor).unwrap().f4;
-        let logits = network.noisy_logits(&f4, noise.as_ref()).unwrap();
+        let logits = network.logits(&f4, noise.as_ref()).unwrap();
         let wanted = values(&network.q_values(&logits).unwrap());
         for threads in [1, 2, 3] {
             let pool = rayon::ThreadPoolBuilder::new()
