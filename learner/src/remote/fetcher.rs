@@ -21,7 +21,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{
     error::BatchError,
     lock,
-    shards::{self, Count, PartialBatch},
+    shards::{PartialBatch, Portion},
 };
 use crate::progress::{Progress, ServedPart};
 
@@ -241,36 +241,26 @@ impl Fetcher {
     fn fetch_from_shards(&mut self) -> Result<Option<Fetched>, BatchError> {
         let shared = self.shared.clone();
         let mut partial = lock(&shared.partial);
-        if partial.parts.is_empty() && partial.pending.iter().all(|&rows| rows == 0) {
-            self.recount(&mut partial, |count, now| count.is_old(now))?;
-            match shards::split(self.shared.requests.rows, &partial.counts, &mut self.rng) {
-                Some(split) => {
-                    partial.pending = split;
-                    partial.shares = shards::shares(&partial.counts);
-                }
+        if partial.parts.is_empty() && partial.is_whole() {
+            self.recount(&mut partial, Portion::is_old)?;
+            if !partial.begin(self.shared.requests.rows, &mut self.rng) {
                 // A run that had all its updates when it was resumed: nothing comes to be held any more.
-                None if partial.all_in => return Ok(Some(Fetched::Finished)),
-                None => {
-                    self.shared.shutdown.wait_timeout(LOOK_AGAIN);
-                    return Ok(None);
+                if partial.all_in {
+                    return Ok(Some(Fetched::Finished));
                 }
+                self.shared.shutdown.wait_timeout(LOOK_AGAIN);
+                return Ok(None);
             }
         }
-        let PartialBatch {
-            counts,
-            pending,
-            shares,
-            ids,
-            parts,
-            from,
-            ..
-        } = &mut *partial;
         let mut asked = Vec::new();
-        for shard in (0..pending.len()).filter(|&shard| pending[shard] > 0) {
-            let other_shards = shards::other_shards(counts, pending, shard);
-            ids[shard] = ids[shard].again();
-            let part = self.ask(shard, ids[shard], pending[shard], Some(other_shards))?;
-            asked.push((shard, part));
+        for shard in 0..partial.portions.len() {
+            let other_shards = partial.other_shards(shard);
+            let portion = &mut partial.portions[shard];
+            if portion.pending > 0 {
+                portion.id = portion.id.again();
+                let part = self.ask(shard, portion.id, portion.pending, Some(other_shards))?;
+                asked.push((shard, part));
+            }
         }
         let (mut finished, mut failed) = (false, None);
         for (shard, asked) in asked {
@@ -282,20 +272,17 @@ impl Fetcher {
                     continue;
                 }
             };
-            ids[shard] = ids[shard].next();
+            let portion = &mut partial.portions[shard];
+            portion.id = portion.id.next();
             match answer {
                 Ok(mut part) => {
-                    counts[shard] = Count {
-                        counts: part.header.counts,
-                        held: part.header.held,
-                        last_seen: Some(Instant::now()),
-                    };
-                    from.push(self.received(shard, &part));
-                    pending[shard] = 0;
+                    portion.note(part.header.counts, part.header.held);
+                    portion.pending = 0;
                     if part.header.origin.is_some() {
-                        part.scale_probabilities(shares[shard] as f32);
+                        part.scale_probabilities(portion.share as f32);
                     }
-                    parts.push(part);
+                    partial.from.push(self.received(shard, &part));
+                    partial.parts.push(part);
                 }
                 Err(NotReady::Wait(_)) => {}
                 Err(NotReady::Finished) => finished = true,
@@ -307,12 +294,13 @@ impl Fetcher {
         if let Some(e) = failed {
             return Err(e);
         }
-        if pending.iter().all(|&rows| rows == 0) {
-            let header = Batch::merged_header(parts).ok_or(BatchError::DifferentShards)?;
+        if partial.is_whole() {
+            let header = Batch::merged_header(&partial.parts);
+            let header = header.ok_or(BatchError::DifferentShards)?;
             let memory = self.shared.pool.take_own(header.payload_bytes());
-            let batch = Batch::merge(parts, memory);
-            parts.clear();
-            let parts = std::mem::take(from);
+            let batch = Batch::merge(&partial.parts, memory);
+            partial.parts.clear();
+            let parts = std::mem::take(&mut partial.from);
             partial.since_whole.answered();
             return Ok(Some(Fetched::Batch(Box::new(Served { batch, parts }))));
         }
@@ -321,10 +309,10 @@ impl Fetcher {
         let is_over = finished && partial.parts.is_empty();
         let waited = partial.since_whole.unanswered();
         if !is_over && partial.all_in && waited > LAST_BATCH_MAX {
-            let left = partial.pending.iter().enumerate();
-            let left = left.filter(|(_, rows)| **rows > 0);
+            let left = partial.portions.iter().enumerate();
+            let left = left.filter(|(_, portion)| portion.pending > 0);
             let left: Vec<_> = left
-                .map(|(shard, rows)| format!("{rows} rows of shard {shard}"))
+                .map(|(shard, portion)| format!("{} rows of shard {shard}", portion.pending))
                 .collect();
             tracing::warn!(
                 "all transitions are in, and the last batch lacks {} since {} s: it is left out",
@@ -340,22 +328,19 @@ impl Fetcher {
     fn recount(
         &self,
         partial: &mut PartialBatch,
-        is_due: impl Fn(&Count, Instant) -> bool,
+        is_due: impl Fn(&Portion, Instant) -> bool,
     ) -> Result<(), BatchError> {
         let now = Instant::now();
-        for (client, count) in self.shared.clients.iter().zip(&mut partial.counts) {
-            if !is_due(count, now) {
+        for (client, portion) in self.shared.clients.iter().zip(&mut partial.portions) {
+            if !is_due(portion, now) {
                 continue;
             }
             let status: ReplayStatus = client.fetch(REQUEST_TIMEOUT).map_err(BatchError::Status)?;
-            *count = Count {
-                counts: ShardCounts {
-                    inserted: status.transitions_inserted,
-                    rows_sampled: status.rows_sampled,
-                },
-                held: status.transitions_held,
-                last_seen: Some(Instant::now()),
+            let counts = ShardCounts {
+                inserted: status.transitions_inserted,
+                rows_sampled: status.rows_sampled,
             };
+            portion.note(counts, status.transitions_held);
             partial.all_in |= status.finished;
         }
         Ok(())

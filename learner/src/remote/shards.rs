@@ -147,17 +147,30 @@ fn one_run<'a>(connect: &[String], run_infos: &'a [RunInfo]) -> anyhow::Result<&
     Ok(first)
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Count {
-    pub(crate) counts: ShardCounts,
-    pub(crate) held: u64,
+/// What one shard says of itself, and what it gives to a batch.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Portion {
+    counts: ShardCounts,
+    held: u64,
     /// When it said so; none before it is asked first.
-    pub(crate) last_seen: Option<Instant>,
+    last_seen: Option<Instant>,
+    /// Rows that are still to come from it.
+    pub(super) pending: u32,
+    /// The chance with which each row was given to it.
+    pub(super) share: f64,
+    /// The request for a part that it gets next.
+    pub(super) id: RequestId,
 }
 
-impl Count {
+impl Portion {
+    /// Takes what the shard has counted by now, and how many transitions it holds.
+    pub(super) fn note(&mut self, counts: ShardCounts, held: u64) {
+        (self.counts, self.held) = (counts, held);
+        self.last_seen = Some(Instant::now());
+    }
+
     /// Whether it is to be asked again: others must not decide by what is old, and one that held nothing may hold something now.
-    pub(crate) fn is_old(&self, now: Instant) -> bool {
+    pub(super) fn is_old(&self, now: Instant) -> bool {
         let age_max = if self.held == 0 {
             EMPTY_AGE_MAX
         } else {
@@ -168,59 +181,11 @@ impl Count {
     }
 }
 
-/// How many of `rows` rows come from each shard: each row's shard is drawn in proportion to what the shards hold, so that
-/// every transition of the whole replay is as likely as any other. `None` if they hold nothing.
-pub(crate) fn split(rows: u32, counts: &[Count], rng: &mut impl Rng) -> Option<Vec<u32>> {
-    let total: u64 = counts.iter().map(|count| count.held).sum();
-    if total == 0 {
-        return None;
-    }
-    let mut split = vec![0; counts.len()];
-    for _ in 0..rows {
-        let mut at = rng.random_range(0..total);
-        for (n, count) in split.iter_mut().zip(counts) {
-            if at < count.held {
-                *n += 1;
-                break;
-            }
-            at -= count.held;
-        }
-    }
-    Some(split)
-}
-
-/// The chance that [`split`] gives a row to each shard.
-pub(crate) fn shares(counts: &[Count]) -> Vec<f64> {
-    let total: u64 = counts.iter().map(|count| count.held).sum();
-    let shares = counts.iter().map(|count| count.held as f64 / total as f64);
-    shares.collect()
-}
-
-/// What all shards but `this` will have counted once each has given its `pending` rows.
-pub(crate) fn other_shards(counts: &[Count], pending: &[u32], this: usize) -> ShardCounts {
-    let others = counts.iter().zip(pending).enumerate();
-    others.filter(|(at, _)| *at != this).fold(
-        ShardCounts::default(),
-        |sum, (_, (count, &rows_sampled))| {
-            let pending = ShardCounts {
-                inserted: 0,
-                rows_sampled: rows_sampled.into(),
-            };
-            sum + count.counts + pending
-        },
-    )
-}
-
 /// The one batch that is assembled from the parts of several shards. It outlives a failed try, because a part that was
 /// given is counted as sampled.
 pub(super) struct PartialBatch {
-    pub(super) counts: Vec<Count>,
-    /// Rows that are still to come from each shard.
-    pub(super) pending: Vec<u32>,
-    /// The chance with which each row was given to each shard.
-    pub(super) shares: Vec<f64>,
-    /// The request for a part that each shard gets next.
-    pub(super) ids: Vec<RequestId>,
+    /// Of each shard.
+    pub(super) portions: Vec<Portion>,
     pub(super) parts: Vec<Batch>,
     pub(super) from: Vec<ServedPart>,
     /// All transitions of the run are in.
@@ -230,16 +195,58 @@ pub(super) struct PartialBatch {
 
 impl PartialBatch {
     pub(super) fn new(shards: usize) -> Self {
+        let portion = Portion {
+            id: RequestId::first(rand::random()),
+            ..Portion::default()
+        };
         Self {
-            counts: vec![Count::default(); shards],
-            pending: vec![0; shards],
-            shares: vec![0.0; shards],
-            ids: vec![RequestId::first(rand::random()); shards],
+            portions: vec![portion; shards],
             parts: Vec::new(),
             from: Vec::new(),
             all_in: false,
             since_whole: Silence::default(),
         }
+    }
+
+    /// Whether no row is still to come.
+    pub(super) fn is_whole(&self) -> bool {
+        self.portions.iter().all(|it| it.pending == 0)
+    }
+
+    /// Begins a batch of `rows` rows: each row's shard is drawn in proportion to what the shards hold, so that every transition of
+    /// the whole replay is as likely as any other. Nothing begins, and the result is false, if they hold nothing.
+    pub(super) fn begin(&mut self, rows: u32, rng: &mut impl Rng) -> bool {
+        let total: u64 = self.portions.iter().map(|it| it.held).sum();
+        if total == 0 {
+            return false;
+        }
+        for portion in &mut self.portions {
+            portion.share = portion.held as f64 / total as f64;
+        }
+        for _ in 0..rows {
+            let mut at = rng.random_range(0..total);
+            for portion in &mut self.portions {
+                if at < portion.held {
+                    portion.pending += 1;
+                    break;
+                }
+                at -= portion.held;
+            }
+        }
+        true
+    }
+
+    /// What all shards but `this` will have counted once each has given its pending rows.
+    pub(super) fn other_shards(&self, this: usize) -> ShardCounts {
+        let others = self.portions.iter().enumerate();
+        let others = others.filter(|(shard, _)| *shard != this);
+        others.fold(ShardCounts::default(), |sum, (_, portion)| {
+            let pending = ShardCounts {
+                inserted: 0,
+                rows_sampled: portion.pending.into(),
+            };
+            sum + portion.counts + pending
+        })
     }
 }
 
@@ -250,14 +257,22 @@ mod tests {
 
     use super::*;
 
-    fn count(held: u64, inserted: u64, rows_sampled: u64) -> Count {
-        Count {
+    fn portion(held: u64, inserted: u64, rows_sampled: u64, pending: u32) -> Portion {
+        Portion {
             counts: ShardCounts {
                 inserted,
                 rows_sampled,
             },
             held,
-            last_seen: None,
+            pending,
+            ..Portion::default()
+        }
+    }
+
+    fn batch_of(portions: &[Portion]) -> PartialBatch {
+        PartialBatch {
+            portions: portions.to_vec(),
+            ..PartialBatch::new(0)
         }
     }
 
@@ -266,18 +281,17 @@ mod tests {
     fn each_transition_is_as_likely_wherever_it_lies() {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let held = [1_000_000, 10, 0, 250_000, 499_990];
-        let counts = held.map(|held| count(held, 0, 0));
         let mut drawn = [0u64; 5];
         for _ in 0..4_000 {
-            let rows = split(256, &counts, &mut rng).unwrap();
-            assert_eq!(rows.iter().sum::<u32>(), 256);
-            drawn
-                .iter_mut()
-                .zip(rows)
-                .for_each(|(sum, n)| *sum += u64::from(n));
+            let mut batch = batch_of(&held.map(|held| portion(held, 0, 0, 0)));
+            assert!(batch.begin(256, &mut rng) && !batch.is_whole());
+            for (sum, portion) in drawn.iter_mut().zip(&batch.portions) {
+                *sum += u64::from(portion.pending);
+            }
         }
         assert_eq!(drawn[2], 0, "nothing is drawn from an empty shard");
         let rows: u64 = drawn.iter().sum();
+        assert_eq!(rows, 4_000 * 256);
         let total: u64 = held.iter().sum();
         let chi_square: f64 = drawn
             .iter()
@@ -289,7 +303,8 @@ mod tests {
             })
             .sum();
         assert!(chi_square < 16.27, "3 degrees of freedom: {chi_square}");
-        assert_eq!(split(8, &[count(0, 0, 0)], &mut rng), None);
+        let mut nothing = batch_of(&[portion(0, 0, 0, 0)]);
+        assert!(!nothing.begin(8, &mut rng) && nothing.is_whole());
     }
 
     #[test]
@@ -297,21 +312,25 @@ mod tests {
         let now = Instant::now();
         let is_old = |held, age_ms| {
             let last_seen = now.checked_sub(Duration::from_millis(age_ms));
-            Count {
+            Portion {
                 last_seen,
-                ..count(held, 0, 0)
+                ..portion(held, 0, 0, 0)
             }
             .is_old(now)
         };
-        assert!(count(9, 0, 0).is_old(now), "it was never asked");
+        assert!(portion(9, 0, 0, 0).is_old(now), "it was never asked");
         assert!(!is_old(9, 400) && is_old(9, 600));
         assert!(!is_old(0, 40) && is_old(0, 60));
     }
 
     #[test]
     fn a_shard_is_told_of_all_others_and_of_the_rest_of_its_batch() {
-        let counts = [count(1, 10, 100), count(2, 20, 200), count(3, 30, 300)];
-        let told = |this| other_shards(&counts, &[5, 6, 7], this);
+        let batch = batch_of(&[
+            portion(1, 10, 100, 5),
+            portion(2, 20, 200, 6),
+            portion(3, 30, 300, 7),
+        ]);
+        let told = |this| batch.other_shards(this);
         assert_eq!(
             told(1),
             ShardCounts {
