@@ -52,31 +52,16 @@ impl Parameters {
     pub fn part_from_tensors(
         config: &ModelConfig,
         part: impl Fn(&str) -> bool,
-        mut tensors: HashMap<String, Tensor>,
+        tensors: HashMap<String, Tensor>,
         device: &Device,
     ) -> Result<Self> {
-        config.validate()?;
-        let mut vars = BTreeMap::new();
-        let shapes = config.parameter_shapes();
-        for (name, shape) in shapes.into_iter().filter(|(name, _)| part(name)) {
-            let tensor = tensors
-                .remove(&name)
-                .ok_or_else(|| ModelError::parameter(&name, "is missing"))?;
-            if tensor.dtype() != DType::F32 {
-                return Err(ModelError::parameter(
-                    &name,
-                    format!("has type {:?}, wanted F32", tensor.dtype()),
-                ));
-            }
-            check_shape(&name, tensor.dims(), &shape)?;
-            let values = tensor.flatten_all()?.to_vec1::<f32>()?;
-            check_finite(&name, &values)?;
-            vars.insert(name, Var::from_vec(values, shape, device)?);
+        let others = tensors.iter().filter(|(_, it)| it.dtype() != DType::F32);
+        if let Some((name, tensor)) = others.min_by_key(|(name, _)| *name) {
+            let why = format!("has type {:?}, wanted F32", tensor.dtype());
+            return Err(ModelError::parameter(name, why));
         }
-        match tensors.keys().min() {
-            Some(name) => Err(ModelError::parameter(name, "is not part of this network")),
-            None => Ok(Self(vars)),
-        }
+        let file = safetensors::serialize(&tensors, None)?;
+        Self::load_part(config, part, &file, device)
     }
 
     /// Parameters from the bytes of a safetensors file that holds exactly this configuration's.
