@@ -6,7 +6,7 @@ use driml_model::{Compute, Features, ModelConfig, Network, Parameters};
 
 use crate::{
     agent::Agent,
-    auxiliary::dim::{DIM, Dim, Vectors, dots_of},
+    auxiliary::dim::{DIM, Vectors, dots_of},
     error::UpdateError,
     losses::{c51::softmax, scores::Scores},
     settings::LearnerSettings,
@@ -19,8 +19,8 @@ pub struct Insight {
     model: ModelConfig,
     network: Network,
     compute: Compute,
-    /// The auxiliary loss, if it compares local features of s_t with local ones of s_{t+k}.
-    local_dim: Option<Dim>,
+    /// Bound of the scores' soft clip, if the auxiliary loss compares local features of s_t with local ones of s_{t+k}.
+    local_clip: Option<f64>,
 }
 
 /// What the network makes of a batch of states.
@@ -54,14 +54,14 @@ impl Insight {
             model: model.clone(),
             network: Network::with_kernels(model, parameters, compute.kernels)?,
             compute,
-            local_dim: is_local.then(|| Dim::new(&settings.auxiliary_settings())),
+            local_clip: is_local.then_some(settings.tanh_clip),
         })
     }
 
     /// Rows and columns of the local features that are compared; none if this agent compares none.
     pub fn local_shape(&self) -> Option<(usize, usize)> {
         let (rows, columns, _) = self.model.local_shape();
-        self.local_dim.map(|_| (rows, columns))
+        self.local_clip.map(|_| (rows, columns))
     }
 
     /// What the network makes of states [B, H, W, C], of its input's size.
@@ -99,7 +99,7 @@ impl Insight {
         actions: &[u8],
         later: &Seen,
     ) -> Result<Option<Vec<f64>>, UpdateError> {
-        let Some(dim) = self.local_dim else {
+        let Some(tanh_clip) = self.local_clip else {
             return Ok(None);
         };
         let actions = Tensor::from_slice(actions, actions.len(), &self.compute.device)?;
@@ -110,7 +110,7 @@ impl Insight {
             return Ok(None);
         };
         let dots = dots_of(vectors.kernels, psi, phi)?;
-        let scores = Scores::new(dots.width, dim.tanh_clip);
+        let scores = Scores::new(dots.width, tanh_clip);
         let (locations, rows, _) = dots.dots.dims3()?;
         let dots = flat(&dots.dots)?;
         let mut matches = vec![0.0; rows * locations];
