@@ -158,27 +158,17 @@ impl<'a> Batch<'a> {
         discounts.filter_map(|(row, &discount)| (discount != 0.0).then_some(row))
     }
 
-    /// s_{t+n} of [`Batch::bootstraps`], of a batch that is valid with states of this length.
-    pub(crate) fn next_states(&self, state_bytes: usize) -> Vec<&'a [u8]> {
-        let whole = self.states_n.len() == self.rows * state_bytes;
-        let bytes: &'a [u8] = self.states_n;
-        let at = |(place, row): (usize, usize)| {
-            let place = if whole { row } else { place };
-            &bytes[place * state_bytes..][..state_bytes]
-        };
-        self.bootstraps().enumerate().map(at).collect()
+    /// s_{t+n} of [`Batch::bootstraps`], of a batch that is valid with states of this length; none is missing.
+    pub(crate) fn next_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
+        let bootstraps = self.bootstrap_discount.iter().map(|&it| it != 0.0);
+        let states = in_places(self.states_n, state_bytes, bootstraps);
+        states.filter(Option::is_some).collect()
     }
 
     /// s_{t+k} [P, B] of a batch that is valid with states of this length; none where a row has no such positive.
     pub fn positive_states(&self, state_bytes: usize) -> Vec<Option<&'a [u8]>> {
-        let whole = self.states_k.len() == self.positive_valid.len() * state_bytes;
-        let mut states = self.states_k.chunks_exact(state_bytes);
-        let positives = self.positive_valid.iter().map(|&valid| {
-            let there = valid != 0;
-            let state = if there || whole { states.next() } else { None };
-            state.filter(|_| there)
-        });
-        positives.collect()
+        let valid = self.positive_valid.iter().map(|&it| it != 0);
+        in_places(self.states_k, state_bytes, valid).collect()
     }
 
     /// The pairs (a_t, a_{t+1}) of the rows that have both.
@@ -193,4 +183,18 @@ impl<'a> Batch<'a> {
             .map(|row| (self.action[row], self.next_action[row]));
         pairs.filter(|&(_, next)| next != NO_ACTION).collect()
     }
+}
+
+/// The state of each place, none where it is not `there`. `states` has one for each place, or for those alone that are there.
+fn in_places(
+    states: &[u8],
+    state_bytes: usize,
+    there: impl ExactSizeIterator<Item = bool>,
+) -> impl Iterator<Item = Option<&[u8]>> {
+    let whole = states.len() == there.len() * state_bytes;
+    let mut states = states.chunks_exact(state_bytes);
+    there.map(move |there| {
+        let state = if there || whole { states.next() } else { None };
+        state.filter(|_| there)
+    })
 }

@@ -8,7 +8,7 @@ use driml_protocol::NO_ACTION;
 use crate::{
     auxiliary::loss::{AuxiliaryLoss, LossInputs, OnlineFeatures, WeightedLoss},
     batch::Batch,
-    deduplicate::{PassInput, State},
+    deduplicate::PassInput,
     error::UpdateError,
     losses::{
         c51::{kl_loss, row_kls, softmax},
@@ -216,7 +216,7 @@ impl Networks {
             num_actions, atoms, ..
         } = self.model;
         let len = self.model.frame_len();
-        let frames: Vec<State<'_>> = batch.next_states(len).into_iter().map(Some).collect();
+        let frames = batch.next_states(len);
         let PassInput { bytes, places } =
             PassInput::of(&frames, batch.states_n, len, self.deduplicate);
         let states_n = states(&self.model, bytes, &self.compute.device)?;
