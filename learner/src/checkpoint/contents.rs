@@ -97,10 +97,7 @@ impl StateFile {
 }
 
 pub(super) fn sha256_of(bytes: &[u8]) -> String {
-    Sha256::digest(bytes)
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
+    format!("{:x}", Sha256::digest(bytes))
 }
 
 pub(super) fn hex_of(hash: u64) -> String {

@@ -119,8 +119,7 @@ pub(crate) fn load(folder: &Path) -> Result<Option<LearnerState>, CheckpointErro
 }
 
 pub(crate) fn sha256(bytes: &[u8]) -> String {
-    let digest = Sha256::digest(bytes);
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+    format!("{:x}", Sha256::digest(bytes))
 }
 
 /// Writes state.json with `change` made to it, and its sum.
