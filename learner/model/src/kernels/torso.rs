@@ -31,38 +31,29 @@ pub(crate) fn torso(
     bias: &Tensor,
     precision: Precision,
 ) -> Result<Tensor> {
-    let fc = Fc {
-        weight: weight.clone(),
-        bias: bias.clone(),
-        outputs: weight.dims2()?.0,
-        precision,
-    };
+    let outputs = weight.dims2()?.0;
     let (shapes, parameters) = stack_of(images, layers)?;
     let images = images.contiguous()?;
     with_simd!(AnySimd::of(precision), simd => {
         let stack = ConvStack::new(simd, shapes);
-        let (inputs, outputs) = (stack.last().map_len(), fc.outputs);
-        if fc.weight.dims() != [outputs, inputs] || fc.bias.dims() != [outputs] {
+        let inputs = stack.last().map_len();
+        if weight.dims() != [outputs, inputs] || bias.dims() != [outputs] {
             bail!(
                 "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
-                fc.weight.shape(),
-                fc.bias.shape()
+                weight.shape(),
+                bias.shape()
             );
         }
         let torso = Torso {
             stack,
-            fc,
+            weight: weight.clone(),
+            bias: bias.clone(),
+            outputs,
+            precision,
             kept: OnceLock::new(),
         };
         images.apply_op2(&parameters, torso)
     })
-}
-
-struct Fc {
-    weight: Tensor,
-    bias: Tensor,
-    outputs: usize,
-    precision: Precision,
 }
 
 /// What the forward pass leaves to the backward pass: the maps, and the same flattened.
@@ -73,7 +64,11 @@ struct Kept {
 
 struct Torso<S: Simd> {
     stack: ConvStack<S>,
-    fc: Fc,
+    /// Of the fully connected layer.
+    weight: Tensor,
+    bias: Tensor,
+    outputs: usize,
+    precision: Precision,
     kept: OnceLock<Kept>,
 }
 
@@ -89,7 +84,7 @@ impl<S: Simd> CustomOp2 for Torso<S> {
         parameters: &CpuStorage,
         parameters_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (stack, fc) = (&self.stack, &self.fc);
+        let stack = &self.stack;
         let images = pixels(images, images_layout)?;
         let (count, inputs) = (stack.count(images), stack.last().map_len());
         let (mut maps, mut flat) = (Buffer::new(count * inputs), Buffer::new(count * inputs));
@@ -98,20 +93,20 @@ impl<S: Simd> CustomOp2 for Torso<S> {
             stack.flatten(maps, flat);
         });
 
-        let (weight, bias) = (values_of(&fc.weight)?, values_of(&fc.bias)?);
+        let (weight, bias) = (values_of(&self.weight)?, values_of(&self.bias)?);
         let biases = Biases {
             values: &bias,
-            outputs: fc.outputs,
+            outputs: self.outputs,
             each: count,
         };
-        let weight = Matrix::new(&weight, fc.outputs, inputs);
+        let weight = Matrix::new(&weight, self.outputs, inputs);
         let x = Matrix::new(&flat, count, inputs);
-        let y = Product::new(fc.precision, x, weight.transposed())
+        let y = Product::new(self.precision, x, weight.transposed())
             .added_to(biases)
             .to_vec();
         let first = self.kept.set(Kept { maps, flat }).is_ok();
         assert!(first, "an operation passes forward once");
-        Ok((CpuStorage::F32(y), (count, fc.outputs).into()))
+        Ok((CpuStorage::F32(y), (count, self.outputs).into()))
     }
 
     fn bwd(
@@ -121,25 +116,25 @@ impl<S: Simd> CustomOp2 for Torso<S> {
         _y: &Tensor,
         grad_y: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let (stack, fc) = (&self.stack, &self.fc);
+        let stack = &self.stack;
         let grad_y = grad_y.detach().contiguous()?;
         let grad_values = values_of(&grad_y)?;
         let (count, inputs) = (grad_y.dims2()?.0, stack.last().map_len());
-        let grad = Matrix::new(&grad_values, count, fc.outputs);
+        let grad = Matrix::new(&grad_values, count, self.outputs);
         let Kept { maps, flat } = self.kept.get().expect("a forward pass came before");
         let to_weight = Product::new(
-            fc.precision,
+            self.precision,
             grad.transposed(),
             Matrix::new(flat, count, inputs),
         );
-        sum_in_place(&fc.weight, |sum| to_weight.summed(sum))?;
-        let to_bias = group_sums(&grad_values, 1, fc.outputs);
-        sum_in_place(&fc.bias, |sum| add_to(sum, to_bias))?;
+        sum_in_place(&self.weight, |sum| to_weight.summed(sum))?;
+        let to_bias = group_sums(&grad_values, 1, self.outputs);
+        sum_in_place(&self.bias, |sum| add_to(sum, to_bias))?;
 
-        let weight = values_of(&fc.weight)?;
-        let weight = Matrix::new(&weight, fc.outputs, inputs);
+        let weight = values_of(&self.weight)?;
+        let weight = Matrix::new(&weight, self.outputs, inputs);
         let mut grad_flat = Buffer::new(count * inputs);
-        Product::new(fc.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
+        Product::new(self.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
         let (images, images_layout) = images.storage_and_layout();
         let gradient = stack.backward(
             pixels(cpu(&images)?, images_layout)?,
