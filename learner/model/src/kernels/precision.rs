@@ -20,22 +20,17 @@ impl Precision {
     /// All of them.
     pub const ALL: [Self; 2] = [Self::F32, Self::Bf16];
 
-    /// Largest error of an operand's rounding, as a share of it.
-    pub const fn operand_error(self) -> f64 {
-        match self {
-            Self::F32 => 0.0,
-            // 2^-8.
-            Self::Bf16 => 1.0 / 256.0,
-        }
-    }
-
     /// Largest error of a sum of `terms` products of f32 numbers, as a share of the sum of the products' sizes, beside
     /// [`Precision::product_floor`]: both operands' rounding, and an f32's last place for each sum, in whatever order they are taken.
     ///
     /// It holds where the sum of the products' sizes is a finite f32. Source: Higham 2002, Accuracy and Stability of Numerical
     /// Algorithms, section 3.1.
     pub fn product_error(self, terms: usize) -> f64 {
-        let operand = self.operand_error();
+        let operand = match self {
+            Self::F32 => 0.0,
+            // 2^-8.
+            Self::Bf16 => 1.0 / 256.0,
+        };
         let sums = (terms + 2) as f64 / 2f64.powi(24);
         (1.0 + operand).powi(2) * (1.0 + sums) - 1.0
     }
