@@ -83,7 +83,7 @@ impl<'a> Batch<'a> {
         if rows == 0 {
             return fault("it has no rows".to_owned());
         }
-        let state_bytes = model.height * model.width * model.input_channels;
+        let state_bytes = model.frame_len();
         let positives = self.positives;
         if !wants.fit(positives, self.anchors.is_some()) {
             return fault(format!(
