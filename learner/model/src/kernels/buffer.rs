@@ -87,6 +87,23 @@ impl<T: Pooled> Drop for Buffer<T> {
     }
 }
 
+/// Scalars where they are, or a copy of them.
+pub(crate) enum Scalars<'a, T: Pooled> {
+    InPlace(&'a [T]),
+    Copied(Buffer<T>),
+}
+
+impl<T: Pooled> Deref for Scalars<'_, T> {
+    type Target = [T];
+
+    fn deref(&self) -> &[T] {
+        match self {
+            Self::InPlace(scalars) => scalars,
+            Self::Copied(scalars) => scalars,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,7 +6,7 @@
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
-use crate::kernels::buffer::Buffer;
+use crate::kernels::buffer::{Buffer, Scalars};
 use crate::kernels::isa::Mode;
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
@@ -53,24 +53,18 @@ struct Dots {
     phi_locations: usize,
 }
 
-/// Vectors [B, R] of one location.
-enum Located<'a> {
-    InPlace(&'a [f32]),
-    Copied(Buffer<f32>),
-}
-
 impl Dots {
-    /// The vectors of location `at` among `vectors` [B, locations, R].
-    fn located<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Located<'a> {
+    /// The vectors [B, R] of location `at` among `vectors` [B, locations, R].
+    fn located<'a>(&self, vectors: &'a [f32], locations: usize, at: usize) -> Scalars<'a, f32> {
         if locations == 1 {
-            return Located::InPlace(vectors);
+            return Scalars::InPlace(vectors);
         }
         let mut copied = Buffer::new(self.rows * self.embedding_dim);
         let rows = vectors.chunks_exact(locations * self.embedding_dim);
         for (to, row) in copied.chunks_exact_mut(self.embedding_dim).zip(rows) {
             to.copy_from_slice(&row[at * self.embedding_dim..][..self.embedding_dim]);
         }
-        Located::Copied(copied)
+        Scalars::Copied(copied)
     }
 
     fn product<'a>(&self, a: Matrix<'a>, b: Matrix<'a>) -> Product<'a> {
@@ -97,7 +91,7 @@ impl Dots {
                 let grad = Matrix::new(grad, self.rows, self.rows);
                 let grad = if transposed { grad.transposed() } else { grad };
                 let others = self.located(others, others_locations, at);
-                let others = Matrix::new(others.values(), self.rows, self.embedding_dim);
+                let others = Matrix::new(&others, self.rows, self.embedding_dim);
                 let mut part = Buffer::new(self.rows * self.embedding_dim);
                 self.product(grad, others).write(&mut part, Mode::Replace);
                 part
@@ -117,15 +111,6 @@ impl Dots {
                 }
             });
         sum
-    }
-}
-
-impl Located<'_> {
-    fn values(&self) -> &[f32] {
-        match self {
-            Self::InPlace(values) => values,
-            Self::Copied(values) => values,
-        }
     }
 }
 
@@ -149,8 +134,8 @@ impl CustomOp2 for Dots {
             .for_each(|(at, dots)| {
                 let psi = self.located(psi, self.psi_locations, at);
                 let phi = self.located(phi, self.phi_locations, at);
-                let psi = Matrix::new(psi.values(), rows, embedding_dim);
-                let phi = Matrix::new(phi.values(), rows, embedding_dim).transposed();
+                let psi = Matrix::new(&psi, rows, embedding_dim);
+                let phi = Matrix::new(&phi, rows, embedding_dim).transposed();
                 self.product(psi, phi).write(dots, Mode::Replace);
             });
         Ok((CpuStorage::F32(dots), (self.locations, rows, rows).into()))

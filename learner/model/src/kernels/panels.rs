@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::kernels::buffer::Buffer;
+use crate::kernels::buffer::{Buffer, Scalars};
 use crate::kernels::isa::{
     Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
@@ -240,15 +240,10 @@ fn pack_transposed<S: Simd>(
 
 /// A left operand as tiles read it.
 pub(crate) struct Rows<'a, E: Element> {
-    values: Operand<'a, E>,
+    values: Scalars<'a, E>,
     row_stride: usize,
     step: usize,
     steps: usize,
-}
-
-enum Operand<'a, E: Element> {
-    InPlace(&'a [E]),
-    Packed(Buffer<E>),
 }
 
 impl<'a, E: Element> Rows<'a, E> {
@@ -268,7 +263,7 @@ impl<'a, E: Element> Rows<'a, E> {
             true => (depth, m * depth),
         };
         let values = if let Some(values) = E::in_place(a.data) {
-            Operand::InPlace(values)
+            Scalars::InPlace(values)
         } else {
             let mut values = Buffer::new(m * steps * depth);
             if a.transposed && S::LEFT_STEPS_ADJOIN {
@@ -280,7 +275,7 @@ impl<'a, E: Element> Rows<'a, E> {
             } else {
                 pack_rows(simd, a.data, k, row_stride, &mut values, threads);
             }
-            Operand::Packed(values)
+            Scalars::Copied(values)
         };
         Self {
             values,
@@ -292,10 +287,7 @@ impl<'a, E: Element> Rows<'a, E> {
 
     pub(crate) fn left(&self, row: usize) -> Left<'_, E> {
         Left {
-            values: match &self.values {
-                Operand::InPlace(values) => values,
-                Operand::Packed(values) => values,
-            },
+            values: &self.values,
             start: row * self.row_stride,
             row_stride: self.row_stride,
             step: self.step,
