@@ -4,6 +4,7 @@
 //! All other outputs would be computed to be dropped, and their gradients are exactly 0. Rows of one group are put beside each
 //! other, so that each group is one product; sums are taken in the order in which the whole layer takes them.
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
@@ -43,9 +44,14 @@ pub(crate) fn grouped_linear(
     }
     let mut order: Vec<usize> = (0..rows).collect();
     order.sort_by_key(|&row| groups[row]);
+    let mut first = 0;
     let parts = order
         .chunk_by(|&a, &b| groups[a] == groups[b])
-        .map(|rows| (usize::from(groups[rows[0]]), rows.len()))
+        .map(|rows| {
+            let own = first..first + rows.len();
+            first = own.end;
+            (usize::from(groups[rows[0]]), own)
+        })
         .collect();
     let op = Grouped {
         order,
@@ -62,8 +68,8 @@ pub(crate) fn grouped_linear(
 struct Grouped {
     /// Rows by group, and within a group in their order.
     order: Vec<usize>,
-    /// The groups that occur, ascending, and how many rows each has.
-    parts: Vec<(usize, usize)>,
+    /// The groups that occur, ascending, and where in `order` the rows of each are.
+    parts: Vec<(usize, Range<usize>)>,
     inputs: usize,
     out: usize,
     precision: Precision,
@@ -97,14 +103,13 @@ impl Grouped {
         &self,
         mut values: &mut [f32],
         len: usize,
-        each: impl Fn(usize, std::ops::Range<usize>, &mut [f32]) + Sync,
+        each: impl Fn(usize, &Range<usize>, &mut [f32]) + Sync,
     ) {
-        let mut first = 0;
         let mut tasks = Vec::with_capacity(self.parts.len());
-        for &(group, rows) in &self.parts {
-            let (own, rest) = std::mem::take(&mut values).split_at_mut(rows * len);
-            tasks.push((group, first..first + rows, own));
-            (values, first) = (rest, first + rows);
+        for (group, rows) in &self.parts {
+            let (own, rest) = std::mem::take(&mut values).split_at_mut(rows.len() * len);
+            tasks.push((*group, rows, own));
+            values = rest;
         }
         tasks
             .into_par_iter()
@@ -112,7 +117,7 @@ impl Grouped {
     }
 
     /// A group's rows of a sorted matrix.
-    fn rows<'a>(sorted: &'a [f32], rows: &std::ops::Range<usize>, len: usize) -> Matrix<'a> {
+    fn rows<'a>(sorted: &'a [f32], rows: &Range<usize>, len: usize) -> Matrix<'a> {
         Matrix::new(&sorted[rows.start * len..rows.end * len], rows.len(), len)
     }
 
@@ -123,29 +128,23 @@ impl Grouped {
 
     /// Adds the gradient of the weight to `sum`.
     fn add_to_weight(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
-        let mut starts = Vec::new();
-        let mut first = 0;
-        for &(group, rows) in &self.parts {
-            starts.resize(group, None);
-            starts.push(Some(first..first + rows));
-            first += rows;
-        }
         sum.par_chunks_exact_mut(self.out * self.inputs)
-            .zip(starts)
-            .for_each(|(sum, rows)| {
-                let Some(rows) = rows else { return };
-                let grad = Self::rows(grad, &rows, self.out).transposed();
-                let x = Self::rows(x, &rows, self.inputs);
+            .enumerate()
+            .for_each(|(group, sum)| {
+                let own = self.parts.iter().find(|(it, _)| *it == group);
+                let Some((_, rows)) = own else { return };
+                let grad = Self::rows(grad, rows, self.out).transposed();
+                let x = Self::rows(x, rows, self.inputs);
                 Product::new(self.precision, grad, x).write(sum, Mode::Add);
             });
     }
 
     /// Adds the gradient of the bias to `sum`.
     fn add_to_bias(&self, sum: &mut [f32], grad: &[f32]) {
-        let mut rows = grad.chunks_exact(self.out);
-        for &(group, count) in &self.parts {
+        let mut all = grad.chunks_exact(self.out);
+        for (group, rows) in &self.parts {
             let sum = &mut sum[group * self.out..][..self.out];
-            for row in rows.by_ref().take(count) {
+            for row in all.by_ref().take(rows.len()) {
                 for (sum, value) in sum.iter_mut().zip(row) {
                     *sum += value;
                 }
@@ -177,7 +176,7 @@ impl CustomOp3 for Grouped {
                 outputs: self.out,
                 each: self.order.len(),
             };
-            let (x, w) = (Self::rows(&x, &rows, self.inputs), self.weight(w, group));
+            let (x, w) = (Self::rows(&x, rows, self.inputs), self.weight(w, group));
             Product::new(self.precision, x, w.transposed())
                 .added_to(biases)
                 .write(y, Mode::Replace);
@@ -206,7 +205,7 @@ impl CustomOp3 for Grouped {
             let w = values_of(w)?;
             let mut grad_x = Buffer::new(self.order.len() * self.inputs);
             self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
-                let (grad, w) = (Self::rows(&grad, &rows, self.out), self.weight(&w, group));
+                let (grad, w) = (Self::rows(&grad, rows, self.out), self.weight(&w, group));
                 Product::new(self.precision, grad, w).write(grad_x, Mode::Replace);
             });
             Tensor::from_vec(self.unsort(&grad_x), x.shape(), x.device())
