@@ -10,7 +10,7 @@ use driml_learner::{
         settings::AuxiliarySettings,
     },
 };
-use driml_model::{DimHeads, LossLayer, ModelConfig};
+use driml_model::{LossLayer, ModelConfig};
 use serde::Deserialize;
 
 /// Its line of the menu: `learner.update.auxiliary_loss = "prediction"`, one later state a row, one column `prediction` in
@@ -50,11 +50,6 @@ struct Prediction {
 }
 
 impl AuxiliaryLoss for Prediction {
-    /// None of DIM's.
-    fn heads(&self, _action: bool) -> DimHeads {
-        DimHeads::NONE
-    }
-
     /// From the features of s_t to those of s_{t+1}.
     fn layers(&self, model: &ModelConfig) -> Vec<LossLayer> {
         vec![LossLayer {

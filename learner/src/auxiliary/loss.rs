@@ -33,8 +33,10 @@ pub struct MenuItem {
 
 /// What an agent learns beside the return.
 pub trait AuxiliaryLoss: fmt::Debug + Send + Sync {
-    /// The heads that the online network needs; `action` says whether Psi is given a_t.
-    fn heads(&self, action: bool) -> DimHeads;
+    /// Those of DIM's heads that the online network needs, if any; `action` says whether Psi is given a_t.
+    fn heads(&self, _action: bool) -> DimHeads {
+        DimHeads::NONE
+    }
 
     /// Extra linear layers, which the online network builds and [`Network::loss_layer`] applies. `model` has the sizes of all
     /// else: `hidden` is the width of f4.

@@ -1,7 +1,5 @@
 //! No auxiliary loss: the agent learns the return alone, without a second pass and without heads.
 
-use driml_model::DimHeads;
-
 use super::{
     loss::{AuxiliaryLoss, LossInputs, MenuItem, Passes, WeightedLoss},
     positives::Positives,
@@ -32,10 +30,6 @@ fn make(settings: &AuxiliarySettings<'_>) -> Result<Box<dyn AuxiliaryLoss>, Upda
 struct ReturnAlone;
 
 impl AuxiliaryLoss for ReturnAlone {
-    fn heads(&self, _action: bool) -> DimHeads {
-        DimHeads::NONE
-    }
-
     fn passes(&self, _positives: usize, _augmented: bool) -> Passes {
         Passes::default()
     }
