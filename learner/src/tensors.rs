@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use candle_core::{CpuStorage, Device, Layout, Tensor, bail};
+use candle_core::{CpuStorage, DType, Device, Layout, Tensor, bail};
 use driml_model::ModelConfig;
 
 use crate::error::UpdateError;
@@ -25,6 +25,11 @@ pub(crate) fn states<'a>(
 /// All values of a tensor of f32, in their order.
 pub(crate) fn flat(tensor: &Tensor) -> candle_core::Result<Vec<f32>> {
     tensor.flatten_all()?.to_vec1()
+}
+
+/// All values of a tensor as f64, in their order.
+pub(crate) fn flat_f64(tensor: &Tensor) -> candle_core::Result<Vec<f64>> {
+    tensor.to_dtype(DType::F64)?.flatten_all()?.to_vec1()
 }
 
 /// As [`floats`](driml_model::floats), to write.

@@ -21,6 +21,7 @@ use crate::{
     noise::UpdateNoise,
     optimiser::adam::AdamSettings,
     settings::LearnerSettings,
+    tensors::flat_f64,
 };
 
 /// Why a case could not be checked.
@@ -209,7 +210,7 @@ impl Case {
             return Err(ParityError::tensor(&name, why));
         }
         self.used.borrow_mut().insert(name);
-        values(tensor)
+        Ok(flat_f64(tensor)?)
     }
 
     /// An expectation that nothing was compared with must not pass as met.
@@ -328,12 +329,4 @@ impl Tensors {
         }
         Ok(tensor.flatten_all()?.to_vec1()?)
     }
-}
-
-/// The numbers of a tensor, as f64.
-pub(super) fn values(tensor: &Tensor) -> Result<Vec<f64>, ParityError> {
-    Ok(tensor
-        .to_dtype(candle_core::DType::F64)?
-        .flatten_all()?
-        .to_vec1()?)
 }

@@ -1,11 +1,11 @@
 //! How far an update of any precision, network and weights is from the same in f32 by candle's own operations.
 //! It judges nothing: tolerances are for the cases of the parity check, whose float64 holds both ways of computing.
 
-use candle_core::{DType, Device};
+use candle_core::Device;
 use driml_model::{Compute, Kernels, greedy};
 use driml_protocol::NO_ACTION;
 
-use crate::{agent::Agent, batch::Batch, error::UpdateError};
+use crate::{agent::Agent, batch::Batch, error::UpdateError, tensors::flat_f64};
 
 /// How a reference computes: with none of this project's kernels.
 pub const REFERENCE: Compute = Compute {
@@ -40,10 +40,7 @@ impl ErrorOfUpdate {
         for (name, var) in reference.online().iter() {
             let [got, expected] = [&own.gradients, &expected.gradients].map(|gradients| {
                 let gradient = gradients.get(name);
-                gradient.map_or_else(
-                    || Ok(vec![0.0; var.elem_count()]),
-                    |it| it.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>(),
-                )
+                gradient.map_or_else(|| Ok(vec![0.0; var.elem_count()]), flat_f64)
             });
             for (got, expected) in got?.iter().zip(expected?) {
                 apart += (got - expected).powi(2);

@@ -13,8 +13,8 @@ use std::{
 use driml_model::{Compute, DimHeads, Encoder, ModelConfig, Network, Parameters};
 use driml_protocol::NO_ACTION;
 
+use case::Case;
 pub use case::ParityError;
-use case::{Case, values};
 use tolerance::Tolerances;
 
 use crate::{
@@ -27,6 +27,7 @@ use crate::{
     },
     evaluation::Evaluation,
     losses::scores::{Dots, Scores},
+    tensors::flat_f64,
 };
 
 /// One tensor group's comparison.
@@ -200,7 +201,7 @@ impl Check<'_> {
         for (name, tensor) in case.online() {
             let expected = case.expected(&format!("grad.{name}"), tensor.dims())?;
             let got = match evaluation.gradients.get(name) {
-                Some(gradient) => values(gradient)?,
+                Some(gradient) => flat_f64(gradient)?,
                 None => vec![0.0; expected.len()],
             };
             let apart = norm(got.iter().zip(&expected).map(|(got, wanted)| got - wanted));
@@ -226,12 +227,12 @@ impl Check<'_> {
             let expected = case.expected(&format!("updated.{name}"), tensor.dims())?;
             // What no lambda uses is not built, so it stays as the file gives it.
             let var = agent.online().get(name);
-            let got = values(var.map_or(tensor, |var| var.as_tensor()))?;
+            let got = flat_f64(var.map_or(tensor, |var| var.as_tensor()))?;
             online.add("updated", name, largest(&got, &expected), tolerance);
         }
         for (name, var) in agent.key().iter().flat_map(|key| key.iter()) {
             let expected = case.expected(&format!("updated_key.{name}"), var.dims())?;
-            let error = largest(&values(var)?, &expected);
+            let error = largest(&flat_f64(var)?, &expected);
             keys.add("updated_key", name, error, tolerance);
         }
         self.lines
@@ -314,7 +315,7 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     })?;
     let saturates = |it: &Dots| -> Result<bool, ParityError> {
         let scores = Scores::new(it.width, settings.tanh_clip);
-        let largest = values(&it.dots)?
+        let largest = flat_f64(&it.dots)?
             .into_iter()
             .map(f64::abs)
             .fold(0.0, f64::max);
