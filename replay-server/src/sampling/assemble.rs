@@ -78,7 +78,12 @@ impl Assembler {
         let (n_step_return, follows) = n_step_return(&self.discounts, self.timeout, window.steps());
         // A state that counts for nothing does not travel.
         let bootstrap = follows.filter(|&i| self.discounts[i] as f32 != 0.0);
-        let furthest = self.draw_k(affinity, window, rng).unwrap_or(0);
+        self.actions.clear();
+        let same_level = window.steps().take_while(|step| step.end == End::Running);
+        let actions = same_level.map(|step| step.action);
+        self.actions
+            .extend(actions.take(self.horizon.k_max() as usize));
+        let furthest = horizon::draw_k(self.horizon, affinity, &self.actions, rng);
         let k_first = match self.horizon {
             Horizon::All { .. } => 1,
             _ => furthest,
@@ -104,23 +109,6 @@ impl Assembler {
             k_first,
         };
         (scalars, states)
-    }
-
-    /// k, or none where no positive is served or a_t ended its episode or level.
-    ///
-    /// H is the number of states after s_t, at most k_max, that come before the end of the episode or level.
-    fn draw_k(&mut self, affinity: &Affinity, window: &Window, rng: &mut impl Rng) -> Option<u32> {
-        self.actions.clear();
-        let same_level = window.steps().take_while(|step| step.end == End::Running);
-        self.actions.extend(
-            same_level
-                .map(|step| step.action)
-                .take(self.horizon.k_max() as usize),
-        );
-        if self.actions.is_empty() {
-            return None;
-        }
-        horizon::draw_k(self.horizon, affinity, &self.actions, rng)
     }
 }
 

@@ -11,26 +11,25 @@ pub use affinity::Affinity;
 
 /// Draws k for an anchor whose next `actions.len()` states lie in its episode and level.
 ///
-/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left), at least one. Result in 1..=H, of several positives the
-/// furthest; `None` where none is served.
+/// `actions` are a_t, .., a_{t+H-1} with H = min(k_max, steps left). Result in 1..=H, of several positives the furthest; 0 where H is 0
+/// or no positive is served.
 /// Source: Mazoure et al. 2020, Deep Reinforcement and InfoMax Learning.
 pub(crate) fn draw_k(
     horizon: Horizon,
     affinity: &Affinity,
     actions: &[u8],
     rng: &mut impl Rng,
-) -> Option<u32> {
-    let steps_left = actions.len() as u32;
-    assert!(steps_left > 0, "an anchor with a positive has a successor");
+) -> u32 {
+    let furthest = actions.len() as u32;
+    if furthest == 0 {
+        return 0;
+    }
     match horizon {
-        Horizon::None {} => None,
+        Horizon::None {} => 0,
         // DRIML-fix, and CPC, which has a positive for each k up to the furthest.
-        Horizon::Fixed { k } | Horizon::All { k_max: k } => Some(k.min(steps_left)),
+        Horizon::Fixed { .. } | Horizon::All { .. } => furthest,
         // DRIML-randk.
-        Horizon::Uniform { k_max } => Some(rng.random_range(1..=k_max.min(steps_left))),
-        Horizon::Nhg { k_max } => {
-            let walk = &actions[..actions.len().min(k_max as usize)];
-            Some(nhg::draw_k(affinity, walk, rng))
-        }
+        Horizon::Uniform { .. } => rng.random_range(1..=furthest),
+        Horizon::Nhg { .. } => nhg::draw_k(affinity, actions, rng),
     }
 }
