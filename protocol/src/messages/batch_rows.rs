@@ -1,6 +1,8 @@
 //! How a batch is written: first all of its rows but their states, then each state, or its frames, in the place that follows from them.
 //! `Batch` documents what the values mean.
 
+use std::ops::Range;
+
 use super::{batch_frames::StackedFrames, batch_header::BatchHeader, batch_layout::Column};
 
 /// All of a row but its states.
@@ -24,6 +26,11 @@ impl RowScalars {
     /// Whether the row has an s_{t+n}.
     pub fn bootstraps(&self) -> bool {
         self.bootstrap_discount != 0.0
+    }
+
+    /// k of each positive that the row has.
+    pub const fn ks(&self) -> Range<u32> {
+        self.k_first..self.k_first + self.positives
     }
 
     pub(super) fn write(&self, header: &BatchHeader, payload: &mut [u8], row: usize) {

@@ -1,7 +1,7 @@
-//! Makes one row of a batch: a_t, a_{t+1}, the n-step return, and which transitions' states are s_t, s_{t+n} and s_{t+k}, with
-//! each k drawn here. It does not choose the anchor and reads no frame.
+//! Makes one row of a batch: a_t, a_{t+1}, the n-step return, how far ahead s_{t+n} and s_{t+k} are, with each k drawn here.
+//! It does not choose the anchor and reads no frame.
 
-use driml_protocol::{End, Horizon, NO_ACTION, POSITIVES_MAX, RowScalars, RunSpec, TimeoutRule};
+use driml_protocol::{End, Horizon, NO_ACTION, RowScalars, RunSpec, TimeoutRule};
 use rand::Rng;
 
 use super::{
@@ -9,39 +9,6 @@ use super::{
     horizon::{self, Affinity},
 };
 use crate::storage::ring::Step;
-
-/// The states of a row, as indices in the ring.
-#[derive(Clone, Copy)]
-pub(crate) struct RowStates {
-    t: u64,
-    /// Where the row bootstraps from.
-    n: Option<u64>,
-    /// k of the first positive; the others follow it step by step.
-    k_first: u32,
-    positives: usize,
-    /// s_{t+k} of each.
-    s_tpk: [u64; POSITIVES_MAX],
-}
-
-impl RowStates {
-    pub(crate) const fn anchor(&self) -> u64 {
-        self.t
-    }
-
-    /// k, of several positives the furthest, 0 without any.
-    pub(crate) fn k(&self) -> u32 {
-        match self.positives {
-            0 => 0,
-            positives => self.k_first + positives as u32 - 1,
-        }
-    }
-
-    /// s_t, s_{t+n}, s_{t+k} for each k: those that the row has, in the order of their numbers in `BatchStatesMut::of_row`.
-    pub(crate) fn indices(&self) -> impl Iterator<Item = u64> {
-        let first = [Some(self.t), self.n].into_iter().flatten();
-        first.chain(self.s_tpk.into_iter().take(self.positives))
-    }
-}
 
 /// The rules of return and positive, and scratch space so that a row allocates nothing.
 pub(crate) struct Assembler {
@@ -63,12 +30,13 @@ impl Assembler {
         }
     }
 
+    /// The row of the anchor that `window` begins with, and the i of the state s_{t+i} that it bootstraps from, if it does.
     pub(crate) fn row(
         &mut self,
         affinity: &Affinity,
         window: &Window,
         rng: &mut impl Rng,
-    ) -> (RowScalars, RowStates) {
+    ) -> (RowScalars, Option<usize>) {
         let anchor = window.step(0);
         let next_action = if anchor.end == End::Running {
             window.step(1).action
@@ -88,27 +56,18 @@ impl Assembler {
             Horizon::All { .. } => 1,
             _ => furthest,
         };
-        let mut states = RowStates {
-            t: window.index(0),
-            n: bootstrap.map(|i| window.index(i)),
-            k_first,
-            positives: 0,
-            s_tpk: [0; POSITIVES_MAX],
-        };
-        // A k of 0 is none.
-        for k in (k_first..=furthest).filter(|&k| k > 0) {
-            states.s_tpk[states.positives] = window.index(k as usize);
-            states.positives += 1;
-        }
         let scalars = RowScalars {
             action: anchor.action,
             next_action,
             n_step_return: return_f32(n_step_return),
             bootstrap_discount: bootstrap.map_or(0.0, |i| self.discounts[i] as f32),
-            positives: states.positives as u32,
+            positives: match furthest {
+                0 => 0,
+                _ => furthest + 1 - k_first,
+            },
             k_first,
         };
-        (scalars, states)
+        (scalars, bootstrap)
     }
 }
 

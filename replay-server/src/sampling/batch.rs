@@ -1,19 +1,19 @@
 //! Draws the rows of a batch and puts it together: anchors by `rows`, each row by `assemble`, and the frames that they need, each once.
 //! Whether a batch may be drawn is for the rate limiter.
 
-use std::collections::{HashMap, hash_map::Entry};
+use std::{collections::HashMap, iter};
 
 use driml_protocol::{Batch, BatchHeader, Buffer, RunSpec, Sampling};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    assemble::{Assembler, RowStates},
+    assemble::Assembler,
     episodes::{Episodes, Window},
     horizon::Affinity,
-    packed_batch::{PackedBatch, PackedFrames},
+    packed_batch::{NeededFrame, PackedBatch, write_or_take},
     rows::{RowSampler, prioritised::Priorities, uniform::Uniform},
 };
-use crate::storage::ring::Ring;
+use crate::storage::{frame_store::Layout, ring::Ring};
 
 /// Everything that drawing needs beside the ring and the generator.
 pub(crate) struct BatchSampler {
@@ -21,7 +21,7 @@ pub(crate) struct BatchSampler {
     episodes: Episodes,
     assembler: Assembler,
     window: Window,
-    frame_bytes: usize,
+    layout: Layout,
 }
 
 impl BatchSampler {
@@ -39,7 +39,7 @@ impl BatchSampler {
             rows,
             assembler: Assembler::new(spec),
             window: Window::default(),
-            frame_bytes: spec.frame_bytes(),
+            layout: Layout::new(spec.frame_bytes()),
         })
     }
 
@@ -53,115 +53,99 @@ impl BatchSampler {
         memory: impl FnOnce(usize) -> Buffer,
     ) -> Option<PackedBatch> {
         let rows = header.rows as usize;
-        let mut scalars = Vec::with_capacity(rows);
-        let mut states: Vec<RowStates> = Vec::with_capacity(rows);
+        let (mut scalars, mut anchors) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
+        // Of all rows, each row's in the order of `BatchStatesMut::of_row`.
+        let mut states: Vec<RowState> = Vec::new();
         let mut age_total = 0;
-        for _ in 0..rows {
+        for row in 0..rows {
             if !self.rows.draw(ring, rng, &mut self.window) {
                 return None;
             }
-            let row = self.assembler.row(affinity, &self.window, rng);
-            scalars.push(row.0);
-            states.push(row.1);
-            age_total += ring.inserted() - 1 - self.window.index(0);
-            let version = self.window.step(0).weights_version;
+            let window = &self.window;
+            let (of_row, bootstrap) = self.assembler.row(affinity, window, rng);
+            let ks = of_row.ks().map(|k| k as usize);
+            let steps = iter::once(0).chain(bootstrap).chain(ks);
+            states.extend(steps.map(|i| RowState {
+                row,
+                index: window.index(i),
+            }));
+            scalars.push(of_row);
+            anchors.push(window.index(0));
+            age_total += ring.inserted() - 1 - window.index(0);
+            let version = window.step(0).weights_version;
             let (newest, oldest) = header.weights_versions;
             header.weights_versions = (newest.max(version), oldest.min(version));
         }
         header.mean_age = age_total as f64 / rows as f64;
-        let mut needed = NeededFrames::default();
-        if let Some(stacked) = &mut header.stacked {
-            needed = NeededFrames::of(ring, &self.episodes, states.iter());
-            stacked.frames = needed.indices.len() as u32;
-        }
+        let shared = header.stacked.as_mut().map(|stacked| {
+            let shared = SharedFrames::of(ring, &self.episodes, &states);
+            stacked.frames = shared.frames.len() as u32;
+            shared
+        });
         let mut batch = Batch::of_rows(header, &scalars, memory);
         // All by the masses that are there now: to find that one was no anchor any more makes the others more likely.
-        let probability = |states: &RowStates| {
-            let probability = self.rows.probability(states.anchor())? as f32;
-            Some((states.anchor(), probability.clamp(f32::MIN_POSITIVE, 1.0)))
+        let probability = |anchor| {
+            let probability = self.rows.probability(anchor)? as f32;
+            Some((anchor, probability.clamp(f32::MIN_POSITIVE, 1.0)))
         };
-        if let Some(draws) = states.iter().map(probability).collect::<Option<Vec<_>>>() {
+        let draws = anchors.into_iter().map(probability);
+        if let Some(draws) = draws.collect::<Option<Vec<_>>>() {
             batch.set_draws(draws.into_iter());
         }
-        let packed = self.take_frames(ring, &states, &needed, &mut batch);
-        let ks = states.iter().map(RowStates::k).collect();
-        Some(PackedBatch { batch, packed, ks })
-    }
-
-    /// Writes the frames of all rows, or takes what is needed to write them later. Stacked states share the frames of `needed`.
-    fn take_frames(
-        &self,
-        ring: &Ring,
-        states: &[RowStates],
-        needed: &NeededFrames,
-        batch: &mut Batch,
-    ) -> PackedFrames {
-        let mut packed = PackedFrames::new(self.frame_bytes);
-        let is_stacked = batch.header.stacked.is_some();
         let mut places = batch.states_mut();
-        let mut stacks = needed.stacks();
-        for (row, states) in states.iter().enumerate() {
-            let numbers: Vec<usize> = places.of_row(row).collect();
-            if !is_stacked {
-                let frames = states.indices().zip(numbers);
-                packed.write_or_take_row(ring, frames, &mut places);
-                continue;
+        let numbers: Vec<usize> = (0..rows).flat_map(|row| places.of_row(row)).collect();
+        let frames: Vec<NeededFrame> = match shared {
+            None => {
+                let frame = |(RowState { row, index }, place)| NeededFrame { row, index, place };
+                states.into_iter().zip(numbers).map(frame).collect()
             }
-            for (number, stack) in numbers.into_iter().zip(&mut stacks) {
-                places.set_stack(number, stack);
+            Some(SharedFrames { frames, stacks }) => {
+                let stacks = stacks.chunks_exact(self.episodes.frame_stack);
+                for (number, stack) in numbers.into_iter().zip(stacks) {
+                    places.set_stack(number, stack);
+                }
+                frames
             }
-            packed.write_or_take_row(ring, needed.first_in(row), &mut places);
-        }
-        packed
+        };
+        let packed = write_or_take(ring, &frames, &mut places);
+        let ks = scalars.iter().map(|row| row.ks().max().unwrap_or(0));
+        Some(PackedBatch {
+            batch,
+            layout: self.layout,
+            packed,
+            ks: ks.collect(),
+        })
     }
+}
+
+/// A state that a row has, by where the ring holds its newest frame.
+struct RowState {
+    row: usize,
+    index: u64,
 }
 
 /// The distinct frames of stacked states, in the order in which rows need them: states of a row share them, and now and then rows do.
 /// A frame is known by where the ring holds it: two that look the same are two.
-#[derive(Default)]
-struct NeededFrames {
-    indices: Vec<u64>,
-    /// How many are needed by the rows up to each.
-    row_ends: Vec<usize>,
-    /// The frames of each state, oldest first, by their place among `indices`: row by row, in the order of [`RowStates::indices`].
+struct SharedFrames {
+    frames: Vec<NeededFrame>,
+    /// The frames of each state, oldest first, by their places.
     stacks: Vec<u32>,
-    frame_stack: usize,
 }
 
-impl NeededFrames {
-    fn of<'a>(ring: &Ring, episodes: &Episodes, rows: impl Iterator<Item = &'a RowStates>) -> Self {
-        let mut this = Self {
-            frame_stack: episodes.frame_stack(),
-            ..Self::default()
-        };
+impl SharedFrames {
+    fn of(ring: &Ring, episodes: &Episodes, states: &[RowState]) -> Self {
+        let (mut frames, mut stacks) = (Vec::new(), Vec::new());
         let mut places = HashMap::new();
-        for states in rows {
-            for state in states.indices() {
-                for index in episodes.stack(ring, state) {
-                    let place = match places.entry(index) {
-                        Entry::Occupied(known) => *known.get(),
-                        Entry::Vacant(new) => {
-                            this.indices.push(index);
-                            *new.insert(this.indices.len() as u32 - 1)
-                        }
-                    };
-                    this.stacks.push(place);
-                }
+        for &RowState { row, index } in states {
+            for index in episodes.stack(ring, index) {
+                let place = places.entry(index).or_insert_with(|| {
+                    let place = frames.len();
+                    frames.push(NeededFrame { row, index, place });
+                    place as u32
+                });
+                stacks.push(*place);
             }
-            this.row_ends.push(this.indices.len());
         }
-        this
-    }
-
-    /// Those that `row` is the first to need, and their places.
-    fn first_in(&self, row: usize) -> impl Iterator<Item = (u64, usize)> {
-        let start = row.checked_sub(1).map_or(0, |before| self.row_ends[before]);
-        let places = start..self.row_ends[row];
-        self.indices[places.clone()].iter().copied().zip(places)
-    }
-
-    /// The places of each state's frames, oldest first.
-    fn stacks(&self) -> impl Iterator<Item = &[u32]> {
-        self.stacks.chunks_exact(self.frame_stack.max(1))
+        Self { frames, stacks }
     }
 }

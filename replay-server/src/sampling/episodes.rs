@@ -36,7 +36,7 @@ impl Window {
 pub(crate) struct Episodes {
     /// Steps that must follow an anchor in its episode.
     pub(crate) reach: usize,
-    frame_stack: usize,
+    pub(crate) frame_stack: usize,
     timeout: TimeoutRule,
 }
 
@@ -86,10 +86,6 @@ impl Episodes {
             }
         }
         true
-    }
-
-    pub(crate) const fn frame_stack(&self) -> usize {
-        self.frame_stack
     }
 
     /// The frames that make the state at `index`, as indices in the ring, oldest first.

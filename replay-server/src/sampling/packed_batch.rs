@@ -15,88 +15,76 @@ use crate::storage::{
 #[must_use]
 pub struct PackedBatch {
     pub(crate) batch: Batch,
-    /// No rows if the batch has its frames.
-    pub(crate) packed: PackedFrames,
+    pub(crate) layout: Layout,
+    /// Row by row; none if the batch has its frames.
+    pub(crate) packed: Vec<PackedFrame>,
     /// k of each row, of several the furthest; 0 where there is none.
     pub(crate) ks: Vec<u32>,
+}
+
+/// A frame that a batch needs: the first row that needs it, where the ring holds it, and its place in the batch.
+pub(crate) struct NeededFrame {
+    pub(crate) row: usize,
+    pub(crate) index: u64,
+    pub(crate) place: usize,
+}
+
+/// A needed frame that is compressed, by its number in its block.
+pub(crate) struct PackedFrame {
+    row: usize,
+    place: usize,
+    block: Arc<Block>,
+    number: usize,
+}
+
+/// Writes frames into their places where the ring holds them plain; takes what is needed to write them later where they are compressed.
+pub(crate) fn write_or_take(
+    ring: &Ring,
+    needed: &[NeededFrame],
+    places: &mut BatchStatesMut<'_>,
+) -> Vec<PackedFrame> {
+    match ring.frames() {
+        Frames::Plain(frames) => {
+            for &NeededFrame { index, place, .. } in needed {
+                let frame = frames.frame(ring.slot(index));
+                places.frame(place).copy_from_slice(frame);
+            }
+            Vec::new()
+        }
+        Frames::Compressed(frames) => {
+            let packed = |&NeededFrame { row, index, place }: &NeededFrame| {
+                let (block, number) = frames.block(index);
+                PackedFrame {
+                    row,
+                    place,
+                    block: block.clone(),
+                    number,
+                }
+            };
+            needed.iter().map(packed).collect()
+        }
+    }
 }
 
 impl PackedBatch {
     /// The batch; with compression this is where most of the work is.
     pub fn unpack(self) -> Batch {
         let Self {
-            mut batch, packed, ..
+            mut batch,
+            layout,
+            packed,
+            ..
         } = self;
-        packed.write(&mut batch);
-        batch
-    }
-}
-
-/// The compressed frames that a batch needs, row by row.
-pub(crate) struct PackedFrames {
-    layout: Layout,
-    frames: Vec<PackedFrame>,
-    /// How many of them the rows up to each are the first to need.
-    row_ends: Vec<usize>,
-}
-
-/// A frame, by its number in its block, and its place in the batch.
-struct PackedFrame {
-    place: usize,
-    block: Arc<Block>,
-    number: usize,
-}
-
-impl PackedFrames {
-    /// No rows yet, of frames of this size.
-    pub(crate) fn new(frame_bytes: usize) -> Self {
-        Self {
-            layout: Layout::new(frame_bytes),
-            frames: Vec::new(),
-            row_ends: Vec::new(),
-        }
-    }
-
-    /// Writes the frames of the next row, indices in the ring and places in the batch, where frames are plain; takes what is needed
-    /// to write them later where they are compressed.
-    pub(crate) fn write_or_take_row(
-        &mut self,
-        ring: &Ring,
-        row: impl Iterator<Item = (u64, usize)>,
-        places: &mut BatchStatesMut<'_>,
-    ) {
-        match ring.frames() {
-            Frames::Plain(frames) => {
-                for (index, place) in row {
-                    let frame = frames.frame(ring.slot(index));
-                    places.frame(place).copy_from_slice(frame);
-                }
-            }
-            Frames::Compressed(frames) => {
-                self.frames.extend(row.map(|(index, place)| {
-                    let (block, number) = frames.block(index);
-                    PackedFrame {
-                        place,
-                        block: block.clone(),
-                        number,
-                    }
-                }));
-                self.row_ends.push(self.frames.len());
-            }
-        }
-    }
-
-    fn write(&self, batch: &mut Batch) {
         let mut places = batch.states_mut();
-        let (layout, mut start) = (self.layout, 0);
         let mut unpacked = Unpacked {
             layout,
             parts: Vec::new(),
             bytes: Vec::new(),
         };
-        for &end in &self.row_ends {
+        // Each part once a row: rows seldom share them.
+        for row in packed.chunk_by(|one, next| one.row == next.row) {
             unpacked.parts.clear();
-            for frame in &self.frames[start..end] {
+            for frame in row {
                 let part = layout.part_of(frame.number);
                 let first = layout.frames_of(part, frame.block.frames).start;
                 let at = unpacked.part(&frame.block, part);
@@ -104,8 +92,8 @@ impl PackedFrames {
                 let bytes = &unpacked.bytes[at..at + layout.frame_bytes];
                 places.frame(frame.place).copy_from_slice(bytes);
             }
-            start = end;
         }
+        batch
     }
 }
 
