@@ -72,4 +72,3 @@ pub use sampling::{
     },
 };
 pub use service::{RunArgs, run, shared_memory_bytes};
-pub use storage::frame_store::{PackedChunk, Packer};

@@ -1,7 +1,7 @@
 //! A replay server that has a long log to read back: all processes learn the progress, wait, and continue; nothing is lost or doubled.
 //! The log is real, and its server gets little of the processor, as on a slow machine: nothing in the program waits for these tests.
 
-use std::{borrow::Cow, fs, path::Path, time::Duration};
+use std::{fs, path::Path, time::Duration};
 
 use driml_protocol::{
     ActorJoin, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Keys, ReplayStatus, RequestId,
@@ -67,8 +67,7 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
         (header.sequence, header.first_transition) = (sequence, sequence);
         let mut chunk = Chunk::zeroed(header);
         chunk.set(0, 0, 0.0, End::Running);
-        let packed = replay.packer().pack(Cow::Owned(chunk));
-        let reply = replay.insert_packed(&packed);
+        let reply = replay.insert(&chunk);
         assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
     }
     spec

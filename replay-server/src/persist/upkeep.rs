@@ -146,9 +146,10 @@ impl Replay {
             ..ChunkHeader::default()
         });
         let packed = self.packer().pack(Cow::Owned(chunk));
-        for run in (0..count).flat_map(|_| packed.runs()) {
+        for _ in 0..count {
             let step = Step::new(0, 0.0, End::Running, 0);
-            self.ring.push_run(run, [step].into_iter(), Link::Lost);
+            self.ring
+                .push_run(packed.run(0), [step].into_iter(), Link::Lost);
         }
     }
 

@@ -48,20 +48,20 @@ impl Replay {
     }
 
     /// Compresses chunks for this replay; it can do so while the replay is in use elsewhere.
-    pub fn packer(&self) -> Packer {
+    pub(crate) fn packer(&self) -> Packer {
         Packer {
             compression: self.config.compression,
             seal_for: self.log.as_ref().map(Journal::spec_hash),
         }
     }
 
-    /// Stores a chunk: [`Replay::packer`] and [`Replay::insert_packed`] in one.
+    /// Stores a chunk, whole, or says why not.
     pub fn insert(&mut self, chunk: &Chunk) -> InsertReply {
         self.insert_packed(&self.packer().pack(Cow::Borrowed(chunk)))
     }
 
-    /// Stores a chunk that this replay's packer packed, whole, or says why not.
-    pub fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
+    /// [`Replay::insert`] of a chunk that this replay's packer packed.
+    pub(crate) fn insert_packed(&mut self, packed: &PackedChunk<'_>) -> InsertReply {
         self.settle(packed).unwrap_or_else(|| self.admit(packed))
     }
 
@@ -198,13 +198,14 @@ impl Replay {
         let steps = header.steps as usize;
         // In all shards, by their last reports.
         let frames = self.limiter.inserted_total();
-        for ((number, stream), run) in streams.iter_mut().enumerate().zip(packed.runs()) {
+        for (number, stream) in streams.iter_mut().enumerate() {
             let rows = number * steps..(number + 1) * steps;
             let step = |row| {
                 let (action, reward) = (chunk.actions()[row], chunk.reward(row));
                 Step::new(action, reward, chunk.end(row), header.weights_version)
             };
             let (link, first) = (stream.link, self.ring.inserted());
+            let run = packed.run(number);
             stream.link = self.ring.push_run(run, rows.clone().map(step), link);
             self.sampler.rows.stored(&self.ring, first, link);
             for step in rows.map(step) {

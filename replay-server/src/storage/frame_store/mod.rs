@@ -8,8 +8,7 @@ mod pack;
 use crate::config::Compression;
 use compressed::CompressedFrames;
 pub(crate) use layout::Layout;
-pub(crate) use pack::{Block, Run};
-pub use pack::{PackedChunk, Packer};
+pub(crate) use pack::{Block, PackedChunk, Packer, Run};
 
 pub(crate) enum Frames {
     Plain(PlainFrames),

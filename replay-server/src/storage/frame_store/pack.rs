@@ -11,14 +11,14 @@ use crate::config::Compression;
 
 /// Prepares chunks for one replay.
 #[derive(Clone, Copy, Debug)]
-pub struct Packer {
+pub(crate) struct Packer {
     pub(crate) compression: Compression,
     /// Hash of the run spec where chunks are also kept on disk, as messages.
     pub(crate) seal_for: Option<u64>,
 }
 
 /// A chunk with its frames as the replay will keep them.
-pub struct PackedChunk<'a> {
+pub(crate) struct PackedChunk<'a> {
     pub(crate) chunk: Cow<'a, Chunk>,
     /// With compression: of each stream.
     packed: Vec<Vec<Arc<Block>>>,
@@ -43,7 +43,7 @@ pub(crate) enum Run<'a> {
 
 impl Packer {
     /// Compresses the chunk's frames, or leaves them as they are.
-    pub fn pack<'a>(&self, chunk: Cow<'a, Chunk>) -> PackedChunk<'a> {
+    pub(crate) fn pack<'a>(&self, chunk: Cow<'a, Chunk>) -> PackedChunk<'a> {
         let packed = match self.compression {
             Compression::None => Vec::new(),
             Compression::Lz4 => runs(&chunk)
@@ -67,11 +67,15 @@ impl PackedChunk<'_> {
         self.chunk.header.payload_bytes().unwrap_or(usize::MAX) + packed.sum::<usize>()
     }
 
-    pub(crate) fn runs(&self) -> impl Iterator<Item = Run<'_>> {
-        let plain = self.packed.is_empty();
-        let plain = plain.then(|| runs(&self.chunk).map(Run::Plain));
-        let packed = self.packed.iter().map(|run| Run::Packed(run));
-        plain.into_iter().flatten().chain(packed)
+    /// The frames of one of its streams.
+    pub(crate) fn run(&self, stream: usize) -> Run<'_> {
+        match self.packed.get(stream) {
+            Some(blocks) => Run::Packed(blocks),
+            None => {
+                let run = runs(&self.chunk).nth(stream);
+                Run::Plain(run.expect("a chunk that is stored has all its streams"))
+            }
+        }
     }
 }
 
