@@ -55,30 +55,25 @@ impl Service {
         incoming: Incoming<J>,
         join: impl Fn(&mut State, J) -> Result<u32, JoinReply>,
     ) {
-        let Some(request) = self.read(&incoming) else {
-            return;
-        };
         let weights_version = self.weights().version();
-        let mut state = self.state();
-        let joined = join(&mut state, request);
-        if !state.replay.is_ready() {
-            return;
-        }
-        let inserted_total = state.replay.inserted_total();
-        let reply = joined.map(|earlier_incarnations| {
-            JoinReply::Welcome(Welcome {
-                inserted_total,
-                weights_version,
-                earlier_incarnations,
-            })
+        self.answer(incoming, |state, request| {
+            let reply = match join(state, request) {
+                Ok(earlier_incarnations) => JoinReply::Welcome(Welcome {
+                    inserted_total: state.replay.inserted_total(),
+                    weights_version,
+                    earlier_incarnations,
+                }),
+                Err(rejected) => rejected,
+            };
+            if !state.replay.is_ready() {
+                return None;
+            }
+            if let JoinReply::Refused { why } = &reply {
+                state.refuse("join", &format!("a process was not admitted: {why}"));
+            }
+            self.changed.notify_all();
+            Some(reply)
         });
-        if let Err(JoinReply::Refused { why }) = &reply {
-            state.refuse("join", &format!("a process was not admitted: {why}"));
-        }
-        drop(state);
-        self.changed.notify_all();
-        let reply = reply.unwrap_or_else(|rejected| rejected);
-        incoming.into_responder().reply(&reply);
     }
 }
 

@@ -88,6 +88,21 @@ impl Service {
             .ok()
     }
 
+    /// Answers a request without payload with what `answer` makes of it, once the lock is free again: nothing if it makes nothing.
+    pub(super) fn answer<R: Request>(
+        &self,
+        incoming: Incoming<R>,
+        answer: impl FnOnce(&mut State, R) -> Option<R::Reply>,
+    ) {
+        let Some(request) = self.read(&incoming) else {
+            return;
+        };
+        let reply = answer(&mut self.state(), request);
+        if let Some(reply) = reply {
+            incoming.into_responder().reply(&reply);
+        }
+    }
+
     /// Waits until something has changed, or for `due_in`, after which something that is parked is due.
     pub(super) fn wait(&self, mut state: MutexGuard<'_, State>, due_in: Option<Duration>) {
         state.note_waiting(Instant::now());

@@ -24,18 +24,13 @@ const SILENT_MAX: Duration = Duration::from_secs(10);
 
 impl Service {
     pub(super) fn leave(&self, incoming: Incoming<Leave>) {
-        if let Some(leave) = self.read(&incoming) {
-            let mut state = self.state();
+        self.answer(incoming, |state, leave| {
             if let Some(why) = state.replay.leave(&leave) {
                 state.say("leave", &format!("a `Leave` was refused: {why}"));
             }
-            let is_ready = state.replay.is_ready();
-            drop(state);
             // Also if it was refused: the actor ends.
-            if is_ready {
-                incoming.into_responder().reply(&Ack);
-            }
-        }
+            state.replay.is_ready().then_some(Ack)
+        });
     }
 
     pub(super) fn affinity(&self, incoming: Incoming<AffinityUpdate>) {
@@ -67,31 +62,26 @@ impl Service {
         what: &str,
         take: impl FnOnce(&mut State, R) -> Result<(), String>,
     ) {
-        let Some(update) = self.read(&incoming) else {
-            return;
-        };
-        let mut state = self.state();
-        if let Err(why) = take(&mut state, update) {
-            return state.refuse(what, &format!("{what} refused: {why}"));
-        }
-        drop(state);
-        incoming.into_responder().reply(&Ack);
+        self.answer(incoming, |state, update| {
+            let taken = take(state, update);
+            if let Err(why) = &taken {
+                state.refuse(what, &format!("{what} refused: {why}"));
+            }
+            taken.ok().map(|()| Ack)
+        });
     }
 
     pub(super) fn report(&self, incoming: Incoming<Report>) {
-        let Some(report) = self.read(&incoming) else {
-            return;
-        };
-        let mut state = self.state();
-        let finished = report.finished;
-        // Otherwise its process has been replaced, or is about to join.
-        if state.participants.reported(report, Instant::now()) {
-            state.replay.note_updates(finished.unwrap_or(0));
-        } else {
-            tracing::debug!("a report of a process that has not joined");
-        }
-        drop(state);
-        incoming.into_responder().reply(&Ack);
+        self.answer(incoming, |state, report| {
+            let finished = report.finished;
+            // Otherwise its process has been replaced, or is about to join.
+            if state.participants.reported(report, Instant::now()) {
+                state.replay.note_updates(finished.unwrap_or(0));
+            } else {
+                tracing::debug!("a report of a process that has not joined");
+            }
+            Some(Ack)
+        });
     }
 
     pub(super) fn processes(&self, incoming: Incoming<ProcessesStatus>) {
@@ -174,10 +164,9 @@ impl Service {
     }
 
     pub(super) fn episodes(&self, incoming: Incoming<EpisodesRequest>) {
-        if let Some(request) = self.read(&incoming) {
-            let reply = self.state().replay.episodes(request);
-            incoming.into_responder().reply(&reply);
-        }
+        self.answer(incoming, |state, request| {
+            Some(state.replay.episodes(request))
+        });
     }
 
     pub(super) fn status(&self, incoming: Incoming<ReplayStatus>) {
