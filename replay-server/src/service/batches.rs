@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use driml_protocol::{
-    Alive, BatchReply, BatchRequest, Buffer, Incoming, NotReady, Responder, fail_point,
+    Alive, BatchReply, BatchRequest, BufferPool, Incoming, NotReady, Responder, fail_point,
 };
 
 use super::{
@@ -25,8 +25,7 @@ impl Service {
             return responder.reply(&BatchReply::NotReady(NotReady::Refused { why }));
         };
         let mut state = self.state();
-        let learner_status = self.note_learner(&mut state, &request);
-        if let Err(why) = learner_status {
+        if let Err(why) = self.note_learner(&mut state, &request) {
             let line = format!("a request for a batch was refused: {why}");
             state.refuse("batch", &line);
             drop(state);
@@ -73,10 +72,7 @@ impl Service {
             fail_point::reach("sample");
             let mut state = self.state();
             let now = Instant::now();
-            let Some((parked, drawn)) = state.next_answer(now, |bytes, shared| match shared {
-                true => self.pool.take(bytes),
-                false => self.pool.take_own(bytes),
-            }) else {
+            let Some((parked, drawn)) = state.next_answer(now, &self.pool) else {
                 let due_in = state.requests.iter().map(|it| it.left(now)).min();
                 self.wait(state, due_in);
                 continue;
@@ -88,8 +84,8 @@ impl Service {
             match drawn.map(PackedBatch::unpack) {
                 Ok(batch) => {
                     let (header, payload) = batch.into_payload();
-                    let (reply, payload) = (BatchReply::Batch(header), payload.freeze());
-                    parked.question.reply_with(&reply, payload);
+                    let reply = BatchReply::Batch(header);
+                    parked.question.reply_with(&reply, payload.freeze());
                 }
                 Err(not_ready) => parked.question.reply(&BatchReply::NotReady(not_ready)),
             }
@@ -98,11 +94,11 @@ impl Service {
 }
 
 impl State {
-    /// The first parked request that can be answered now, with its answer; `memory` gives so many bytes, which may be shared.
+    /// The first parked request that can be answered now, with its answer in memory of `pool`.
     fn next_answer(
         &mut self,
         now: Instant,
-        memory: impl Fn(usize, bool) -> Buffer,
+        pool: &BufferPool,
     ) -> Option<(Parked, Result<PackedBatch, NotReady>)> {
         for at in 0..self.requests.len() {
             let parked = &self.requests[at];
@@ -112,7 +108,10 @@ impl State {
                 shared_memory,
                 ..
             } = parked.request;
-            let memory = |bytes| memory(bytes, shared_memory);
+            let memory = |bytes| match shared_memory {
+                true => pool.take(bytes),
+                false => pool.take_own(bytes),
+            };
             let drawn = self.replay.draw_for(id, rows, memory);
             if !matches!(drawn, Err(NotReady::Wait(_))) || parked.left(now).is_zero() {
                 let parked = self.requests.remove(at);
