@@ -4,7 +4,6 @@
 use std::{ops::Range, sync::Arc};
 
 use driml_protocol::{Batch, BatchStatesMut};
-use lz4_flex::block::{decompress_into, decompress_into_with_dict};
 
 use crate::storage::{
     frame_store::{Block, Frames, Layout},
@@ -127,17 +126,8 @@ impl<'a> Unpacked<'a> {
             self.bytes.resize(place.end, 0);
         }
         let (before, rest) = self.bytes.split_at_mut(start);
-        let (stored, to) = (block.part(number), &mut rest[..length]);
-        if stored.len() == length {
-            to.copy_from_slice(stored);
-        } else {
-            let unpacked = match key {
-                None => decompress_into(stored, to),
-                Some(key) => decompress_into_with_dict(stored, to, &before[key..][..frame_bytes]),
-            };
-            let unpacked = unpacked.expect("we packed this part");
-            assert_eq!(unpacked, length, "a part has all its frames");
-        }
+        let key = key.map_or(0..0, |at| at..at + frame_bytes);
+        block.unpack(number, &before[key], &mut rest[..length]);
         self.parts.push(Part {
             block,
             number,

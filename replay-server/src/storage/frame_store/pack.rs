@@ -1,10 +1,13 @@
-//! Compresses a chunk before it is stored, so that the replay is not locked meanwhile.
+//! Compresses a chunk before it is stored, and unpacks frames after they are drawn, so that the replay is not locked meanwhile.
 //! It stores nothing and does not judge the chunk.
 
 use std::{borrow::Cow, sync::Arc};
 
 use driml_protocol::{Chunk, codec};
-use lz4_flex::block::{compress_into, compress_into_with_dict, get_maximum_output_size};
+use lz4_flex::block::{
+    compress_into, compress_into_with_dict, decompress_into, decompress_into_with_dict,
+    get_maximum_output_size,
+};
 
 use super::layout::{Layout, PartEnds};
 use crate::config::Compression;
@@ -122,8 +125,18 @@ impl Block {
         }
     }
 
-    pub(crate) fn part(&self, part: usize) -> &[u8] {
+    /// Unpacks a part into `to`, which has room for its frames alone. `key` is the block's first frame; for that itself it is not read.
+    pub(crate) fn unpack(&self, part: usize, key: &[u8], to: &mut [u8]) {
         let end = |part: usize| self.part_ends[part] as usize;
-        &self.bytes[part.checked_sub(1).map_or(0, end)..end(part)]
+        let stored = &self.bytes[part.checked_sub(1).map_or(0, end)..end(part)];
+        if stored.len() == to.len() {
+            return to.copy_from_slice(stored);
+        }
+        let unpacked = match part {
+            0 => decompress_into(stored, to),
+            _ => decompress_into_with_dict(stored, to, key),
+        };
+        let unpacked = unpacked.expect("we packed this part");
+        assert_eq!(unpacked, to.len(), "a part has all its frames");
     }
 }
