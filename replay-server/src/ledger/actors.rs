@@ -50,6 +50,11 @@ impl Actor {
     fn is_past(&self, incarnation: u64) -> bool {
         self.past.iter().any(|it| it.incarnation == incarnation)
     }
+
+    /// Whether a chunk continues its streams, or begins them.
+    fn fits(&self, header: &ChunkHeader) -> bool {
+        self.streams.is_empty() || self.streams.len() == header.streams as usize
+    }
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -158,7 +163,7 @@ impl Actors {
         if header.sequence > expected {
             return Ok(Verdict::OutOfOrder { expected });
         }
-        if header.sequence > 0 && streams as usize != actor.streams.len() {
+        if header.sequence > 0 && !actor.fits(header) {
             return Err(format!(
                 "actor {number} sends {streams} streams after {}; their number must not change before it starts anew",
                 actor.streams.len()
@@ -169,11 +174,12 @@ impl Actors {
 
     /// Checks that a chunk can be counted: it is of a life that counts, and has its streams. If not, the error says why.
     pub(crate) fn check_known(&self, header: &ChunkHeader) -> Result<(), String> {
-        let streams = self.living(header.actor, header.incarnation)?.streams.len();
-        if header.sequence == 0 || streams == 0 || streams == header.streams as usize {
+        let actor = self.living(header.actor, header.incarnation)?;
+        if header.sequence == 0 || actor.fits(header) {
             return Ok(());
         }
-        Err(format!("{} streams after {streams}", header.streams))
+        let (streams, before) = (header.streams, actor.streams.len());
+        Err(format!("{streams} streams after {before}"))
     }
 
     /// Whether a chunk that was judged out of order is to be stored all the same: those before it were stored by an earlier life of
@@ -181,13 +187,12 @@ impl Actors {
     ///
     /// An actor that sends the same one again, although it was told what is expected, has nothing older.
     pub(crate) fn insists(&mut self, header: &ChunkHeader) -> bool {
-        let restored = self.restored;
-        let Some(actor) = self.actors.get_mut(&header.actor).filter(|_| restored) else {
-            return false;
-        };
-        let streams = actor.streams.len();
-        let fits = streams == 0 || streams == header.streams as usize;
-        fits && actor.insisted.replace(header.sequence) == Some(header.sequence)
+        let actor = self.actors.get_mut(&header.actor);
+        actor.is_some_and(|actor| {
+            self.restored
+                && actor.fits(header)
+                && actor.insisted.replace(header.sequence) == Some(header.sequence)
+        })
     }
 
     /// Transitions from `first_lost` on are gone: streams that end among them hang together with nothing any more.
