@@ -27,26 +27,26 @@ impl Service {
         let WeightsUpload { learner, weights } = upload;
         let allowed = self.state().check_learner(learner);
         match allowed.and_then(|()| self.weights().put(weights, &safetensors)) {
-            Ok(is_new) => {
-                if is_new {
-                    let keeper = self.weights().keeper();
-                    if let Some(keep) = keeper {
-                        keep();
-                    }
-                    let now = Instant::now();
-                    self.state().timings.weights_came(&weights, now);
-                    let version = weights.version;
-                    if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
-                        tracing::warn!("weights {version} were not announced: {why}");
-                    }
+            Ok(true) => {
+                let keeper = self.weights().keeper();
+                if let Some(keep) = keeper {
+                    keep();
                 }
-                incoming.into_responder().reply(&Ack);
+                let now = Instant::now();
+                self.state().timings.weights_came(&weights, now);
+                let version = weights.version;
+                if let Err(why) = self.announcements.put(&WeightsVersion { version }) {
+                    tracing::warn!("weights {version} were not announced: {why}");
+                }
             }
+            // They came again.
+            Ok(false) => {}
             Err(why) => {
                 let line = format!("weights were refused: {why}");
-                self.state().refuse("weights", &line);
+                return self.state().refuse("weights", &line);
             }
         }
+        incoming.into_responder().reply(&Ack);
     }
 
     pub(super) fn give_weights(&self, incoming: Incoming<WeightsRequest>) {
