@@ -9,7 +9,6 @@ use crate::{
     client::RunClient,
     messages::{
         join::{JoinReply, Welcome},
-        recovering::Recovering,
         run_info::RunInfo,
     },
     process::{log_limiter::LogLimiter, shutdown::Shutdown, silence::Silence},
@@ -55,7 +54,7 @@ pub fn run_info(
     keys: &Keys,
     shutdown: &Shutdown,
 ) -> Result<Option<RunInfo>, JoinError> {
-    let mut patience = Patience::begin();
+    let mut patience = Patience::default();
     loop {
         match run_info_within(session, keys, TRY_MAX) {
             Ok(run_info) => return Ok(Some(run_info)),
@@ -80,6 +79,7 @@ pub fn run_info_within(
 }
 
 /// How long a joining process waits for its replay server, and what it logs meanwhile.
+#[derive(Default)]
 struct Patience {
     silence: Silence,
     silence_said: LogLimiter,
@@ -87,39 +87,19 @@ struct Patience {
 }
 
 impl Patience {
-    fn begin() -> Self {
-        Self {
-            silence: Silence::default(),
-            silence_said: LogLimiter::default(),
-            recovery_said: LogLimiter::default(),
-        }
-    }
-
     /// Takes note that a try failed; says now and then what is waited for.
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
-        match e {
-            SessionError::Recovering(recovering) => {
-                self.silence.answered();
-                self.say_recovering(&recovering);
+        if let SessionError::Recovering(recovering) = e {
+            self.silence.answered();
+            if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
+                tracing::info!("waiting for as long as it takes: {recovering}");
             }
-            last => {
-                if self.silence.unanswered() > SERVER_MAX {
-                    return Err(JoinError::NoReplayServer { last });
-                }
-                self.say_silent(&last);
-            }
+            return Ok(());
         }
-        Ok(())
-    }
-
-    fn say_recovering(&mut self, recovering: &Recovering) {
-        if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
-            tracing::info!("waiting for as long as it takes: {recovering}");
+        let since = self.silence.unanswered();
+        if since > SERVER_MAX {
+            return Err(JoinError::NoReplayServer { last: e });
         }
-    }
-
-    fn say_silent(&mut self, e: &SessionError) {
-        let since = self.silence.length();
         if since > SILENT_MAX && self.silence_said.due().is_some() {
             let (since, max) = (since.as_secs(), SERVER_MAX.as_secs());
             // A router may listen there, to which the replay server has yet to connect.
@@ -133,6 +113,7 @@ impl Patience {
                 "waiting for the replay server since {since} s, for {max} s at most: {why}"
             );
         }
+        Ok(())
     }
 }
 
@@ -145,7 +126,7 @@ pub fn take_part(
     join: &impl Request<Reply = JoinReply>,
     shutdown: &Shutdown,
 ) -> Result<Option<Welcome>, JoinError> {
-    let mut patience = Patience::begin();
+    let mut patience = Patience::default();
     let mut taken_since = None;
     loop {
         match client.ask(join, TRY_MAX) {
