@@ -31,19 +31,15 @@ impl Requests {
         if known.is_some_and(|at| self.last[at].id == id && self.last[at].given.is_none()) {
             return Some(Vec::new());
         }
-        let known = known.and_then(|at| self.last.remove(at));
-        let mut request = known.unwrap_or(Request {
-            id: RequestId::first(id.client_id),
-            given: None,
-        });
         let order = |id: RequestId| (id.number, id.attempt);
-        let is_first = request.given.is_none() && id == request.id;
-        let lost = (is_first || order(id) > order(request.id)).then(|| {
-            let given = request.given.take();
-            let given = given.filter(|_| request.id.number == id.number);
-            request.id = id;
-            given.unwrap_or_default()
-        });
+        let (request, lost) = match known.and_then(|at| self.last.remove(at)) {
+            Some(known) if order(id) <= order(known.id) => (known, None),
+            known => {
+                let repeated = known.filter(|it| it.id.number == id.number);
+                let lost = repeated.and_then(|it| it.given).unwrap_or_default();
+                (Request { id, given: None }, Some(lost))
+            }
+        };
         if self.last.len() == CLIENTS_MAX {
             self.last.pop_front();
         }
