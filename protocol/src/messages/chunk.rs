@@ -67,6 +67,17 @@ pub struct ChunkHeader {
 }
 
 impl ChunkHeader {
+    /// Transitions in the chunk.
+    pub const fn transitions(&self) -> usize {
+        self.streams as usize * self.steps as usize
+    }
+
+    /// Bytes of the payload of such a chunk; none if they are more than the address space.
+    pub fn payload_bytes(&self) -> Option<usize> {
+        self.transitions()
+            .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
+    }
+
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         if self.payload_bytes() == Some(payload.len()) && self.transitions() > 0 {
             return Ok(());
@@ -91,19 +102,6 @@ pub fn transitions_max(envs: u32, steps_per_chunk: u32, round_transitions_max: O
     let whole = envs.saturating_mul(steps_per_chunk.into());
     let longest = round_transitions_max.map_or(whole, |round| whole.min(round.max(envs)));
     longest.max(TRANSITIONS_LEAST)
-}
-
-impl ChunkHeader {
-    /// Transitions in the chunk.
-    pub const fn transitions(&self) -> usize {
-        self.streams as usize * self.steps as usize
-    }
-
-    /// Bytes of the payload of such a chunk; none if they are more than the address space.
-    pub fn payload_bytes(&self) -> Option<usize> {
-        self.transitions()
-            .checked_mul(self.frame_bytes as usize + TRANSITION_BYTES)
-    }
 }
 
 /// Consecutive steps of several streams: row `stream * steps + step` is (s_t, a_t, r_t, what a_t ended).

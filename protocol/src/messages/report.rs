@@ -79,17 +79,7 @@ impl Report {
             finished: None,
         }
     }
-}
 
-fn cut(text: &str, bytes_max: usize) -> String {
-    let mut end = text.len().min(bytes_max);
-    while !text.is_char_boundary(end) {
-        end -= 1;
-    }
-    text[..end].to_owned()
-}
-
-impl Report {
     pub(super) fn checked(&self, payload: &[u8]) -> Result<(), CodecError> {
         let warning = self.last_warning.as_ref();
         let too_long = self.doing.len() > DOING_MAX
@@ -114,6 +104,14 @@ impl Report {
             Participant::Learner(_) => None,
         }
     }
+}
+
+fn cut(text: &str, bytes_max: usize) -> String {
+    let mut end = text.len().min(bytes_max);
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    text[..end].to_owned()
 }
 
 #[cfg(test)]

@@ -85,13 +85,12 @@ impl Keys {
     /// Whose liveliness token has this key; none for a token of another run.
     pub fn alive(&self, key: &str) -> Option<Alive> {
         let rest = key.strip_prefix(&self.namespace)?.strip_prefix("/alive/")?;
-        let hex = |text| u64::from_str_radix(text, 16).ok();
         let (process, mark) = match rest.split('/').collect::<Vec<_>>()[..] {
             ["actor", actor, mark] => (ProcessName::Actor(actor.parse().ok()?), mark),
             ["learner", mark] => (ProcessName::Learner, mark),
             _ => return None,
         };
-        let mark = hex(mark)?;
+        let mark = u64::from_str_radix(mark, 16).ok()?;
         Some(Alive { process, mark })
     }
 }
