@@ -69,6 +69,7 @@ pub use process::{
     activity::Activity,
     atomic_write, fail_point, last_warning, lock_file,
     log_limiter::{LogLimiter, LogLimiters},
+    mutex::lock,
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
 };

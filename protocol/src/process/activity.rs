@@ -2,9 +2,11 @@
 //! The process reports it; nothing is observed here.
 
 use std::{
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
+
+use super::mutex::lock;
 
 /// What a process is doing now. Clones are the same.
 #[derive(Clone, Debug)]
@@ -16,13 +18,9 @@ impl Activity {
         Self(Arc::new(Mutex::new((doing.to_owned(), Instant::now()))))
     }
 
-    fn now(&self) -> MutexGuard<'_, (String, Instant)> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Sets what it does from now on; the same activity keeps its start time.
     pub fn begin(&self, doing: &str) {
-        let mut now = self.now();
+        let mut now = lock(&self.0);
         if now.0 != doing {
             *now = (doing.to_owned(), Instant::now());
         }
@@ -30,7 +28,7 @@ impl Activity {
 
     /// What it does, and for how long.
     pub fn get(&self) -> (String, Duration) {
-        let now = self.now();
+        let now = lock(&self.0);
         (now.0.clone(), now.1.elapsed())
     }
 }

@@ -2,19 +2,21 @@
 //! The logger stores it here; where else a log line goes is not known here.
 
 use std::{
-    sync::{Mutex, PoisonError},
+    sync::Mutex,
     time::{Duration, Instant},
 };
+
+use super::mutex::lock;
 
 static LAST: Mutex<Option<(String, Instant)>> = Mutex::new(None);
 
 /// Keeps a warning in the place of the one before.
 pub fn note(text: String) {
-    *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some((text, Instant::now()));
+    *lock(&LAST) = Some((text, Instant::now()));
 }
 
 /// The last one and its age; none if there was none.
 pub fn get() -> Option<(String, Duration)> {
-    let last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    let last = lock(&LAST);
     last.as_ref().map(|(text, at)| (text.clone(), at.elapsed()))
 }

@@ -7,6 +7,7 @@ pub mod fail_point;
 pub mod last_warning;
 pub mod lock_file;
 pub(crate) mod log_limiter;
+pub(crate) mod mutex;
 pub(crate) mod shutdown;
 pub(crate) mod silence;
 pub(crate) mod termination;

@@ -10,6 +10,7 @@ use std::{
 
 use super::{
     fail_point,
+    mutex::lock,
     termination::{self, EndSign},
 };
 
@@ -27,19 +28,19 @@ pub struct Shutdown {
 impl Shutdown {
     /// Raises the flag.
     pub fn set(&self) {
-        *self.flag() = true;
+        *lock(&self.state.0) = true;
         self.state.1.notify_all();
     }
 
     /// Whether the flag is raised.
     pub fn is_set(&self) -> bool {
-        *self.flag()
+        *lock(&self.state.0)
     }
 
     /// Sleeps for `timeout`, or until the flag is raised; returns whether it is.
     pub fn wait_timeout(&self, timeout: Duration) -> bool {
-        let (_, raised) = &*self.state;
-        let waited = raised.wait_timeout_while(self.flag(), timeout, |set| !*set);
+        let (flag, raised) = &*self.state;
+        let waited = raised.wait_timeout_while(lock(flag), timeout, |set| !*set);
         let (flag, _) = waited.expect("no thread panics while holding the flag");
         *flag
     }
@@ -47,11 +48,6 @@ impl Shutdown {
     /// Sleeps until the flag is raised.
     pub fn wait(&self) {
         while !self.wait_timeout(Duration::from_secs(3600)) {}
-    }
-
-    fn flag(&self) -> std::sync::MutexGuard<'_, bool> {
-        let flag = self.state.0.lock();
-        flag.expect("no thread panics while holding the flag")
     }
 
     /// The result of `work`, run on a thread of this `name`; `None` if the flag is raised first. The thread is then left alone.

@@ -7,7 +7,7 @@
 use std::{
     fmt,
     ops::{Deref, DerefMut},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex},
 };
 
 use zenoh::{
@@ -20,6 +20,7 @@ use zenoh::{
 };
 
 use super::shared_memory::{self, METADATA_BYTES, Trust};
+use crate::process::mutex::lock;
 
 /// Memory for the payload of a message. Clones have memory of their own.
 pub struct Buffer(Memory);
@@ -34,12 +35,6 @@ struct Pool {
     spare: Mutex<Vec<Vec<u8>>>,
     spare_max: usize,
     shared: Option<Shared>,
-}
-
-impl Pool {
-    fn spare(&self) -> MutexGuard<'_, Vec<Vec<u8>>> {
-        self.spare.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 struct Shared {
@@ -79,7 +74,7 @@ impl BufferPool {
 
     /// `bytes` bytes of this process's own memory, with whatever was in them before.
     pub fn take_own(&self, bytes: usize) -> Buffer {
-        let mut vec = self.0.spare().pop().unwrap_or_default();
+        let mut vec = lock(&self.0.spare).pop().unwrap_or_default();
         vec.resize(bytes, 0);
         Buffer(Memory::Own(vec, Some(self.0.clone())))
     }
@@ -96,26 +91,22 @@ impl BufferPool {
     /// Tells that a message in shared memory did not arrive: the next ones are made of own memory.
     pub fn avoid_shared_memory(&self) {
         if let Some(shared) = &self.0.shared {
-            shared.trust().lost();
+            lock(&shared.trust).lost();
         }
     }
 
     /// Tells that a message in shared memory has arrived.
     pub fn shared_memory_works(&self) {
         if let Some(shared) = &self.0.shared {
-            shared.trust().worked();
+            lock(&shared.trust).worked();
         }
     }
 }
 
 impl Shared {
-    fn trust(&self) -> MutexGuard<'_, Trust> {
-        self.trust.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Never waits: a receiver that died may keep its pieces for a while.
     fn take(&self, bytes: usize) -> Option<ZShmMut> {
-        if !self.trust().ask() {
+        if !lock(&self.trust).ask() {
             return None;
         }
         let piece = self.provider.alloc(bytes);
@@ -173,7 +164,7 @@ impl From<Vec<u8>> for Buffer {
 impl Drop for Buffer {
     fn drop(&mut self) {
         if let Memory::Own(bytes, Some(pool)) = &mut self.0 {
-            let mut spare = pool.spare();
+            let mut spare = lock(&pool.spare);
             if spare.len() < pool.spare_max {
                 spare.push(std::mem::take(bytes));
             }

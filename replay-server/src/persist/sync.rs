@@ -5,12 +5,12 @@ use std::{
     collections::{BTreeMap, BTreeSet},
     fs::File,
     io,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use driml_protocol::{LogLimiter, Shutdown, fail_point};
+use driml_protocol::{LogLimiter, Shutdown, fail_point, lock};
 
 /// Segments that wait to be flushed; with one more they are flushed before anything else is written.
 const WAITING_MAX: usize = 32;
@@ -32,15 +32,10 @@ struct Shared {
 }
 
 impl Shared {
-    fn unflushed(&self) -> MutexGuard<'_, Unflushed> {
-        let locked = self.unflushed.lock();
-        locked.unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn flush(&self) -> io::Result<()> {
-        let _one = self.flushing.lock().unwrap_or_else(PoisonError::into_inner);
+        let _one = lock(&self.flushing);
         let begun = Instant::now();
-        let mut unflushed = self.unflushed();
+        let mut unflushed = lock(&self.unflushed);
         let segments = std::mem::take(&mut unflushed.segments);
         let folder = unflushed.folder.take();
         drop(unflushed);
@@ -49,7 +44,7 @@ impl Shared {
             .iter()
             .try_for_each(|(&number, file)| file.sync_data().inspect_err(|_| lost = Some(number)))
             .and_then(|()| folder.as_ref().map_or(Ok(()), |folder| folder.sync_all()));
-        let mut unflushed = self.unflushed();
+        let mut unflushed = lock(&self.unflushed);
         if flushed.is_err() {
             // Due the next time again.
             unflushed.segments.extend(segments);
@@ -98,7 +93,7 @@ impl Syncer {
     }
 
     pub(super) fn opened(&self, number: u64, file: Arc<File>) {
-        let mut unflushed = self.shared.unflushed();
+        let mut unflushed = lock(&self.shared.unflushed);
         unflushed.segments.insert(number, file);
         unflushed.folder = Some(self.folder.clone());
         let too_many = unflushed.segments.len() > WAITING_MAX;
@@ -110,7 +105,7 @@ impl Syncer {
 
     /// Seconds since a flush began that succeeded; 0 where each write is flushed and all were.
     pub(super) fn flushed_s(&self) -> f64 {
-        let unflushed = self.shared.unflushed();
+        let unflushed = lock(&self.shared.unflushed);
         match self.thread.is_none() && unflushed.segments.is_empty() {
             true => 0.0,
             false => unflushed.flushed.elapsed().as_secs_f64(),
@@ -119,19 +114,19 @@ impl Syncer {
 
     /// Segment `number` is gone, and need not be flushed.
     pub(super) fn removed(&self, number: u64) {
-        let mut unflushed = self.shared.unflushed();
+        let mut unflushed = lock(&self.shared.unflushed);
         unflushed.segments.remove(&number);
         unflushed.lost.remove(&number);
     }
 
     /// Whether a flush of segment `number` failed. Where each write is flushed, one that fails is written again.
     pub(super) fn has_lost(&self, number: u64) -> bool {
-        self.thread.is_some() && self.shared.unflushed().lost.contains(&number)
+        self.thread.is_some() && lock(&self.shared.unflushed).lost.contains(&number)
     }
 
     /// Something was written to segment `number`; where each write is flushed, the disk may refuse.
     pub(super) fn written(&self, number: u64, file: &Arc<File>) -> io::Result<()> {
-        let mut unflushed = self.shared.unflushed();
+        let mut unflushed = lock(&self.shared.unflushed);
         let segments = &mut unflushed.segments;
         segments.entry(number).or_insert_with(|| file.clone());
         drop(unflushed);

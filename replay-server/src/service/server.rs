@@ -9,7 +9,7 @@ use std::{
 
 use driml_protocol::{
     Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiters, Recovering,
-    Request, Responder, Shutdown, WeightsVersion,
+    Request, Responder, Shutdown, WeightsVersion, lock,
 };
 
 use super::{
@@ -63,7 +63,7 @@ pub(super) struct Question {
 
 impl Service {
     pub(super) fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Counts and logs a message that cannot be read.

@@ -1,13 +1,10 @@
 //! Weights on their way: taken from the learner once a version, announced, and given to actors in pieces.
 
-use std::{
-    sync::{MutexGuard, PoisonError},
-    time::Instant,
-};
+use std::{sync::MutexGuard, time::Instant};
 
 use driml_protocol::{
     Ack, BufferPool, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
-    WeightsVersion,
+    WeightsVersion, lock,
 };
 use zenoh::bytes::ZBytes;
 
@@ -15,7 +12,7 @@ use super::{server::Service, weights_store::WeightsStore};
 
 impl Service {
     pub(super) fn weights(&self) -> MutexGuard<'_, WeightsStore> {
-        self.weights.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.weights)
     }
 
     pub(super) fn take_weights(&self, incoming: Incoming<WeightsUpload>) {
