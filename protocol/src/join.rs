@@ -58,7 +58,6 @@ pub fn run_info(
     loop {
         match run_info_within(session, keys, TRY_MAX) {
             Ok(run_info) => return Ok(Some(run_info)),
-            Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(e) => patience.wait_after(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
@@ -87,15 +86,19 @@ struct Patience {
 }
 
 impl Patience {
-    /// Takes note that a try failed; says now and then what is waited for.
+    /// Takes note that a try failed, and says now and then what is waited for; an error if another try is of no use.
     fn wait_after(&mut self, e: SessionError) -> Result<(), JoinError> {
-        if let SessionError::Recovering(recovering) = e {
-            self.silence.answered();
-            if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
-                tracing::info!("waiting for as long as it takes: {recovering}");
+        let e = match e {
+            SessionError::Unreadable { why, .. } => return Err(why.into()),
+            SessionError::Recovering(recovering) => {
+                self.silence.answered();
+                if recovering.progress.is_slow() && self.recovery_said.due().is_some() {
+                    tracing::info!("waiting for as long as it takes: {recovering}");
+                }
+                return Ok(());
             }
-            return Ok(());
-        }
+            e => e,
+        };
         let since = self.silence.unanswered();
         if since > SERVER_MAX {
             return Err(JoinError::NoReplayServer { last: e });
@@ -148,7 +151,6 @@ pub fn take_part(
                     taken_since = Some(Instant::now());
                 }
             },
-            Err(SessionError::Unreadable { why, .. }) => return Err(why.into()),
             Err(e) => patience.wait_after(e)?,
         }
         if shutdown.wait_timeout(PAUSE) {
