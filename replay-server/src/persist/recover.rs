@@ -184,13 +184,12 @@ impl Reader<'_> {
     ) -> Result<(), PersistError> {
         let path = self.folder.segment(number);
         let name = file_name(&path);
-        let first = record::first(bytes);
-        if first.as_ref().err() == Some(&Broken::Torn) && is_last {
+        let first = match record::first(bytes) {
             // The server ended while it began this one; nothing is in it.
-            return self.folder.remove(number);
-        }
-        let begins = first.ok().filter(|it| it.kind == RecordKind::Segment);
-        let header = begins.and_then(|first| {
+            Err(Broken::Torn) if is_last => return self.folder.remove(number),
+            first => first.ok().filter(|it| it.kind == RecordKind::Segment),
+        };
+        let header = first.and_then(|first| {
             let header = codec::decode_value::<SegmentHeader>(first.body);
             header.ok().map(|it| (it, first.ordinal, first.bytes()))
         });
