@@ -101,9 +101,7 @@ pub fn decode<M: Message>(bytes: &[u8], spec_hash: Option<u64>) -> Result<(M, &[
     let mut sum = prefix.checksum_begun();
     sum.update(header);
     sum.update(payload);
-    prefix.check(sum, M::KIND, spec_hash)?;
-    let message: M = decode_within::<_, HEADER_BYTES_MAX>(header)?;
-    message.validate(payload)?;
+    let message = prefix.message(sum, header, payload, spec_hash)?;
     Ok((message, payload))
 }
 
@@ -124,9 +122,7 @@ pub fn receive<M: Message>(
     copy(&mut bytes, &mut header, &mut sum);
     let mut payload = pool.take_own(prefix.payload_len());
     copy(&mut bytes, &mut payload, &mut sum);
-    prefix.check(sum, M::KIND, spec_hash)?;
-    let message: M = decode_within::<_, HEADER_BYTES_MAX>(&header)?;
-    message.validate(&payload)?;
+    let message = prefix.message(sum, &header, &payload, spec_hash)?;
     Ok((message, payload))
 }
 
@@ -174,27 +170,31 @@ impl Prefix {
         usize::try_from(self.payload_bytes).unwrap_or(usize::MAX)
     }
 
-    fn check(
+    /// The message, if its checksum, kind and run are right, and header and payload are what its type promises.
+    fn message<M: Message>(
         &self,
         sum: crc32fast::Hasher,
-        kind: u16,
+        header: &[u8],
+        payload: &[u8],
         spec_hash: Option<u64>,
-    ) -> Result<(), CodecError> {
+    ) -> Result<M, CodecError> {
         if sum.finalize() != self.checksum {
             return Err(CodecError::Checksum);
         }
-        if self.kind != kind {
+        if self.kind != M::KIND {
             return Err(CodecError::Kind {
                 theirs: self.kind,
-                ours: kind,
+                ours: M::KIND,
             });
         }
-        match spec_hash {
-            Some(ours) if ours != self.spec_hash => Err(CodecError::RunSpec {
+        if let Some(ours) = spec_hash.filter(|ours| *ours != self.spec_hash) {
+            return Err(CodecError::RunSpec {
                 theirs: self.spec_hash,
                 ours,
-            }),
-            _ => Ok(()),
+            });
         }
+        let message: M = decode_within::<_, HEADER_BYTES_MAX>(header)?;
+        message.validate(payload)?;
+        Ok(message)
     }
 }
