@@ -51,7 +51,7 @@ pub(super) struct Place {
 
 /// How a log is written, and how much it may take.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Limits {
+pub(super) struct LogLimits {
     /// From this size on, a segment is followed by another.
     pub(super) segment_bytes: u64,
     pub(super) disk_bytes_max: Option<u64>,
@@ -73,7 +73,7 @@ pub(crate) struct Journal {
     segments: VecDeque<Segment>,
     pub(super) file: Arc<File>,
     ordinal: u64,
-    limits: Limits,
+    limits: LogLimits,
     /// Bytes of the largest record so far, by which a segment may become larger than it should.
     largest: u64,
     syncer: Syncer,
@@ -93,7 +93,7 @@ impl Journal {
         folder: LogFolder,
         id: LogId,
         place: Place,
-        limits: Limits,
+        limits: LogLimits,
         snapshot: &Snapshot,
     ) -> Result<Self, PersistError> {
         let syncer = File::open(&folder.path)

@@ -10,7 +10,7 @@ use driml_protocol::{RunSpec, Shutdown, TRANSITION_BYTES};
 
 use super::{
     folder::{FORMAT, LogFolder, LogId, Mark, PersistError},
-    journal::{Journal, Limits},
+    journal::{Journal, LogLimits},
     recover::{Reading, Recovery, find_id, go_back, recover},
 };
 use crate::{
@@ -56,7 +56,7 @@ impl Replay {
 pub struct KeptReplay {
     mark: Option<Mark>,
     id: LogId,
-    limits: Limits,
+    limits: LogLimits,
     folder: LogFolder,
 }
 
@@ -117,14 +117,14 @@ impl KeptReplay {
 }
 
 /// How large a segment is, what all may take, and how often they are flushed.
-fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> Limits {
+fn limits(args: &PersistArgs, spec: &RunSpec, config: &Config) -> LogLimits {
     let shards = u64::from(config.shards);
     let disk_bytes_max = config.disk_bytes_max.map(|max| max / shards);
     let row_bytes = spec.frame_bytes() as u64 + TRANSITION_BYTES as u64;
     let ring = (config.capacity_transitions / shards).saturating_mul(row_bytes);
     let all = disk_bytes_max.map_or(ring, |max| max.min(ring));
     let fitting = (all / SEGMENTS).clamp(SEGMENT_BYTES_MIN, SEGMENT_BYTES_MAX);
-    Limits {
+    LogLimits {
         segment_bytes: args.segment_bytes.unwrap_or(fitting),
         disk_bytes_max,
         fsync: config.fsync_ms.map_or(FSYNC_DEFAULT, Duration::from_millis),

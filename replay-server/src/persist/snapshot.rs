@@ -31,7 +31,7 @@ pub(crate) enum Note {
 
 /// What a replay knows beside its transitions: a snapshot takes all of it and brings all of it back.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct State {
+pub(crate) struct ReplayState {
     pub(crate) actors: Actors,
     /// The learner that is served, as it joined.
     pub(crate) learner: Option<LearnerJoin>,
@@ -49,7 +49,7 @@ pub(crate) struct State {
     pub(crate) starving: bool,
 }
 
-impl State {
+impl ReplayState {
     pub(crate) fn new(spec: &RunSpec, shard: u32) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(spec.seed);
         rng.set_stream(RNG_STREAM + u64::from(shard));
@@ -84,7 +84,7 @@ pub(crate) struct Snapshot {
     pub(crate) capacity: u64,
     pub(crate) counts: Counts,
     pub(crate) rows: RowsState,
-    pub(crate) state: State,
+    pub(crate) state: ReplayState,
 }
 
 impl Snapshot {
@@ -95,7 +95,7 @@ impl Snapshot {
 
     /// Checks that this is of a replay like `ours`, whatever its checksum says; the error says why not. One that is taken can be counted
     /// on from: no count overflows, and none becomes less than nothing.
-    pub(crate) fn check(&self, ours: &State) -> Result<(), &'static str> {
+    pub(crate) fn check(&self, ours: &ReplayState) -> Result<(), &'static str> {
         let (inserted, counts, state) = (self.inserted, &self.counts, &self.state);
         let (counted, expected) = (&state.statistics.counted, &ours.statistics.counted);
         let num_actions = expected.action_histogram.len();

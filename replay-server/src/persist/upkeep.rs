@@ -8,7 +8,7 @@ use driml_protocol::{Chunk, ChunkHeader, CodecError, End, ShardCounts, codec};
 use super::{
     folder::{Mark, PersistError},
     journal::Journal,
-    snapshot::{Note, Snapshot, State},
+    snapshot::{Note, ReplayState, Snapshot},
 };
 use crate::{
     replay::Replay,
@@ -94,7 +94,7 @@ impl Replay {
             capacity: self.ring.capacity(),
             counts: self.limiter.counts,
             rows: self.sampler.rows.state(&self.ring),
-            state: State {
+            state: ReplayState {
                 statistics: self.state.statistics.logged(),
                 ..self.state.clone()
             },
@@ -177,13 +177,13 @@ impl Replay {
         codec::encode_value(&Snapshot {
             counts,
             rows: RowsState::Uniform { are_listed: false },
-            state: State {
+            state: ReplayState {
                 actors: state.actors,
                 learner: state.learner,
                 resumed_after: state.resumed_after,
                 inserted_before: state.inserted_before,
                 statistics: state.statistics.of_stored(),
-                ..State::new(&self.spec, self.origin.shard)
+                ..ReplayState::new(&self.spec, self.origin.shard)
             },
             ..self.snapshot()
         })

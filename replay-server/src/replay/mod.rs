@@ -13,7 +13,7 @@ use driml_protocol::{
 use crate::{
     config::Config,
     ledger::requests::Requests,
-    persist::{journal::Journal, snapshot::State},
+    persist::{journal::Journal, snapshot::ReplayState},
     rate_limiter::RateLimiter,
     sampling::batch::BatchSampler,
     storage::{frame_store::Frames, ring::Ring},
@@ -27,7 +27,7 @@ pub struct Replay {
     pub(crate) ring: Ring,
     pub(crate) limiter: RateLimiter,
     pub(crate) sampler: BatchSampler,
-    pub(crate) state: State,
+    pub(crate) state: ReplayState,
     requests: Requests,
     /// Who draws, as batches say it that are drawn by priority: priorities of rows that another one drew change nothing. A replay server
     /// that is started again numbers its transitions anew, or has lost some, and so draws another incarnation.
@@ -81,7 +81,7 @@ impl Replay {
             ring: Ring::new(capacity, frames).map_err(not_granted)?,
             limiter: RateLimiter::new(config),
             sampler: BatchSampler::new(spec, &config.sampling, capacity).map_err(not_granted)?,
-            state: State::new(spec, shard),
+            state: ReplayState::new(spec, shard),
             requests: Requests::default(),
             origin: Origin {
                 shard,

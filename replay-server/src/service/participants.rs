@@ -20,11 +20,11 @@ pub(super) struct Participants {
     waiting: (Waiting, Instant),
     /// Those that have not joined too.
     connected: HashSet<Alive>,
-    processes: BTreeMap<ProcessName, Participant>,
+    processes: BTreeMap<ProcessName, Account>,
 }
 
 /// One participant, over all its lives.
-struct Participant {
+struct Account {
     alive: Alive,
     lives: u32,
     /// When it was connected, or went.
@@ -49,7 +49,7 @@ impl Participants {
         if earlier.is_some_and(|account| account.alive == who) {
             return;
         }
-        let account = Participant {
+        let account = Account {
             alive: who,
             lives: earlier.map_or(0, |account| account.lives) + 1,
             changed: now,
@@ -61,12 +61,12 @@ impl Participants {
     }
 
     /// The participant of this life, if it takes part.
-    fn of(&mut self, who: Alive) -> Option<&mut Participant> {
+    fn of(&mut self, who: Alive) -> Option<&mut Account> {
         let account = self.processes.get_mut(&who.process)?;
         (account.alive == who).then_some(account)
     }
 
-    fn all(&self, learner: bool) -> impl Iterator<Item = &Participant> {
+    fn all(&self, learner: bool) -> impl Iterator<Item = &Account> {
         let processes = self.processes.iter();
         let processes =
             processes.filter(move |(who, _)| (**who == ProcessName::Learner) == learner);
@@ -165,7 +165,7 @@ impl Participants {
         now: Instant,
         held_since: impl Fn(ProcessName) -> Option<Instant>,
     ) -> Vec<ProcessStatus> {
-        let process = |(&who, account): (&ProcessName, &Participant)| {
+        let process = |(&who, account): (&ProcessName, &Account)| {
             let report = account.report.as_ref();
             let report = report.map(|(report, at)| (report, seconds(now, *at)));
             ProcessStatus {
