@@ -6,7 +6,6 @@ use driml_experiments::{
     flags::{ExperimentCommand, SweepArgs, TradeoffArgs},
     plot::{self, flags::PlotArgs},
 };
-use driml_machine::process_env::Purpose;
 
 use crate::commands::{
     actor::{self, ActorArgs},
@@ -89,14 +88,6 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// What its process is for.
-    pub(crate) const fn purpose(&self) -> Purpose {
-        match self {
-            Self::ReplayServer(_) => Purpose::ReplayServer,
-            _ => Purpose::Other,
-        }
-    }
-
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Train(args) => train::run(args),

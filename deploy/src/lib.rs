@@ -20,7 +20,7 @@ use driml_machine::{
 
 pub use crate::registry::Registry;
 
-use crate::cli::Cli;
+use crate::cli::{Cli, Command};
 
 /// Runs the program: 0 when all went well, 64 for a call that cannot work, 130 when interrupted, 1 for all else.
 pub fn main() -> ExitCode {
@@ -42,7 +42,8 @@ pub fn main_with(registry: Registry) -> ExitCode {
             };
         }
     };
-    let settled = process_env::settle(cli.command.purpose());
+    let is_replay_server = matches!(cli.command, Command::ReplayServer(_));
+    let settled = process_env::settle(is_replay_server);
     console::log_to_stderr();
     if let Err(e) = settled {
         tracing::warn!("this process runs without the environment that makes it fast: {e}");

@@ -14,22 +14,13 @@ const EVERYONE: [(&str, &str); 3] = [
 /// chunks that were freed in it, which is memory that only grows in a run whose actors come and go.
 const REPLAY_SERVER: (&str, &str) = ("MALLOC_ARENA_MAX", "2");
 
-/// What a process is for, as far as its environment depends on it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Purpose {
-    /// A replay server.
-    ReplayServer,
-    /// Any other process or command, which needs what all need.
-    Other,
-}
-
 /// Starts this program again, in the same process and with the same arguments, if the environment lacks something. What the user
 /// has set stays unchanged.
 ///
 /// # Errors
 /// The program cannot be started again. It may continue, only slower.
-pub fn settle(purpose: Purpose) -> io::Result<()> {
-    let missing = missing(purpose, |name| env::var_os(name).is_some());
+pub fn settle(is_replay_server: bool) -> io::Result<()> {
+    let missing = missing(is_replay_server, |name| env::var_os(name).is_some());
     if missing.is_empty() {
         return Ok(());
     }
@@ -53,9 +44,12 @@ pub fn program() -> PathBuf {
     file.unwrap_or_else(|| "/proc/self/exe".into())
 }
 
-/// The variables that a process for `purpose` lacks, with their values.
-fn missing(purpose: Purpose, has: impl Fn(&str) -> bool) -> Vec<(&'static str, &'static str)> {
-    let own = (purpose == Purpose::ReplayServer).then_some(REPLAY_SERVER);
+/// The variables that this process lacks, with their values.
+fn missing(
+    is_replay_server: bool,
+    has: impl Fn(&str) -> bool,
+) -> Vec<(&'static str, &'static str)> {
+    let own = is_replay_server.then_some(REPLAY_SERVER);
     let needed = EVERYONE.into_iter().chain(own);
     needed.filter(|(name, _)| !has(name)).collect()
 }
@@ -92,9 +86,9 @@ mod tests {
 
     #[test]
     fn what_is_missing_is_added_and_what_is_set_stays() {
-        assert_eq!(missing(Purpose::Other, |_| false), EVERYONE);
-        assert_eq!(missing(Purpose::Other, |_| true), []);
-        let server = missing(Purpose::ReplayServer, |name| name == "CANDLE_NUM_THREADS");
+        assert_eq!(missing(false, |_| false), EVERYONE);
+        assert_eq!(missing(false, |_| true), []);
+        let server = missing(true, |name| name == "CANDLE_NUM_THREADS");
         assert_eq!(server, [EVERYONE[1], EVERYONE[2], REPLAY_SERVER]);
     }
 }
