@@ -167,25 +167,17 @@ impl Evaluator {
         let Some((updates, episodes)) = due else {
             return false;
         };
-        match self.start(updates, episodes, screen) {
+        let words = format!("evaluate --keep --checkpoint {updates} --episodes {episodes}");
+        let mut args: Vec<_> = words.split(' ').map(OsStr::new).collect();
+        args.push(self.run_dir.path().as_os_str());
+        let logs = self.run_dir.logs();
+        match ManagedProcess::start("evaluation", &args, 1, &logs, screen, None) {
             Ok(process) => self.playing = Some(process),
             Err(e) => screen.line(&format!(
                 "the checkpoint after {updates} updates is not played: {e:#}"
             )),
         }
         self.playing.is_some()
-    }
-
-    fn start(
-        &self,
-        updates: u64,
-        episodes: u32,
-        screen: &Screen,
-    ) -> anyhow::Result<ManagedProcess> {
-        let words = format!("evaluate --keep --checkpoint {updates} --episodes {episodes}");
-        let mut args: Vec<_> = words.split(' ').map(OsStr::new).collect();
-        args.push(self.run_dir.path().as_os_str());
-        ManagedProcess::start("evaluation", &args, 1, &self.run_dir.logs(), screen, None)
     }
 
     /// Takes note of an evaluation that has ended. One that failed costs the run nothing but a line.
