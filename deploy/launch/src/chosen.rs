@@ -67,29 +67,25 @@ pub fn config_of(folder: &RunFolder) -> anyhow::Result<RunConfig> {
 
 pub(crate) fn checkpoint_at(folder: &RunFolder, which: Which) -> anyhow::Result<PathBuf> {
     let run = folder.display();
-    if which == Which::Best {
-        let best = checkpoint::list(&folder.best())?.pop();
-        return best.map(|(_, path)| path).with_context(|| {
-            usage!(
-                "{run} has no best checkpoint: none was evaluated. Train with --eval-interval UPDATES, or evaluate one \
-                 with `driml evaluate {run} --checkpoint UPDATES --keep`"
-            )
-        });
-    }
-    let all = checkpoint::list(&folder.checkpoints())?;
-    let newest = all.last().map(|it| it.0);
-    let newest =
-        newest.with_context(|| usage!("{run} has no checkpoint yet: let the run continue"))?;
-    let wanted = match which {
-        Which::After(updates) => updates,
-        _ => newest,
+    let place = match which {
+        Which::Best => folder.best(),
+        Which::Newest | Which::After(_) => folder.checkpoints(),
     };
+    let mut all = checkpoint::list(&place)?;
     let known: Vec<_> = all.iter().map(|(updates, _)| updates.to_string()).collect();
-    let found = all.into_iter().find(|(updates, _)| *updates == wanted);
-    found.map(|(_, path)| path).with_context(|| {
-        usage!(
+    let chosen = match which {
+        Which::After(wanted) => all.into_iter().find(|(updates, _)| *updates == wanted),
+        Which::Newest | Which::Best => all.pop(),
+    };
+    chosen.map(|(_, path)| path).with_context(|| match which {
+        Which::Best => usage!(
+            "{run} has no best checkpoint: none was evaluated. Train with --eval-interval UPDATES, or evaluate one \
+             with `driml evaluate {run} --checkpoint UPDATES --keep`"
+        ),
+        Which::After(wanted) if !known.is_empty() => usage!(
             "{run} has no checkpoint after {wanted} updates; it has those after {}. learner.checkpoints_kept sets how many are kept",
             known.join(", ")
-        )
+        ),
+        _ => usage!("{run} has no checkpoint yet: let the run continue"),
     })
 }
