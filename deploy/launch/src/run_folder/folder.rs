@@ -94,12 +94,13 @@ impl RunFolder {
 
     /// Whether nothing lies in the folder, or only what a run makes before its first frame.
     fn is_empty_run(&self, entries: fs::ReadDir) -> bool {
-        let (config, checkpoints) = (self.config(), self.checkpoints());
         let tables = [self.metrics(), self.episodes()];
         let others = [
+            self.config(),
             self.summary(),
             self.endpoints(),
             self.rendezvous(),
+            self.checkpoints(),
             self.logs(),
             self.lock_file(),
         ];
@@ -107,17 +108,15 @@ impl RunFolder {
             let frames = Table::read(path).ok().and_then(|it| it.last("frames"));
             frames.is_some_and(|frames: u64| frames > 0)
         };
-        let entries: Vec<_> = entries.flatten().collect();
         let is_made = |it: &fs::DirEntry| {
-            let (path, name) = (it.path(), it.file_name());
-            let made = [&config, &checkpoints].into_iter().chain(&tables);
-            made.chain(&others).any(|made| *made == path)
-                || name.to_string_lossy().starts_with(EVENTS)
+            tables.iter().chain(&others).any(|made| *made == it.path())
+                || it.file_name().to_string_lossy().starts_with(EVENTS)
         };
-        let saved = driml_learner::checkpoint::list(&checkpoints);
+        let saved = driml_learner::checkpoint::list(&self.checkpoints());
+        let entries: Vec<_> = entries.flatten().collect();
         entries.is_empty()
             || entries.iter().all(is_made)
-                && config.exists()
+                && self.config().exists()
                 && !tables.iter().any(has_frames)
                 && saved.is_ok_and(|all| all.is_empty())
     }
