@@ -79,19 +79,19 @@ impl Table {
         path: &Path,
         is_kept: impl Fn(&Self, &StringRecord) -> anyhow::Result<bool>,
     ) -> anyhow::Result<()> {
-        let (mut kept, mut aside) = (Self::default(), Self::default());
+        let mut aside = Self {
+            header: self.header.clone(),
+            rows: Vec::new(),
+        };
         for row in std::mem::take(&mut self.rows) {
-            let table = match is_kept(self, &row)? {
-                true => &mut kept,
-                false => &mut aside,
-            };
-            table.rows.push(row);
+            match is_kept(self, &row)? {
+                true => self.rows.push(row),
+                false => aside.rows.push(row),
+            }
         }
-        self.rows = kept.rows;
         if aside.rows.is_empty() {
             return Ok(());
         }
-        aside.header.clone_from(&self.header);
         let free = |n: u32| path.with_extension(format!("aside-{n}.csv"));
         let free = (1..).map(free).find(|it| !it.exists());
         let beside = free.context("no name is free beside the table")?;
