@@ -4,7 +4,6 @@
 use std::{
     ffi::OsString,
     fs::{self, File},
-    io::Write,
     path::Path,
 };
 
@@ -15,7 +14,7 @@ use serde::Deserialize;
 
 use super::{
     folder::RunFolder,
-    table::{Table, csv_row},
+    table::{Table, append, csv_row},
 };
 use crate::metrics::rounded;
 
@@ -113,7 +112,7 @@ impl Evaluated {
         let doing = || format!("writing {}", path.display());
         let file = File::options().create(true).append(true).open(&path);
         let mut file = file.with_context(doing)?;
-        let before = file.metadata().with_context(doing)?.len();
+        let is_new = file.metadata().with_context(doing)?.len() == 0;
         let row = csv_row([
             self.seconds.map_or(String::new(), |it| it.to_string()),
             self.frames.map_or(String::new(), |it| it.to_string()),
@@ -122,15 +121,9 @@ impl Evaluated {
             rounded(self.mean_return).to_string(),
             rounded(self.deviation).to_string(),
         ]);
-        let head = (before == 0).then(|| csv_row(HEADER.split(',')));
+        let head = is_new.then(|| csv_row(HEADER.split(',')));
         // A whole row at once: others may read meanwhile.
-        let rows = [head.unwrap_or_default(), row].concat();
-        let written = file.write_all(&rows);
-        if written.is_err() {
-            // Half a row may be there.
-            let _ = file.set_len(before);
-        }
-        written.with_context(doing)
+        append(&mut file, &[head.unwrap_or_default(), row].concat()).with_context(doing)
     }
 }
 

@@ -165,13 +165,7 @@ impl AppendLog {
 
     /// Writes all rows that wait, or none.
     fn write(&mut self) -> io::Result<()> {
-        let bytes = self.waiting.make_contiguous().concat();
-        let before = self.file.metadata()?.len();
-        if let Err(e) = self.file.write_all(&bytes) {
-            // Half a row may be there. Should this fail too, the next try begins with half a row before it.
-            let _ = self.file.set_len(before);
-            return Err(e);
-        }
+        append(&mut self.file, &self.waiting.make_contiguous().concat())?;
         self.waiting.clear();
         Ok(())
     }
@@ -183,6 +177,17 @@ impl AppendLog {
         let (name, unit) = (&self.name, self.unit);
         Some(format!("{rows} {unit} of {name} are lost: {error}"))
     }
+}
+
+/// Writes all bytes at the end of a file, or none.
+pub(super) fn append(file: &mut File, bytes: &[u8]) -> io::Result<()> {
+    let before = file.metadata()?.len();
+    let written = file.write_all(bytes);
+    if written.is_err() {
+        // Half a row may be there. Should this fail too, the next try begins with half a row before it.
+        let _ = file.set_len(before);
+    }
+    written
 }
 
 /// A row of a CSV file, as bytes.
