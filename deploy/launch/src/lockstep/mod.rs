@@ -7,10 +7,7 @@ mod processes;
 #[cfg(test)]
 mod tests;
 
-use std::{
-    convert::Infallible,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use driml_protocol::{GracefulShutdown, Shutdown};
@@ -147,7 +144,7 @@ fn record(recorder: &mut RunRecorder, view: &mut RunView, lockstep: &mut Lockste
     let ended = status.episodes;
     view.take_learner(Some(lockstep.turn.status.clone()));
     view.take_replay(vec![status]);
-    let ask = |_, since| Ok::<_, Infallible>(lockstep.replay.episodes_since(since));
+    let ask = |_, since| Some(lockstep.replay.episodes_since(since));
     let mut warnings = recorder.record_episodes(view, ask);
     warnings.extend(recorder.record(view, &[]));
     lockstep.replay.note_recorded(ended);

@@ -6,7 +6,7 @@
 //! played it, and in which environment; `return`, undiscounted, and `length` in steps, both empty if a part of it was lost.
 //! Of more than the replay server keeps between two looks the oldest are missing, and so are their numbers.
 
-use std::{collections::VecDeque, fmt::Display};
+use std::collections::VecDeque;
 
 use driml_machine::error::usage;
 use driml_protocol::{EndedEpisode, EpisodesReply, Played, RETURNS_OF, ReplayStatus};
@@ -85,10 +85,10 @@ impl TrainingEpisodes {
 
     /// Takes what each shard counts and asks it for the episodes that ended since those that are known, after so many `seconds` of the
     /// run, if they are known. The file then holds as many as the shards count, and each once. Returns warnings about the file.
-    pub(super) fn update<E: Display>(
+    pub(super) fn update(
         &mut self,
         shards: &[ReplayStatus],
-        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
+        ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
         seconds: Option<f64>,
     ) -> Vec<String> {
         let frames = shards.iter().map(|it| it.transitions_inserted).sum();
@@ -115,11 +115,9 @@ impl TrainingEpisodes {
                 if received >= status.episodes {
                     break;
                 }
-                let reply = ask(shard, received);
-                let failed = |e: &E| tracing::debug!("episodes of shard {shard}: {e}");
                 let is_newer =
                     |it: &EpisodesReply| it.ended >= status.episodes && it.before >= received;
-                let Some(reply) = reply.inspect_err(failed).ok().filter(is_newer) else {
+                let Some(reply) = ask(shard, received).filter(is_newer) else {
                     break;
                 };
                 let missing = reply.before - received;

@@ -2,7 +2,6 @@
 //! It asks no process: its caller hands a view over.
 
 use std::{
-    fmt::Display,
     fs::{self, File},
     time::Instant,
 };
@@ -138,12 +137,12 @@ impl RunRecorder {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
-    /// Asks for the episodes that ended since the last time: those of a shard after the first so many. Warnings are returned as by
-    /// [`Self::record`], which is to follow.
-    pub(crate) fn record_episodes<E: Display>(
+    /// Asks for the episodes that ended since the last time: those of a shard after the first so many, none if it does not answer.
+    /// Warnings are returned as by [`Self::record`], which is to follow.
+    pub(crate) fn record_episodes(
         &mut self,
         view: &RunView,
-        ask: impl Fn(usize, u64) -> Result<EpisodesReply, E>,
+        ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
     ) -> Vec<String> {
         let seconds = (!std::mem::take(&mut self.is_late)).then(|| self.seconds());
         self.episodes.update(&view.shards, ask, seconds)

@@ -1,7 +1,5 @@
 //! The run folder's files: what a run leaves, and what a resumed one continues.
 
-use std::convert::Infallible;
-
 use driml_actor::Schedule;
 use driml_protocol::{EndedEpisode, LearnerStatus, Played, Waiting};
 use expect_test::expect;
@@ -100,7 +98,7 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
         before: 0,
         episodes: vec![episode; 7],
     };
-    let said = recorder.record_episodes(&all, |_, _| Ok::<_, Infallible>(ended.clone()));
+    let said = recorder.record_episodes(&all, |_, _| Some(ended.clone()));
     assert!(said.is_empty(), "{said:?}");
     let said = recorder.record(&mut all, &[Some(12.34), None]);
     assert!(said.is_empty(), "{said:?}");
