@@ -94,8 +94,11 @@ impl Due {
     /// Those after the checkpoints that the run's folder lists as played.
     pub(crate) fn new(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let config = config.local.evaluation;
-        let newest = config.map(|_| Evaluated::newest(run_dir));
-        let newest = newest.transpose()?.unwrap_or(0);
+        let played = match config {
+            Some(_) => Evaluated::all(run_dir)?,
+            None => Vec::new(),
+        };
+        let newest = played.iter().map(|it| it.updates).max().unwrap_or(0);
         Ok(Self { config, newest })
     }
 

@@ -61,12 +61,6 @@ impl Evaluated {
         })
     }
 
-    /// Updates behind the newest checkpoint that was played; 0 if none was.
-    pub(crate) fn newest(folder: &RunFolder) -> anyhow::Result<u64> {
-        let all = Self::all(folder)?;
-        Ok(all.iter().map(|it| it.updates).max().unwrap_or(0))
-    }
-
     /// The kept best checkpoint and what it earned when it was played for the most episodes; none of a folder that has none.
     pub(crate) fn best(folder: &RunFolder) -> anyhow::Result<Option<Self>> {
         let kept = driml_learner::checkpoint::list(&folder.best())?;
