@@ -29,7 +29,7 @@ pub struct RunRecorder {
     /// No other launcher writes to the folder while this is held.
     _lock: File,
     resume_point: ResumePoint,
-    /// Seconds and episodes in the last row before the run was resumed.
+    /// Seconds that the run took before it was resumed, and episodes in the last row that stays.
     seconds_before: f64,
     episodes_before: u64,
     /// The k of all rows up to there.
@@ -88,7 +88,7 @@ impl RunRecorder {
         Ok(Self {
             _lock: lock,
             resume_point,
-            seconds_before: seconds.max(rows.last("seconds").unwrap_or(0.0)),
+            seconds_before: seconds,
             episodes_before: if is_kept { 0 } else { rows_of_episodes },
             k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
@@ -157,7 +157,7 @@ impl RunRecorder {
         let known = rss_mib.iter().copied().chain(std::iter::repeat(None));
         for (((_, rss), max), now) in self.rss_mib.iter_mut().zip(&mut self.rss_max).zip(known) {
             *rss = now;
-            *max = now.map_or(*max, |now| Some(max.map_or(now, |max| max.max(now))));
+            *max = now.into_iter().chain(*max).reduce(f64::max);
         }
         self.complete(view);
         let (frames, updates) = (view.replay.transitions_inserted, view.learner.updates);
