@@ -50,12 +50,6 @@ const FOLLOWS: [(&str, &str); 17] = [
 /// Where a whole frame's size is, if frames are cut.
 const FRAME: &str = "input.frame";
 
-/// Writes the names that everything else follows from.
-pub(crate) fn name(table: &mut Table, world: &str, agent: &str) {
-    put(table, "run.world", Value::String(world.into()));
-    put(table, "run.agent", Value::String(agent.into()));
-}
-
 /// The limits of a world that runs in its own process, in `[world]`.
 const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
 

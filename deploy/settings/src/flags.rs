@@ -56,7 +56,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             let world: WorldName = world.map_err(|e| usage!("--env: {e}"))?;
             let agent = presets::agent(args.agent.as_deref().unwrap_or(AGENT))?;
             let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
-            let source = Source::Layers(preset, world, agent.name);
+            let source = Source::Layers(preset, world, agent);
             (source, format!("preset {}", preset.name))
         }
     };

@@ -70,8 +70,12 @@ fn lambdas(table: &Table) -> String {
 }
 
 /// The resolved settings, each with its source.
-pub fn sourced(preset: &'static Preset, world: WorldName, agent: &Agent) -> Result<String, Usage> {
-    let source = Source::Layers(preset, world, agent.name);
+pub fn sourced(
+    preset: &'static Preset,
+    world: WorldName,
+    agent: &'static Agent,
+) -> Result<String, Usage> {
+    let source = Source::Layers(preset, world, agent);
     // What the preset asks for, on any machine; memory that is free at this moment is not a setting.
     let machine = Machine {
         memory_bytes: u64::MAX,

@@ -15,14 +15,14 @@ use crate::{
     derived::{self, derive},
     memory,
     overrides::Override,
-    presets::{self, Preset},
+    presets::{self, Agent, Preset},
 };
 
 /// Where the settings come from before flags are applied.
 #[derive(Clone, Debug)]
 pub enum Source {
     /// Layers: preset, world, agent.
-    Layers(&'static Preset, WorldName, &'static str),
+    Layers(&'static Preset, WorldName, &'static Agent),
     /// A file that driml wrote: its name and text.
     File(String, String),
 }
@@ -60,8 +60,10 @@ pub struct Flags {
 pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
     let mut table = match source {
         Source::Layers(preset, world, agent) => {
-            let mut table = presets::layers(preset, *world, presets::agent(agent)?)?;
-            derived::name(&mut table, &world.to_string(), agent);
+            let mut table = presets::layers(preset, *world, agent)?;
+            // Everything else follows from these names.
+            derived::put(&mut table, "run.world", world.to_string().into());
+            derived::put(&mut table, "run.agent", agent.name.into());
             derived::cut_frames(&mut table);
             if let Some(command) = world.command() {
                 // How long it is waited for is needed at once.

@@ -19,7 +19,7 @@ const MACHINE: Machine = Machine {
 fn source(preset: &str, world: &str, agent: &str) -> Source {
     let agent = presets::agent(agent).unwrap();
     let preset = presets::preset(preset).unwrap();
-    Source::Layers(preset, world.parse().unwrap(), agent.name)
+    Source::Layers(preset, world.parse().unwrap(), agent)
 }
 
 fn sets(sets: &[&str]) -> Flags {
@@ -51,7 +51,7 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     for preset in PRESETS {
         for world in WorldName::all() {
             for agent in AGENTS {
-                let source = Source::Layers(preset, world, agent.name);
+                let source = Source::Layers(preset, world, agent);
                 let config = match resolve(&source, &Flags::default(), &MACHINE) {
                     Ok(config) => config,
                     Err(e) if e.0.contains("take --preset paper") => continue,
