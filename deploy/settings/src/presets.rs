@@ -207,7 +207,8 @@ fn names(name: &str, all: impl Iterator<Item = &'static str>) -> (String, String
     (nearest(name, all.iter().copied()), all.join(", "))
 }
 
-/// Lays base, world, preset and agent over one another, in this order: a later one wins.
+/// Lays base, world, preset and agent over one another, in this order: a later one wins. Of each file first comes what holds everywhere,
+/// then each `[[only]]` block that names the world.
 pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result<Table, Usage> {
     if !preset.families.is_empty() && !preset.families.contains(&world.kind()) {
         return Err(usage!(
@@ -216,9 +217,14 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
             preset.families.join(", ")
         ));
     }
+    let name = world.with_own_library().to_string();
     let mut table = Table::new();
     for layer in stack(preset, world, agent) {
-        lay(&mut table, &layer, &world.with_own_library().to_string());
+        let (everywhere, blocks) = layer.read();
+        merge(&mut table, everywhere);
+        for block in blocks.into_iter().filter(|it| it.is_for(&name)) {
+            merge(&mut table, block.set);
+        }
     }
     Ok(table)
 }
@@ -227,15 +233,6 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
 pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Layer> {
     let below = [BASE, world_layer(world)].into_iter();
     below.chain(preset.layer).chain([agent.layer]).collect()
-}
-
-/// Lays one file over `table`: first what holds everywhere, then each `[[only]]` block that names `world`.
-fn lay(table: &mut Table, layer: &Layer, world: &str) {
-    let (everywhere, blocks) = layer.read();
-    merge(table, everywhere);
-    for block in blocks.into_iter().filter(|it| it.is_for(world)) {
-        merge(table, block.set);
-    }
 }
 
 /// An `[[only]]` block of a layer.
