@@ -29,7 +29,7 @@ const FRAME_BYTES: u64 = 64 * 64 * 3;
 pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let machine = Machine::this();
     vec![
-        cores(machine.cores),
+        cores(&machine),
         vectors(floats_at_once()),
         kernels(),
         memory(&machine),
@@ -39,12 +39,8 @@ pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     ]
 }
 
-fn cores(cores: u32) -> Fact {
-    let machine = Machine {
-        cores,
-        ..Machine::default()
-    };
-    let actors = machine.actors();
+fn cores(machine: &Machine) -> Fact {
+    let (cores, actors) = (machine.cores, machine.actors());
     let text = format!("{cores}, all of them for the learner; --actors is {actors} unless given");
     match cores {
         0 | 1 => Fact::note("cores", format!("{text}; all processes share it")),
@@ -187,20 +183,19 @@ mod tests {
 
     #[test]
     fn each_fact_has_its_state() {
-        let memory_of = |memory_bytes| {
-            memory(&Machine {
-                memory_bytes,
-                ..Machine::default()
-            })
+        let machine = |cores, memory_bytes| Machine {
+            cores,
+            memory_bytes,
+            fast_bf16: false,
         };
         for (fact, state) in [
             (vectors(Some(16)), State::Ok),
             (vectors(Some(8)), State::Ok),
             (vectors(Some(1)), State::Note),
             (vectors(None), State::Note),
-            (memory_of(1 << 29), State::Missing),
-            (memory_of(2 << 30), State::Note),
-            (memory_of(8 << 30), State::Ok),
+            (memory(&machine(2, 1 << 29)), State::Missing),
+            (memory(&machine(2, 2 << 30)), State::Note),
+            (memory(&machine(2, 8 << 30)), State::Ok),
             // What docker grants unless it is told otherwise.
             (shared_memory(Ok(64 << 20)), State::Note),
             (shared_memory(Ok(1 << 30)), State::Ok),
@@ -209,8 +204,8 @@ mod tests {
             (locked_memory(Some(8 << 20)), State::Note),
             (locked_memory(Some(1 << 30)), State::Ok),
             (locked_memory(None), State::Ok),
-            (cores(1), State::Note),
-            (cores(2), State::Ok),
+            (cores(&machine(1, 0)), State::Note),
+            (cores(&machine(2, 0)), State::Ok),
         ] {
             assert_eq!(fact.state, state, "{fact}");
         }
