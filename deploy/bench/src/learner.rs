@@ -133,10 +133,8 @@ impl Bench<'_> {
         for (name, sets) in SIZES {
             let sets = [sets, &["learner.deduplicate_states=false"]].concat();
             let (work, gflop) = counted_updates(AGENT, &sets, &self.compute)?;
-            let (rate, name) = (
-                self.effort.rate_by_median(work)?,
-                format!("{name}: {gflop:.2} GFLOP"),
-            );
+            let name = format!("{name}: {gflop:.2} GFLOP");
+            let rate = self.effort.rate_by_median(work)?;
             self.found(&name, rate, "updates/s");
             self.found(&format!("{name}, arithmetic"), rate * gflop, "GFLOP/s");
         }

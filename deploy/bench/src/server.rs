@@ -78,11 +78,8 @@ impl Server {
         );
         let mut process = start("replay-server", &args, &sets, folder)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
-        let credentials = wire.credentials(Role::Observer)?;
         wait_for(&mut process, &wire.endpoint)?;
-        let endpoints = Endpoints::to(vec![wire.endpoint.clone()]);
-        let credentials = credentials.as_ref();
-        let session = session::open_as(&endpoints, &keys, credentials, MESSAGE_BYTES_MAX)?;
+        let session = wire.open(&keys, Role::Observer)?;
         let run_info = join::run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;
         Ok(Self {
@@ -177,16 +174,11 @@ impl Server {
     }
 
     fn client(&mut self, role: Role, spec_hash: u64) -> anyhow::Result<RunClient> {
-        let session = match self.wire.credentials(role)? {
-            None => self.sessions[0].clone(),
-            own => {
-                let endpoints = Endpoints::to(vec![self.wire.endpoint.clone()]);
-                let session =
-                    session::open_as(&endpoints, &self.keys, own.as_ref(), MESSAGE_BYTES_MAX)?;
-                self.sessions.push(session.clone());
-                session
-            }
-        };
+        let mut session = self.sessions[0].clone();
+        if matches!(self.wire.folder, Some((TLS_DIR, _))) {
+            session = self.wire.open(&self.keys, role)?;
+            self.sessions.push(session.clone());
+        }
         Ok(RunClient::new(session, self.keys.clone(), spec_hash))
     }
 
@@ -205,12 +197,20 @@ impl Server {
 }
 
 impl Wire {
-    /// What a role needs where the server is guarded.
-    fn credentials(&self, role: Role) -> anyhow::Result<Option<Credentials>> {
-        Ok(match &self.folder {
+    /// A session in a role, with its certificate where the server is guarded.
+    fn open(&self, keys: &Keys, role: Role) -> anyhow::Result<Session> {
+        let credentials = match &self.folder {
             Some((TLS_DIR, dir)) => Some(Credentials::read(Path::new(dir), role)?),
             _ => None,
-        })
+        };
+        let endpoints = Endpoints::to(vec![self.endpoint.clone()]);
+        let credentials = credentials.as_ref();
+        Ok(session::open_as(
+            &endpoints,
+            keys,
+            credentials,
+            MESSAGE_BYTES_MAX,
+        )?)
     }
 }
 
