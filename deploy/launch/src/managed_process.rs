@@ -30,7 +30,7 @@ pub struct ManagedProcess {
     child: Child,
     started: Instant,
     end: Option<ExitStatus>,
-    log: ProcessLog,
+    pub(crate) log: ProcessLog,
 }
 
 /// The variable that says how many threads a process has for arithmetic.
@@ -173,11 +173,6 @@ impl ManagedProcess {
         }
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?;
         Some(kib(&status, "VmRSS:")? as f64 / 1024.0)
-    }
-
-    /// What to say about lines of its log that could not be written; `None` if all were.
-    pub(crate) fn missing_log_lines(&self) -> Option<String> {
-        self.log.missing()
     }
 
     /// How it ended and its last lines, as one message.

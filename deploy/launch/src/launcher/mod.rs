@@ -409,7 +409,7 @@ impl Launch<'_> {
                 &mut poller.view
             }
         };
-        let logs = self.processes.all().filter_map(|it| it.missing_log_lines());
+        let logs = self.processes.all().filter_map(|it| it.log.missing());
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, view);

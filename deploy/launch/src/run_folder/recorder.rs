@@ -175,7 +175,7 @@ impl RunRecorder {
 
     /// What to say about rows that could not be written up to now.
     pub fn missing(&self) -> Vec<String> {
-        let events = self.events.as_ref().and_then(Events::missing);
+        let events = self.events.as_ref().and_then(|it| it.file.missing());
         let mut missing = self.episodes.missing();
         missing.extend([self.metrics.missing(), events].into_iter().flatten());
         missing

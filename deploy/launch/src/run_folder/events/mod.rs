@@ -31,7 +31,7 @@ const MARGIN: usize = 8;
 
 #[derive(Debug)]
 pub(super) struct Events {
-    file: AppendLog,
+    pub(super) file: AppendLog,
     checkpoints: PathBuf,
     slow_at: Option<Instant>,
     /// Counts when histograms were written last.
@@ -130,10 +130,6 @@ impl Events {
         let image = Value::Image { width, height, png };
         Some(encode::summary(at, &[("affinity/A".to_owned(), image)]))
     }
-
-    pub(super) fn missing(&self) -> Option<String> {
-        self.file.missing()
-    }
 }
 
 fn now() -> f64 {
@@ -191,7 +187,7 @@ mod tests {
         let points = [("return/mean_return".to_owned(), 1.5)];
         assert_eq!(events.add(&points, &replay, false), None);
         let again = Events::create(&folder, 70).unwrap();
-        assert_eq!(again.missing(), None);
+        assert_eq!(again.file.missing(), None);
         let mut counts = Vec::new();
         let files = fs::read_dir(root.path()).unwrap();
         let mut paths: Vec<_> = files.map(|it| it.unwrap().path()).collect();
