@@ -296,6 +296,11 @@ impl Screen {
         }
     }
 
+    /// Writes some lines, each as [`Self::line`] does.
+    pub(crate) fn lines(&self, lines: impl IntoIterator<Item = String>) {
+        lines.into_iter().for_each(|it| self.line(&it));
+    }
+
     /// Says how far something is: beside the bar, or now and then in a line; `text` is told whether it is beside the bar.
     pub fn show(&mut self, position: u64, text: impl FnOnce(bool) -> String) {
         let now = Instant::now();

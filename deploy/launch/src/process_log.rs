@@ -66,9 +66,7 @@ impl ProcessLog {
                 let line = String::from_utf8_lossy(&line).into_owned();
                 let shown = is_warning(&line).then(|| format!("{name}: {line}"));
                 let said = lock(&kept).add(line);
-                for line in shown.into_iter().chain(said) {
-                    screen.line(&line);
-                }
+                screen.lines(shown.into_iter().chain(said));
             }
         };
         let thread = std::thread::Builder::new().name(format!("log of {}", self.name));

@@ -16,7 +16,7 @@ use driml_replay_server::shared_memory_bytes;
 use driml_settings::config::RunConfig;
 
 use crate::{
-    console::{self, Screen, print_wrapped},
+    console::{self, print_wrapped},
     endpoint::wait_until_listening,
     evaluator::Evaluator,
     last_play,
@@ -27,7 +27,7 @@ use crate::{
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
     run_view::{Plan, RunView, updates_served},
-    view::{Display, Poller, Reached, TEMPLATE},
+    view::{Display, Poller, Reached},
 };
 
 const POLL: Duration = Duration::from_secs(1);
@@ -92,8 +92,7 @@ pub fn run(
     write_whole(&run_dir.endpoints(), endpoints.join("\n").as_bytes())?;
     let place = rendezvous.path().as_os_str().as_encoded_bytes();
     write_whole(&run_dir.rendezvous(), place)?;
-    let screen = Screen::new(config.frames(), TEMPLATE);
-    let display = Display::new(screen.clone(), Instant::now(), resume_point.updates);
+    let display = Display::new(config.frames(), Instant::now(), resume_point.updates);
     // What killed processes left is room again.
     session::sweep_shared_memory();
     let shared_memory = config.transport.shared_memory && {
@@ -110,7 +109,6 @@ pub fn run(
         endpoints,
         outside,
         rendezvous,
-        screen,
         display,
         shutdown,
         processes: Processes::default(),
@@ -123,13 +121,13 @@ pub fn run(
     let ran = launch.start_and_watch(&mut recorder);
     let ended = launch.end(ran, &mut recorder);
     session::sweep_shared_memory();
-    launch.screen.clear();
+    launch.display.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
     let (mut summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
     // An interrupted or failed run does not wait for it.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
-        evaluator.finish(&launch.screen, &|| launch.shutdown.ending.is_set());
+        evaluator.finish(&launch.display.screen, &|| launch.shutdown.ending.is_set());
     }
     // No process is left that could be reached by them; where these files stay behind, locks show it.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
@@ -175,7 +173,6 @@ struct Launch<'a> {
     endpoints: Vec<String>,
     outside: Outside,
     rendezvous: Rendezvous,
-    screen: Screen,
     display: Display,
     shutdown: GracefulShutdown,
     processes: Processes,
@@ -266,12 +263,12 @@ impl Launch<'_> {
                 let ask = |shard, since| poller.episodes(shard, since, true);
                 let mut warnings = recorder.record_episodes(view, ask);
                 warnings.extend(recorder.record(&mut poller.view, &rss));
-                warnings.iter().for_each(|line| self.screen.line(line));
+                self.display.screen.lines(warnings);
             }
             recorder.complete(&mut poller.view);
             let view = &poller.view;
             self.display.show(view);
-            self.evaluator.look(&self.screen);
+            self.evaluator.look(&self.display.screen);
             if view.is_learned() {
                 return Ok(Outcome::Finished);
             }
@@ -307,7 +304,7 @@ impl Launch<'_> {
             true => ran.or(Ok(Outcome::Interrupted)),
         };
         if matches!(ran, Ok(Outcome::Interrupted)) {
-            self.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
+            self.display.screen.line("stopping: actors deliver what they have, the learner saves (Ctrl-C again ends at once)");
         }
         let now = self.shutdown.now.clone();
         let abort = move || now.is_set();
@@ -354,7 +351,9 @@ impl Launch<'_> {
         let failed = failed.filter(|it| !warnings.contains(it));
         warnings.extend(failed);
         for warning in warnings.iter().filter(|it| !error.contains(*it)) {
-            self.screen.line(&format!("while stopping, {warning}"));
+            self.display
+                .screen
+                .line(&format!("while stopping, {warning}"));
         }
         result
     }

@@ -46,8 +46,8 @@ impl Outside {
 
 impl Launch<'_> {
     fn start(&self, name: &str, args: &[OsString], threads: u32) -> anyhow::Result<ManagedProcess> {
-        let (logs, screen, rendezvous) = (self.run_dir.logs(), &self.screen, &self.rendezvous);
-        ManagedProcess::start(name, args, threads, &logs, screen, Some(rendezvous))
+        let (logs, screen) = (self.run_dir.logs(), &self.display.screen);
+        ManagedProcess::start(name, args, threads, &logs, screen, Some(&self.rendezvous))
     }
 
     pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
@@ -156,7 +156,7 @@ impl Launch<'_> {
     }
 
     fn note_restart(&self, report: &str, how: &str) {
-        self.screen.line(&format!("{report}\n{how}"));
+        self.display.screen.line(&format!("{report}\n{how}"));
         session::sweep_shared_memory();
     }
 }

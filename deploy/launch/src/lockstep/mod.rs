@@ -15,12 +15,12 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::Which,
-    console::{self, Screen, print_wrapped},
+    console::{self, print_wrapped},
     evaluator::{Due, keep},
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder},
     run_view::{Plan, RunView},
-    view::{Display, TEMPLATE},
+    view::Display,
 };
 use processes::Lockstep;
 
@@ -45,7 +45,6 @@ pub fn run(
     let mut due = Due::new(config, run_dir)?;
     let events = config.local.tensorboard;
     let mut recorder = RunRecorder::open(run_dir, config, Vec::new(), resumed, events)?;
-    let screen = Screen::new(config.frames(), TEMPLATE);
     let mut lockstep = match resumed {
         Some(_) => Lockstep::resume(config, run_dir)?,
         None => Lockstep::begin(config, run_dir)?,
@@ -54,7 +53,8 @@ pub fn run(
         frames, updates, ..
     } = resumed.unwrap_or_default();
     let mut view = RunView::beginning(Plan::of(config), frames, updates);
-    let mut display = Display::new(screen.clone(), Instant::now(), updates);
+    let mut display = Display::new(config.frames(), Instant::now(), updates);
+    let screen = display.screen.clone();
     let mut play = |updates, is_last| {
         let Some(episodes) = due.take(updates, is_last) else {
             return;
@@ -93,8 +93,7 @@ pub fn run(
         let show = shown.elapsed() >= POLL;
         if show || lockstep.replay.inserted_total() / row_frames > row {
             row = lockstep.replay.inserted_total() / row_frames;
-            let warnings = record(&mut recorder, &mut view, &mut lockstep);
-            warnings.iter().for_each(|line| screen.line(line));
+            screen.lines(record(&mut recorder, &mut view, &mut lockstep));
             if show {
                 shown = Instant::now();
                 display.show(&view);

@@ -49,19 +49,19 @@ fn number(value: Option<f64>) -> String {
 
 #[derive(Debug)]
 pub(crate) struct Display {
-    screen: Screen,
+    pub(crate) screen: Screen,
     /// Updates with which it began, and when the first beyond them was seen.
     updates_before: u64,
     learns_since: Option<Instant>,
     /// When the run began: a terminal's bar has its own clock.
-    began: Instant,
+    pub(crate) began: Instant,
 }
 
 impl Display {
-    /// Of a run that began at `began`, and has done so many updates.
-    pub(crate) fn new(screen: Screen, began: Instant, updates_before: u64) -> Self {
+    /// Of a run of so many frames that began at `began`, and has done so many updates.
+    pub(crate) fn new(frames: u64, began: Instant, updates_before: u64) -> Self {
         Self {
-            screen,
+            screen: Screen::new(frames, TEMPLATE),
             updates_before,
             learns_since: None,
             began,
@@ -159,7 +159,7 @@ mod tests {
     };
 
     fn display() -> Display {
-        Display::new(Screen::default(), Instant::now(), 0)
+        Display::new(8_000, Instant::now(), 0)
     }
 
     fn view(planned: (u64, u64), replay: ReplayStatus, learner: LearnerStatus) -> RunView {

@@ -138,7 +138,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
         }
         poller.ask();
         if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-            watched.screen.line(&failed);
+            watched.display.screen.line(&failed);
         }
     };
     poller.close();

@@ -13,11 +13,11 @@ use driml_settings::config::RunConfig;
 
 use crate::{
     chosen::config_of,
-    console::{self, Screen},
+    console,
     launcher::process_names,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
     run_view::{RunView, updates_served},
-    view::{Display, Poller, TEMPLATE},
+    view::{Display, Poller},
 };
 
 /// How long replay servers that said that everything is sampled may be silent before they have ended.
@@ -37,11 +37,9 @@ pub struct Outputs {
 }
 
 pub(super) struct Watched {
-    pub(super) screen: Screen,
-    display: Display,
+    /// It shows the run from its beginning, as far as that is known.
+    pub(super) display: Display,
     recorder: Option<RunRecorder>,
-    /// When the run began, as far as is known.
-    began: Instant,
 }
 
 impl Watched {
@@ -51,22 +49,16 @@ impl Watched {
         let folder = outputs.run_dir.as_ref();
         let recorder = folder.map(|it| record(it, config, view, outputs.tensorboard));
         let recorder = recorder.transpose()?;
-        let screen = Screen::new(config.frames(), TEMPLATE);
         let up_s = view.up_s().unwrap_or(0.0).min(UP_MAX);
         let up = Duration::try_from_secs_f64(up_s).unwrap_or_default();
-        if let Some(bar) = screen.bar() {
+        let now = Instant::now();
+        let began = now.checked_sub(up).unwrap_or(now);
+        let display = Display::new(config.frames(), began, view.learner.updates);
+        if let Some(bar) = display.screen.bar() {
             // The view's clock is the run's. All copies of a bar are one.
             drop(bar.clone().with_elapsed(up));
         }
-        let now = Instant::now();
-        let began = now.checked_sub(up).unwrap_or(now);
-        let updates = view.learner.updates;
-        Ok(Self {
-            display: Display::new(screen.clone(), began, updates),
-            screen,
-            recorder,
-            began,
-        })
+        Ok(Self { display, recorder })
     }
 
     /// Takes the poller's last answers: shows and records them. True if the run is over.
@@ -81,7 +73,7 @@ impl Watched {
             let ask = |shard, since| poller.episodes(shard, since, false);
             let mut warnings = recorder.record_episodes(&poller.view, ask);
             warnings.extend(recorder.record(&mut poller.view, &[]));
-            warnings.iter().for_each(|line| self.screen.line(line));
+            self.display.screen.lines(warnings);
         }
         self.display.show(&poller.view);
         self.is_over(poller)
@@ -115,23 +107,21 @@ impl Watched {
         if poller.view.learner.updates >= updates {
             return;
         }
-        self.screen.line(
+        self.display.screen.line(
             "the learner's last answer is missing: its updates are those whose batches were served, its losses and weights those before",
         );
         poller.view.learner.updates = updates;
-        let recorded = self.recorder.as_mut();
-        let warnings = recorded.map(|it| it.record(&mut poller.view, &[]));
-        warnings
-            .iter()
-            .flatten()
-            .for_each(|line| self.screen.line(line));
+        if let Some(recorder) = &mut self.recorder {
+            let warnings = recorder.record(&mut poller.view, &[]);
+            self.display.screen.lines(warnings);
+        }
     }
 
     /// Takes the live lines away, says what could not be recorded, and gives the summary of a run that ended so.
     pub(super) fn conclude(&mut self, view: &mut RunView, outcome: Outcome) -> Summary {
-        self.screen.clear();
+        self.display.screen.clear();
         let Some(recorder) = &self.recorder else {
-            let seconds = self.began.elapsed().as_secs_f64();
+            let seconds = self.display.began.elapsed().as_secs_f64();
             return Summary::of(outcome, view, seconds, ResumePoint::default());
         };
         let missing = recorder.missing();
