@@ -316,28 +316,6 @@ fn by_which_rule_rows_are_drawn_is_for_replay_and_learner_alone() {
 }
 
 #[test]
-fn a_rule_takes_its_own_settings_alone() {
-    for (set, unknown) in [
-        ("run.horizon={rule=\"none\",k=3}", "unknown field `k`"),
-        (
-            "run.horizon={rule=\"fixed\",k=3,k_max=3}",
-            "unknown field `k_max`",
-        ),
-        (
-            "replay.sampling={rule=\"uniform\",alpha=0.5}",
-            "unknown field `alpha`",
-        ),
-        (
-            "model.head={dueling=true,noise_sigma=0.5}",
-            "unknown field `noise_sigma`",
-        ),
-    ] {
-        let said = with("chain", "c51", &[set]).unwrap_err().to_string();
-        assert!(said.contains(unknown), "{set}: {said}");
-    }
-}
-
-#[test]
 fn a_file_s_torso_is_switched_with_its_settings() {
     let nature = with("procgen:bigfish", "c51", &[]).unwrap();
     let of_nature = |set: &[&str]| of_file("it.toml", nature.to_toml(), set);
