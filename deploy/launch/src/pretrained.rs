@@ -65,7 +65,7 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
             0 => "this program has none".into(),
             _ => format!("there are {PREFIX}{}", games.join(&format!(", {PREFIX}"))),
         };
-        return Err(usage!("no pretrained weights of {game:?}{near}; {known}").into());
+        bail!(usage!("no pretrained weights of {game:?}{near}; {known}"));
     };
     let player = read(&format!("{PREFIX}{game}"), bytes.to_vec())?;
     let world = &player.config.run.world;

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use driml_envs::WorldConfig;
 use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::{
@@ -160,19 +160,17 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     // A run in lockstep has one, which is empty where its world cannot be saved.
     let companion = checkpoint::companion(newest)?;
     if companion.as_ref().is_some_and(Vec::is_empty) {
-        return Err(usage!(
+        bail!(usage!(
             "the run in {} cannot be resumed, because the state of its world cannot be saved: start it again",
             folder.display()
-        )
-        .into());
+        ));
     }
     let lockstep = companion.is_some();
     if !lockstep && !config.world.is_resumable() {
-        return Err(usage!(
+        bail!(usage!(
             "the run in {} cannot be resumed, because a checkpoint does not save its position in world.lethal_schedule: start it again",
             folder.display()
-        )
-        .into());
+        ));
     }
     // Where nothing was learned, only a run in lockstep keeps what it has.
     let (frames, rows) = match updates {

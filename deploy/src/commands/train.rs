@@ -3,6 +3,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::bail;
 use clap::Args;
 use driml_launch::{
     console::{self, print_wrapped},
@@ -104,7 +105,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             };
             args.lockstep = found.lockstep;
             if args.lockstep && args.listen.is_some() {
-                return Err(usage!("a run in lockstep is one process: leave --listen out").into());
+                bail!(usage!(
+                    "a run in lockstep is one process: leave --listen out"
+                ));
             }
             let from = format!("its checkpoint after {} updates", found.point.updates);
             (found.config, from, Some(found.point))
@@ -118,20 +121,18 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     check_listening(listen, args.tls.is_set(), args.network.allow_insecure)?;
     check_unused(listen)?;
     if args.tls.is_set() && !args.listen.as_deref().is_some_and(session::is_quic) {
-        return Err(usage!(
+        bail!(usage!(
             "--tls-dir is for processes on other machines, which need an endpoint: add --listen quic/HOST:PORT"
-        )
-        .into());
+        ));
     }
     // Errors in them are reported before anything is made.
     args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
     let (shards, actors) = (config.replay.shards, config.local.actors);
     if shards > actors {
-        return Err(usage!(
+        bail!(usage!(
             "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
-        )
-        .into());
+        ));
     }
     check_ladder(&config)?;
     if args.lockstep {

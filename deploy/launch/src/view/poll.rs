@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use driml_machine::error::{Usage, usage};
 use driml_protocol::{
     CodecError, EpisodesReply, EpisodesRequest, Keys, LearnerStatus, ProcessesStatus, ReplayStatus,
@@ -70,11 +70,10 @@ impl Poller {
             let served = settings(&session, &keys, endpoint, namespace)?;
             let hash = served.run.hash();
             if config.get_or_insert(served).run.hash() != hash {
-                return Err(usage!(
+                bail!(usage!(
                     "{} and {endpoint} are of different runs: name the replay shards of one",
                     endpoints[0]
-                )
-                .into());
+                ));
             }
             servers.push(Reached {
                 name: endpoint.clone(),
@@ -209,10 +208,9 @@ fn settings(
             return Err(why).context(what);
         }
         Err(SessionError::NoAnswerer { .. }) => {
-            return Err(usage!(
+            bail!(usage!(
                 "a program listens on {endpoint}, but it is not a replay server with the namespace {namespace:?}"
-            )
-            .into());
+            ));
         }
         Err(other) => {
             let what = format!("the replay server on {endpoint} does not answer");

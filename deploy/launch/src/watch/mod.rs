@@ -113,7 +113,7 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
     poller.ask();
     let mut file = outputs.prometheus.as_deref().map(PrometheusFile::new);
     if let Some(failed) = file.as_mut().and_then(|it| it.write(&poller.view)) {
-        return Err(usage!("--prometheus: {failed}").into());
+        bail!(usage!("--prometheus: {failed}"));
     }
     let is_begun = |folder: &RunFolder| folder.metrics().exists();
     let is_unknown =

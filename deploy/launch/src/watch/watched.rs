@@ -163,13 +163,12 @@ fn check_same(folder: &RunFolder, config: &RunConfig) -> anyhow::Result<()> {
         return Ok(());
     }
     let name = |it: &RunSpec| format!("{} with {}, seed {}", it.world, it.agent, it.seed);
-    Err(usage!(
+    bail!(usage!(
         "{} holds another run ({}) than the one that is watched ({}): choose another --run-dir",
         folder.display(),
         name(&there),
         name(&config.run)
-    )
-    .into())
+    ))
 }
 
 /// Which of the rows that are there stay.
@@ -180,11 +179,10 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
     let now = view.replay.transitions_inserted;
     let after_updates = view.after_updates.unwrap_or(0);
     if after_updates == 0 && frames > now {
-        return Err(usage!(
+        bail!(usage!(
             "the run in {} had {frames} frames, and the watched run has {now}: it was restarted; choose another --run-dir",
             folder.display()
-        )
-        .into());
+        ));
     }
     Ok(ResumePoint {
         // A run that was resumed makes the updates since its checkpoint again.

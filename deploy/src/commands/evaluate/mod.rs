@@ -11,7 +11,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use driml_actor::Step;
 use driml_figure::Film;
@@ -96,11 +96,10 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     let folder = RunFolder::new(folder);
     let which = args.checkpoint.unwrap_or_default();
     if pretrained.is_some() && (args.checkpoint.is_some() || args.weights.is_some() || args.keep) {
-        return Err(usage!(
+        bail!(usage!(
             "{} is a single network: --checkpoint, --weights and --keep are for the folder of a run",
             folder.display()
-        )
-        .into());
+        ));
     }
     if args.keep {
         let shutdown = Shutdown::on_signals(args.exit_with_parent);
@@ -191,7 +190,9 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
 fn export(player: &Player, path: &Path) -> anyhow::Result<()> {
     if path.extension().is_none_or(|it| it != "safetensors") {
         let name = path.display();
-        return Err(usage!("--export {name}: the file's name ends in .safetensors").into());
+        bail!(usage!(
+            "--export {name}: the file's name ends in .safetensors"
+        ));
     }
     let bytes = pretrained::export(player)?;
     write_whole(path, &bytes)?;
