@@ -37,7 +37,7 @@ pub(super) fn assembling(
     effort: &Effort,
 ) -> anyhow::Result<[Measurement; 2]> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
-    let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes());
+    let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes);
     let mut filled = Filled::new(&config, CAPACITY, recording)?;
     let sampling = effort.rate_by_median(|| {
         black_box(filled.draw()?);

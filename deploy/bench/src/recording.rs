@@ -48,7 +48,7 @@ impl ChunkShape {
 
 /// Transitions of [`STREAMS`] environments of bigfish under a random policy, for [`STEPS`] steps.
 pub(super) struct Recording {
-    frame_bytes: usize,
+    pub(super) frame_bytes: usize,
     /// [STEPS, STREAMS, frame bytes].
     frames: Vec<u8>,
     /// Action, reward and end of each step [STEPS, STREAMS].
@@ -104,11 +104,6 @@ impl Recording {
     /// Writes the frames, raw, for a process that is not ours.
     pub(super) fn write_frames(&self, path: &Path) -> anyhow::Result<()> {
         std::fs::write(path, &self.frames).with_context(|| format!("writing {}", path.display()))
-    }
-
-    /// Bytes of one frame.
-    pub(super) const fn frame_bytes(&self) -> usize {
-        self.frame_bytes
     }
 
     /// Chunk after chunk of one actor, each of `shape` and in memory of `pool`; the recording plays round and round.

@@ -101,11 +101,6 @@ impl ManagedProcess {
         Self::spawn("script", command, log, &Screen::default()).unwrap()
     }
 
-    /// The process's number.
-    pub fn pid(&self) -> u32 {
-        self.child.id()
-    }
-
     /// Whether it has ended in a way that a restart may mend: in order, killed, or after it had run for a while. A broken
     /// invariant of our own aborts it.
     pub(crate) fn may_be_started_again(&mut self) -> bool {
@@ -171,7 +166,7 @@ impl ManagedProcess {
         if self.end().is_some() {
             return None;
         }
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid())).ok()?;
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
         Some(kib(&status, "VmRSS:")? as f64 / 1024.0)
     }
 
@@ -187,7 +182,7 @@ impl ManagedProcess {
             }
             Some((None, None)) => "exited".into(),
         };
-        let (name, log, last) = (&self.name, self.log.path().display(), self.log.last_words());
+        let (name, log, last) = (&self.name, self.log.path.display(), self.log.last_words());
         format!("{name} {how} (log: {log}){last}")
     }
 }

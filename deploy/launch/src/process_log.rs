@@ -22,7 +22,7 @@ const WAITING_MAX: usize = 1000;
 #[derive(Debug)]
 pub(crate) struct ProcessLog {
     name: String,
-    path: PathBuf,
+    pub(crate) path: PathBuf,
     kept: Arc<Mutex<Kept>>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -73,10 +73,6 @@ impl ProcessLog {
         let thread = thread.spawn(carry).context("starting a thread")?;
         self.threads.push(thread);
         Ok(())
-    }
-
-    pub(crate) fn path(&self) -> &Path {
-        &self.path
     }
 
     /// The error with which the process ended, if it said one, or else its last lines.
@@ -162,7 +158,7 @@ mod tests {
         log.follow(std::io::Cursor::new(lines.clone()), &screen)
             .unwrap();
         log.finish();
-        assert_eq!(std::fs::read_to_string(log.path()).unwrap(), lines);
+        assert_eq!(std::fs::read_to_string(&log.path).unwrap(), lines);
         let said = log.last_words();
         assert!(said.starts_with("; its last lines:\n  line 2\n") && said.ends_with("line 9"));
         assert_eq!(log.missing(), None);
