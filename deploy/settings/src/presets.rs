@@ -184,27 +184,23 @@ pub fn world(name: &str) -> Result<WorldName, Usage> {
 pub fn agent(name: &str) -> Result<&'static Agent, Usage> {
     let agents = agents();
     let found = agents.iter().copied().find(|agent| agent.name == name);
-    found.ok_or_else(|| {
-        let (near, names) = names(name, agents.iter().map(|it| it.name));
-        usage!("there is no agent {name:?}{near}; --agent takes {names}")
-    })
+    found.ok_or_else(|| Usage(unknown("agent", name, agents.iter().map(|it| it.name))))
 }
 
 /// Finds a preset by name.
 pub fn preset(name: &str) -> Result<&'static Preset, Usage> {
     let found = PRESETS.iter().find(|preset| preset.name == name);
     found.ok_or_else(|| {
-        let (near, names) = names(name, PRESETS.iter().map(|it| it.name));
-        usage!(
-            "there is no preset {name:?}{near}; --preset takes {names} (`driml presets` describes them)"
-        )
+        let unknown = unknown("preset", name, PRESETS.iter().map(|it| it.name));
+        usage!("{unknown} (`driml presets` describes them)")
     })
 }
 
-/// The name that is nearest to `name`, as a question, and all of them.
-fn names(name: &str, all: impl Iterator<Item = &'static str>) -> (String, String) {
+/// The answer to a name that the flag `kind` does not take: the nearest one, as a question, and all of them.
+fn unknown(kind: &str, name: &str, all: impl Iterator<Item = &'static str>) -> String {
     let all: Vec<_> = all.collect();
-    (nearest(name, all.iter().copied()), all.join(", "))
+    let (near, names) = (nearest(name, all.iter().copied()), all.join(", "));
+    format!("there is no {kind} {name:?}{near}; --{kind} takes {names}")
 }
 
 /// Lays base, world, preset and agent over one another, in this order: a later one wins. Of each file first comes what holds everywhere,
