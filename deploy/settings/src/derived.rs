@@ -50,12 +50,10 @@ const FOLLOWS: [(&str, &str); 17] = [
 /// Where a whole frame's size is, if frames are cut.
 const FRAME: &str = "input.frame";
 
-/// The limits of a world that runs in its own process, in `[world]`.
-const LIMITS: [&str; 2] = ["start_timeout_ms", "step_timeout_ms"];
-
 /// Asks a world that runs in its own process what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
-    let [start, step] = LIMITS.map(|limit| whole_size(table, &format!("world.{limit}")));
+    let limits = ["world.start_timeout_ms", "world.step_timeout_ms"];
+    let [start, step] = limits.map(|limit| whole_size(table, limit));
     let declared = driml_envs::exec_declaration(command, start? as u64, step? as u64)
         .map_err(|e| usage!("--env: {e}"))?;
     for (path, side) in [
