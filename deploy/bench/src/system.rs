@@ -70,7 +70,7 @@ pub(super) fn measure(frames: Option<u64>, flags: &BenchFlags) -> anyhow::Result
     ];
     for (process, mib) in &watched.summary.rss_mib_max {
         let what = format!("memory of {process}");
-        figures.extend(mib.as_f64().map(|mib| Measurement::found(what, mib, "MiB")));
+        figures.extend(mib.map(|mib| Measurement::found(what, mib, "MiB")));
     }
     Ok(figures)
 }
@@ -166,8 +166,7 @@ impl Watched {
             columns.push((format!("{name} p50 {unit}"), quantiles.map(|it| it.p50)));
             columns.push((format!("{name} p99 {unit}"), quantiles.map(|it| it.p99)));
         }
-        let memory = self.summary.rss_mib_max.values();
-        let memory = memory.filter_map(|mib| mib.as_f64()).sum();
+        let memory = self.summary.rss_mib_max.values().flatten().sum();
         columns.push(("MiB of all".to_owned(), Some(memory)));
         let whole = &self.summary.replay;
         columns.push(("retried".to_owned(), Some(whole.chunks_retried as f64)));

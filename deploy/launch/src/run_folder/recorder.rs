@@ -189,7 +189,7 @@ impl RunRecorder {
     pub fn summarise(&self, outcome: Outcome, view: &mut RunView) -> Summary {
         self.complete(view);
         let rss = self.rss_mib.iter().zip(&self.rss_max);
-        let rss = rss.map(|((name, _), mib)| (name.clone(), mib.map(f64::round).into()));
+        let rss = rss.map(|((name, _), mib)| (name.clone(), mib.map(f64::round)));
         Summary {
             rss_mib_max: rss.collect(),
             ..Summary::of(outcome, view, self.seconds(), self.resume_point)

@@ -1,7 +1,7 @@
 //! `summary.json`: how a run ended and what it counted, in one object.
 //! It computes nothing; the recorder fills it in.
 
-use std::{fs, time::Duration};
+use std::{collections::BTreeMap, fs, time::Duration};
 
 use anyhow::Context;
 use driml_machine::units::duration;
@@ -111,7 +111,7 @@ pub struct Summary {
     /// How often an actor that had died was started again; what it had not delivered is in no count.
     pub actors_restarted: u32,
     /// Highest resident memory of each process, MiB.
-    pub rss_mib_max: serde_json::Map<String, serde_json::Value>,
+    pub rss_mib_max: BTreeMap<String, Option<f64>>,
     /// What its weights earn; none where they were not played.
     pub(crate) played: Option<LastPlay>,
     /// The replay's own account at the end; its episodes are those since the run was resumed last.
@@ -150,7 +150,7 @@ impl Summary {
             weights_sha256: learner.weights_sha256.clone(),
             replay_servers_restarted: 0,
             actors_restarted: 0,
-            rss_mib_max: serde_json::Map::new(),
+            rss_mib_max: BTreeMap::new(),
             played: None,
             replay: replay.clone(),
         }

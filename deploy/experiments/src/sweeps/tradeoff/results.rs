@@ -2,8 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::Value;
-
 use super::{
     dials::{Dial, LevelOf},
     settings::Common,
@@ -71,8 +69,7 @@ pub(super) const MEASURES: [Measure; 7] = [
     measure("wall_seconds", |it| Some(it.ran.summary.wall_seconds)),
     // Highest resident memory of all processes.
     measure("rss_mib", |it| {
-        let each = it.ran.summary.rss_mib_max.values();
-        Some(each.filter_map(Value::as_f64).sum())
+        Some(it.ran.summary.rss_mib_max.values().flatten().sum())
     }),
     // Updates by which the weights that acted were behind, median.
     measure("weights_behind_updates", |it| {
