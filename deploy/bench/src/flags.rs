@@ -150,12 +150,8 @@ pub enum Component {
 
 impl Component {
     /// Its name on the command line.
-    pub(crate) const fn name(self) -> &'static str {
-        match self {
-            Self::Learner => "learner",
-            Self::Policy => "policy",
-            Self::Replay => "replay",
-            Self::Env => "env",
-        }
+    pub(crate) fn name(self) -> String {
+        let value = self.to_possible_value().expect("no component is hidden");
+        value.get_name().to_owned()
     }
 }

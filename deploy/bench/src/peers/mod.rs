@@ -174,7 +174,7 @@ fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     // In a later round: what it measured before is not the whole comparison.
     let failed = pair.of_ours.is_none() && sides.absent.is_some();
     Some(Row {
-        component: pair.component.name().into(),
+        component: pair.component.name(),
         what: pair.ours.clone(),
         unit: unit.into(),
         ours: median(ours),

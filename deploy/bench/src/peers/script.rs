@@ -129,7 +129,7 @@ impl Script {
 pub(super) fn ours(component: Component, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
     let program = std::env::current_exe().context("finding this program's own file")?;
     let mut command = Command::new(program);
-    command.args(["bench", component.name(), "--json", "-"]);
+    command.args(["bench", &component.name(), "--json", "-"]);
     command.args(["--threads", &flags.threads.to_string()]);
     command.args(flags.quick.then_some("--quick"));
     for precision in &flags.precision {
