@@ -59,10 +59,8 @@ impl Recording {
     pub(super) fn play() -> anyhow::Result<Self> {
         procgen_sys::Engine::install(&mut console::line)?;
         let config = settings::of_run(settings::WORLD, "c51", "paper", &[])?;
-        let sent = (
-            config.run.frame_height as usize,
-            config.run.frame_width as usize,
-        );
+        let run = &config.run;
+        let sent = (run.frame_height as usize, run.frame_width as usize);
         let whole = config.world.build(STREAMS, 1, 0)?;
         let mut world = RestrictedWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();

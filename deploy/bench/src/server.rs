@@ -71,11 +71,9 @@ impl Server {
         let held = format!("replay.capacity_transitions={}", wire.held);
         let sets = [&settings::REPLAY[..], &[&*shared_memory, &*held]].concat();
         let mut args = vec!["replay-server", "--keep-alive", "--listen", &wire.endpoint];
-        args.extend(
-            wire.folder
-                .iter()
-                .flat_map(|(flag, dir)| [*flag, dir.as_str()]),
-        );
+        if let Some((flag, dir)) = &wire.folder {
+            args.extend([*flag, dir]);
+        }
         let mut process = start("replay-server", &args, &sets, folder)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
         wait_for(&mut process, &wire.endpoint)?;
