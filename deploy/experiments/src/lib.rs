@@ -5,7 +5,7 @@
 //!   experiments that consist of runs, each a TOML file, a page template and what is special about it.
 //! * `studies` are the experiments that train something of their own; `stability` measures numeric routines.
 //! * `cache` keeps finished pieces of work in an experiment's folder, `stats` has the statistics, `page` fills in templates, `plot` draws
-//!   what runs recorded.
+//!   what runs recorded, `small` makes the smallest networks.
 //!
 //! A new experiment of runs is three files in `sweeps` and a variant of [`flags::ExperimentCommand`]. Results that are kept are in
 //! `deploy/experiments/results/`.
@@ -34,6 +34,7 @@ pub mod flags;
 mod page;
 pub mod plot;
 mod progress;
+mod small;
 mod stability;
 mod stats;
 mod studies;

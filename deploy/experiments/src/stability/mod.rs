@@ -5,7 +5,6 @@ mod checks;
 mod edges;
 mod figure;
 mod property;
-mod small;
 
 use std::collections::HashSet;
 

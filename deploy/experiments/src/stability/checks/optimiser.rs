@@ -10,7 +10,7 @@ use driml_learner::{
 };
 use driml_model::{ModelConfig, Parameters};
 
-use crate::stability::{property::*, small};
+use crate::{small, stability::property::*};
 
 const NORMS: &str =
     "all 0, 1e-45, 1e-38, 1e20, 3.4e38; one of 3.4e38 among 1e-45; 10 and 131,000 of them";

@@ -3,7 +3,7 @@
 use candle_core::Device;
 use driml_model::{Parameters, StoredAs};
 
-use crate::stability::{property::*, small};
+use crate::{small, stability::property::*};
 
 const NEAREST: &str = "weights not read as the nearest, ties to even, with their sign";
 const OF_WEIGHT: &str = "a weight, as a share of it";

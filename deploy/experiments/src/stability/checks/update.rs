@@ -10,7 +10,7 @@ use driml_model::{ConvLayer, ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use driml_settings::flags::of_names;
 
-use crate::stability::{property::*, small};
+use crate::{small, stability::property::*};
 
 /// How far two ways of computing may be apart, each of which is right to half of it.
 const UPDATES_APART: f64 = 2e-4;

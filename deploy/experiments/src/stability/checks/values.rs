@@ -8,7 +8,7 @@ use driml_model::{
 };
 use rand::SeedableRng;
 
-use crate::stability::{property::*, small};
+use crate::{small, stability::property::*};
 
 const LOGITS: &str = "2, 51, 1,001 atoms; supports from 0, far from 0 ([1e6, 1e6 + 1], [1000, 1001]), 1 ulp and 2e30 wide; logits equal, +-1e38, one -inf";
 const TOO_LARGE: &str = "weights that take a value beyond 3.4e38 in some rows of a batch";

@@ -3,13 +3,13 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::{AdamSettings, Lambda, auxiliary::dim::Dim};
-use driml_model::{ConvLayer, Features, HeadConfig, ModelConfig, TorsoName};
+use driml_model::{Features, ModelConfig};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::chain::Chain;
-use crate::{progress::Progress, studies::dim::DimLearner};
+use crate::{progress::Progress, small, studies::dim::DimLearner};
 
 /// Ratio between the updates of two measurements.
 const MEASURE_GROWTH: f64 = 1.04;
@@ -156,35 +156,15 @@ struct Heads {
 impl Heads {
     fn new(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<Self> {
         let lambda = Lambda {
-            l3t3: 0.0,
-            l3t4: 0.0,
-            l4t3: 0.0,
             l4t4: 1.0,
+            ..Lambda::NONE
         };
         // The heads read f4, which is here the one-hot state itself; torso and C51 head are as small as can be, and
         // no loss reaches them.
         let model = ModelConfig {
-            height: 1,
-            width: 1,
-            input_channels: 1,
-            num_actions: 1,
-            atoms: 2,
-            v_min: 0.0,
-            v_max: 1.0,
-            torso: TorsoName::Nature,
-            conv: vec![ConvLayer {
-                out: 1,
-                kernel: 1,
-                stride: 1,
-            }],
-            channels: vec![],
-            scale_blocks: false,
-            hidden: states,
             embedding_dim: settings.embedding_dim,
-            action_embed: 1,
             dim: lambda.dim_heads(false),
-            loss_layers: vec![],
-            head: HeadConfig::PLAIN,
+            ..small::config(2, states, (0.0, 1.0))
         };
         let tanh_clip = settings.tanh_clip;
         let dim = Dim { lambda, tanh_clip };

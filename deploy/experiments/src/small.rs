@@ -6,7 +6,7 @@ use candle_core::{Device, Tensor};
 use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
 
 /// A network of one pixel, one action and these atoms; its head's weight has `atoms` times `hidden` scalars.
-pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
+pub(crate) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelConfig {
     ModelConfig {
         height: 1,
         width: 1,
@@ -33,12 +33,12 @@ pub(super) fn config(atoms: usize, hidden: usize, support: (f32, f32)) -> ModelC
 }
 
 /// The network of least parameters: eight in all.
-pub(super) fn least() -> ModelConfig {
+pub(crate) fn least() -> ModelConfig {
     config(2, 1, (-1.0, 1.0))
 }
 
 /// Scalars in all parameters together.
-pub(super) fn len(config: &ModelConfig) -> usize {
+pub(crate) fn len(config: &ModelConfig) -> usize {
     let shapes = config.parameter_shapes();
     shapes
         .iter()
@@ -47,7 +47,7 @@ pub(super) fn len(config: &ModelConfig) -> usize {
 }
 
 /// Tensors with these scalars, one after the other.
-pub(super) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<String, Tensor>> {
+pub(crate) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<String, Tensor>> {
     let mut rest = values;
     let each = config.parameter_shapes().into_iter().map(|(name, shape)| {
         let (first, after) = rest.split_at(shape.iter().product());
@@ -58,12 +58,12 @@ pub(super) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<St
 }
 
 /// Parameters with these scalars, which are finite.
-pub(super) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
+pub(crate) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
     Parameters::from_tensors(config, tensors(config, values)?, &Device::Cpu)
 }
 
 /// The scalars of all parameters, in the order of [`parameters`].
-pub(super) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
+pub(crate) fn values(config: &ModelConfig, parameters: &Parameters) -> Result<Vec<f32>> {
     let mut values = Vec::new();
     for (name, _) in config.parameter_shapes() {
         if let Some(var) = parameters.get(&name) {
