@@ -94,6 +94,43 @@ impl Chain {
         apart * apart + 4.0 * up * down * sine * sine
     }
 
+    /// The stationary law as the rows of T^(2^40), by squaring.
+    fn stationary_numerically(&self) -> Vec<f64> {
+        let (mut power, k) = (self.transitions(), self.states);
+        for _ in 0..40 {
+            let square =
+                |i: usize, j: usize| (0..k).map(|l| power[i * k + l] * power[l * k + j]).sum();
+            let next: Vec<f64> = (0..k * k).map(|at| square(at / k, at % k)).collect();
+            // Rounding would let the rows' sums drift, and squaring double the drift.
+            let normalised = next.chunks(k).flat_map(|row| {
+                let sum: f64 = row.iter().sum();
+                row.iter().map(move |p| p / sum)
+            });
+            power = normalised.collect();
+        }
+        power[..k].to_vec()
+    }
+
+    /// Sum of rho_i T_ij ln(T_ij / rho_j), in nats.
+    pub(super) fn mutual_information_numerically(&self) -> f64 {
+        let (t, k) = (self.transitions(), self.states);
+        let rho = self.stationary_numerically();
+        let term = |at: usize| match t[at] {
+            0.0 => 0.0,
+            p => rho[at / k] * p * (p / rho[at % k]).ln(),
+        };
+        (0..k * k).map(term).sum()
+    }
+
+    /// 1 - lambda_2 from the eigenvalues of the symmetric matrix sqrt(T_ij T_ji), which has T's as T balances in detail.
+    pub(super) fn spectral_gap_numerically(&self) -> f64 {
+        let (t, k) = (self.transitions(), self.states);
+        let entry = |at: usize| (t[at] * t[at % k * k + at / k]).sqrt();
+        let mut values = eigenvalues((0..k * k).map(entry).collect(), k);
+        values.sort_by(f64::total_cmp);
+        values[k - 1] - values[k - 2]
+    }
+
     pub(super) fn step(&self, state: usize, rng: &mut impl Rng) -> usize {
         if rng.random::<f64>() < self.alpha {
             (state + 1).min(self.states - 1)
@@ -107,40 +144,6 @@ impl Chain {
 fn entropy(law: &[f64]) -> f64 {
     let terms = law.iter().filter(|p| **p > 0.0).map(|p| p * p.ln());
     -terms.sum::<f64>()
-}
-
-/// The stationary law of `t` [k, k] as the rows of T^(2^40), by squaring.
-pub(super) fn stationary_numerically(t: &[f64], k: usize) -> Vec<f64> {
-    let mut power = t.to_vec();
-    for _ in 0..40 {
-        let square = |i: usize, j: usize| (0..k).map(|l| power[i * k + l] * power[l * k + j]).sum();
-        let next: Vec<f64> = (0..k * k).map(|at| square(at / k, at % k)).collect();
-        // Rounding would let the rows' sums drift, and squaring double the drift.
-        let normalised = next.chunks(k).flat_map(|row| {
-            let sum: f64 = row.iter().sum();
-            row.iter().map(move |p| p / sum)
-        });
-        power = normalised.collect();
-    }
-    power[..k].to_vec()
-}
-
-/// Sum of rho_i T_ij ln(T_ij / rho_j), in nats.
-pub(super) fn mutual_information_numerically(t: &[f64], k: usize) -> f64 {
-    let rho = stationary_numerically(t, k);
-    let term = |at: usize| match t[at] {
-        0.0 => 0.0,
-        p => rho[at / k] * p * (p / rho[at % k]).ln(),
-    };
-    (0..k * k).map(term).sum()
-}
-
-/// 1 - lambda_2 from the eigenvalues of the symmetric matrix sqrt(T_ij T_ji), which has T's as T balances in detail.
-pub(super) fn spectral_gap_numerically(t: &[f64], k: usize) -> f64 {
-    let entry = |at: usize| (t[at] * t[at % k * k + at / k]).sqrt();
-    let mut values = eigenvalues((0..k * k).map(entry).collect(), k);
-    values.sort_by(f64::total_cmp);
-    values[k - 1] - values[k - 2]
 }
 
 /// Eigenvalues of a symmetric matrix [k, k] by Jacobi's rotations.
@@ -182,14 +185,13 @@ mod tests {
         for states in [2, 3, 10, 17] {
             for alpha in [0.05, 0.3, 0.499, 0.5, 0.7, 0.95] {
                 let chain = Chain { states, alpha };
-                let t = chain.transitions();
                 let what = format!("K = {states}, alpha = {alpha}");
-                let laws = [chain.stationary(), stationary_numerically(&t, states)];
+                let laws = [chain.stationary(), chain.stationary_numerically()];
                 let pairs = laws[0].iter().zip(&laws[1]);
                 pairs.for_each(|(a, b)| assert_near(*a, *b, &what));
-                let information = mutual_information_numerically(&t, states);
+                let information = chain.mutual_information_numerically();
                 assert_near(chain.mutual_information(), information, &what);
-                let gap = spectral_gap_numerically(&t, states);
+                let gap = chain.spectral_gap_numerically();
                 assert_near(chain.spectral_gap(), gap, &what);
             }
         }

@@ -4,7 +4,7 @@
 use driml_figure::{Axis, Chart, Figure, GREY, Heat, Mark, Panel, Series};
 
 use super::{
-    chain::{Chain, mutual_information_numerically, spectral_gap_numerically},
+    chain::Chain,
     results::{Measure, Results, SHARE, TV, Trained},
     training::Sampling,
 };
@@ -57,12 +57,10 @@ fn closed_form(results: &Results, name: &str, value: impl Fn(&Chain) -> f64) -> 
     Series::line(name, 0, points.collect())
 }
 
-/// The same by linear algebra, from the transitions at each alpha.
-fn numerical(results: &Results, value: impl Fn(&[f64], usize) -> f64) -> Series {
-    let points = results.settings.alphas.iter().map(|&alpha| {
-        let chain = results.chain(alpha);
-        (alpha, value(&chain.transitions(), chain.states))
-    });
+/// The same by linear algebra, at each alpha.
+fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
+    let alphas = results.settings.alphas.iter();
+    let points = alphas.map(|&alpha| (alpha, value(&results.chain(alpha))));
     Series::line("numerical", 0, points.collect()).marked(Mark::Rings)
 }
 
@@ -75,7 +73,7 @@ fn information(results: &Results) -> Panel {
     let series = vec![
         ring.marked(Mark::Dashed),
         closed_form(results, "closed form", Chain::mutual_information),
-        numerical(results, mutual_information_numerically),
+        numerical(results, Chain::mutual_information_numerically),
         learnt.marked(Mark::Bars),
     ];
     let title = "(c) Mutual information of successive states";
@@ -86,7 +84,7 @@ fn information(results: &Results) -> Panel {
 fn inverse_gap(results: &Results) -> Panel {
     let series = vec![
         closed_form(results, "closed form", |it| 1.0 / it.spectral_gap()),
-        numerical(results, |t, k| 1.0 / spectral_gap_numerically(t, k)),
+        numerical(results, |it| 1.0 / it.spectral_gap_numerically()),
     ];
     let y = Axis::linear("1 / (1 - \u{3bb}\u{2082}) [steps]").showing(&[0.0]);
     let title = "(d) Inverse spectral gap";

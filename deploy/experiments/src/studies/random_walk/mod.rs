@@ -63,16 +63,15 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let k = results.settings.states;
     let laws = results.settings.alphas.iter().map(|&alpha| {
         let chain = results.chain(alpha);
-        let t = chain.transitions();
         let learnt = Spread::of(results.learnt_information(alpha));
         let of_chain = [
             chain.mutual_information(),
-            chain::mutual_information_numerically(&t, k),
+            chain.mutual_information_numerically(),
             learnt.expect("each bias has a seed").mean,
             chain.mutual_information_of_a_ring(),
             chain.mutual_information_as_printed(),
             chain.spectral_gap(),
-            chain::spectral_gap_numerically(&t, k),
+            chain.spectral_gap_numerically(),
         ];
         (alpha, of_chain.map(rounded))
     });
