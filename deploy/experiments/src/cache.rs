@@ -62,19 +62,9 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    /// Opens the folder, or makes it. `units` is the work of all pieces together.
+    /// Opens the folder, or makes it. `units` is the work of all pieces together. For a report alone it makes no folder, and writes
+    /// down no settings, as they made nothing; runs that lie in one with their calls are enough.
     pub(crate) fn open(
-        name: &str,
-        flags: &ExperimentFlags,
-        settings: &impl Serialize,
-        units: u64,
-    ) -> anyhow::Result<Self> {
-        Self::open_queue(name, flags, settings, units, false)
-    }
-
-    /// [`Session::open`] of a sweep. For a report alone it makes no folder, and writes down no settings, as they
-    /// made nothing; runs that lie in one with their calls are enough.
-    pub(crate) fn open_queue(
         name: &str,
         flags: &ExperimentFlags,
         settings: &impl Serialize,
@@ -291,8 +281,8 @@ mod tests {
             out: Some(folder.path().join("walk")),
             seeds: None,
         };
-        let open = |settings: &str| Session::open("walk", &flags, &settings, 40);
-        let report = |settings: &str| Session::open_queue("walk", &flags, &settings, 40, true);
+        let open = |settings: &str| Session::open("walk", &flags, &settings, 40, false);
+        let report = |settings: &str| Session::open("walk", &flags, &settings, 40, true);
         assert!(report("a").unwrap_err().is::<Usage>());
         assert!(!folder.path().join("walk").exists());
         // Of runs that were copied there, with the wrong flags: they are not what is kept.

@@ -152,17 +152,6 @@ pub struct SweepArgs {
     pub(crate) out: Option<PathBuf>,
 }
 
-impl SweepArgs {
-    /// Where it works, as experiments say it.
-    pub(crate) fn folder(&self) -> ExperimentFlags {
-        ExperimentFlags {
-            smoke: false,
-            out: self.out.clone(),
-            seeds: None,
-        }
-    }
-}
-
 /// The table `full` or `smoke` of an experiment's settings, which are built in.
 pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool) -> T {
     let length = if smoke { "smoke" } else { "full" };

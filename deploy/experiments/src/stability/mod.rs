@@ -35,7 +35,7 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let table = || TABLE.into_iter().flatten();
     let units = table().count() as u64 * u64::from(settings.seeds);
-    let mut session = Session::open(NAME, args, &settings, units)?;
+    let mut session = Session::open(NAME, args, &settings, units, false)?;
     // What another build of the routines kept says nothing of these.
     let program = cache::program()?;
     let mut rows: Vec<Row> = Vec::new();

@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     cache::{Session, settings_of},
-    flags::SweepArgs,
+    flags::{ExperimentFlags, SweepArgs},
     page::number,
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
@@ -44,7 +44,12 @@ struct Settings {
 /// # Errors
 /// As [`crate::run`].
 pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
-    let kept = settings_of(NAME, &args.folder()).filter(|_| args.report);
+    let flags = ExperimentFlags {
+        smoke: false,
+        out: args.out.clone(),
+        seeds: None,
+    };
+    let kept = settings_of(NAME, &flags).filter(|_| args.report);
     let (settings, seeds) = settings(args, kept)?;
     let axes = &settings.axes;
     let cells = cells(axes, args.seeds)?;
@@ -64,7 +69,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     plans.sort_by_key(|(_, plan)| plan.call.seed);
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     queue::install(&plans, args.report)?;
-    let mut session = Session::open_queue(NAME, &args.folder(), &settings, units, args.report)?;
+    let mut session = Session::open(NAME, &flags, &settings, units, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
     session.work().1.clear();
     let rows = rows(&cells, &swept.made);

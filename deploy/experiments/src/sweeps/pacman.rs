@@ -29,7 +29,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let units = plans.iter().map(|(_, plan)| plan.units).sum();
     let report = args.queue.report;
     queue::install(&plans, report)?;
-    let mut session = Session::open_queue(NAME, &args.flags, &settings, units, report)?;
+    let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
     swept.check_any(report)?;
     let results = Results::read(settings, swept)?;

@@ -78,7 +78,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     }
     let mut it = Tradeoff {
         args,
-        session: Session::open_queue(&name, &args.flags, &settings.common, 0, report_only)?,
+        session: Session::open(&name, &args.flags, &settings.common, 0, report_only)?,
         settings,
         speeds: BTreeMap::new(),
     };

@@ -46,7 +46,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let task = task(&settings)?;
     let units = u64::from(settings.seeds) * settings.updates;
-    let mut session = Session::open(NAME, args, &task, units)?;
+    let mut session = Session::open(NAME, args, &task, units, false)?;
     let mut trained = Vec::new();
     for seed in 1..=settings.seeds {
         let key = format!("seed{seed}");

@@ -29,7 +29,7 @@ pub(crate) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
     let pieces = settings.alphas.len() * Sampling::ALL.len() * settings.seeds as usize;
     let units = pieces as u64 * settings.updates;
-    let mut session = Session::open(NAME, args, &settings, units)?;
+    let mut session = Session::open(NAME, args, &settings, units, false)?;
 
     let mut trained = Vec::with_capacity(pieces);
     let grid = Sampling::ALL.into_iter().flat_map(|sampling| {
