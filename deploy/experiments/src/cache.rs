@@ -62,8 +62,8 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    /// Opens the folder, or makes it. `units` is the work of all pieces together. For a report alone it makes no folder, and writes
-    /// down no settings, as they made nothing; runs that lie in one with their calls are enough.
+    /// Opens the folder, or makes it. `units` is the work of all pieces together; runs announce their own. For a report alone it makes
+    /// no folder, and writes down no settings, as they made nothing; runs that lie in one with their calls are enough.
     pub(crate) fn open(
         name: &str,
         flags: &ExperimentFlags,

@@ -54,7 +54,7 @@ impl Progress {
         self.done
     }
 
-    /// Counts work that was done in vain and has to be done again.
+    /// Announces more work: what is found to be needed on the way, and what was done in vain and has to be done again.
     pub(crate) fn again(&mut self, units: u64) {
         self.total += units;
         if let Some(bar) = self.screen.bar() {

@@ -67,9 +67,8 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         }));
     }
     plans.sort_by_key(|(_, plan)| plan.call.seed);
-    let units = plans.iter().map(|(_, plan)| plan.units).sum();
     queue::install(&plans, args.report)?;
-    let mut session = Session::open(NAME, &flags, &settings, units, args.report)?;
+    let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
     session.work().1.clear();
     let rows = rows(&cells, &swept.made);

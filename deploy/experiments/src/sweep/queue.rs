@@ -42,7 +42,7 @@ const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`; with `report` it makes none.
+/// Makes all runs, `jobs` at once, in the order of `plans`, and announces their work; with `report` it makes none.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
@@ -50,6 +50,7 @@ pub(crate) fn make<P>(
     report: bool,
 ) -> anyhow::Result<Swept<P>> {
     let (folder, progress) = session.work();
+    progress.again(plans.iter().map(|(_, plan)| plan.units).sum());
     let mut queue = Queue {
         runs: Runs::open(folder)?,
         jobs,

@@ -26,10 +26,9 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let settings = settings::with_flags(args)?;
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
-    let units = plans.iter().map(|(_, plan)| plan.units).sum();
     let report = args.queue.report;
     queue::install(&plans, report)?;
-    let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
+    let mut session = Session::open(NAME, &args.flags, &settings, 0, report)?;
     let swept = queue::make(&mut session, plans, settings.jobs, report)?;
     swept.check_any(report)?;
     let results = Results::read(settings, swept)?;

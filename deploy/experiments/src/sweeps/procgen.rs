@@ -26,7 +26,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let plans: Vec<_> = plans.collect();
     let play = settings.play(Levels::Train);
     // Each run's agent plays, and a random policy beside it.
-    let units = plans.len() as u64 * (settings.frames + 2 * play.units);
+    let units = plans.len() as u64 * 2 * play.units;
     let report = args.queue.report;
     queue::install(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;

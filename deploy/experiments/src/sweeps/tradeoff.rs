@@ -271,9 +271,9 @@ impl Tradeoff<'_> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
         queue::install(&wanted, report_only)?;
-        let work: u64 = wanted.iter().map(|(_, plan)| plan.units + units).sum();
-        // A random policy plays once.
-        self.session.work().1.again(work + units);
+        // Each run plays, and a random policy once.
+        let plays = wanted.len() as u64 + 1;
+        self.session.work().1.again(units * plays);
         let common = self.settings.common.clone();
         let session = &mut self.session;
         let Swept { made, missing } = queue::make(session, wanted, common.jobs, report_only)?;
