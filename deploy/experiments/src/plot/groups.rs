@@ -65,8 +65,7 @@ pub(super) fn of(runs: &[Run], together: bool) -> Vec<Group<'_>> {
             None => groups.push(vec![run]),
         }
     }
-    let all: Vec<_> = groups.iter().map(|group| &group[..]).collect();
-    let named = names::of(&all).into_iter().zip(groups);
+    let named = names::of(&groups).into_iter().zip(groups);
     named.map(|(name, runs)| Group { name, runs }).collect()
 }
 

@@ -11,23 +11,23 @@ use super::runs::Run;
 const TOLD_MAX: usize = 3;
 
 /// A name for each of these lists of runs, which differ in their seeds alone; no two are alike.
-pub(super) fn of(groups: &[&[&Run]]) -> Vec<String> {
-    let name = |runs: &&[&Run]| {
-        let Some(what) = &runs[0].what else {
+pub(super) fn of(groups: &[Vec<&Run>]) -> Vec<String> {
+    let name = |runs: &Vec<&Run>| {
+        let (Some(what), Some(own)) = (&runs[0].what, &runs[0].settings) else {
             return runs[0].name.clone();
         };
         let peers = groups.iter().map(|other| other[0]);
         let peers = peers.filter(|other| other.what.as_ref() == Some(what));
-        let peers: Vec<_> = peers.map(|run| settings(run.settings.as_ref())).collect();
+        let peers = peers.filter_map(|other| other.settings.as_ref());
+        let peers: Vec<_> = peers.map(settings).collect();
         let mut parts = vec![what.clone()];
-        let own = settings(runs[0].settings.as_ref());
-        parts.extend(differences(&own, &peers));
+        parts.extend(differences(&settings(own), &peers));
         parts.push(seeds(runs));
         parts.join(", ")
     };
     let names: Vec<String> = groups.iter().map(name).collect();
     let alike = |name: &String| names.iter().filter(|other| *other == name).count() > 1;
-    let told_apart = |(name, runs): (&String, &&[&Run])| match alike(name) {
+    let told_apart = |(name, runs): (&String, &Vec<&Run>)| match alike(name) {
         true if *name != runs[0].name => format!("{name} ({})", runs[0].name),
         _ => name.clone(),
     };
@@ -47,23 +47,18 @@ fn seeds(runs: &[&Run]) -> String {
 }
 
 /// Every setting with its whole name.
-fn settings(table: Option<&Table>) -> BTreeMap<String, String> {
+fn settings(table: &Table) -> BTreeMap<String, String> {
     let mut all = BTreeMap::new();
-    for (key, value) in table.into_iter().flatten() {
-        flatten(key, value, &mut all);
+    for (key, value) in table {
+        if let Value::Table(inner) = value {
+            let inner = settings(inner).into_iter();
+            all.extend(inner.map(|(name, text)| (format!("{key}.{name}"), text)));
+        } else {
+            let text = value.as_str().map(str::to_owned);
+            all.insert(key.clone(), text.unwrap_or_else(|| value.to_string()));
+        }
     }
     all
-}
-
-fn flatten(name: &str, value: &Value, all: &mut BTreeMap<String, String>) {
-    if let Value::Table(table) = value {
-        for (key, value) in table {
-            flatten(&format!("{name}.{key}"), value, all);
-        }
-    } else {
-        let text = value.as_str().map(str::to_owned);
-        all.insert(name.to_owned(), text.unwrap_or_else(|| value.to_string()));
-    }
 }
 
 /// The settings of `own` that are not the same in all of `peers`, which contain it, each as `name=value`.
@@ -122,7 +117,7 @@ mod tests {
             (deep, wide, "torso=impala, height=64, conv=unset"),
             (many, "", "a=1, b=1, c=1, and 2 more settings"),
         ] {
-            let [own, other] = [own, other].map(|text| settings(text.parse().ok().as_ref()));
+            let [own, other] = [own, other].map(|text| settings(&text.parse().unwrap()));
             let found = differences(&own, &[other, own.clone()]);
             assert_eq!(found.join(", "), expected);
         }
