@@ -92,7 +92,7 @@ impl Group<'_> {
         // Evaluations are of some runs only.
         let having = self.runs.iter().filter(|run| run.has_values(column));
         let each = having.map(|run| {
-            let values = run.values_over(args.x.column(), column)?;
+            let values = run.values(args.x.column(), column)?;
             Ok(match args.smooth {
                 Some(window) => smoothed(&values, window as f64),
                 None => values,

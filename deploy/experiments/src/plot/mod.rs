@@ -129,7 +129,7 @@ fn charts(args: &PlotArgs) -> anyhow::Result<Figure> {
     for column in &columns {
         // A name that no run knows is an error.
         if !runs.iter().any(|run| run.has_values(column)) {
-            runs[0].values_over(args.x.column(), column)?;
+            runs[0].values(args.x.column(), column)?;
         }
         let reports = |run: &Run| run.auxiliary_losses().contains(column);
         let is_loss = runs.iter().any(reports);

@@ -59,15 +59,10 @@ impl Run {
         })
     }
 
-    /// The values of a column over frames; rows without a value are left out.
-    pub(crate) fn values(&self, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
-        self.values_over("frames", column)
-    }
-
-    /// The values of a column over another one which only grows, in their order; rows without a value are left out.
+    /// The values of a column over `x`, one which only grows, in their order; rows without a value are left out.
     ///
     /// Rows at the same place are one point, their mean: a row is written each second, in which there may be no new frame.
-    pub(crate) fn values_over(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
+    pub(crate) fn values(&self, x: &str, column: &str) -> Result<Vec<(f64, f64)>, Usage> {
         let (table, path) = self.table(column);
         let x = self.place(table, x)?;
         let place = self.place(table, column)?;

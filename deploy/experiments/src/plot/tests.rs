@@ -91,7 +91,7 @@ fn agents_with_different_losses_are_drawn_beside_each_other() {
 fn a_row_cut_off_a_folder_given_twice_and_one_that_is_no_runs_are_left_out() {
     let root = Runs::new();
     let a = root.run("a", "c51", 1, &format!("{METRICS}4,3"));
-    let values = read(&a).values("mean_return").unwrap();
+    let values = read(&a).values("frames", "mean_return").unwrap();
     assert_eq!(values, [(10.0, 1.5), (20.0, 2.5)]);
     let (none, again) = (root.0.path().to_owned(), root.0.path().join("./a"));
     let svg = drawn(&root.args(&[&none, &a, &again], &["mean_return"]));
@@ -148,7 +148,7 @@ fn lines_are_called_by_what_differs_and_by_their_seeds() {
 fn rows_at_the_same_place_are_one_point_whatever_their_order() {
     let metrics = "seconds,frames,updates,loss\n1,10,0,1\n2,10,1,3\n3,30,2,5\n4,20,2,7\n";
     let run = read(&Runs::new().run("a", "c51", 1, metrics));
-    let over = |x| run.values_over(x, "loss").unwrap();
+    let over = |x| run.values(x, "loss").unwrap();
     assert_eq!(over("frames"), [(10.0, 2.0), (20.0, 7.0), (30.0, 5.0)]);
     assert_eq!(over("updates"), [(0.0, 1.0), (1.0, 3.0), (2.0, 6.0)]);
     assert_eq!(over("seconds").len(), 4);

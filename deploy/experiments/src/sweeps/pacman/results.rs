@@ -58,7 +58,7 @@ impl Results {
                 Point::Epsilon(epsilon) => {
                     let frames = settings.predictability.frames as f64;
                     for (column, _) in LOSSES {
-                        let points = metrics.values(column)?;
+                        let points = metrics.values("frames", column)?;
                         losses.push(Loss {
                             epsilon,
                             seed,
@@ -116,7 +116,7 @@ fn mean_from(points: &Points, frames: f64) -> Option<f64> {
 
 /// Mean return of the last 100 episodes over episodes, up to the end of the last task.
 fn trace(run: &Run, continual: &Continual) -> anyhow::Result<Points> {
-    let mut points = run.values_over("episodes", "mean_return")?;
+    let mut points = run.values("episodes", "mean_return")?;
     points.retain(|point| point.0 <= continual.episodes() as f64);
     Ok(points)
 }

@@ -133,7 +133,8 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
             series.push(Series::line("random", 0, level(random)).coloured(GREY));
         }
         for (index, (agent, of)) in settings.agents.iter().zip(&game.agents).enumerate() {
-            let read = |it: &&Made<Point>| Ok(Run::read(&it.run.folder)?.values("mean_return")?);
+            let read =
+                |it: &&Made<Point>| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?);
             let each = of.runs.iter().map(read);
             let curve = over_seeds(&each.collect::<anyhow::Result<Vec<_>>>()?);
             if curve.points.is_empty() {

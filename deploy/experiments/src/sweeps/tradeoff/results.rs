@@ -93,7 +93,7 @@ impl PointResult {
     /// Training return over seconds, of each run.
     pub(super) fn training_curves(&self) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
         let read =
-            |it: &SeedResult| Ok(Run::read(&it.ran.folder)?.values_over("seconds", "mean_return")?);
+            |it: &SeedResult| Ok(Run::read(&it.ran.folder)?.values("seconds", "mean_return")?);
         self.seeds.iter().map(read).collect()
     }
 }
