@@ -6,7 +6,7 @@ use minijinja::{Environment, Error, ErrorKind, UndefinedBehavior, Value, context
 
 use crate::{
     flags::this_command,
-    stats::{Spread, difference, interval},
+    stats::{Spread, difference, interval, mean},
 };
 
 const SMOKE: &str =
@@ -72,9 +72,7 @@ fn fill(template: &str, values: &Value) -> Result<String, Error> {
         written(&value, |it| format!("x{it:.2}"))
     });
     environment.add_filter("duration", |value: Value| written(&value, rough_duration));
-    environment.add_filter("mean", |list: Value| {
-        of_list(&list, |all| Some(Spread::of(all.iter().copied())?.mean))
-    });
+    environment.add_filter("mean", |list: Value| of_list(&list, mean));
     environment.add_filter("spread", |list: Value, decimals: Option<usize>| {
         of_list(&list, |all| mean_and_sd(all, decimals.unwrap_or(3), true))
     });

@@ -37,6 +37,11 @@ impl Spread {
     }
 }
 
+/// The mean; none of no value.
+pub(crate) fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| mean_and_deviation(values).0)
+}
+
 /// A mean and the interval in which it lies with 95% confidence if values are normal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Interval {
@@ -49,8 +54,8 @@ pub(crate) struct Interval {
 ///
 /// A bootstrap of so few values as there are seeds is too narrow: of three, its 95% interval has the mean in 75% of cases.
 pub(crate) fn interval(values: &[f64]) -> Option<Interval> {
-    (!values.is_empty()).then(|| Interval {
-        mean: mean_and_deviation(values).0,
+    mean(values).map(|mean| Interval {
+        mean,
         ends: stats::interval(values),
     })
 }

@@ -78,10 +78,6 @@ fn players(folder: &RunFolder, checkpoints: usize) -> anyhow::Result<Vec<Which>>
     Ok(newest.map(|(updates, _)| Which::After(*updates)).collect())
 }
 
-pub(crate) fn mean(returns: &[f64]) -> Option<f64> {
-    (!returns.is_empty()).then(|| returns.iter().sum::<f64>() / returns.len() as f64)
-}
-
 #[cfg(test)]
 mod tests {
     use std::fs;

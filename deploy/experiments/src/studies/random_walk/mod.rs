@@ -18,7 +18,7 @@ use crate::{
     cache::Session,
     flags::{self, ExperimentFlags},
     plot::Curve,
-    stats::Spread,
+    stats::{Spread, mean},
 };
 
 const NAME: &str = "random-walk";
@@ -63,11 +63,11 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     let k = results.settings.states;
     let laws = results.settings.alphas.iter().map(|&alpha| {
         let chain = results.chain(alpha);
-        let learnt = Spread::of(results.learnt_information(alpha));
+        let learnt = mean(&results.learnt_information(alpha));
         let of_chain = [
             chain.mutual_information(),
             chain.mutual_information_numerically(),
-            learnt.expect("each bias has a seed").mean,
+            learnt.expect("each bias has a seed"),
             chain.mutual_information_of_a_ring(),
             chain.mutual_information_as_printed(),
             chain.spectral_gap(),
@@ -120,7 +120,7 @@ fn values(results: &Results) -> Value {
     let of_errors = |part: fn(&Spread) -> f64| errors.iter().map(part).collect::<Vec<_>>();
     let holds = |measure: Measure| {
         let found = results.gap_correlations(Sampling::Stationary, measure);
-        Spread::of(found).is_some_and(|spread| spread.mean > 0.5)
+        mean(&found).is_some_and(|mean| mean > 0.5)
     };
     // What follows from the closed forms alone, at any length of the experiment.
     let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
-    stats::{Spread, rank_correlation},
+    stats::{mean, rank_correlation},
     sweep::plan::{Made, Swept},
 };
 
@@ -111,7 +111,7 @@ impl Results {
 
 fn mean_from(points: &Points, frames: f64) -> Option<f64> {
     let late = points.iter().filter(|point| point.0 >= frames);
-    Spread::of(late.map(|point| point.1)).map(|it| it.mean)
+    mean(&late.map(|point| point.1).collect::<Vec<_>>())
 }
 
 /// Mean return of the last 100 episodes over episodes, up to the end of the last task.
@@ -128,7 +128,7 @@ fn tasks(points: &Points, continual: &Continual) -> Vec<Option<(f64, f64)>> {
         let (start, end) = (length * task as f64, length * (task + 1) as f64);
         let inside = points.iter().filter(|(x, _)| *x > start && *x <= end);
         let values: Vec<f64> = inside.map(|point| point.1).collect();
-        Some((*values.last()?, Spread::of(values)?.mean))
+        Some((*values.last()?, mean(&values)?))
     };
     (0..continual.tasks).map(of_task).collect()
 }
@@ -137,7 +137,7 @@ impl Trace {
     /// The mean over all tasks; none if the run lacks one.
     pub(super) fn over_tasks(&self) -> Option<f64> {
         let tasks = self.tasks.iter().map(|task| Some((*task)?.1));
-        Spread::of(tasks.collect::<Option<Vec<_>>>()?).map(|spread| spread.mean)
+        mean(&tasks.collect::<Option<Vec<_>>>()?)
     }
 }
 

@@ -14,10 +14,10 @@ use crate::{
     cache::Session,
     plot::{Run, over_seeds},
     stats::{
-        Spread,
+        Spread, mean,
         over_games::{Scores, improvement, iqm},
     },
-    sweep::{plan::Made, results::mean},
+    sweep::plan::Made,
     sweeps::published::{normalised, paper},
 };
 

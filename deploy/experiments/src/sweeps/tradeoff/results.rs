@@ -8,8 +8,8 @@ use super::{
 };
 use crate::{
     plot::Run,
-    stats::{Difference, Interval, Spread, difference, interval},
-    sweep::{plan::FinishedRun, results::mean},
+    stats::{Difference, Interval, difference, interval, mean},
+    sweep::plan::FinishedRun,
 };
 
 /// Numbers of the bench, or errors against the reference, by their names in the data.
@@ -118,12 +118,12 @@ impl Row<'_> {
     /// The level's frames a second over the base's, of the seeds that both have: a base's further seeds run at another time, beside other
     /// runs.
     pub(super) fn frames_gain(&self) -> Option<f64> {
-        let mean = |point: &PointResult, other: &PointResult| {
+        let mean_of = |point: &PointResult, other: &PointResult| {
             let both = |it: &&SeedResult| other.seeds.iter().any(|of| of.seed == it.seed);
             let values = point.seeds.iter().filter(both);
-            Spread::of(values.filter_map(FRAMES_PER_SECOND.of)).map(|it| it.mean)
+            mean(&values.filter_map(FRAMES_PER_SECOND.of).collect::<Vec<_>>())
         };
-        Some(mean(self.result, self.base)? / mean(self.base, self.result)?)
+        Some(mean_of(self.result, self.base)? / mean_of(self.base, self.result)?)
     }
 }
 
