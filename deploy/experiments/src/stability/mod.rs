@@ -55,29 +55,19 @@ pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
         }
         rows.extend(property::tried(of_property));
     }
-    session.csv("promises", COLUMNS, table_of(&rows))?;
+    let promises = rows.iter().map(|row| {
+        let of = (&row.routine, &row.range, &row.extreme, row.cases);
+        let kept = if row.is_kept() { "yes" } else { "no" };
+        let found = [number(row.worst), number(row.bound)];
+        (of, found, kept, &row.promise, &row.input)
+    });
+    session.csv("promises", COLUMNS, promises)?;
     session.figure("worst", &figure::figure(&rows, &cases(&rows)))?;
     let page = session.folder().join("README.md");
     session.finish(include_str!("page.md.j2"), values(&rows, &settings))?;
     let is_kept = rows.iter().all(Row::is_kept);
     ensure!(is_kept, "{} See {}", verdict(&rows), page.display());
     Ok(())
-}
-
-fn table_of(rows: &[Row]) -> impl Iterator<Item = Vec<String>> {
-    rows.iter().map(|row| {
-        vec![
-            row.routine.clone(),
-            row.range.clone(),
-            row.extreme.clone(),
-            row.cases.to_string(),
-            number(row.worst),
-            number(row.bound),
-            (if row.is_kept() { "yes" } else { "no" }).to_owned(),
-            row.promise.clone(),
-            row.input.clone(),
-        ]
-    })
 }
 
 /// Two digits; what is not a number is the largest float.
