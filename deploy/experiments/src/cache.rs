@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_figure::Figure;
+use driml_figure::{Figure, Look};
 use driml_launch::{
     console::{self, print},
     run_folder::write_whole,
@@ -227,8 +227,13 @@ impl Session {
         file.flush().with_context(doing)
     }
 
+    /// Writes the figure as `stem.svg` and `stem.png`.
     pub(crate) fn figure(&self, stem: &str, figure: &Figure) -> anyhow::Result<()> {
-        Ok(figure.save_both(&self.folder, stem)?)
+        for extension in ["svg", "png"] {
+            let path = self.folder.join(format!("{stem}.{extension}"));
+            figure.save(&path, Look::Card)?;
+        }
+        Ok(())
     }
 
     /// Writes the page of this template with these values, says where it is, and ends.

@@ -81,12 +81,7 @@ pub enum Look {
 
 impl Figure {
     /// Writes the figure in the format of the file's extension.
-    pub fn save(&self, path: &Path) -> Result<(), FigureError> {
-        self.save_as(path, Look::Card)
-    }
-
-    /// [`Figure::save`] with another look.
-    pub fn save_as(&self, path: &Path, look: Look) -> Result<(), FigureError> {
+    pub fn save(&self, path: &Path, look: Look) -> Result<(), FigureError> {
         let format = Format::of(path)?;
         let svg = |letters| self.draw(look, letters).into_svg();
         let bytes = match format {
@@ -96,12 +91,6 @@ impl Figure {
         };
         let path = path.to_owned();
         std::fs::write(&path, bytes).map_err(|source| FigureError::Write { path, source })
-    }
-
-    /// Writes `folder/stem.svg` and `folder/stem.png`.
-    pub fn save_both(&self, folder: &Path, stem: &str) -> Result<(), FigureError> {
-        let save = |extension| self.save(&folder.join(format!("{stem}.{extension}")));
-        save("svg").and_then(|()| save("png"))
     }
 
     fn draw(&self, look: Look, letters: Letters) -> Canvas {
@@ -210,7 +199,7 @@ mod tests {
         ] {
             let write = || -> String {
                 let path = path.with_extension(extension);
-                figure().save(&path).unwrap();
+                figure().save(&path, Look::Card).unwrap();
                 let bytes = std::fs::read(path).unwrap();
                 bytes.into_iter().map(char::from).collect()
             };
@@ -232,7 +221,7 @@ mod tests {
                 Panel::Chart(Chart::new(title, x, y, vec![line]))
             };
             let panels = vec![chart("first"), chart("second")];
-            Figure { panels, ..figure() }.save_as(&path, look).unwrap();
+            Figure { panels, ..figure() }.save(&path, look).unwrap();
             std::fs::read_to_string(path).unwrap()
         };
         let (card, plain) = (svg(Look::Card, "a.svg"), svg(Look::Plain, "b.svg"));
@@ -264,7 +253,7 @@ mod tests {
     #[test]
     fn other_extensions_are_refused() {
         for name in ["a.eps", "a", "svg"] {
-            let said = figure().save(Path::new(name)).unwrap_err();
+            let said = figure().save(Path::new(name), Look::Card).unwrap_err();
             assert!(matches!(said, FigureError::Extension(_)), "{name}");
         }
     }

@@ -5,7 +5,7 @@
 //! and no experiment.
 //!
 //! ```
-//! use driml_figure::{Axis, Chart, Figure, Panel, Series};
+//! use driml_figure::{Axis, Chart, Figure, Look, Panel, Series};
 //!
 //! let curve = Series::line("driml-ada", 0, vec![(0.0, 1.0), (50_000.0, 4.5), (100_000.0, 9.0)]);
 //! let chart = Chart::new(
@@ -23,7 +23,7 @@
 //! };
 //! let folder = tempfile::tempdir()?;
 //! let path = folder.path().join("returns.svg");
-//! figure.save(&path)?;
+//! figure.save(&path, Look::Card)?;
 //! assert!(std::fs::read_to_string(&path)?.starts_with("<svg "));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

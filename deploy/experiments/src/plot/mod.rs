@@ -66,7 +66,7 @@ pub fn run(args: &PlotArgs) -> anyhow::Result<()> {
         charts(args)?
     };
     let look = if args.plain { Look::Plain } else { Look::Card };
-    figure.save_as(&args.out, look)?;
+    figure.save(&args.out, look)?;
     print(&format!("{}\n", args.out.display()))
 }
 
