@@ -146,12 +146,11 @@ impl Session {
         &self.folder
     }
 
-    /// The folder, and the progress of work that keeps itself there.
-    pub(crate) fn work(&mut self) -> (&Path, &mut Progress) {
-        (&self.folder, &mut self.progress)
+    pub(crate) const fn progress(&mut self) -> &mut Progress {
+        &mut self.progress
     }
 
-    /// Counts the time that such work took, added up over runs that are made `at_once` at a time.
+    /// Counts the time that work took which is kept elsewhere, added up over runs that are made `at_once` at a time.
     pub(crate) fn spend(&mut self, seconds: f64, at_once: u32) {
         self.seconds += seconds;
         self.at_once = at_once;

@@ -70,7 +70,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     queue::install(&plans, args.report)?;
     let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
     let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
-    session.work().1.clear();
+    session.progress().clear();
     let rows = rows(&cells, &swept.made);
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();

@@ -49,10 +49,11 @@ pub(crate) fn make<P>(
     jobs: u32,
     report: bool,
 ) -> anyhow::Result<Swept<P>> {
-    let (folder, progress) = session.work();
+    let runs = Runs::open(session.folder())?;
+    let progress = session.progress();
     progress.again(plans.iter().map(|(_, plan)| plan.units).sum());
     let mut queue = Queue {
-        runs: Runs::open(folder)?,
+        runs,
         jobs,
         commit: commit()?,
         waiting: VecDeque::new(),

@@ -150,7 +150,7 @@ impl Tradeoff<'_> {
                 } else {
                     let common = &self.settings.common;
                     let (base, config) = (common.config(&of.base)?, common.config(point)?);
-                    self.session.work().1.again(units);
+                    self.session.progress().again(units);
                     let measure = |_: &mut _| speed::measure(&base, &config, smoke);
                     Some(self.session.piece_of(&program, &key, units, measure)?)
                 };
@@ -273,7 +273,7 @@ impl Tradeoff<'_> {
         queue::install(&wanted, report_only)?;
         // Each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
-        self.session.work().1.again(units * plays);
+        self.session.progress().again(units * plays);
         let common = self.settings.common.clone();
         let session = &mut self.session;
         let Swept { made, missing } = queue::make(session, wanted, common.jobs, report_only)?;
@@ -328,7 +328,7 @@ impl Tradeoff<'_> {
     fn exactness(&mut self, point: &Point, run: &FinishedRun) -> anyhow::Result<Measured> {
         // The run's own: its seed need not be the first.
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
-        self.session.work().1.again(units);
+        self.session.progress().again(units);
         let key = format!("exactness-{}", point.key);
         let (rows, states) = exactness::sizes(&config);
         let weights = &run.summary.weights_sha256;

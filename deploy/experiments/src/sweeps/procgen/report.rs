@@ -177,7 +177,7 @@ pub(super) fn over_games(
         for game in games {
             let mut of_game = Vec::new();
             for it in &game.agents[at].runs {
-                session.work().1.again(play.units);
+                session.progress().again(play.units);
                 let key = format!("{}-single", it.plan.name);
                 let returns = play.greedy(session, &key, &it.run)?;
                 let returns = returns.and_then(|it| mean(&it));
