@@ -190,8 +190,22 @@ fn quoted(word: String) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
+    use clap::Parser;
+
     use super::*;
+
+    #[derive(Parser)]
+    struct CommandLine<T: Args> {
+        #[command(flatten)]
+        args: T,
+    }
+
+    /// What a command takes from these words.
+    pub(crate) fn parsed<T: Args>(words: &str) -> T {
+        let words = ["driml"].into_iter().chain(words.split_whitespace());
+        CommandLine::parse_from(words).args
+    }
 
     #[test]
     fn a_command_can_be_pasted() {

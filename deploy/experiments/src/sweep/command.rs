@@ -206,22 +206,12 @@ fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser;
-
     use super::*;
-
-    #[derive(Parser)]
-    struct CommandLine {
-        #[command(flatten)]
-        args: SweepArgs,
-    }
+    use crate::flags::tests::parsed;
 
     #[test]
     fn a_report_need_not_repeat_what_the_folder_was_made_with() {
-        let of = |line: &str, kept| {
-            let words = ["sweep"].into_iter().chain(line.split_whitespace());
-            settings(&CommandLine::parse_from(words).args, kept).unwrap()
-        };
+        let of = |line: &str, kept| settings(&parsed(line), kept).unwrap();
         let kept = || Some(of("--agent c51,curl --frames 320", None).0);
         assert_eq!(of("--report", kept()), (kept().unwrap(), SEEDS_FOUND_MAX));
         let asked = of("--report --agent c51 --seeds 2", kept());

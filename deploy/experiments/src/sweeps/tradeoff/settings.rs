@@ -111,20 +111,13 @@ impl Common {
 mod tests {
     use std::collections::BTreeSet;
 
-    use clap::Parser;
     use driml_settings::presets;
 
     use super::*;
-
-    #[derive(Parser)]
-    struct CommandLine {
-        #[command(flatten)]
-        args: TradeoffArgs,
-    }
+    use crate::flags::tests::parsed;
 
     fn of(line: &str, found: Option<Common>) -> Result<Settings, Usage> {
-        let words = ["tradeoff"].into_iter().chain(line.split(' '));
-        let args = CommandLine::parse_from(words).args;
+        let args: TradeoffArgs = parsed(line);
         super::of(&args, presets::world(&args.env)?, found)
     }
 
