@@ -33,14 +33,22 @@ pub(crate) struct Curve {
 }
 
 impl Curve {
-    /// The mean of the values at each x, and their range; nothing where there are none.
-    pub(crate) fn of_means(all: impl IntoIterator<Item = (f64, Vec<f64>)>) -> Self {
+    /// The mean of the values at each x, and their band; nothing where there are none.
+    pub(crate) fn of_means(all: impl IntoIterator<Item = (f64, Vec<f64>)>, band: Band) -> Self {
         let mut curve = Self::default();
         for (x, values) in all {
-            if let Some(spread) = Spread::of(values) {
-                curve.points.push((x, spread.mean));
-                curve.band.push((x, spread.min, spread.max));
-            }
+            let Some(spread) = Spread::of(values.iter().copied()) else {
+                continue;
+            };
+            let mean = spread.mean;
+            let ends = || interval(&values)?.ends;
+            let (low, high) = match band {
+                Band::Range => (spread.min, spread.max),
+                Band::Sd => (mean - spread.sd, mean + spread.sd),
+                Band::Ci => ends().unwrap_or((mean, mean)),
+            };
+            curve.points.push((x, mean));
+            curve.band.push((x, low, high));
         }
         curve
     }
@@ -99,16 +107,12 @@ impl Group<'_> {
             })
         });
         let each = each.collect::<anyhow::Result<Vec<_>>>()?;
-        Ok(one_curve(&each, args.band))
+        Ok(over_seeds(&each, args.band))
     }
 }
 
-/// One or several curves as one, with a band of their range if there are several.
-pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>]) -> Curve {
-    one_curve(each, Band::Range)
-}
-
-fn one_curve(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
+/// One or several curves as one, with a band if there are several.
+pub(crate) fn over_seeds(each: &[Vec<(f64, f64)>], band: Band) -> Curve {
     let each: Vec<_> = each.iter().filter(|it| !it.is_empty()).collect();
     match &each[..] {
         [] => Curve::default(),
@@ -148,26 +152,16 @@ fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
     let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
     let start = starts.fold(f64::NEG_INFINITY, f64::max);
     let end = ends.fold(f64::INFINITY, f64::min);
-    let mut curve = Curve::default();
     if start > end {
-        return curve;
+        return Curve::default();
     }
     let last = if start == end { 0 } else { GRID_POINTS };
-    for i in 0..=last {
+    let means = (0..=last).map(|i| {
         let x = start + (end - start) * i as f64 / GRID_POINTS as f64;
-        let values: Vec<f64> = curves.iter().map(|points| between(points, x)).collect();
-        let spread = Spread::of(values.iter().copied()).expect("there are curves");
-        let mean = spread.mean;
-        let ends = || interval(&values)?.ends;
-        let (low, high) = match band {
-            Band::Range => (spread.min, spread.max),
-            Band::Sd => (mean - spread.sd, mean + spread.sd),
-            Band::Ci => ends().unwrap_or((mean, mean)),
-        };
-        curve.points.push((x, mean));
-        curve.band.push((x, low, high));
-    }
-    curve
+        let values = curves.iter().map(|points| between(points, x));
+        (x, values.collect())
+    });
+    Curve::of_means(means, band)
 }
 
 /// The value at `x` on the line through `points`, which are in the order of x and not empty; beyond its ends, theirs.

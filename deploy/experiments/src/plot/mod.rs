@@ -21,14 +21,15 @@ use driml_launch::{
 };
 use driml_machine::error::usage;
 
-use self::{
-    flags::{Band, PlotArgs},
-    groups::Group,
-    runs::{C51_LOSS, SPREAD_OF_K},
-};
 pub(crate) use self::{
+    flags::Band,
     groups::{Curve, over_seeds, smoothed},
     runs::Run,
+};
+use self::{
+    flags::PlotArgs,
+    groups::Group,
+    runs::{C51_LOSS, SPREAD_OF_K},
 };
 
 const CHART_SIZE: (f64, f64) = (460.0, 310.0);

@@ -14,7 +14,7 @@ use self::training::{Episodes, Measured, Settings, Task, Trained, View, train};
 use crate::{
     cache::Session,
     flags::{self, ExperimentFlags},
-    plot::Curve,
+    plot::{Band, Curve},
     stats::Spread,
 };
 
@@ -160,7 +160,7 @@ fn learning(task: &Task, trained: &[Trained]) -> Figure {
             let values = trained.iter().map(|one| value(&one.checks[at].1));
             (*update as f64, values.collect())
         });
-        Curve::of_means(means).series(name, index)
+        Curve::of_means(means, Band::Range).series(name, index)
     };
     let ends = vec![(0.0, 0.5), (task.settings.updates as f64, 0.5)];
     let nothing = Series::line("nothing told", 0, ends).coloured(GREY);

@@ -8,7 +8,7 @@ use super::{
     results::{Measure, Results, SHARE, TV, Trained},
     training::Sampling,
 };
-use crate::plot::Curve;
+use crate::plot::{Band, Curve};
 
 /// The paper's four panels.
 pub(super) fn fig1(results: &Results) -> Figure {
@@ -67,7 +67,7 @@ fn numerical(results: &Results, value: impl Fn(&Chain) -> f64) -> Series {
 fn information(results: &Results) -> Panel {
     let alphas = results.settings.alphas.iter();
     let learnt = alphas.map(|&alpha| (alpha, results.learnt_information(alpha)));
-    let learnt = Curve::of_means(learnt).series("learnt", 1);
+    let learnt = Curve::of_means(learnt, Band::Range).series("learnt", 1);
     let of_a_ring = Chain::mutual_information_of_a_ring;
     let ring = closed_form(results, "a ring, no ends", of_a_ring).coloured(GREY);
     let series = vec![
@@ -136,7 +136,7 @@ fn by_sampling(
             let x = x(&results.chain(alpha), index as f64 - 1.0);
             (x, values.collect())
         });
-        let curve = Curve::of_means(means).series(sampling.name(), index);
+        let curve = Curve::of_means(means, Band::Range).series(sampling.name(), index);
         curve.marked(Mark::Bars)
     };
     Sampling::ALL.iter().enumerate().map(of).collect()

@@ -5,7 +5,7 @@ use super::{
     training::{Learnt, Sampling, Settings},
 };
 use crate::{
-    plot::Curve,
+    plot::{Band, Curve},
     stats::{Spread, rank_correlation},
 };
 
@@ -88,10 +88,11 @@ impl Results {
     pub(super) fn tv_curve(&self, alpha: f64) -> Curve {
         let each: Vec<_> = self.of(Sampling::Stationary, alpha).collect();
         let updates = each.iter().take(1).flat_map(|one| &one.learnt.updates);
-        Curve::of_means(updates.enumerate().map(|(at, &update)| {
+        let means = updates.enumerate().map(|(at, &update)| {
             let values = each.iter().map(|one| one.learnt.tv[at]);
             (update as f64, values.collect())
-        }))
+        });
+        Curve::of_means(means, Band::Range)
     }
 
     /// Of each seed, the rank correlation over alpha between 1 / gap and the updates until the error is small.

@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::settings::{CHECKPOINTS, Point, Settings};
 use crate::{
     cache::Session,
-    plot::{Run, over_seeds},
+    plot::{Band, Run, over_seeds},
     stats::{
         Spread, mean,
         over_games::{Scores, improvement, iqm},
@@ -136,7 +136,8 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
             let read =
                 |it: &&Made<Point>| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?);
             let each = of.runs.iter().map(read);
-            let curve = over_seeds(&each.collect::<anyhow::Result<Vec<_>>>()?);
+            let each = each.collect::<anyhow::Result<Vec<_>>>()?;
+            let curve = over_seeds(&each, Band::Range);
             if curve.points.is_empty() {
                 continue;
             }

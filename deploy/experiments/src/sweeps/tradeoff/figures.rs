@@ -3,7 +3,10 @@
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
 
 use super::results::{FRAMES_PER_SECOND, Measure, PointResult, Results};
-use crate::{plot::over_seeds, stats::Spread};
+use crate::{
+    plot::{Band, over_seeds},
+    stats::Spread,
+};
 
 const COLUMNS: usize = 3;
 const PANEL: (f64, f64) = (330.0, 250.0);
@@ -88,7 +91,7 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
     for rows in results.by_dial() {
         let mut series = Vec::new();
         for (index, row) in rows.iter().enumerate() {
-            let curve = over_seeds(&row.result.training_curves()?);
+            let curve = over_seeds(&row.result.training_curves()?, Band::Range);
             series.push(curve.series(row.name, index));
         }
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));
