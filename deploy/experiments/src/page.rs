@@ -12,11 +12,6 @@ use crate::{
 const SMOKE: &str =
     "**This is the smoke length: it shows that everything works, and its numbers mean nothing.**";
 
-/// The cell of a number; empty in data where there is none.
-pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
-    value.map_or(String::new(), |value| format!("{value:.decimals$}"))
-}
-
 /// What a page says of the time that all pieces took together, made `at_once` at a time, on a machine with so many `cores` where that is
 /// known.
 pub(crate) fn time(seconds: f64, at_once: u32, cores: Option<u32>) -> String {

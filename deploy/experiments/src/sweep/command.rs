@@ -15,7 +15,6 @@ use super::{
 use crate::{
     cache::{Session, settings_of},
     flags::{ExperimentFlags, SweepArgs},
-    page::number,
     plot::{self, flags::PlotArgs},
     stats::{Spread, interval},
 };
@@ -202,6 +201,11 @@ fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
         row
     };
     cells.iter().enumerate().map(row).collect()
+}
+
+/// The cell of a number; empty where there is none.
+fn number(value: Option<f64>, decimals: usize) -> String {
+    value.map_or(String::new(), |value| format!("{value:.decimals$}"))
 }
 
 #[cfg(test)]
