@@ -100,9 +100,8 @@ impl Network {
     }
 
     /// The words before a command that is to run on a machine, or on the `router`, from which every machine can be reached.
-    pub fn on(&self, machine: &str) -> Vec<String> {
-        let words = ["ip", "netns", "exec", &self.namespace(machine)];
-        words.map(str::to_owned).to_vec()
+    pub fn on(&self, machine: &str) -> String {
+        format!("ip netns exec {}", self.namespace(machine))
     }
 
     /// Pulls a machine's cable: what is in flight is lost, without an error on either side.

@@ -27,7 +27,7 @@ const MARK: &str = "DRIML_TEST_SYSTEM";
 /// A folder and the processes that were started in it. Dropping it kills those that are left.
 #[derive(Debug)]
 pub struct TestSystem {
-    program: PathBuf,
+    program: String,
     folder: tempfile::TempDir,
     mark: String,
     /// After how many updates learners that are started wait; none do after [`NEVER`].
@@ -120,39 +120,30 @@ impl TestSystem {
         format!("local {flags} --listen {} --run-dir run", self.endpoint())
     }
 
-    /// Starts the program in the system's folder. Arguments are as in a shell, split at blanks.
+    /// Starts the program in the system's folder. Arguments are as in a shell, with quotes around those that have blanks.
     pub fn start(&self, args: &str) -> Process {
-        Process::start(args.to_owned(), self.command(args))
+        self.start_after("", args)
     }
 
-    /// [`Self::start`] with one more variable in the environment, which all processes of a run inherit.
-    pub fn start_with(&self, variable: &str, value: &str, args: &str) -> Process {
-        let mut command = self.command(args);
-        command.env(variable, value);
-        Process::start(format!("{variable}={value} {args}"), command)
-    }
-
-    /// [`Self::start`] with `--env`, whose value may have blanks.
-    pub fn start_with_world(&self, args: &str, world: &str) -> Process {
-        let mut command = self.command(args);
-        command.args(["--env", world]);
-        Process::start(format!("{args} --env {world:?}"), command)
+    /// [`Self::start`] with other words before the program, such as those that put it on another machine, or `env` with variables, which
+    /// all processes of a run inherit.
+    pub fn start_after(&self, words: &str, args: &str) -> Process {
+        Process::start(args.to_owned(), self.command_after(words, args))
     }
 
     /// How the program is started, for tests that do it in their own way.
     pub fn command(&self, args: &str) -> Command {
-        self.command_after(&[], args)
+        self.command_after("", args)
     }
 
-    /// [`Self::command`] with other words before the program, such as those that put it on another machine.
-    pub fn command_after(&self, words: &[String], args: &str) -> Command {
-        let program = self.program.as_os_str();
-        let mut words = words.iter().map(AsRef::as_ref).chain([program]);
-        let first = words.next().unwrap_or(program);
-        let mut command = Command::new(first);
+    fn command_after(&self, words: &str, args: &str) -> Command {
+        let split = |text: &str| shlex::split(text).expect("quotes are closed");
+        let mut line = split(words);
+        line.push(self.program.clone());
+        line.extend(split(args));
+        let mut command = Command::new(&line[0]);
         command
-            .args(words)
-            .args(args.split_whitespace())
+            .args(&line[1..])
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
             .envs(self.hold())
@@ -195,19 +186,18 @@ impl TestSystem {
 
     /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
     pub fn start_process(&self, args: &str) -> Process {
-        let parent = std::process::id();
-        self.start(&format!("{args} --exit-with-parent {parent}"))
+        self.start_process_after("", args)
     }
 
     /// [`Self::start_process`] with other words before the program.
-    pub fn start_process_after(&self, words: &[String], args: &str) -> Process {
-        let args = format!("{args} --exit-with-parent {}", std::process::id());
-        Process::start(args.clone(), self.command_after(words, &args))
+    pub fn start_process_after(&self, words: &str, args: &str) -> Process {
+        let parent = std::process::id();
+        self.start_after(words, &format!("{args} --exit-with-parent {parent}"))
     }
 
     /// Runs the program to its end, with other words before it.
-    pub fn run_after(&self, words: &[String], args: &str) -> Ended {
-        Process::start(args.to_owned(), self.command_after(words, args)).wait()
+    pub fn run_after(&self, words: &str, args: &str) -> Ended {
+        self.start_after(words, args).wait()
     }
 
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be

@@ -4,7 +4,7 @@
 use std::fs;
 
 use driml_protocol::Waiting;
-use driml_tests::{Process, check_nothing_lost};
+use driml_tests::check_nothing_lost;
 
 use crate::{LONG, SHORT, system};
 
@@ -158,11 +158,8 @@ fn a_process_by_hand_settles_its_environment() {
         "replay-server --listen {} --env chain --preset smoke",
         system.endpoint()
     );
-    let mut command = system.command(&flags);
-    command
-        .env("CANDLE_NUM_THREADS", "3")
-        .env_remove("MALLOC_ARENA_MAX");
-    let mut server = Process::start(flags, command);
+    let variables = "env -u MALLOC_ARENA_MAX CANDLE_NUM_THREADS=3";
+    let mut server = system.start_after(variables, &flags);
     server.wait_for_stderr("replay server listens on ");
     let environ = fs::read_to_string(format!("/proc/{}/environ", server.pid())).unwrap();
     let has = |variable: &str| environ.split('\0').any(|it| it == variable);

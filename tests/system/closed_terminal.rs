@@ -192,9 +192,7 @@ fn a_hangup_ends_a_launched_run_once() {
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
     let run = system.local(&format!("--agent driml-ada {LONG}"));
-    let words = ["sh", "-c", "trap '' HUP; exec \"$0\" \"$@\""].map(String::from);
-    let command = system.command_after(&words, &run);
-    let process = Process::start("nohup driml local".into(), command);
+    let process = system.start_after("sh -c 'trap \"\" HUP; exec \"$0\" \"$@\"'", &run);
     let client = system.connect();
     let before = client.wait_for_updates(100);
     process.signal(Signal::SIGHUP);

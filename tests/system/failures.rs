@@ -136,16 +136,15 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
 #[test]
 fn processes_whose_launcher_died_deliver_what_they_have() {
     /// A launcher of three processes, each with a file for its output.
-    const LAUNCHER: &str = "
+    const LAUNCHER: &str = "sh -c '
         driml=$1 endpoint=$2; shift 2
         $driml replay-server --listen $endpoint $* --exit-with-parent $$ 2> server &
         $driml learner --connect $endpoint --run-dir run --exit-with-parent $$ 2> learner &
         $driml actor --connect $endpoint --id 0 --exit-with-parent $$ 2> actor &
-        wait";
+        wait' sh";
     let system = system();
-    let words = ["sh", "-c", LAUNCHER, "sh"].map(String::from);
     let args = format!("{} --agent c51 {LONG}", system.endpoint());
-    let launcher = Process::start("a launcher".into(), system.command_after(&words, &args));
+    let launcher = system.start_after(LAUNCHER, &args);
     let client = system.connect();
     client.wait_for_updates(100);
     drop(client);

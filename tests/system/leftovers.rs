@@ -8,13 +8,17 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, launched, system};
 
+/// The word before the program that makes `tmp` in the system's folder its temporary folder.
+fn in_temporary(system: &TestSystem) -> String {
+    format!("env TMPDIR={}", system.path("tmp").display())
+}
+
 /// A run that has learned something and saved nothing, whose temporary folder is `tmp` in the system's; and its processes.
 fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
-    let temporary = system.path("tmp");
-    fs::create_dir_all(&temporary).unwrap();
+    fs::create_dir(system.path("tmp")).unwrap();
     let never = format!("--set learner.checkpoint_period_updates={NEVER}");
     let run = format!("local --agent driml-ada {LONG} {never} --run-dir run");
-    let process = system.start_with("TMPDIR", temporary.to_str().unwrap(), &run);
+    let process = system.start_after(&in_temporary(system), &run);
     let run = system.run_folder("run");
     run.wait_for_updates(100);
     (process, PROCESSES.map(|role| system.find_process(role)))
@@ -47,11 +51,9 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     process.wait();
     system.wait_until_all_have_ended();
     assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
-    let temporary_folder = system.path("tmp");
     let next = format!("local --agent c51 {SHORT} --run-dir next");
     system
-        .start_with("TMPDIR", temporary_folder.to_str().unwrap(), &next)
-        .wait()
+        .run_after(&in_temporary(&system), &next)
         .expect_code(0);
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);
@@ -86,7 +88,7 @@ fn shared_memory_of_killed_processes_is_removed() {
 }
 
 /// The shared memory that the processes have open.
-pub(crate) fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
+fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
     let mut files = Vec::new();
     for process in processes {
         let maps = fs::read_to_string(format!("/proc/{}/maps", process.pid)).unwrap();
@@ -100,7 +102,7 @@ pub(crate) fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
     files
 }
 
-pub(crate) fn check_gone(files: &[PathBuf]) {
+fn check_gone(files: &[PathBuf]) {
     let left: Vec<&PathBuf> = files.iter().filter(|file| file.exists()).collect();
     assert!(left.is_empty(), "{left:?}");
 }

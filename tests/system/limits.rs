@@ -6,9 +6,8 @@ use std::fs;
 use crate::{LONG, SHORT, system};
 
 /// Words before a command that set a limit of the shell's `ulimit`, for it and its children.
-fn limited(limit: &str) -> Vec<String> {
-    let limit = format!("ulimit {limit} && exec \"$0\" \"$@\"");
-    ["sh", "-c", &limit].map(String::from).into()
+fn limited(limit: &str) -> String {
+    format!("sh -c 'ulimit {limit} && exec \"$0\" \"$@\"'")
 }
 
 #[test]
@@ -67,10 +66,8 @@ fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
     );
     fs::create_dir(&folder).unwrap();
     let run = format!("local --agent c51 {SHORT} --run-dir run");
-    system
-        .start_with("TMPDIR", &folder, &run)
-        .wait()
-        .expect_code(0);
+    let temporary = format!("env TMPDIR={folder}");
+    system.run_after(&temporary, &run).expect_code(0);
     let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
     system
         .refuses(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");

@@ -59,33 +59,33 @@ fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
 
 /// Runs it whole; finished after half of its frames and prolonged; and resumed after each signal: Ctrl-C, which saves, and death, after
 /// which what was learned since the last checkpoint is learned again. All come to the same.
-pub(crate) fn continues_exactly(env: &str, flags: &str, frames: u64) {
+pub(crate) fn continues_exactly(flags: &str) {
+    const FRAMES: u64 = 2048;
     let start = |system: &TestSystem, frames: u64, name: &str| {
-        let args = format!(
+        system.start(&format!(
             "local --lockstep {flags} --actors 2 --frames {frames} --set replay.replay_ratio=8 \
              --set learner.checkpoint_period_updates=100 --run-dir {name}"
-        );
-        system.start_with_world(&args, env)
+        ))
     };
     let system = system();
     let run = |frames: u64, name: &str| {
         start(&system, frames, name).wait().expect_code(0);
         system.run_folder(name).check_finished()
     };
-    let whole = run(frames, "whole");
+    let whole = run(FRAMES, "whole");
     assert!(whole.updates > 300 && whole.episodes > 0, "{whole:#?}");
     let whole = result(whole);
 
-    let half = run(frames / 2, "half");
+    let half = run(FRAMES / 2, "half");
     assert_ne!(half.weights_sha256, whole.0);
-    system.run_ok(&format!("local --resume half --frames {frames}"));
+    system.run_ok(&format!("local --resume half --frames {FRAMES}"));
     let prolonged = system.run_folder("half").check_finished();
     assert_eq!(result(prolonged), whole, "prolonged");
 
     for signal in [Signal::SIGINT, Signal::SIGKILL] {
         let system = crate::system();
         system.hold_at(150);
-        let process = start(&system, frames, "run");
+        let process = start(&system, FRAMES, "run");
         let run = system.run_folder("run");
         // After a checkpoint and before the next.
         run.wait_for_updates(110);
@@ -110,11 +110,11 @@ pub(crate) fn continues_exactly(env: &str, flags: &str, frames: u64) {
 
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
-    continues_exactly("chain", "--preset smoke --agent driml-ada", 2048);
+    continues_exactly("--env chain --preset smoke --agent driml-ada");
     // Its noise continues, in the learner and in the actors. Else beta rises over a run's own length.
     let beta = "--set replay.sampling.beta_updates=500";
-    let flags = format!("--preset smoke --agent rainbow {beta}");
-    continues_exactly("chain", &flags, 2048);
+    let flags = format!("--env chain --preset smoke --agent rainbow {beta}");
+    continues_exactly(&flags);
 }
 
 /// N updates, saved and resumed for N more, are 2 N.

@@ -70,7 +70,7 @@ const PROCESSES: [&str; 3] = ["replay-server", "learner", "actor"];
 
 /// Rows drawn by priority, with Rainbow's numbers.
 const PRIORITISED: &str =
-    "--set replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}";
+    "--set 'replay.sampling={rule=\"prioritised\",alpha=0.5,beta_start=0.4,beta_end=1.0}'";
 
 /// A launched run of `driml-ada` that has learned more than so many `updates`.
 fn launched(system: &TestSystem, updates: u64) -> Process {

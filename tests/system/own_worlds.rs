@@ -29,11 +29,8 @@ fn numbered(fault: &str) -> String {
 fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
     let env = numbered("");
-    let flags = format!("{SMALL} --agent driml-ada --frames 1280");
-    system
-        .start_with_world(&format!("local {flags} --actors 2 --run-dir run"), &env)
-        .wait()
-        .expect_code(0);
+    let flags = format!("{SMALL} --agent driml-ada --frames 1280 --env '{env}'");
+    system.run_ok(&format!("local {flags} --actors 2 --run-dir run"));
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.frames, 1280);
@@ -45,13 +42,7 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     assert!(run.log("actor-0").contains("a line on stdout does no harm"));
 
     let lockstep = |args: &str, name: &str| {
-        let args = format!("local --lockstep {args} --run-dir {name}");
-        let process = if name == "first" {
-            system.start_with_world(&args, &env)
-        } else {
-            system.start(&args)
-        };
-        process.wait().expect_code(0);
+        system.run_ok(&format!("local --lockstep {args} --run-dir {name}"));
         system.run_folder(name).check_finished().weights_sha256
     };
     let first = lockstep(&flags, "first");
@@ -65,13 +56,19 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
 
 #[test]
 fn a_process_that_saves_its_state_continues_exactly_in_lockstep() {
-    let flags = format!("{SMALL} --agent driml-ada");
-    continues_exactly(&numbered("saves"), &flags, 2048);
+    let env = numbered("saves");
+    continues_exactly(&format!("{SMALL} --agent driml-ada --env '{env}'"));
 }
 
 #[test]
 fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
-    let flags = format!("local --lockstep {SMALL} --agent c51 --frames 640");
+    let run = |fault| {
+        let flags = format!(
+            "{SMALL} --agent c51 --frames 640 --env '{}'",
+            numbered(fault)
+        );
+        format!("local --lockstep {flags} --run-dir run")
+    };
     for (fault, sentence) in [
         ("", "this world's state cannot be saved"),
         (
@@ -80,8 +77,7 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
         ),
     ] {
         let system = system();
-        let process = system.start_with_world(&format!("{flags} --run-dir run"), &numbered(fault));
-        let ended = process.wait().expect_code(0);
+        let ended = system.run_ok(&run(fault));
         assert!(!ended.stdout.contains("--resume"), "{}", ended.stdout);
         ended
             .expect_said(sentence)
@@ -96,8 +92,7 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     // One that fails in it ends the run.
     let system = system();
     system
-        .start_with_world(&format!("{flags} --run-dir run"), &numbered("saves large"))
-        .wait()
+        .run(&run("saves large"))
         .expect_code(1)
         .expect_said("wrote a state of 67108865 bytes; 67108864 are possible");
 }
@@ -113,10 +108,10 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
         ),
     ] {
         let system = system();
-        let args = format!("local {SMALL} {limit} --agent c51 --frames 100000 --run-dir run");
+        let env = numbered(fault);
+        let flags = format!("{SMALL} {limit} --agent c51 --frames 100000 --env '{env}'");
         system
-            .start_with_world(&args, &numbered(fault))
-            .wait()
+            .run(&format!("local {flags} --run-dir run"))
             .expect_code(1)
             .expect_said(sentence);
         assert_eq!(system.survivors(), [], "{fault}");
@@ -128,10 +123,10 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
 fn what_was_played_before_a_world_failed_is_stored() {
     let system = system();
     let slow = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
-    let args = format!("local {SMALL} {slow} --agent c51 --frames 100000 --run-dir run");
+    let env = numbered("raise 25");
+    let flags = format!("{SMALL} {slow} --agent c51 --frames 100000 --env '{env}'");
     system
-        .start_with_world(&args, &numbered("raise 25"))
-        .wait()
+        .run(&format!("local {flags} --run-dir run"))
         .expect_code(1)
         .expect_said("the dragon got out");
     assert_eq!(system.survivors(), []);
@@ -143,30 +138,24 @@ fn what_was_played_before_a_world_failed_is_stored() {
 #[test]
 fn a_command_that_is_no_world_is_refused_before_anything_starts() {
     let system = system();
-    for (env, sentence) in [
-        ("exec:no-such-command", "the shell found no such command"),
-        ("exec:echo hello", "does not declare itself as a world"),
-        ("exec:", "exec:COMMAND"),
-    ] {
-        system
-            .start_with_world(&format!("local {SMALL} --run-dir run"), env)
-            .wait()
-            .expect_code(64)
-            .expect_said(sentence);
-        assert!(!system.path("run").exists());
-    }
+    let local = format!("local {SMALL} --run-dir run");
+    system.refuses_each(&format!(
+        "
+        {local} --env exec:no-such-command => the shell found no such command
+        {local} --env 'exec:echo hello' => does not declare itself as a world
+        {local} --env exec: => exec:COMMAND
+        "
+    ));
+    assert!(!system.path("run").exists());
     assert_eq!(system.survivors(), []);
 }
 
 #[test]
 fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let system = system();
-    let flags = format!(
-        "replay-server --listen {} {SMALL} --agent c51 --frames 100000000 --exit-with-parent {}",
-        system.endpoint(),
-        std::process::id()
-    );
-    let server = system.start_with_world(&flags, &numbered(""));
+    let env = numbered("");
+    let flags = format!("{SMALL} --agent c51 --frames 100000000 --env '{env}'");
+    let server = system.start_replay_server(&flags);
     let learner = system.start_learner("run");
     system
         .start_actor(0)
@@ -174,18 +163,16 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         .expect_code(1)
         .expect_said("an actor starts none because a replay server says so")
         .expect_said("--env \"exec:exec python3 ");
-    let actor = format!(
-        "actor --connect {} --exit-with-parent {}",
-        system.endpoint(),
-        std::process::id()
-    );
-    system
-        .start_with_world(&actor, "chain")
+    let actor = |flags: &str| {
+        let endpoint = system.endpoint();
+        system.start_process(&format!("actor --connect {endpoint} {flags}"))
+    };
+    actor("--env chain")
         .wait()
         .expect_code(1)
         .expect_said("and not chain");
     // The same world by another command, as another machine may have it; it will hang.
-    let hanging = system.start_with_world(&format!("{actor} --id 1"), &numbered("hang 50"));
+    let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
     let client = system.connect();
     client.wait_for_replay("the actor", |replay| replay.actors == 1);
     wait_until("the world's hanging", || {
@@ -241,17 +228,10 @@ fn gymnasium() -> Option<String> {
 fn atari_by_gymnasium_trains() {
     let Some(python) = gymnasium() else { return };
     let system = system();
-    let env = format!(
-        "exec:{python} {} ALE/Pong-v5 --atari",
-        file("deploy/python/driml_env.py")
-    );
-    system
-        .start_with_world(
-            "local --preset smoke --agent c51 --frames 480 --run-dir run",
-            &env,
-        )
-        .wait()
-        .expect_code(0);
+    let script = file("deploy/python/driml_env.py");
+    system.run_ok(&format!(
+        "local --preset smoke --agent c51 --frames 480 --run-dir run --env 'exec:{python} {script} ALE/Pong-v5 --atari'"
+    ));
     let run = system.run_folder("run");
     assert_eq!(run.check_finished().frames, 480);
     let config = run.config();
@@ -268,11 +248,9 @@ fn atari_by_gymnasium_trains() {
 #[test]
 fn atari_continues_exactly_in_lockstep() {
     let Some(python) = gymnasium() else { return };
-    let env = format!(
-        "exec:{python} {} ALE/Breakout-v5 --atari --clip --size 20",
-        file("deploy/python/driml_env.py")
-    );
-    continues_exactly(&env, &format!("{SMALL} --agent driml-ada"), 2048);
+    let script = file("deploy/python/driml_env.py");
+    let env = format!("exec:{python} {script} ALE/Breakout-v5 --atari --clip --size 20");
+    continues_exactly(&format!("{SMALL} --agent driml-ada --env '{env}'"));
 }
 
 /// The adapter's own test, which needs Gymnasium: every way in which vectors begin anew, seeds, shapes, and what is refused.

@@ -35,7 +35,8 @@ static THREADS: [(&str, &str, &str); 8] = [
 fn ends_the_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
     let run = format!("local --agent driml-ada {LONG} {flags} --run-dir run");
-    let ended = system.start_with(fail_point::VARIABLE, point, &run).wait();
+    let panics = format!("env '{}={point}'", fail_point::VARIABLE);
+    let ended = system.run_after(&panics, &run);
     let contains = |line: &str, words: &str| {
         assert!(line.contains(words), "{point}: {words:?} in {ended:#?}");
     };

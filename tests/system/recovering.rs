@@ -105,12 +105,11 @@ fn slow_down(server: &mut Process) -> SlowMachine {
 
 /// Starts a replay server that stands still until its machine is slowed down: it cannot have read all before.
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
-    let words = ["sh", "-c", "kill -STOP $$; exec \"$@\"", "sh"].map(String::from);
     let serve = format!(
         "replay-server --keep-alive --listen {} {flags}",
         system.endpoint()
     );
-    system.start_process_after(&words, &serve)
+    system.start_process_after("sh -c 'kill -STOP $$; exec \"$0\" \"$@\"'", &serve)
 }
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.

@@ -10,13 +10,11 @@ use crate::{LONG, chain, disk_full::fill, system};
 
 /// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that the test is skipped, if
 /// that is not permitted.
-fn with_shared_memory(size: &str) -> Option<Vec<String>> {
-    let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm && exec \"$0\" \"$@\"");
-    let words: Vec<String> = ["unshare", "-m", "sh", "-c", &mount]
-        .map(String::from)
-        .into();
-    let mut tried = Command::new(&words[0]);
-    succeeds(tried.args(&words[1..]).arg("true")).then_some(words)
+fn with_shared_memory(size: &str) -> Option<String> {
+    let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm");
+    let mut tried = Command::new("unshare");
+    tried.args(["-m", "sh", "-c", &mount]);
+    succeeds(&mut tried).then(|| format!("unshare -m sh -c '{mount} && exec \"$0\" \"$@\"'"))
 }
 
 /// How often it was said that there is too little, or that what was sent so does not arrive.
@@ -64,7 +62,7 @@ fn a_run_continues_when_others_fill_it_up() {
     };
     let system = system();
     let run = system.local(&format!("--agent c51 {LONG} --actors 2"));
-    let mut process = driml_tests::Process::start(run.clone(), system.command_after(&words, &run));
+    let mut process = system.start_after(&words, &run);
     let client = system.connect();
     client.wait_for_updates(100);
     // One that starts when it is full warns, too.
