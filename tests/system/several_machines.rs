@@ -23,9 +23,8 @@ struct Run {
     network: Network,
     flags: String,
     ratio: u64,
-    server: Option<Process>,
-    learner: Option<Process>,
-    actors: Vec<Option<Process>>,
+    /// Of each of [`MACHINES`], as far as they take part.
+    processes: Vec<Process>,
 }
 
 const MACHINES: [&str; 5] = ["server", "learner", "actor0", "actor1", "actor2"];
@@ -42,12 +41,11 @@ impl Run {
             network,
             flags,
             ratio,
-            server: None,
-            learner: None,
-            actors: Vec::new(),
+            processes: Vec::new(),
         };
-        run.actors.resize_with(actors, || None);
-        (0..2 + actors).for_each(|machine| run.start_on(machine));
+        for machine in 0..2 + actors {
+            run.processes.push(run.start_on(machine));
+        }
         Some(run)
     }
 
@@ -55,16 +53,7 @@ impl Run {
         format!("tcp/{}:7447", self.network.address("server"))
     }
 
-    /// The process on a machine.
-    fn on(&mut self, machine: usize) -> &mut Option<Process> {
-        match machine {
-            0 => &mut self.server,
-            1 => &mut self.learner,
-            _ => &mut self.actors[machine - 2],
-        }
-    }
-
-    fn start_on(&mut self, machine: usize) {
+    fn start_on(&self, machine: usize) -> Process {
         let endpoint = self.endpoint();
         let args = match machine {
             0 => format!(
@@ -75,8 +64,7 @@ impl Run {
             _ => format!("actor --connect {endpoint} --id {}", machine - 2),
         };
         let words = self.network.on(MACHINES[machine]);
-        let process = self.system.start_process_after(&words, &args);
-        *self.on(machine) = Some(process);
+        self.system.start_process_after(&words, &args)
     }
 
     /// The status of the run, fetched from the router; none while no process answers.
@@ -126,12 +114,13 @@ impl Run {
         ] {
             assert_eq!(count("replay", what), 0, "{what}");
         }
-        for actor in self.actors.drain(..).flatten() {
+        for actor in self.processes.drain(2..) {
             actor.wait().expect_code(0);
         }
-        let learner = self.learner.take().unwrap();
-        learner.stop().expect_code(0);
-        self.server.take().unwrap().stop().expect_code(0);
+        // The learner, then the server.
+        for process in self.processes.into_iter().rev() {
+            process.stop().expect_code(0);
+        }
         assert_eq!(self.system.survivors(), []);
     }
 }
@@ -227,28 +216,21 @@ fn random_faults_lose_nothing() {
         ));
         match kind {
             0 | 3 => {
-                let Some(process) = run.on(machine).take() else {
-                    continue;
-                };
                 let signal = if kind == 0 {
                     Signal::SIGKILL
                 } else {
                     Signal::SIGTERM
                 };
+                let process = &mut run.processes[machine];
                 process.signal(signal);
-                process.wait();
+                wait_until("its end", || !process.is_running());
                 sleep(pause);
-                run.start_on(machine);
+                run.processes[machine] = run.start_on(machine);
             }
             1 => {
-                let signal = |run: &mut Run, signal| {
-                    if let Some(process) = run.on(machine) {
-                        process.signal(signal);
-                    }
-                };
-                signal(&mut run, Signal::SIGSTOP);
+                run.processes[machine].signal(Signal::SIGSTOP);
                 sleep(pause);
-                signal(&mut run, Signal::SIGCONT);
+                run.processes[machine].signal(Signal::SIGCONT);
             }
             _ => {
                 run.network.cut(MACHINES[machine]);
