@@ -1,4 +1,4 @@
-//! Waiting for what another process does: by looking, with a deadline.
+//! Waiting for what other processes do: by looking, with a deadline; and for several at the same time.
 
 use std::{
     thread,
@@ -30,4 +30,14 @@ pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 /// Waits until something holds.
 pub fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     wait_for(what, || holds().then_some(()));
+}
+
+/// Does this for all items at the same time, where most of it is waiting.
+pub fn at_once<T: Send>(items: impl IntoIterator<Item = T>, work: impl Fn(T) + Sync) {
+    let work = &work;
+    thread::scope(|scope| {
+        for item in items {
+            scope.spawn(move || work(item));
+        }
+    });
 }

@@ -1,12 +1,9 @@
 //! One process that stands still (Ctrl-Z, a debugger, a paused container): the others continue, and wait for it only so long.
 //! A whole run that stands still is in `closed_terminal`.
 
-use std::{
-    thread,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
-use driml_tests::{Outcome, Process, TestSystem, wait_until};
+use driml_tests::{Outcome, Process, TestSystem, at_once, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, failures::interrupt_until_it_ends, launched, system};
@@ -21,11 +18,7 @@ fn a_frozen_process_does_not_hold_the_others_up() {
         a_replay_server_ends_whose_launcher_died,
         a_frozen_actor_does_not_stop_the_others,
     ];
-    thread::scope(|scope| {
-        for check in checks {
-            scope.spawn(check);
-        }
-    });
+    at_once(checks, |check| check());
 }
 
 /// A run of two actors, of which one stands still, that has learned from all its transitions.

@@ -2,7 +2,7 @@
 //! The panics are asked for with `DRIML_TEST_PANIC`, which debug builds have (`driml_protocol::fail_point`).
 
 use driml_protocol::fail_point;
-use driml_tests::Outcome;
+use driml_tests::{Outcome, at_once};
 
 use crate::{LONG, PRIORITISED, system};
 
@@ -78,9 +78,7 @@ fn a_panic_in_any_thread_ends_the_run_and_is_named() {
     });
     let threads: Vec<_> = threads.collect();
     // These runs wait for each other's ends more than they compute.
-    std::thread::scope(|scope| {
-        for some in threads.chunks(6) {
-            scope.spawn(|| some.iter().copied().for_each(ends_the_run));
-        }
+    at_once(threads.chunks(6), |some| {
+        some.iter().copied().for_each(ends_the_run);
     });
 }

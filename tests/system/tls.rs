@@ -4,7 +4,6 @@
 use std::{
     net::UdpSocket,
     process::Command,
-    thread,
     time::{Duration, Instant},
 };
 
@@ -14,7 +13,7 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 use driml_tests::{
-    Certificates, Client, Outcome, Process, TestSystem, Valid, succeeds, wait_until,
+    Certificates, Client, Outcome, Process, TestSystem, Valid, at_once, succeeds, wait_until,
 };
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
@@ -257,16 +256,12 @@ fn strangers_at_a_replay_server() {
         ("a replay server's", &tls.good, Some("replay-server")),
     ];
     // Each takes as long as it may to give up.
-    thread::scope(|scope| {
-        for (name, certificates, role) in attempts {
-            scope.spawn(move || {
-                let opened = open_raw(&[
-                    ("connect/endpoints", format!("[{endpoint:?}]")),
-                    ("transport/link/tls", raw_tls("connect", certificates, role)),
-                ]);
-                assert!(opened.is_err(), "a certificate that is {name}");
-            });
-        }
+    at_once(attempts, |(name, certificates, role)| {
+        let opened = open_raw(&[
+            ("connect/endpoints", format!("[{endpoint:?}]")),
+            ("transport/link/tls", raw_tls("connect", certificates, role)),
+        ]);
+        assert!(opened.is_err(), "a certificate that is {name}");
     });
     server.wait_for_stderr("QUIC acceptor failed: ");
     // Without QUIC, at whose port nothing listens.

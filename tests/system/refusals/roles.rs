@@ -1,19 +1,16 @@
 //! What a certificate is good for: its own role and number, and nothing else, whatever its holder sends.
 //! Which clients are admitted at all is in `tls`.
 
-use std::{
-    sync::{
-        Arc,
-        atomic::{AtomicUsize, Ordering},
-    },
-    thread,
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
 };
 
 use driml_protocol::{
     ActorJoin, Alive, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, ReplayStatus, RunInfo,
     WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
-use driml_tests::{Client, Process, new_learner, wait_until};
+use driml_tests::{Client, Process, at_once, new_learner, wait_until};
 use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
@@ -62,11 +59,7 @@ impl Guarded {
 
 /// Sends all rows at the same time, as most of their answers are waited for in vain.
 fn send_at_once(client: &Client, rows: impl IntoIterator<Item = Row>) {
-    thread::scope(|scope| {
-        for row in rows {
-            scope.spawn(move || send(client, [row]));
-        }
-    });
+    at_once(rows, |row| send(client, [row]));
 }
 
 #[test]

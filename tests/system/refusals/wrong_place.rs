@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use driml_tests::{Ended, TestSystem};
+use driml_tests::{Ended, TestSystem, at_once};
 use nix::sys::signal::Signal;
 
 use crate::{SHORT, system};
@@ -38,16 +38,6 @@ fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
     ended
 }
 
-/// Does this for all these commands at the same time, as most of it is waiting.
-fn at_once(commands: &[&str], check: impl Fn(&str) + Sync) {
-    let check = &check;
-    thread::scope(|scope| {
-        for &command in commands {
-            scope.spawn(move || check(command));
-        }
-    });
-}
-
 /// An endpoint and what listens there.
 fn listener() -> (String, TcpListener) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -68,7 +58,7 @@ fn a_closed_port_differs_from_an_unknown_host() {
         ),
         (unknown, format!("the host of {unknown} is unknown: ")),
     ] {
-        at_once(&COMMANDS, |command| {
+        at_once(COMMANDS, |command| {
             refused(&system, &format!("{command} {endpoint}"), 30).expect_said(&said);
         });
     }
@@ -98,7 +88,7 @@ fn a_web_server_is_no_replay_server() {
             });
         }
     });
-    at_once(&COMMANDS, |command| {
+    at_once(COMMANDS, |command| {
         refused(&system, &format!("{command} {endpoint}"), 5)
             .expect_said(&format!(
                 "something listens on {endpoint} that is not driml"
