@@ -49,31 +49,27 @@ impl Network {
 
     fn build(&self) -> Result<(), String> {
         let router = self.router();
-        ip(&format!("netns add {router}"))?;
-        ip(&format!("-n {router} link set lo up"))?;
-        let forward = format!("netns exec {router} sysctl -qw net.ipv4.ip_forward=1");
-        ip(&forward)?;
+        let mut commands = format!(
+            "netns add {router}
+            -n {router} link set lo up
+            netns exec {router} sysctl -qw net.ipv4.ip_forward=1"
+        );
         for (number, machine) in self.machines.iter().enumerate() {
             let namespace = self.namespace(machine);
             let (inner, outer) = (format!("{}i{number}", self.name), self.device(machine));
-            ip(&format!("netns add {namespace}"))?;
-            ip(&format!("-n {namespace} link set lo up"))?;
-            ip(&format!(
-                "link add {inner} netns {namespace} type veth peer name {outer} netns {router}"
-            ))?;
-            ip(&format!(
-                "-n {namespace} addr add 10.77.{number}.2/24 dev {inner}"
-            ))?;
-            ip(&format!(
-                "-n {router} addr add 10.77.{number}.1/24 dev {outer}"
-            ))?;
-            ip(&format!("-n {namespace} link set {inner} up"))?;
-            ip(&format!("-n {router} link set {outer} up"))?;
-            ip(&format!(
-                "-n {namespace} route add default via 10.77.{number}.1"
-            ))?;
+            commands += &format!(
+                "
+                netns add {namespace}
+                -n {namespace} link set lo up
+                link add {inner} netns {namespace} type veth peer name {outer} netns {router}
+                -n {namespace} addr add 10.77.{number}.2/24 dev {inner}
+                -n {router} addr add 10.77.{number}.1/24 dev {outer}
+                -n {namespace} link set {inner} up
+                -n {router} link set {outer} up
+                -n {namespace} route add default via 10.77.{number}.1"
+            );
         }
-        Ok(())
+        commands.lines().map(str::trim).try_for_each(ip)
     }
 
     fn number(&self, machine: &str) -> usize {
