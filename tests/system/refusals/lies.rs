@@ -15,7 +15,8 @@ use driml_tests::{Client, Process, TestSystem, check_nothing_lost, new_learner, 
 use zenoh::{Wait, query::Query};
 
 use super::{
-    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, leave, sealed, send, upload,
+    Row, SILENCE, actor_join, affinity, batch_request, chunk_header, leave, sealed, send,
+    send_refused, upload,
 };
 use crate::{PRIORITISED, launched_with, system};
 
@@ -52,18 +53,7 @@ impl Lied {
 
     /// Sends rows, of which so many are counted as refused.
     fn sends(&self, rows: impl IntoIterator<Item = Row>, lies: u64) {
-        let before = self.status();
-        send(&self.client, rows);
-        self.counted(&before, lies);
-    }
-
-    /// So many more messages were refused since `before`.
-    fn counted(&self, before: &ReplayStatus, lies: u64) {
-        // The last one may still be on its way through a busy server.
-        let status = self.client.wait_for_replay("all lies", |replay| {
-            replay.messages_refused >= before.messages_refused + lies
-        });
-        assert_eq!(status.messages_refused - before.messages_refused, lies);
+        send_refused(&self.client, "all lies", rows, lies);
     }
 
     /// The run continues with its own numbers, and its log is short.

@@ -6,7 +6,9 @@ use driml_protocol::{
 };
 use driml_tests::{Client, Process, TestSystem};
 
-use super::{Row, SILENCE, affinity, batch_request, chunk_header, leave, newer, sealed, send};
+use super::{
+    Row, SILENCE, affinity, batch_request, chunk_header, leave, newer, sealed, send_refused,
+};
 use crate::{LONG, system};
 
 /// A replay server and a client of it.
@@ -61,13 +63,11 @@ impl Served {
     /// Sends what is refused: each row is counted, and stores nothing.
     fn refuses(&self, rows: impl IntoIterator<Item = Row>) {
         for row in rows {
-            let before = self.client.replay().unwrap();
             let why = format!("{}: {}", row.key, row.expected);
-            send(&self.client, [row]);
-            let after = self.client.replay().unwrap();
-            let refused = after.messages_refused - before.messages_refused;
-            let stored = after.transitions_inserted - before.transitions_inserted;
-            assert_eq!((refused, stored), (1, 0), "{why}");
+            let stored = || self.client.replay().unwrap().transitions_inserted;
+            let before = stored();
+            send_refused(&self.client, &why, [row], 1);
+            assert_eq!(stored(), before, "{why}");
         }
     }
 

@@ -134,6 +134,15 @@ fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
     }
 }
 
+/// Sends each row's message, checks the answer, and that the replay server counts so many messages more as refused.
+fn send_refused(client: &Client, what: &str, rows: impl IntoIterator<Item = Row>, refused: u64) {
+    let before = client.replay().unwrap().messages_refused;
+    send(client, rows);
+    // The last one may still be on its way through a busy server.
+    let status = client.wait_for_replay(what, |replay| replay.messages_refused >= before + refused);
+    assert_eq!(status.messages_refused - before, refused, "{what}");
+}
+
 /// An answer of any kind.
 fn describe(bytes: &[u8]) -> String {
     fn read<M: Message + std::fmt::Debug>(bytes: &[u8]) -> Option<String> {
