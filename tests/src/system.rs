@@ -203,10 +203,14 @@ impl TestSystem {
     /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
     /// asked, as the learner does.
     pub fn start_replay_server(&self, flags: &str) -> Process {
-        self.start_process(&format!(
-            "replay-server --keep-alive --listen {} {flags}",
-            self.endpoint()
-        ))
+        self.start_replay_server_after("", flags)
+    }
+
+    /// [`Self::start_replay_server`] with other words before the program.
+    pub fn start_replay_server_after(&self, words: &str, flags: &str) -> Process {
+        let endpoint = self.endpoint();
+        let args = format!("replay-server --keep-alive --listen {endpoint} {flags}");
+        self.start_process_after(words, &args)
     }
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.

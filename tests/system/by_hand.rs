@@ -154,12 +154,8 @@ fn an_actor_killed_and_started_again_continues() {
 #[test]
 fn a_process_by_hand_settles_its_environment() {
     let system = system();
-    let flags = format!(
-        "replay-server --listen {} --env chain --preset smoke",
-        system.endpoint()
-    );
     let variables = "env -u MALLOC_ARENA_MAX CANDLE_NUM_THREADS=3";
-    let mut server = system.start_after(variables, &flags);
+    let mut server = system.start_replay_server_after(variables, "--env chain --preset smoke");
     server.wait_for_stderr("replay server listens on ");
     let environ = fs::read_to_string(format!("/proc/{}/environ", server.pid())).unwrap();
     let has = |variable: &str| environ.split('\0').any(|it| it == variable);

@@ -28,11 +28,8 @@ fn a_run_with_more_actors_than_files_may_be_open_does_not_start() {
 #[test]
 fn a_replay_server_warns_if_it_may_not_open_enough_files() {
     let system = system();
-    let server = format!(
-        "replay-server --agent c51 {LONG} --actors 20 --listen {}",
-        system.endpoint()
-    );
-    let mut server = system.start_process_after(&limited("-n 60"), &server);
+    let flags = format!("--agent c51 {LONG} --actors 20");
+    let mut server = system.start_replay_server_after(&limited("-n 60"), &flags);
     server.wait_for_stderr(
         "a replay server for 20 actors needs 128 open files, and the system allows 60: ",
     );
@@ -43,12 +40,9 @@ fn a_replay_server_warns_if_it_may_not_open_enough_files() {
 #[test]
 fn a_file_that_may_not_grow_is_an_error_and_no_end() {
     let system = system();
-    let server = format!(
-        "replay-server --agent c51 {LONG} --replay-dir replay --listen {}",
-        system.endpoint()
-    );
+    let flags = format!("--agent c51 {LONG} --replay-dir replay");
     // Half a block of the system's is too little for a segment of shared memory, too.
-    let mut server = system.start_process_after(&limited("-f 64"), &server);
+    let mut server = system.start_replay_server_after(&limited("-f 64"), &flags);
     server.wait_for_stderr("replay server listens on ");
     let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));
     server.wait_for_stderr("cannot be written: File too large (os error 27)");

@@ -105,11 +105,7 @@ fn slow_down(server: &mut Process) -> SlowMachine {
 
 /// Starts a replay server that stands still until its machine is slowed down: it cannot have read all before.
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
-    let serve = format!(
-        "replay-server --keep-alive --listen {} {flags}",
-        system.endpoint()
-    );
-    system.start_process_after("sh -c 'kill -STOP $$; exec \"$0\" \"$@\"'", &serve)
+    system.start_replay_server_after("sh -c 'kill -STOP $$; exec \"$0\" \"$@\"'", flags)
 }
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
