@@ -1,14 +1,11 @@
 //! `driml local` with a process for each role: what a run leaves behind, in every world that needs nothing installed.
 //! How runs end badly is in `failures`.
 
-use std::{
-    collections::BTreeSet,
-    net::{Ipv4Addr, TcpListener},
-};
+use std::collections::BTreeSet;
 
 use driml_tests::{Client, Outcome, Summary, wait_until};
 
-use crate::{LONG, SHORT, chain, system};
+use crate::{LONG, SHORT, chain, listener, system};
 
 #[test]
 fn c51_leaves_a_whole_run_folder() {
@@ -60,7 +57,7 @@ fn driml_ada_with_two_actors_over_tcp() {
     // The run is not over before its second actor has started.
     system.hold_at(500);
     let longer = chain(2_560);
-    let endpoint = free_tcp_endpoint();
+    let (endpoint, _) = listener();
     let flags = format!("{longer} --actors 2 --listen {endpoint} --run-dir run");
     // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the
     // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
@@ -92,7 +89,7 @@ fn driml_ada_with_two_actors_over_tcp() {
 #[test]
 fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     let system = system();
-    let endpoint = free_tcp_endpoint();
+    let (endpoint, _) = listener();
     let run = system.start(&format!(
         "local --agent c51 {LONG} --listen {endpoint} --run-dir run"
     ));
@@ -107,17 +104,6 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     run.interrupt().expect_code(130);
     folder.check(Outcome::Interrupted);
     assert_eq!(actors(), BTreeSet::from([0, 5]));
-}
-
-/// An unused endpoint, at a loopback address of this process so that no other takes it meanwhile.
-fn free_tcp_endpoint() -> String {
-    let [_, high, middle, low] = std::process::id().to_be_bytes();
-    let address = Ipv4Addr::new(127, high, middle, low);
-    let free = TcpListener::bind((address, 0))
-        .unwrap()
-        .local_addr()
-        .unwrap();
-    format!("tcp/{free}")
 }
 
 #[test]

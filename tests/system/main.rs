@@ -45,11 +45,21 @@ mod tiny_replay;
 mod tls;
 mod watch;
 
+use std::net::{Ipv4Addr, TcpListener};
+
 use driml_tests::{Process, TestSystem};
 
 /// A fresh system of the program that cargo has built for this test.
 fn system() -> TestSystem {
     TestSystem::new(env!("CARGO_BIN_EXE_driml-under-test"))
+}
+
+/// An unused endpoint and what listens there, at a loopback address of this process so that no other takes it meanwhile.
+fn listener() -> (String, TcpListener) {
+    let [_, high, middle, low] = std::process::id().to_be_bytes();
+    let address = Ipv4Addr::new(127, high, middle, low);
+    let listener = TcpListener::bind((address, 0)).unwrap();
+    (format!("tcp/{}", listener.local_addr().unwrap()), listener)
 }
 
 /// A run on the chain that takes about a second: 540 updates of 16 rows, replay ratio 8.

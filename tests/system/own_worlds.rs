@@ -5,7 +5,7 @@ use std::{fs, path::Path};
 
 use driml_tests::{python, skip, skipped_offline, wait_until};
 
-use crate::{lockstep::continues_exactly, system};
+use crate::{lockstep::continues_exactly, repo_rules::root, system};
 
 /// What a world with frames of 12 x 12 needs beside the preset `smoke`.
 const SMALL: &str =
@@ -13,8 +13,7 @@ const SMALL: &str =
 
 /// A file of this repository.
 fn file(name: &str) -> String {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    root.join(name).display().to_string()
+    root().join(name).display().to_string()
 }
 
 /// The world whose every frame says which one it is; it needs `python3` and nothing else.

@@ -1,9 +1,9 @@
 //! `driml parity` on updates computed elsewhere in float64; `deploy/docs/src/reference/parity.md` says what the files hold.
 //! How each tensor compares is the learner's own test.
 
-use std::{fs, path::Path};
+use std::fs;
 
-use crate::system;
+use crate::{repo_rules::root, system};
 
 /// A case, and its tensor that is changed.
 const CHANGED: [(&str, &str); 5] = [
@@ -17,7 +17,7 @@ const CHANGED: [(&str, &str); 5] = [
 #[test]
 fn a_case_with_another_expectation_fails() {
     let system = system();
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("parity");
+    let folder = root().join("tests/parity");
     let mut call = format!("parity {}", folder.join("curl.safetensors").display());
     for (case, tensor) in CHANGED {
         let mut bytes = fs::read(folder.join(format!("{case}.safetensors"))).unwrap();

@@ -3,7 +3,6 @@
 
 use std::{
     io::{Read, Write},
-    net::TcpListener,
     thread,
     time::{Duration, Instant},
 };
@@ -11,7 +10,7 @@ use std::{
 use driml_tests::{Ended, TestSystem, at_once};
 use nix::sys::signal::Signal;
 
-use crate::{SHORT, system};
+use crate::{SHORT, listener, system};
 
 /// The commands that connect to a replay server.
 const COMMANDS: [&str; 4] = [
@@ -38,17 +37,10 @@ fn refused(system: &TestSystem, command: &str, seconds: u64) -> Ended {
     ended
 }
 
-/// An endpoint and what listens there.
-fn listener() -> (String, TcpListener) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    (format!("tcp/{}", listener.local_addr().unwrap()), listener)
-}
-
 #[test]
 fn a_closed_port_differs_from_an_unknown_host() {
     let system = system();
-    let (endpoint, listener) = listener();
-    drop(listener);
+    let (endpoint, _) = listener();
     let unknown = "tcp/no-such-host.invalid:7447";
     for (endpoint, said) in [
         // Processes give the replay server some seconds to start, `driml status` does not.
@@ -100,8 +92,7 @@ fn a_web_server_is_no_replay_server() {
 #[test]
 fn a_router_without_a_run_is_named_while_it_is_waited_for() {
     let system = system();
-    let (endpoint, listener) = listener();
-    drop(listener);
+    let (endpoint, _) = listener();
     let _router = driml_tests::listen(&endpoint);
     at_once(&COMMANDS[..2], |command| {
         let started = Instant::now();
