@@ -20,9 +20,9 @@ fn twenty_four_actors_wait_for_one_learner() {
     // However fast the machine is, the run is not over before the last actor waits.
     system.hold_at(100);
     let process = system.start(&system.local(&flags));
-    let client = system.connect();
-    client.wait_for_replay("24 actors that wait", |replay| replay.actors_waiting == 24);
-    drop(client);
+    system
+        .connect()
+        .wait_for_replay("24 actors that wait", |replay| replay.actors_waiting == 24);
     system.let_go();
     let ended = process.wait().expect_code(0);
     let summary = system.run_folder("run").check_finished();
@@ -37,9 +37,9 @@ fn actors_that_wait_deliver_what_they_have_when_they_are_told_to_stop() {
     let waiting = "--set replay.replay_ratio=512 --set replay.warmup_transitions=2000";
     let flags = format!("--agent c51 {LONG} --actors 32 {waiting}");
     let process = system.start(&system.local(&flags));
-    let client = system.connect();
-    client.wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
-    drop(client);
+    system
+        .connect()
+        .wait_for_replay("32 actors that wait", |replay| replay.actors_waiting == 32);
     process.interrupt().expect_code(130);
     let summary = system.run_folder("run").check(Outcome::Interrupted);
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");

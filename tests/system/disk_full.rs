@@ -54,8 +54,7 @@ fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
         "local --agent c51 {LONG} --set learner.checkpoint_period_updates={checkpoint_period} --listen {} --run-dir disk/run",
         system.endpoint()
     ));
-    let client = system.connect();
-    client.wait_for_updates(100);
+    system.connect().wait_for_updates(100);
     process
 }
 

@@ -120,10 +120,10 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     let flags = "--env mspacman --agent c51 --preset smoke --frames 100000 --actors 1";
     let changing = "--set world.lethal_schedule={episodes_per_task=5,order=[0,1]}";
     let process = system.start(&system.local(&format!("{flags} {changing}")));
-    let client = system.connect();
-    client.wait_for_replay("some transitions", |replay| replay.transitions_inserted > 0);
+    system
+        .connect()
+        .wait_for_replay("some transitions", |replay| replay.transitions_inserted > 0);
     system.find_process("actor").signal(Signal::SIGKILL);
-    drop(client);
     process
         .wait()
         .expect_code(1)
@@ -145,9 +145,7 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
     let system = system();
     let args = format!("{} --agent c51 {LONG}", system.endpoint());
     let launcher = system.start_after(LAUNCHER, &args);
-    let client = system.connect();
-    client.wait_for_updates(100);
-    drop(client);
+    system.connect().wait_for_updates(100);
     launcher.signal(Signal::SIGKILL);
     system.wait_until_all_have_ended();
     for (role, words) in [

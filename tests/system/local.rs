@@ -63,9 +63,7 @@ fn driml_ada_with_two_actors_over_tcp() {
     // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
     let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
     let process = system.start(&format!("local --agent driml-ada {alphabet} {flags}"));
-    let client = Client::join(&endpoint);
-    client.wait_for_replay("both actors", |replay| replay.actors == 2);
-    drop(client);
+    Client::join(&endpoint).wait_for_replay("both actors", |replay| replay.actors == 2);
     system.let_go();
     process.wait().expect_code(0);
     let run = system.run_folder("run");

@@ -55,11 +55,9 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
     system.hold_at(1_000);
     let flags = format!("--durable --agent c51 {longer} {PRIORITISED}");
     let process = system.start(&system.local(&flags));
-    let client = system.connect();
-    client.wait_for_updates(500);
+    system.connect().wait_for_updates(500);
     system.find_process("replay-server").signal(Signal::SIGKILL);
     system.let_go();
-    drop(client);
     process
         .wait()
         .expect_code(0)

@@ -174,9 +174,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let server = system.start_replay_server(&serve);
     let mut learner = system.start_learner("run");
     let mut actors = vec![system.start_actor(0)];
-    let client = system.connect();
-    client.wait_for_updates(50);
-    drop(client);
+    system.connect().wait_for_updates(50);
     server.kill();
 
     let mut server = start_stopped(&system, &serve);
@@ -270,9 +268,7 @@ fn a_server_that_reads_is_stopped_and_started_again() {
 fn a_resumed_run_shows_how_far_its_server_is() {
     let system = system();
     let mut process = system.start(&system.local(&format!("--durable {}", flags(SHORTER))));
-    let client = system.connect();
-    client.wait_for_updates(10);
-    drop(client);
+    system.connect().wait_for_updates(10);
     process.stop().expect_code(130);
     let run = system.run_folder("run");
     let config = system.read("run/config.toml");
