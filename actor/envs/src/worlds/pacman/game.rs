@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     config::PacmanConfig,
-    ghost::{Chance, Ghost},
+    ghost::Ghost,
     maze::{DIRECTIONS, GHOSTS, Item, Maze, Place},
     render,
 };
@@ -73,7 +73,6 @@ impl Game {
         &mut self,
         config: &PacmanConfig,
         maze: &Maze,
-        chance: Chance,
         action: u8,
     ) -> (f32, StepEnd) {
         let (agent_before, boosted_before) = (self.agent, self.boost_left > 0);
@@ -88,7 +87,7 @@ impl Game {
 
         let ghosts_before = self.ghosts.map(|ghost| ghost.place);
         for ghost in &mut self.ghosts {
-            ghost.step(maze, agent_before, boosted_before, chance, &mut self.rng);
+            ghost.step(config, maze, agent_before, boosted_before, &mut self.rng);
         }
         if self.pellets_left == 0 {
             return (reward + config.reward_cleared, StepEnd::Terminal);

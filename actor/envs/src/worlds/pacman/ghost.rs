@@ -4,7 +4,10 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use super::maze::{DIRECTIONS, Direction, Maze, Place};
+use super::{
+    config::PacmanConfig,
+    maze::{DIRECTIONS, Direction, Maze, Place},
+};
 
 /// What a ghost is at. Which one the situation asks for: `wanted`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -15,15 +18,6 @@ pub(crate) enum Mode {
     Follow,
     /// Take the move that ends furthest from the agent.
     Avoid,
-}
-
-/// How much of a ghost's behaviour is chance.
-#[derive(Clone, Copy)]
-pub(crate) struct Chance {
-    /// Probability of a random move instead of the mode's, at each step.
-    pub(crate) epsilon: f64,
-    /// Probability of changing over to the wanted mode, at each step in which it is another.
-    pub(crate) switch_probability: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -47,17 +41,17 @@ impl Ghost {
     /// One step: perhaps a change of mode, then one move.
     pub(crate) fn step(
         &mut self,
+        config: &PacmanConfig,
         maze: &Maze,
         agent: Place,
         boosted: bool,
-        chance: Chance,
         rng: &mut impl Rng,
     ) {
         let wanted = wanted(maze.in_sight(self.place, agent), boosted);
-        if wanted != self.mode && rng.random::<f64>() < chance.switch_probability {
+        if wanted != self.mode && rng.random::<f64>() < config.switch_probability {
             self.mode = wanted;
         }
-        let direction = if rng.random::<f64>() < chance.epsilon {
+        let direction = if rng.random::<f64>() < config.epsilon {
             Some(draw(maze.open(self.place), rng))
         } else {
             match self.mode {
@@ -114,11 +108,13 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+    use crate::worlds::pacman::tests::config;
 
-    const fn chance(epsilon: f64, switch_probability: f64) -> Chance {
-        Chance {
+    fn chance(epsilon: f64, switch_probability: f64) -> PacmanConfig {
+        PacmanConfig {
             epsilon,
             switch_probability,
+            ..config()
         }
     }
 
@@ -131,8 +127,8 @@ mod tests {
             for agent in (0..places).filter(|&agent| agent != place && maze.in_sight(place, agent))
             {
                 let (mut follower, mut avoider) = (Ghost::at(place), Ghost::at(place));
-                follower.step(&maze, agent, false, certain, &mut rng);
-                avoider.step(&maze, agent, true, certain, &mut rng);
+                follower.step(&certain, &maze, agent, false, &mut rng);
+                avoider.step(&certain, &maze, agent, true, &mut rng);
                 assert_eq!((follower.mode, avoider.mode), (Mode::Follow, Mode::Avoid));
                 let closer = maze.distance(place, agent) - 1;
                 assert_eq!(maze.distance(follower.place, agent), closer);
@@ -154,7 +150,7 @@ mod tests {
         let agent = 0;
         assert!(!maze.in_sight(ghost.place, agent));
         for _ in 0..maze.distance(ghost.place, agent) {
-            ghost.step(&maze, agent, false, chance(0.0, 0.0), &mut rng);
+            ghost.step(&chance(0.0, 0.0), &maze, agent, false, &mut rng);
         }
         assert_eq!((ghost.place, ghost.mode), (agent, Mode::Follow));
     }
@@ -168,7 +164,7 @@ mod tests {
         let changed = (0..trials)
             .filter(|_| {
                 let mut ghost = start;
-                ghost.step(&maze, start.place, false, chance(0.0, p), &mut rng);
+                ghost.step(&chance(0.0, p), &maze, start.place, false, &mut rng);
                 ghost.mode == Mode::Follow
             })
             .count() as f64;
@@ -192,7 +188,7 @@ mod tests {
                 heading: Some(1),
                 ..Ghost::at(crossing)
             };
-            ghost.step(&maze, 0, false, chance(1.0, 0.0), &mut rng);
+            ghost.step(&chance(1.0, 0.0), &maze, 0, false, &mut rng);
             counts[usize::from(ghost.heading.unwrap())] += 1;
         }
         let squares = counts.map(|count| f64::from(count - 10_000).powi(2));
@@ -209,7 +205,7 @@ mod tests {
         let mut visited = std::collections::BTreeSet::new();
         for _ in 0..20_000 {
             let before = ghost;
-            ghost.step(&maze, before.place, false, chance(0.0, 0.0), &mut rng);
+            ghost.step(&chance(0.0, 0.0), &maze, before.place, false, &mut rng);
             visited.insert(ghost.place);
             let back = before
                 .heading

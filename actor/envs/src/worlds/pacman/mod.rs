@@ -22,7 +22,6 @@ pub(crate) mod tests;
 
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use game::Game;
-use ghost::Chance;
 use maze::{HEIGHT, Maze, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
@@ -38,7 +37,6 @@ use crate::worlds::ising::{Boundary, IsingLattice};
 /// A move into a wall is a no-op. The no-op is a separate action so that an agent can wait for a ghost to pass.
 pub struct PacmanWorld {
     config: PacmanConfig,
-    chance: Chance,
     maze: Maze,
     /// The frame at the start of an episode, without what moves.
     fresh: Vec<u8>,
@@ -96,13 +94,8 @@ impl PacmanWorld {
                 walls.push((lattice, rng));
             }
         }
-        let chance = Chance {
-            epsilon: config.epsilon,
-            switch_probability: config.switch_probability,
-        };
         Ok(Self {
             config: config.clone(),
-            chance,
             envs: (0..num_envs).map(start).collect(),
             maze,
             fresh,
@@ -137,7 +130,7 @@ impl Envs for PacmanWorld {
 
     fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd) {
         let game = &mut self.envs[env];
-        let (reward, end) = game.step(&self.config, &self.maze, self.chance, action);
+        let (reward, end) = game.step(&self.config, &self.maze, action);
         if end != StepEnd::Running {
             let (rng, episodes) = (game.rng.clone(), game.episodes + 1);
             *game = Game::start(&self.config, &self.maze, &self.fresh, rng, episodes);
