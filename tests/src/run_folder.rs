@@ -190,10 +190,7 @@ impl RunFolder {
         let tensors = SafeTensors::deserialize(&bytes).unwrap();
         let published = tensors.iter().filter(|(name, _)| !name.starts_with("dim."));
         let file = safetensors::serialize(published, None).unwrap();
-        Sha256::digest(file)
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect()
+        format!("{:x}", Sha256::digest(file))
     }
 
     /// Checks what holds of every run that ended in order, and gives its summary.

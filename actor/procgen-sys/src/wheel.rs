@@ -113,8 +113,7 @@ pub(crate) fn check_hash(path: &Path, expected: &str) -> Result<(), ProcgenError
     let mut hasher = Sha256::new();
     let mut file = File::open(path).map_err(ProcgenError::io("opening", path))?;
     io::copy(&mut file, &mut hasher).map_err(ProcgenError::io("reading", path))?;
-    let bytes = hasher.finalize();
-    let actual: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+    let actual = format!("{:x}", hasher.finalize());
     if actual == expected {
         return Ok(());
     }
