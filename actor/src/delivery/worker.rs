@@ -180,11 +180,10 @@ impl DeliveryWorker {
                 )));
             }
         }
-        let reply = match self.send_window().and_then(|()| self.wait_for_first()) {
-            Ok(Some(reply)) => Ok(reply),
+        let reply = self.send_window().and_then(|()| self.wait_for_first());
+        let Some(reply) = reply.transpose() else {
             // To be let in at once, as the actor leaves.
-            Ok(None) => return Ok(self.again()),
-            Err(e) => Err(e),
+            return Ok(self.again());
         };
         if reply.is_ok() {
             self.silence.answered();
