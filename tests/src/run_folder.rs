@@ -8,12 +8,13 @@ use std::{
 
 pub use driml_launch::run_folder::{Outcome, Summary, Table};
 use safetensors::SafeTensors;
+use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::{client::check_nothing_lost, waiting::wait_for};
 
 /// A row of `episodes.csv`.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[allow(
     missing_docs,
     reason = "the names are those of the file, which the launcher documents"
@@ -24,6 +25,7 @@ pub struct EpisodeRow {
     pub episode: u64,
     pub actor: u64,
     pub env: u64,
+    #[serde(rename = "return")]
     pub episode_return: Option<f64>,
     pub length: Option<u64>,
 }
@@ -111,19 +113,10 @@ impl RunFolder {
     /// The rows of `episodes.csv` so far.
     pub fn episodes(&self) -> Vec<EpisodeRow> {
         let table = self.table("episodes.csv");
-        let rows = table.rows.iter().map(|row| {
-            let count = |name| table.value(row, name).unwrap();
-            EpisodeRow {
-                seconds: table.value(row, "seconds"),
-                frames: count("frames"),
-                episode: count("episode"),
-                actor: count("actor"),
-                env: count("env"),
-                episode_return: table.value(row, "return"),
-                length: table.value(row, "length"),
-            }
-        });
-        rows.collect()
+        let header = table.header.into();
+        let rows = table.rows.iter();
+        rows.map(|row| row.deserialize(Some(&header)).unwrap())
+            .collect()
     }
 
     /// Checks that every episode has a row, and that the mean return is of the last 100 episodes, or of all if there were fewer.
