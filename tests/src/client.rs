@@ -1,7 +1,7 @@
 //! A client of a run over zenoh, as any process is one: asks, and sends whatever a test wants.
 //! It takes no part in the run and keeps nothing.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
@@ -12,7 +12,7 @@ use driml_protocol::{
 };
 use zenoh::{Session, Wait, qos::Priority};
 
-use crate::waiting::{DEADLINE, wait_for};
+use crate::waiting::wait_for;
 
 /// The prefix of a run's keys unless a process is told otherwise.
 const NAMESPACE: &str = "driml";
@@ -85,14 +85,12 @@ impl Client {
 
     /// A client of the run at an endpoint, once its replay server answers.
     pub fn join(endpoint: &str) -> Self {
-        let deadline = Instant::now() + DEADLINE;
+        let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
         // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-        loop {
-            match session::open(&Endpoints::to(vec![endpoint.to_owned()])) {
-                Ok(session) => return Self::over(session),
-                Err(e) => assert!(Instant::now() < deadline, "{e}"),
-            }
-        }
+        let session = wait_for(&format!("a process that listens on {endpoint}"), || {
+            session::open(&endpoints).ok()
+        });
+        Self::over(session)
     }
 
     /// Sends bytes and gives the bytes of the answer.

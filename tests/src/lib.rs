@@ -27,4 +27,4 @@ pub use run_folder::{EpisodeRow, Outcome, RunFolder, Summary, Table, updates_of}
 pub use skipped::{is_offline, note, skip, skipped_offline, succeeds};
 pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};
-pub use waiting::{DEADLINE, at_once, wait_for, wait_until};
+pub use waiting::{at_once, wait_for, wait_until};

@@ -14,7 +14,7 @@ use nix::{
     unistd::Pid,
 };
 
-use crate::waiting::wait_for;
+use crate::waiting::{wait_for, wait_until};
 
 /// A started process. Dropping it kills it.
 #[derive(Debug)]
@@ -121,7 +121,7 @@ impl Process {
 
     /// Waits until standard error holds `words`.
     pub fn wait_for_stderr(&mut self, words: &str) {
-        wait_for(&format!("{}: {words:?} on stderr", self.name), || {
+        wait_until(&format!("{}: {words:?} on stderr", self.name), || {
             // In this order: what it said just before its end is not missed.
             let ended =
                 self.child.try_wait().unwrap().is_some() && self.stderr.reader.is_finished();
@@ -132,7 +132,7 @@ impl Process {
                 "{} ended without saying {words:?}:\n{said}",
                 self.name
             );
-            found.then_some(())
+            found
         });
     }
 
@@ -146,8 +146,8 @@ impl Process {
         let what = format!("the end of {}", self.name);
         let status = wait_for(&what, || self.child.try_wait().unwrap());
         // Its pipes close with it, as it has no child that holds them.
-        wait_for(&format!("the last output of {}", self.name), || {
-            (self.stdout.reader.is_finished() && self.stderr.reader.is_finished()).then_some(())
+        wait_until(&format!("the last output of {}", self.name), || {
+            self.stdout.reader.is_finished() && self.stderr.reader.is_finished()
         });
         Ended {
             code: status.code(),

@@ -18,7 +18,7 @@ use crate::{
     client::Client,
     process::{Ended, Process},
     run_folder::{Outcome, RunFolder, Summary},
-    waiting::wait_for,
+    waiting::{wait_for, wait_until},
 };
 
 /// The variable that marks each process of a system. Children inherit it, so that those of a killed launcher are found too.
@@ -286,9 +286,7 @@ impl TestSystem {
 
     /// Waits until no process that the program has started here is left.
     pub fn wait_until_all_have_ended(&self) {
-        wait_for("the end of all processes", || {
-            self.survivors().is_empty().then_some(())
-        });
+        wait_until("the end of all processes", || self.survivors().is_empty());
     }
 }
 

@@ -7,7 +7,7 @@ use std::{
 
 /// How long any one wait may take. The longest are for experiments of many runs: three minutes where four other processes want the
 /// same two cores. A CI job's limit is above it.
-pub const DEADLINE: Duration = Duration::from_secs(600);
+const DEADLINE: Duration = Duration::from_secs(600);
 /// Between two looks at a condition: as long as a look takes, as one may start a process, within these limits.
 const LOOK_AGAIN: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(200)];
 
