@@ -2,16 +2,18 @@
 //! With `DRIML_OFFLINE=1` each test here is skipped and says so; what each game does is tested beside the worlds.
 
 use driml_settings::config::RunConfig;
-use driml_tests::{check_has, skipped_offline};
+use driml_tests::{TestSystem, check_has, skipped_offline};
 
 use crate::system;
 
+/// A system where the engine may be fetched; none, and the test is skipped by name, where it may not.
+fn with_engine() -> Option<TestSystem> {
+    (!skipped_offline()).then(system)
+}
+
 #[test]
 fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
-    if skipped_offline() {
-        return;
-    }
-    let system = system();
+    let Some(system) = with_engine() else { return };
     system
         .run_ok("local --env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2 --run-dir run");
     let summary = system.run_folder("run").check_finished();
@@ -25,10 +27,7 @@ fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
 /// Frames as the engine gives them lose a border that no convolution reads; at 104 x 80 they are enlarged after that.
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
-    if skipped_offline() {
-        return;
-    }
-    let system = system();
+    let Some(system) = with_engine() else { return };
     for (name, sets, cut) in [
         ("64", "", [60, 60]),
         (
@@ -63,10 +62,7 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
-    if skipped_offline() {
-        return;
-    }
-    let system = system();
+    let Some(system) = with_engine() else { return };
     system.run_ok(
         "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
              --set actor.actions=visible --set learner.affinity.alphabet=visible --run-dir run",
@@ -79,10 +75,7 @@ fn an_agent_chooses_among_the_actions_that_differ() {
 
 #[test]
 fn an_experiment_of_three_seeds_has_scores_over_games() {
-    if skipped_offline() {
-        return;
-    }
-    let system = system();
+    let Some(system) = with_engine() else { return };
     system
         .run_ok("experiment procgen --smoke --games bigfish --agents c51,driml-ada --seeds 3 --frames 608 --episodes 1 --out table");
     let page = system.read("table/README.md");
