@@ -306,7 +306,6 @@ impl Environment for ExecWorld {
         self.hear_done(self.config.step_patience(), doing)?;
         let numbers = self.block.read_results(rewards);
         let numbers = numbers.map_err(|e| self.process.system(doing, &e))?;
-        let mut wrong = None;
         for (copy, (end, &number)) in ends.iter_mut().zip(numbers).enumerate() {
             *end = match number {
                 0 => StepEnd::Running,
@@ -314,21 +313,17 @@ impl Environment for ExecWorld {
                 2 => StepEnd::TimedOut,
                 3 => StepEnd::Terminal,
                 number => {
-                    wrong = Some(format!(
+                    return Err(self.process.fail(&format!(
                         "ended the step of copy {copy} with {number}; 0 runs on, 1 is the next level, 2 timed out, 3 terminal"
-                    ));
-                    break;
+                    )));
                 }
             };
         }
         if let Some(copy) = rewards.iter().position(|reward| !reward.is_finite()) {
-            let reward = rewards[copy];
-            wrong.get_or_insert_with(|| format!("gave copy {copy} the reward {reward}"));
+            let wrong = format!("gave copy {copy} the reward {}", rewards[copy]);
+            return Err(self.process.fail(&wrong));
         }
-        match wrong {
-            Some(text) => Err(self.process.fail(&text)),
-            None => Ok(()),
-        }
+        Ok(())
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
