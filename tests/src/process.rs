@@ -207,6 +207,12 @@ impl Ended {
         self
     }
 
+    /// Checks that it ended with an error, exit code 1, and `words` on standard error.
+    #[track_caller]
+    pub fn expect_error(self, words: &str) -> Self {
+        self.expect_code(1).expect_said(words)
+    }
+
     /// Standard output, as JSON.
     #[track_caller]
     pub fn json(&self) -> serde_json::Value {

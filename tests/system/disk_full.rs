@@ -233,13 +233,11 @@ fn a_folder_that_cannot_be_used_is_said() {
     };
     other(&flags)
         .wait()
-        .expect_code(1)
-        .expect_said("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
+        .expect_error("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
     server.stop().expect_code(0);
     other(&flags.replace("c51", "driml-ada"))
         .wait()
-        .expect_code(1)
-        .expect_said("replay holds the replay of another run (its run spec has the hash");
+        .expect_error("replay holds the replay of another run (its run spec has the hash");
 
     let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
@@ -251,8 +249,7 @@ fn a_folder_that_cannot_be_used_is_said() {
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
         .wait()
-        .expect_code(1)
-        .expect_said("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
+        .expect_error("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
     drop(disk);
     assert!(system.names("replay").len() > 2);
 }

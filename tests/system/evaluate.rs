@@ -64,8 +64,7 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
     }
     system
         .run("evaluate run --returns none/returns.csv")
-        .expect_code(1)
-        .expect_said("--returns none/returns.csv");
+        .expect_error("--returns none/returns.csv");
 
     // Any checkpoint that is there is played.
     let kept = system.run_folder("run").checkpoints();
@@ -339,8 +338,7 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named()
     let call = "evaluate --run run --episodes 1";
     system
         .run(call)
-        .expect_code(1)
-        .expect_said(&format!(
+        .expect_error(&format!(
             "error: run/checkpoints/{name}/online.safetensors is damaged: "
         ))
         .expect_said("remove the folder it is in");
@@ -352,8 +350,7 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named()
     fs::write(system.path("run/config.toml"), other).unwrap();
     system
         .run(call)
-        .expect_code(1)
-        .expect_said("belongs to a run with specification")
+        .expect_error("belongs to a run with specification")
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     system.refuses(call, "has no checkpoint yet");

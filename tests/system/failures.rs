@@ -17,8 +17,7 @@ fn a_second_interrupt_ends_at_once() {
     process.signal(Signal::SIGINT);
     process.wait_for_stderr("Ctrl-C again ends at once");
     interrupt_until_it_ends(process)
-        .expect_code(1)
-        .expect_said("stopped at once by a second interrupt: what was not saved is lost");
+        .expect_error("stopped at once by a second interrupt: what was not saved is lost");
     system.check_over(Outcome::Failed);
 }
 
@@ -56,8 +55,7 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
     let ended = process
         .wait()
-        .expect_code(1)
-        .expect_said("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
+        .expect_error("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
     assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
     assert_eq!(system.survivors(), []);
 }
@@ -70,8 +68,7 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
         system.find_process(role).signal(Signal::SIGKILL);
         process
             .wait()
-            .expect_code(1)
-            .expect_said(&format!(
+            .expect_error(&format!(
                 "error: {role} was killed by signal 9 SIGKILL (log: "
             ))
             .expect_said("`driml train --resume run` resumes it");
@@ -126,8 +123,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     system.find_process("actor").signal(Signal::SIGKILL);
     process
         .wait()
-        .expect_code(1)
-        .expect_said("error: actor-0 was killed by signal 9 SIGKILL (log: ")
+        .expect_error("error: actor-0 was killed by signal 9 SIGKILL (log: ")
         .expect_said("actor-0 is not started again: the ghosts of this run change");
     system.check_over(Outcome::Failed);
 }

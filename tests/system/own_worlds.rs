@@ -92,8 +92,7 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
     let system = system();
     system
         .run(&run("saves large"))
-        .expect_code(1)
-        .expect_said("wrote a state of 67108865 bytes; 67108864 are possible");
+        .expect_error("wrote a state of 67108865 bytes; 67108864 are possible");
 }
 
 #[test]
@@ -111,8 +110,7 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
         let flags = format!("{SMALL} {limit} --agent c51 --frames 100000 --env '{env}'");
         system
             .run(&format!("local {flags} --run-dir run"))
-            .expect_code(1)
-            .expect_said(sentence);
+            .expect_error(sentence);
         assert_eq!(system.survivors(), [], "{fault}");
     }
 }
@@ -126,8 +124,7 @@ fn what_was_played_before_a_world_failed_is_stored() {
     let flags = format!("{SMALL} {slow} --agent c51 --frames 100000 --env '{env}'");
     system
         .run(&format!("local {flags} --run-dir run"))
-        .expect_code(1)
-        .expect_said("the dragon got out");
+        .expect_error("the dragon got out");
     assert_eq!(system.survivors(), []);
     // On a slow machine the actor is started again, and plays as much once more.
     let frames = system.run_folder("run").summary().frames;
@@ -159,17 +156,13 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     system
         .start_actor(0)
         .wait()
-        .expect_code(1)
-        .expect_said("an actor starts none because a replay server says so")
+        .expect_error("an actor starts none because a replay server says so")
         .expect_said("--env \"exec:exec python3 ");
     let actor = |flags: &str| {
         let endpoint = system.endpoint();
         system.start_process(&format!("actor --connect {endpoint} {flags}"))
     };
-    actor("--env chain")
-        .wait()
-        .expect_code(1)
-        .expect_said("and not chain");
+    actor("--env chain").wait().expect_error("and not chain");
     // The same world by another command, as another machine may have it; it will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
     let client = system.connect();

@@ -27,8 +27,7 @@ fn a_case_with_another_expectation_fails() {
     }
     let ended = system
         .run(&call)
-        .expect_code(1)
-        .expect_said("error: 5 of 6 files are out of tolerance");
+        .expect_error("error: 5 of 6 files are out of tolerance");
     let said = &ended.stdout;
     let failed: Vec<_> = said.lines().filter(|it| it.ends_with("FAILED")).collect();
     assert_eq!(failed.len(), CHANGED.len(), "{said}");

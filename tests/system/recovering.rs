@@ -193,8 +193,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     check_has(&said, &words);
     system
         .run(&format!("watch --once --connect {endpoint}"))
-        .expect_code(1)
-        .expect_said("reads its replay back from disk");
+        .expect_error("reads its replay back from disk");
     let mut watched = system.start(&format!("watch --connect {endpoint} --run-dir seen"));
     watched.wait_for_stderr(": reads its replay back from disk, ");
     actors.push(system.start_actor(1));

@@ -69,7 +69,7 @@ fn missing_processes_are_named_with_what_to_do() {
     server.signal(Signal::SIGSTOP);
     let ended = system.run(&format!("status --connect {endpoint}"));
     server.signal(Signal::SIGCONT);
-    ended.expect_code(1).expect_said("endpoint");
+    ended.expect_error("endpoint");
 }
 
 #[test]

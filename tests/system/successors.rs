@@ -59,8 +59,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
     let learner = system.start_learner("run");
     learner
         .wait()
-        .expect_code(1)
-        .expect_said("resume with the settings it was made with");
+        .expect_error("resume with the settings it was made with");
     server.stop().expect_code(0);
 }
 
@@ -84,10 +83,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     let (server, learner, client) = between_checkpoints(&system, patience);
     drop(client);
     server.kill();
-    learner
-        .wait()
-        .expect_code(1)
-        .expect_said("no batch and no answer for 1s");
+    learner.wait().expect_error("no batch and no answer for 1s");
     assert!(system.run_folder("run").saved_updates() > 75);
 }
 
@@ -109,14 +105,12 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     ));
     learner
         .wait()
-        .expect_code(1)
-        .expect_said("this replay server does not know the learner: it was started again");
+        .expect_error("this replay server does not know the learner: it was started again");
     let saved = system.run_folder("run").saved_updates();
     assert!(saved > 75);
     actor
         .wait()
-        .expect_code(1)
-        .expect_said("does not know this life of actor 1: it was started anew");
+        .expect_error("does not know this life of actor 1: it was started anew");
 
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
@@ -145,8 +139,7 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     };
     system
         .run(&stranger(""))
-        .expect_code(1)
-        .expect_said("and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints");
+        .expect_error("and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints");
     let before = client.replay().unwrap();
     assert!(before.updates > 75, "{before:#?}");
     let restarted = system.start(&stranger("--keep-alive --restart"));
@@ -167,8 +160,7 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     assert_eq!(replay.updates, 540);
     system
         .run(&stranger(""))
-        .expect_code(1)
-        .expect_said("the run is finished, with 540 updates");
+        .expect_error("the run is finished, with 540 updates");
     learner.wait().expect_code(0);
     actor.wait().expect_code(0);
     server.stop().expect_code(0);

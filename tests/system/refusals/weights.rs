@@ -131,7 +131,7 @@ fn processes_of_another_protocol_version_do_not_join() {
             .wait()
             .unwrap();
         for process in [system.start_actor(0), system.start_learner("run")] {
-            process.wait().expect_code(1).expect_said(reason);
+            process.wait().expect_error(reason);
         }
         queryable.undeclare().wait().unwrap();
     }
