@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::repo_rules::{files, root};
+use super::repo_rules::{Source, read, root, sources};
 
 /// Lines of the README, which is to be read on two screens.
 const README_LINES_MAX: usize = 130;
@@ -20,30 +20,9 @@ const CELL_WORDS_MAX: usize = 12;
 const DOCS: &str = "deploy/docs/src";
 const LANGUAGES: [&str; 7] = ["", "sh", "text", "toml", "rust", "python", "ini"];
 
-struct Page {
-    name: String,
-    path: PathBuf,
-    text: String,
-}
-
-fn markdown() -> Vec<Page> {
-    let pages = files()
-        .into_iter()
-        .filter(|(name, _)| name.ends_with(".md") || name.ends_with(".md.j2"));
-    let page = |(name, path): (String, PathBuf)| Page {
-        text: fs::read_to_string(&path).unwrap(),
-        name,
-        path,
-    };
-    pages.map(page).collect()
-}
-
-/// Those that are read as they are.
-fn pages() -> Vec<Page> {
-    let mut pages = markdown();
-    pages.retain(|page| page.name.ends_with(".md"));
-    assert!(pages.len() > 20, "the walk found {} only", pages.len());
-    pages
+/// The pages that are read as they are.
+fn pages() -> Vec<Source> {
+    sources(&[".md"])
 }
 
 fn expect_none(what: &str, wrong: &[String]) {
@@ -92,9 +71,10 @@ fn every_link_leads_to_a_file_and_heading_of_the_repository() {
                 continue;
             }
             let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
+            let path = root().join(&page.name);
             let target = match file {
-                "" => page.path.clone(),
-                file => page.path.parent().unwrap().join(file),
+                "" => path,
+                file => path.parent().unwrap().join(file),
             };
             let leads = target.exists()
                 && (anchor.is_empty()
@@ -128,7 +108,7 @@ fn code_blocks_are_closed_and_of_a_known_language() {
 
 #[test]
 fn the_book_lists_each_of_its_pages_once() {
-    let summary = fs::read_to_string(root().join(DOCS).join("SUMMARY.md")).unwrap();
+    let summary = read(format!("{DOCS}/SUMMARY.md"));
     let mut listed: Vec<_> = summary
         .split("](")
         .skip(1)
@@ -146,9 +126,8 @@ fn the_book_lists_each_of_its_pages_once() {
 
 #[test]
 fn the_page_of_the_protocol_has_every_key() {
-    let page = root().join(DOCS).join("reference/protocol.md");
-    let page = fs::read_to_string(page).unwrap();
-    let table = fs::read_to_string(root().join("protocol/src/messages/table.rs")).unwrap();
+    let page = read(format!("{DOCS}/reference/protocol.md"));
+    let table = read("protocol/src/messages/table.rs");
     let keys = table.split(", at \"").skip(1);
     let keys: Vec<_> = keys.filter_map(|rest| rest.split('"').next()).collect();
     for key in &keys {
@@ -188,7 +167,7 @@ fn without_links(text: &str) -> String {
 
 #[test]
 fn all_pages_together_stay_within_the_budget() {
-    let counts: Vec<_> = markdown()
+    let counts: Vec<_> = sources(&[".md", ".md.j2"])
         .into_iter()
         .map(|page| (words(&page.text), page.name))
         .collect();
@@ -201,7 +180,7 @@ fn all_pages_together_stay_within_the_budget() {
 
 #[test]
 fn the_readme_is_short() {
-    let text = fs::read_to_string(root().join("README.md")).unwrap();
+    let text = read("README.md");
     let (lines, words) = (text.lines().count(), words(&text));
     assert!(
         lines <= README_LINES_MAX && words <= README_WORDS_MAX,

@@ -20,7 +20,10 @@ use driml_tests::{
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{repo_rules::root, system};
+use crate::{
+    repo_rules::{read, root},
+    system,
+};
 
 /// Largest difference of a value, and of a probability, between PyTorch and driml, both in f32.
 const VALUE_OFF: f64 = 2e-5;
@@ -142,7 +145,7 @@ fn pytorch_and_onnx_runtime_compute_what_driml_does() {
 
 #[test]
 fn the_page_has_the_actions_in_their_order() {
-    let page = fs::read_to_string(root().join("deploy/docs/src/reference/weights.md")).unwrap();
+    let page = read("deploy/docs/src/reference/weights.md");
     for (world, names) in [
         ("chain", &ChainWorld::ACTION_NAMES[..]),
         ("mspacman", &PacmanWorld::ACTION_NAMES),

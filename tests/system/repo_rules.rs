@@ -68,10 +68,14 @@ pub(crate) fn folders_of_crates() -> impl Iterator<Item = &'static str> {
     arrows().map(|(_, folder, _)| folder)
 }
 
+/// The text of a file, by its path from the root.
+pub(crate) fn read(path: impl AsRef<Path>) -> String {
+    fs::read_to_string(root().join(path)).unwrap()
+}
+
 /// A file of TOML, by its path from the root.
 fn toml(path: impl AsRef<Path>) -> toml::Table {
-    let text = fs::read_to_string(root().join(path)).unwrap();
-    text.parse().unwrap()
+    read(path).parse().unwrap()
 }
 
 /// What each package of `Cargo.lock` depends on: on any platform, with tests and benches. Versions of one are taken together.
@@ -157,8 +161,8 @@ fn each_process_is_free_of_what_is_none_of_its_business() {
     }
 }
 
-/// Every file of the repository that is not built, fetched or left by a run, with its path from the root.
-pub(crate) fn files() -> Vec<(String, PathBuf)> {
+/// Every file of the repository that is not built, fetched or left by a run, by its path from the root.
+fn files() -> Vec<String> {
     let mut files = Vec::new();
     let mut folders = vec![root()];
     while let Some(folder) = folders.pop() {
@@ -180,27 +184,31 @@ pub(crate) fn files() -> Vec<(String, PathBuf)> {
             if entry.file_type().unwrap().is_dir() {
                 folders.push(path);
             } else {
-                files.push((name, path));
+                files.push(name);
             }
         }
     }
     files.sort();
+    assert!(files.len() > 300, "the walk found only {files:?}");
     files
 }
 
-fn rust_files() -> Vec<(String, String)> {
-    let rust = files()
-        .into_iter()
-        .filter(|(name, _)| name.ends_with(".rs"));
-    let files: Vec<_> = rust
-        .map(|(name, path)| (name, fs::read_to_string(path).unwrap()))
-        .collect();
-    assert!(
-        files.len() > 100,
-        "the walk found {} files only",
-        files.len()
-    );
-    files
+/// A file of text.
+pub(crate) struct Source {
+    /// Its path from the root.
+    pub(crate) name: String,
+    pub(crate) text: String,
+}
+
+/// The files whose names end in one of these.
+pub(crate) fn sources(endings: &[&str]) -> Vec<Source> {
+    let mut names = files();
+    names.retain(|name| endings.iter().any(|it| name.ends_with(it)));
+    let source = |name: String| Source {
+        text: read(&name),
+        name,
+    };
+    names.into_iter().map(source).collect()
 }
 
 /// The identifiers in a Rust file outside its comments. Strings count as code, which errs on the strict side.
@@ -214,7 +222,7 @@ fn words(text: &str) -> BTreeSet<&str> {
 
 #[test]
 fn every_source_file_says_what_it_is_for() {
-    for (name, text) in rust_files() {
+    for Source { name, text } in sources(&[".rs"]) {
         let first = text.lines().next().unwrap_or_default();
         assert!(
             first.starts_with("//! ") && first.len() > 12,
@@ -225,18 +233,18 @@ fn every_source_file_says_what_it_is_for() {
 
 #[test]
 fn the_code_stays_within_its_budget() {
-    let files = rust_files();
+    let files = sources(&[".rs"]);
     for (folder, lines_max) in LINES_MAX {
         let inside = files
             .iter()
-            .filter(|(name, _)| Path::new(name).starts_with(folder));
-        let lines: usize = inside.map(|(_, text)| text.lines().count()).sum();
+            .filter(|it| Path::new(&it.name).starts_with(folder));
+        let lines: usize = inside.map(|it| it.text.lines().count()).sum();
         assert!(
             (1..=lines_max).contains(&lines),
             "{folder} has {lines} lines of Rust; at most {lines_max}"
         );
     }
-    for (name, text) in &files {
+    for Source { name, text } in &files {
         let lines = text.lines().count();
         assert!(
             lines <= FILE_LINES_MAX,
@@ -266,7 +274,7 @@ fn dangerous_words_stay_where_they_are_needed() {
     ];
     for (word, places) in rules {
         let mut seen = 0;
-        for (name, text) in rust_files() {
+        for Source { name, text } in sources(&[".rs"]) {
             // This file has to name them.
             if name != "tests/system/repo_rules.rs" && words(&text).contains(word) {
                 assert!(
@@ -287,7 +295,7 @@ fn dangerous_words_stay_where_they_are_needed() {
 fn comments_and_messages_say_who_does_what() {
     // This file is looked at too.
     let vague = ["no_body", "some_body", "every_body", "who_ever"].map(|it| it.replace('_', ""));
-    for (name, text) in rust_files() {
+    for Source { name, text } in sources(&[".rs"]) {
         let text = text.to_lowercase();
         let found = vague.iter().find(|it| text.contains(*it));
         assert_eq!(found, None, "{name}: name the process or person");
@@ -298,9 +306,9 @@ fn comments_and_messages_say_who_does_what() {
 fn nothing_points_at_the_machine_it_was_written_on() {
     // Put together here, as this file is looked at too.
     let places = ["work", "root"].map(|folder| format!("/{folder}/"));
-    for (name, path) in files() {
+    for name in files() {
         // Binary files, such as parity cases, hold no paths.
-        let Ok(text) = fs::read_to_string(path) else {
+        let Ok(text) = fs::read_to_string(root().join(&name)) else {
             continue;
         };
         for (number, line) in text.lines().enumerate() {
