@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use libloading::os::unix::{Library, RTLD_LOCAL, RTLD_NOW};
 
@@ -38,10 +38,9 @@ const PACKAGES: [(&str, &str, &str); 6] = [
 
 /// Loads the library at `path`, or finds it already loaded.
 pub(crate) fn load(path: &Path) -> Result<&'static Api, ProcgenError> {
-    static LOADED: OnceLock<Mutex<BTreeMap<PathBuf, &'static Api>>> = OnceLock::new();
+    static LOADED: Mutex<BTreeMap<PathBuf, &'static Api>> = Mutex::new(BTreeMap::new());
     check_machine()?;
-    let loaded = LOADED.get_or_init(Mutex::default);
-    let mut loaded = loaded.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(api) = loaded.get(path) {
         return Ok(api);
     }
