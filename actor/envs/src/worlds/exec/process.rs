@@ -82,13 +82,12 @@ impl WorldProcess {
             .stderr(Stdio::null())
             .process_group(0)
             .spawn()?;
-        let group = i32::try_from(guard.id()).map_err(io::Error::other)?;
         let started = Command::new(SHELL)
             .args(["-c", command])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
-            .process_group(group)
+            .process_group(guard.id() as i32)
             .spawn();
         let mut child = match started {
             Ok(child) => child,
@@ -257,10 +256,8 @@ impl WorldProcess {
             if matches!(process.try_wait(), Ok(Some(_))) {
                 continue;
             }
-            let group = i32::try_from(process.id()).map(Pid::from_raw);
-            if let Err(e) = group.map(|group| killpg(group, Signal::SIGKILL)) {
-                tracing::debug!("killing the world `{}`: {e}", self.command);
-            }
+            // One that leads no group has none to kill.
+            let _ = killpg(Pid::from_raw(process.id() as i32), Signal::SIGKILL);
             if let Err(e) = process.kill() {
                 tracing::debug!("killing the world `{}`: {e}", self.command);
             }
