@@ -11,7 +11,7 @@ use safetensors::SafeTensors;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
-use crate::{client::check_nothing_lost, waiting::wait_for};
+use crate::{client::check_nothing_lost, waiting::wait_until};
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -82,15 +82,10 @@ impl RunFolder {
         Table::read(&self.path.join(name)).unwrap()
     }
 
-    /// Updates in the last row of the metrics so far; none before the first row.
-    pub fn updates_recorded(&self) -> Option<u64> {
-        self.table("metrics.csv").last("updates")
-    }
-
     /// Waits until the metrics have a row with more than so many updates.
     pub fn wait_for_updates(&self, updates: u64) {
-        wait_for(&format!("a row with more than {updates} updates"), || {
-            self.updates_recorded().filter(|&it| it > updates)
+        wait_until(&format!("a row with more than {updates} updates"), || {
+            self.table("metrics.csv").last::<u64>("updates") > Some(updates)
         });
     }
 

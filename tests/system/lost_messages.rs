@@ -139,13 +139,15 @@ impl Server {
         self.answer::<Leave>(endpoint, |server, payload| {
             let hash = spec().hash();
             let leave = codec::decode::<Leave>(payload, Some(hash)).unwrap().0;
-            let tries = server.count_leave(leave.actor);
+            let mut leaves = server.leaves.lock().unwrap();
+            let tries = leaves.entry(leave.actor).or_default();
+            *tries += 1;
             // The first does not arrive, and the answer to the second does not.
-            if tries > 1 {
+            if *tries > 1 {
                 let refused = server.replay.lock().unwrap().leave(&leave);
                 assert_eq!(refused, None);
             }
-            (tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
+            (*tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
         });
     }
 
@@ -162,14 +164,6 @@ impl Server {
                 None => server.lost.lock().unwrap().push(query),
             }
         });
-    }
-
-    /// Counts a `Leave` of this actor; gives how often it has said it.
-    fn count_leave(&self, actor: u32) -> u32 {
-        let mut leaves = self.leaves.lock().unwrap();
-        let tries = leaves.entry(actor).or_default();
-        *tries += 1;
-        *tries
     }
 
     fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {

@@ -34,11 +34,6 @@ fn held(system: &TestSystem, process: &str) -> Held {
     }
 }
 
-/// Segments of shared memory on this machine, other runs' too.
-fn segments() -> usize {
-    fs::read_dir("/dev/shm").unwrap().count()
-}
-
 #[test]
 #[ignore = "an hour: cargo nextest run --workspace --run-ignored only -E 'test(soak)' --no-capture"]
 fn nothing_grows() {
@@ -74,7 +69,8 @@ fn nothing_grows() {
             let look = (
                 held(&system, "replay-server"),
                 held(&system, "learner"),
-                segments(),
+                // Segments of shared memory on this machine, other runs' too.
+                fs::read_dir("/dev/shm").unwrap().count(),
             );
             note(&format!("after {:?}: {look:?}", started.elapsed()));
             looks.push(look);
