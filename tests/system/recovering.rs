@@ -110,8 +110,8 @@ fn start_stopped(system: &TestSystem, flags: &str) -> Process {
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
 fn recovering(system: &TestSystem) -> Option<Value> {
-    let ended = system.run(&format!("status --connect {} --json", system.endpoint()));
-    let answer = ended.expect_code(0).json();
+    let status = format!("status --connect {} --json", system.endpoint());
+    let answer = system.run_ok(&status).json();
     let recovering = answer["servers"][0]["recovering"].clone();
     if recovering.is_null() {
         return None;

@@ -57,8 +57,9 @@ fn missing_processes_are_named_with_what_to_do() {
     let words = ["learner        GONE for", "from its newest checkpoint"];
     wait_for_status(&system, &words);
 
-    let ended = system.run(&format!("status --connect {endpoint} --json"));
-    let answer = ended.expect_code(0).json();
+    let answer = system
+        .run_ok(&format!("status --connect {endpoint} --json"))
+        .json();
     let processes = &answer["servers"][0]["processes"]["processes"];
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);

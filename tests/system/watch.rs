@@ -167,14 +167,10 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let metrics = COLUMNS.iter().map(|it| it.name);
     let fields: BTreeSet<_> = metrics.chain(FIELDS).collect();
     assert_eq!(names, fields);
-    assert_eq!(
-        (&said["frames"], &said["updates"]),
-        (&1280.into(), &540.into())
-    );
-    assert_eq!(
-        (&said["well"], &said["finished"]),
-        (&true.into(), &true.into())
-    );
+    assert_eq!(said["frames"], 1280);
+    assert_eq!(said["updates"], 540);
+    assert_eq!(said["well"], true);
+    assert_eq!(said["finished"], true);
     assert_eq!(said["losses"].as_object().unwrap().len(), 1);
     // The page for persons is that of `driml status`.
     system
