@@ -139,6 +139,12 @@ impl Client {
         wait_for(what, || self.replay().filter(&wanted))
     }
 
+    /// Waits until the replay server has stored more than so many transitions.
+    pub fn wait_for_transitions(&self, transitions: u64) -> ReplayStatus {
+        let what = format!("more than {transitions} transitions");
+        self.wait_for_replay(&what, |replay| replay.transitions_inserted > transitions)
+    }
+
     /// Waits until the learner's status is as wanted, and gives it.
     pub fn wait_for_learner(
         &self,

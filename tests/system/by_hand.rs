@@ -132,9 +132,7 @@ fn an_actor_killed_and_started_again_continues() {
     let learner = system.start_learner("run");
     let actor = system.start_actor(3);
     let client = system.connect();
-    client.wait_for_replay("some transitions", |replay| {
-        replay.transitions_inserted > 500
-    });
+    client.wait_for_transitions(500);
     actor.kill();
     let before = client.wait_for_replay("the actor's absence", |replay| replay.actors == 0);
     assert!(!before.finished);

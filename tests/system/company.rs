@@ -111,15 +111,14 @@ fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
     let learner = system.start_learner("run");
     let first = system.start_actor(3);
     let client = system.connect();
-    client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
+    client.wait_for_transitions(0);
     let mut second = system.start_actor(3);
     second.wait_for_stderr(
         "another process is actor 3 of this run: give each actor another number (--id)",
     );
+    // The first one still plays.
     let before = client.replay().unwrap();
-    client.wait_for_replay("more of the first", |replay| {
-        replay.transitions_inserted > before.transitions_inserted
-    });
+    client.wait_for_transitions(before.transitions_inserted);
     first.stop().expect_code(0).expect_said("leaves: ");
     second.wait_for_stderr("actor 3 steps 4 environments");
     second.stop().expect_code(0);

@@ -190,9 +190,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         words.iter().all(|it| said.contains(it))
     });
     fs::remove_file(filler).unwrap();
-    client.wait_for_replay("more frames", |replay| {
-        replay.transitions_inserted > stopped.transitions_inserted + 1_000
-    });
+    client.wait_for_transitions(stopped.transitions_inserted + 1_000);
     server.wait_for_stderr("can be written again; nothing was lost");
     let said = system.run(&ask).stdout;
     assert!(

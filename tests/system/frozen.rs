@@ -114,9 +114,7 @@ fn a_frozen_actor_does_not_stop_the_others() {
     assert!(learner.is_running() && healthy.is_running() && frozen.is_running());
     frozen.signal(Signal::SIGCONT);
     let others = client.replay().unwrap().transitions_inserted;
-    client.wait_for_replay("more transitions", |replay| {
-        replay.transitions_inserted > others + 500
-    });
+    client.wait_for_transitions(others + 500);
     for actor in [healthy, frozen] {
         actor.stop().expect_code(0).expect_said("leaves: ");
     }

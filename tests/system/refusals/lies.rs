@@ -59,11 +59,9 @@ impl Lied {
     /// The run continues with its own numbers, and its log is short.
     fn continues(self) {
         let updates = self.client.learner().unwrap().updates;
-        let before = self.status();
+        let transitions = self.status().transitions_inserted;
         self.client.wait_for_updates(updates + 20);
-        let status = self.client.wait_for_replay("more transitions", |replay| {
-            replay.transitions_inserted > before.transitions_inserted + 100
-        });
+        let status = self.client.wait_for_transitions(transitions + 100);
         check_nothing_lost(&status);
         assert_eq!((status.actors, status.finished), (1, false));
         assert!(status.affinity_version < 1 << 20, "{status:#?}");

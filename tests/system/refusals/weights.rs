@@ -61,7 +61,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     );
     assert_eq!(client.replay().unwrap().transitions_inserted, 0);
     send(1, &good);
-    client.wait_for_replay("transitions", |replay| replay.transitions_inserted > 0);
+    client.wait_for_transitions(0);
 
     // Then it keeps them, whatever comes.
     let mut damaged = of(2, &good, LEARNER);
@@ -93,9 +93,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
     send(7, &good);
 
     let before = client.replay().unwrap().transitions_inserted;
-    client.wait_for_replay("more transitions", |replay| {
-        replay.transitions_inserted > before + 1000
-    });
+    client.wait_for_transitions(before + 1000);
     let said = actor.stop().expect_code(0).stderr;
     assert!(!said.contains("newer ones did not come"), "{said}");
     assert_eq!(client.replay().unwrap().transitions_lost, 0);
