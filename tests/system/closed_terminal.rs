@@ -5,7 +5,7 @@ use std::{
     fs::{File, OpenOptions},
     io::{BufRead, BufReader, Read, pipe},
     os::{fd::AsFd, unix::fs::OpenOptionsExt},
-    process::{Child, ExitStatus, Stdio},
+    process::{Child, Stdio},
     sync::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
@@ -77,20 +77,16 @@ impl Window {
     }
 }
 
-/// A run that writes all that it says to `output`.
-fn start(system: &TestSystem, output: impl Into<Stdio>, errors: impl Into<Stdio>) -> Child {
-    let run = system.local(&format!("--agent driml-ada {LONG}"));
-    let mut command = system.command(&run);
-    command.stdin(Stdio::null()).stdout(output).stderr(errors);
+/// A run of this call that writes all that it says to `out` and `err`.
+fn start(system: &TestSystem, run: &str, out: impl Into<Stdio>, err: impl Into<Stdio>) -> Child {
+    let mut command = system.command(run);
+    command.stdin(Stdio::null()).stdout(out).stderr(err);
     command.spawn().unwrap()
 }
 
-fn end(child: &mut Child) -> ExitStatus {
-    wait_for("the launcher's end", || child.try_wait().unwrap())
-}
-
-/// The result is that of an interrupt: everything is saved, no process runs.
-fn check_saved(system: &TestSystem, ended: ExitStatus) {
+/// The launcher ends as after an interrupt: everything is saved, no process runs.
+fn check_saved(system: &TestSystem, mut launcher: Child) {
+    let ended = wait_for("the launcher's end", || launcher.try_wait().unwrap());
     assert_eq!(ended.code(), Some(130), "{ended}");
     assert_eq!(system.survivors(), []);
     let summary = system.run_folder("run").check(Outcome::Interrupted);
@@ -101,13 +97,14 @@ fn check_saved(system: &TestSystem, ended: ExitStatus) {
 fn a_closed_window_saves_the_run() {
     let system = system();
     let (window, terminal) = Window::open();
-    let mut child = start(&system, terminal.try_clone().unwrap(), terminal);
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
+    let launcher = start(&system, &run, terminal.try_clone().unwrap(), terminal);
     system.connect().wait_for_updates(100);
     wait_until("the progress bar", || {
         window.shown().contains("replay ratio 7")
     });
     window.close();
-    check_saved(&system, end(&mut child));
+    check_saved(&system, launcher);
 }
 
 #[test]
@@ -115,13 +112,14 @@ fn a_pipe_closed_after_two_lines_saves_the_run() {
     let system = system();
     // `driml local ... 2>&1 | head -2`
     let (reader, writer) = pipe().unwrap();
-    let mut child = start(&system, writer.try_clone().unwrap(), writer);
+    let run = system.local(&format!("--agent driml-ada {LONG}"));
+    let launcher = start(&system, &run, writer.try_clone().unwrap(), writer);
     let mut lines = BufReader::new(reader).lines();
     let head = [lines.next(), lines.next()];
     assert!(head.iter().flatten().all(|line| line.is_ok()), "{head:?}");
     system.connect().wait_for_updates(100);
     drop(lines);
-    check_saved(&system, end(&mut child));
+    check_saved(&system, launcher);
 }
 
 #[test]
@@ -129,14 +127,10 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
     let system = system();
     let (reader, writer) = pipe().unwrap();
     let run = format!("local --agent c51 {LONG} --lockstep --run-dir run");
-    let mut command = system.command(&run);
-    command.stdin(Stdio::null()).stdout(Stdio::null());
-    let mut child = command.stderr(writer).spawn().unwrap();
-    drop(command);
-    let run = system.run_folder("run");
-    run.wait_for_updates(100);
+    let launcher = start(&system, &run, Stdio::null(), writer);
+    system.run_folder("run").wait_for_updates(100);
     drop(reader);
-    check_saved(&system, end(&mut child));
+    check_saved(&system, launcher);
 }
 
 /// Under `nohup` all processes of a test ignore hangups. It does not ask the program, which may be wrong.
