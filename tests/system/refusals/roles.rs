@@ -149,14 +149,10 @@ fn an_actor_declares_nothing_but_its_own() {
         .wait()
         .unwrap();
     let liveliness = one.session.liveliness();
-    let other = liveliness
-        .declare_token(keys.alive_key(Alive::actor(0, 5)))
-        .wait()
-        .unwrap();
-    let learner = liveliness
-        .declare_token(keys.alive_key(Alive::learner(5)))
-        .wait()
-        .unwrap();
+    let tokens = [Alive::actor(0, 5), Alive::learner(5)].map(|other| {
+        let token = liveliness.declare_token(keys.alive_key(other));
+        token.wait().unwrap()
+    });
     let lie = WeightsVersion { version: 1 << 60 };
     one.session
         .put(keys.of::<WeightsVersion>(), sealed(&one, &lie))
@@ -178,7 +174,7 @@ fn an_actor_declares_nothing_but_its_own() {
         0,
         "it receives nothing that is not for it"
     );
-    drop((declared, everything, other, learner));
+    drop((declared, everything, tokens));
 }
 
 #[test]
