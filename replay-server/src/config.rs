@@ -64,14 +64,14 @@ pub struct Config {
     /// the death of the process it always survives. 0 flushes before each answer. Without it 1,000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fsync_ms: Option<u64>,
-    /// The point from which `replay_ratio` holds, if it or the batch size was changed when the run was resumed; without it the end of the
-    /// warm-up.
+    /// The point from which `replay_ratio` holds, if it, the batch size or the warm-up was changed when the run was resumed and the
+    /// warm-up is over by then; without it the end of the warm-up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub since: Option<Since>,
 }
 
 /// A point in a run: what was counted when it was resumed with other settings. `driml train --resume` writes it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Since {
     /// Transitions stored.
@@ -88,6 +88,16 @@ pub(crate) fn reach(spec: &RunSpec) -> u32 {
 }
 
 impl Config {
+    /// The point from which `replay_ratio` holds.
+    pub fn ratio_start(&self) -> Since {
+        let since = self.since.unwrap_or_default();
+        let transitions = since.transitions.max(self.warmup_transitions);
+        Since {
+            transitions,
+            ..since
+        }
+    }
+
     /// One shard in memory, drawn from uniformly, in which neither side ever waits: for tests, benches and checks.
     pub fn unlimited(capacity_transitions: u64) -> Self {
         Self {

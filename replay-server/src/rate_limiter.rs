@@ -35,15 +35,12 @@ pub(crate) struct Counts {
 impl RateLimiter {
     /// Nothing stored, nothing sampled, in a run with these settings, whose ratio may have been another before it was resumed.
     pub fn new(config: &Config) -> Self {
-        let since = match config.since {
-            Some(since) => (since.transitions, since.rows),
-            None => (config.warmup_transitions, 0),
-        };
+        let start = config.ratio_start();
         Self {
             config: config.clone(),
             since: ShardCounts {
-                inserted: since.0,
-                rows_sampled: since.1,
+                inserted: start.transitions,
+                rows_sampled: start.rows,
             },
             counts: Counts::default(),
         }

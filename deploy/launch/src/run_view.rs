@@ -55,11 +55,8 @@ impl Plan {
 
 /// Updates whose batches were served when `rows` were sampled in the whole run: before it was resumed with other settings, and since.
 pub(crate) fn updates_served(config: &RunConfig, rows: u64) -> u64 {
-    let (rows_before, updates) = config
-        .replay
-        .since
-        .map_or((0, 0), |it| (it.rows, it.updates));
-    updates + rows.saturating_sub(rows_before) / u64::from(config.learner.batch_size)
+    let start = config.replay.ratio_start();
+    start.updates + rows.saturating_sub(start.rows) / u64::from(config.learner.batch_size)
 }
 
 /// Mean and standard deviation over the rows served.

@@ -165,12 +165,10 @@ impl RunConfig {
     /// Updates of the whole run, at the replay ratio: those done before it was resumed with other settings, and those that the rest of
     /// its transitions allow.
     pub fn updates(&self) -> u64 {
-        let (transitions, before) = match self.replay.since {
-            Some(since) => (since.transitions, since.updates),
-            None => (self.replay.warmup_transitions, 0),
-        };
-        let rows = self.frames().saturating_sub(transitions) as f64 * self.replay.replay_ratio;
-        before + (rows / f64::from(self.learner.batch_size)) as u64
+        let start = self.replay.ratio_start();
+        let frames = self.frames().saturating_sub(start.transitions);
+        let rows = frames as f64 * self.replay.replay_ratio;
+        start.updates + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
     /// Runs each component's checks of its own table, then those that span two tables.

@@ -172,7 +172,7 @@ impl Replay {
         }
         let reward_max = f32::MAX / spec.n_step as f32;
         let mut rewards = (0..header.transitions()).map(|row| chunk.reward(row));
-        if let Some(reward) = rewards.find(|reward| reward.abs() > reward_max) {
+        if let Some(reward) = rewards.find(|reward| reward.is_nan() || reward.abs() > reward_max) {
             return Err(format!(
                 "a reward of {reward:e}; returns of {} steps are float32, so a reward is at most {reward_max:e}: scale the world's rewards",
                 spec.n_step

@@ -1,9 +1,11 @@
 //! What a replay rejects or delays, settings that cannot work, and the end of a run: neither side waits forever.
 //! Rows are looked at where a replay holds the least, and no message is lost or repeated.
 
-use driml_protocol::{Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Waiting};
+use driml_protocol::{
+    Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, ShardCounts, Waiting,
+};
 use driml_replay_server::{
-    ACTORS_MAX, Compression, Config, NotReady, RateLimiter, Replay, STREAMS_MAX,
+    ACTORS_MAX, Compression, Config, NotReady, RateLimiter, Replay, STREAMS_MAX, Since,
 };
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
@@ -48,7 +50,7 @@ fn unfit_chunks_are_refused_with_a_reason() {
     };
     let mut unfit = vec![(with(5, 0.0), "action 5; this run has 5")];
     // Of rewards the sum of seven must be a float.
-    for reward in [3e38, -3e38, f32::MAX] {
+    for reward in [3e38, -3e38, f32::MAX, f32::NAN] {
         unfit.push((with(0, reward), "scale the world's rewards"));
     }
     for (spoil, reason) in headers {
@@ -243,21 +245,27 @@ proptest! {
         warmup in 0u64..3000,
         extra in 0u64..200,
         length in 0u64..5000,
+        // Where it was resumed with another warm-up, ratio or batch size: transitions and rows before.
+        resumed in prop::option::of((0u64..4000, 0u64..10_000)),
         moves in prop::collection::vec((any::<bool>(), 1u64..300), 1..400),
     ) {
         let batch = (f64::from(rows) / ratio).ceil() as u64 + 1;
         let slack = 4 * batch + extra;
-        let max = warmup + batch + length;
+        let (transitions, rows_before) = resumed.unwrap_or_default();
+        let start = transitions.max(warmup);
+        let max = start + batch + length;
         let mut limiter = RateLimiter::new(&Config {
             replay_ratio: ratio,
             warmup_transitions: warmup,
             slack_transitions: slack,
             transitions_max: Some(max),
+            since: resumed.map(|_| Since { transitions, rows: rows_before, updates: 0 }),
             ..Config::unlimited(1)
-        });
-        let (mut inserted, mut sampled) = (0u64, 0u64);
+        })
+        .counting_on(counts(transitions, rows_before), ShardCounts::default());
+        let (mut inserted, mut sampled) = (transitions, rows_before);
         // Rows that the ratio has allowed, counted one transition at a time.
-        let mut allowed = 0.0;
+        let mut allowed = rows_before as f64;
         let mut moves = moves.into_iter();
         // The moves first, then whatever is possible to the end.
         loop {
@@ -265,7 +273,7 @@ proptest! {
             let (insert, chunk) = next.unwrap_or((limiter.may_insert(), 50));
             if insert && limiter.may_insert() {
                 limiter.inserted(chunk);
-                allowed += ratio * ((inserted + chunk).max(warmup) - inserted.max(warmup)) as f64;
+                allowed += ratio * ((inserted + chunk).max(start) - inserted.max(start)) as f64;
                 inserted += chunk;
             } else if limiter.may_sample(rows) {
                 limiter.sampled(rows);
@@ -275,7 +283,7 @@ proptest! {
             prop_assert_eq!(limiter.finished(rows), inserted >= max && !may_sample);
             prop_assert!(may_insert || may_sample || limiter.finished(rows), "both sides wait");
             prop_assert!(sampled as f64 <= allowed + 1e-6, "{} rows of {}", sampled, allowed);
-            prop_assert!(sampled == 0 || inserted >= warmup);
+            prop_assert!(sampled == rows_before || inserted >= warmup);
             let ahead = allowed - sampled as f64 - ratio * slack as f64;
             prop_assert!(ahead <= ratio * 300.0 + 1e-6, "a chunk at most beyond the slack");
             match limiter.waiting(rows) {
