@@ -253,6 +253,7 @@ impl Actors {
             });
         }
         actor.expected = header.sequence + 1;
+        actor.insisted = None;
         actor.current.produced = header.first_transition + header.transitions() as u64;
         (&mut actor.streams, difference)
     }

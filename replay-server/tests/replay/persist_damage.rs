@@ -280,6 +280,23 @@ fn after_a_loss_an_actor_continues_and_the_loss_is_counted() {
 }
 
 #[test]
+fn a_chunk_that_overtook_others_before_they_came_is_not_stored_ahead_of_the_next() {
+    let kept = Kept::new(10_000);
+    let mut replay = kept.open_saying(&[]);
+    let mut insert = |sequence| {
+        let header = header(0, 1, sequence, kept.history.inserted);
+        replay.insert(&Chunk::zeroed(header))
+    };
+    let InsertReply::OutOfOrder { expected } = insert(10_000) else {
+        panic!("a chunk from far beyond")
+    };
+    for (sequence, may_be_stored) in [(3, false), (0, true), (1, true), (3, false), (2, true)] {
+        let reply = insert(expected + sequence);
+        assert_eq!(is_stored(&reply), may_be_stored, "{sequence}: {reply:?}");
+    }
+}
+
+#[test]
 fn a_segment_of_another_log_is_left_alone() {
     let (kept, other) = (Kept::new(10_000), Kept::new(10_000));
     let foreign = kept.args.dir.join("segment-000000000500.log");
