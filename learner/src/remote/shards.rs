@@ -22,7 +22,7 @@ use crate::progress::{Progress, ServedPart};
 const AGE_MAX: Duration = Duration::from_millis(500);
 const EMPTY_AGE_MAX: Duration = Duration::from_millis(50);
 
-/// Sessions with all shards of a run, in the order of the endpoints, and what the run's settings are.
+/// Sessions with all shards of a run, in the order of their numbers, and what the run's settings are.
 pub(crate) struct Shards {
     pub(crate) sessions: Vec<Session>,
     pub(crate) config_toml: String,
@@ -59,8 +59,12 @@ impl Shards {
             run_infos.push(run_info);
         }
         let config_toml = one_run(connect, &run_infos)?.config_toml.clone();
+        // A learner that joins again may have its endpoints in another order.
+        let mut shards: Vec<_> = run_infos.iter().zip(sessions).collect();
+        shards.sort_by_key(|(run_info, _)| run_info.shard.0);
+        let sessions = shards.into_iter().map(|(_, session)| session);
         Ok(Some(Self {
-            sessions,
+            sessions: sessions.collect(),
             config_toml,
         }))
     }
