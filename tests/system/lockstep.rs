@@ -142,6 +142,12 @@ fn a_run_that_is_prolonged_is_a_longer_one() {
         system
             .run_ok("local --resume half")
             .expect_printed("nothing is left to do");
+        if agent == "rainbow" {
+            system.refuses(
+                "local --resume half --frames 1216 --set replay.sampling.alpha=0",
+                "replay.sampling.alpha = 0, but the replay that is kept has its priorities to the power of 0.5",
+            );
+        }
         system.run_ok("local --resume half --frames 1216");
         let resumed = system.run_folder("half").check_finished();
         assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{world}");

@@ -15,6 +15,7 @@ use driml_machine::{
     error::{Interrupted, usage},
     resources::Machine,
 };
+use driml_protocol::Sampling;
 use driml_replay_server::Since;
 use driml_settings::{
     config::RunConfig,
@@ -198,6 +199,19 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         )));
     }
     let replay_is_kept = lockstep || config.local.durable && folder.replay().is_dir();
+    let alpha = |it: &RunConfig| match it.replay.sampling {
+        Sampling::Prioritised { alpha, .. } => Some(alpha),
+        Sampling::Uniform {} => None,
+    };
+    if replay_is_kept
+        && let [Some(old), Some(new)] = [&before, &config].map(alpha)
+        && old != new
+    {
+        return Err(usage!(
+            "replay.sampling.alpha = {new}, but the replay that is kept has its priorities to the power of {old}: resume without this --set"
+        )
+        .into());
+    }
     let point = ResumePoint {
         updates,
         rows,
