@@ -20,6 +20,8 @@ use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
 
 /// A process that ends with an error within this time of its start would do so again.
 const AT_ONCE: Duration = Duration::from_secs(10);
+/// How long a process may take to end once it was killed.
+pub(crate) const KILLED_MAX: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(20);
 
 /// A process that was started.
@@ -190,6 +192,9 @@ impl ManagedProcess {
 impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
-        let _ = self.child.wait();
+        // Without end where the kernel does not let it go, as a driver that hangs.
+        if self.wait_until(Instant::now() + KILLED_MAX, || false).is_none() {
+            tracing::warn!("{} (process {}) does not end", self.name, self.pid());
+        }
     }
 }

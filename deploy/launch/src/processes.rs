@@ -9,10 +9,7 @@ use std::{
 use driml_machine::units::duration;
 use nix::sys::signal::Signal;
 
-use crate::managed_process::ManagedProcess;
-
-/// How long a process may take to end once it was killed.
-const KILLED_MAX: Duration = Duration::from_secs(30);
+use crate::managed_process::{KILLED_MAX, ManagedProcess};
 
 #[derive(Default)]
 pub(crate) struct Processes {
