@@ -7,6 +7,7 @@ use std::{
 };
 
 use anyhow::Context;
+use driml_learner::checkpoint::{self, CheckpointError};
 use driml_machine::error::{Usage, usage};
 use driml_protocol::lock_file;
 use driml_settings::config::RunConfig;
@@ -79,6 +80,12 @@ impl RunFolder {
     /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
     /// that is corrected takes its folder again.
     pub fn check_free(&self) -> Result<(), Usage> {
+        let checkpoints = self.checkpoints();
+        if checkpoints.is_dir()
+            && let Err(e @ CheckpointError::InUse(_)) = checkpoint::lock(&checkpoints)
+        {
+            return Err(Usage(e.to_string()));
+        }
         let taken = match fs::read_dir(&self.path) {
             Ok(entries) => !self.is_empty_run(entries),
             Err(_) => self.path.exists(),
@@ -112,7 +119,7 @@ impl RunFolder {
             tables.iter().chain(&others).any(|made| *made == it.path())
                 || it.file_name().to_string_lossy().starts_with(EVENTS)
         };
-        let saved = driml_learner::checkpoint::list(&self.checkpoints());
+        let saved = checkpoint::list(&self.checkpoints());
         let entries: Vec<_> = entries.flatten().collect();
         entries.is_empty()
             || entries.iter().all(is_made)
@@ -151,6 +158,12 @@ impl RunFolder {
         lock.ok_or_else(|| {
             usage!("the run in {folder} is still running: stop it first, or wait").into()
         })
+    }
+
+    /// Whether another launcher holds it, also for a user who may only read it.
+    pub(crate) fn is_locked(&self) -> bool {
+        let file = File::open(self.lock_file());
+        file.is_ok_and(|file| matches!(lock_file::try_lock(&file), Ok(false)))
     }
 
     pub(crate) fn check_whole(&self) -> anyhow::Result<()> {
@@ -225,6 +238,10 @@ mod tests {
         fs::create_dir_all(folder.logs()).unwrap();
         fs::create_dir_all(folder.checkpoints()).unwrap();
         assert!(folder.check_free().is_ok());
+        let saving = checkpoint::lock(&folder.checkpoints()).unwrap();
+        let said = folder.check_free().unwrap_err().to_string();
+        assert!(said.contains("another learner saves in "), "{said}");
+        drop(saving);
 
         write(folder.metrics(), "seconds,frames\n0.5,32\n");
         assert!(folder.check_free().is_err(), "it has frames");

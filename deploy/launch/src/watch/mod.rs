@@ -179,7 +179,7 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
         return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
     }
     // A launcher that runs there holds the lock.
-    if !endpoints.is_empty() && folder.lock().is_err() {
+    if !endpoints.is_empty() && folder.is_locked() {
         let frames = progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
             true => "is stopping: all frames are stored and its replay server has exited",

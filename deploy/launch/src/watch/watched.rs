@@ -141,12 +141,13 @@ fn record(
     if folder.config().exists() || folder.checkpoints().is_dir() {
         check_same(folder, config)?;
         resumed = Some(resume_point(folder, view)?);
-        folder.lock().map_err(|_| {
-            usage!(
+        if folder.is_locked() {
+            return Err(usage!(
                 "{} is written by `driml train` or by another `driml watch`: watch without --run-dir, or choose another folder",
                 folder.display()
             )
-        })?;
+            .into());
+        }
     }
     let processes = process_names(config);
     let mut recorder = RunRecorder::open(folder, config, processes, resumed, events)?;
