@@ -26,7 +26,7 @@ impl Precision {
     /// It holds where the sum of the products' sizes is a finite f32. Source: Higham 2002, Accuracy and Stability of Numerical
     /// Algorithms, section 3.1.
     pub fn product_error(self, terms: usize) -> f64 {
-        let operand = match self {
+        let operand: f64 = match self {
             Self::F32 => 0.0,
             // 2^-8.
             Self::Bf16 => 1.0 / 256.0,

@@ -5,7 +5,8 @@
 use half::bf16;
 
 use super::{
-    amx::{ROWS, ROWS_MAX, STEPS, SUMS, Tiles, compute},
+    amx::{ROWS_MAX, compute},
+    amx_tiles::{ROWS, STEPS, SUMS, Tiles},
     element::Rounding,
     simd::{LANES, Loop, RawTile, Simd},
 };
