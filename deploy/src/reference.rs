@@ -125,7 +125,7 @@ fn settings() -> String {
         `driml presets --game bigfish --agent driml-fix` prints it with the source of every value.\n\n\
         ## Base\n\n```toml\n";
     page += &fs::read_to_string(base).unwrap();
-    page += "```\n\n## Presets\n\n";
+    page += "```\n\n## Presets\n\n* `paper`: base, world and agent alone.\n";
     let link = |folder: &str, name: &str| {
         format!("[`{name}`](../../../settings/presets/{folder}/{name}.toml)")
     };
