@@ -2,7 +2,7 @@
 //! It knows neither tensors nor threads, and nothing of what comes between two convolutions.
 
 use crate::geometry::ConvShape;
-use crate::kernels::buffer::Buffer;
+use crate::kernels::buffer::{ALIGNMENT, Buffer};
 use crate::kernels::convolution::{
     Convolution, add_locations, gradient_panels, multiply_windows, weight_gradient,
 };
@@ -41,8 +41,10 @@ impl Border {
     }
 
     /// Scalars in memory: where a row of a window is an odd number of them, products of pairs read a zero behind the last one.
+    /// Whole lines of the cache, so that what lies behind begins with one.
     pub(crate) const fn len<E: Element>(self) -> usize {
-        (self.height + 2) * (self.width + 2) * self.channels + E::DEPTH - 1
+        let all = (self.height + 2) * (self.width + 2) * self.channels + E::DEPTH - 1;
+        all.next_multiple_of(ALIGNMENT / size_of::<E>())
     }
 
     /// Row `y` of the maps.

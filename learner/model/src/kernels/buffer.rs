@@ -7,7 +7,7 @@ use std::sync::{Mutex, PoisonError};
 use half::bf16;
 
 /// Where a buffer begins is a multiple of so many bytes, a line of a cache: AMX takes six times as long for rows that cross lines.
-const ALIGNMENT: usize = 64;
+pub(crate) const ALIGNMENT: usize = 64;
 /// Buffers that the pool of each type keeps; more go back to the allocator.
 const KEPT_MAX: usize = 384;
 

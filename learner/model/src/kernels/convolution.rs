@@ -267,7 +267,8 @@ impl<E: Element> Masked<E> {
     }
 
     fn write_rows<S: Simd<Element = E>>(&mut self, simd: S, out: usize) {
-        write_rows(simd, &self.values, out, &mut self.rows);
+        let stride = out.next_multiple_of(E::DEPTH);
+        write_rows(simd, &self.values, out, stride, &mut self.rows);
     }
 }
 

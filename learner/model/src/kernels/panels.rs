@@ -3,7 +3,7 @@
 
 use rayon::prelude::*;
 
-use crate::kernels::buffer::{Buffer, Scalars};
+use crate::kernels::buffer::{ALIGNMENT, Buffer, Scalars};
 use crate::kernels::isa::{
     Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
@@ -258,14 +258,16 @@ impl<'a, E: Element> Rows<'a, E> {
         );
         let (m, k, depth) = (a.rows, a.cols, E::DEPTH);
         let steps = k.div_ceil(depth);
+        let line = ALIGNMENT / size_of::<E>();
         let (row_stride, step) = match a.transposed && !S::LEFT_STEPS_ADJOIN {
+            false if S::LEFT_STEPS_ADJOIN => ((steps * depth).next_multiple_of(line), depth),
             false => (steps * depth, depth),
             true => (depth, m * depth),
         };
         let values = if let Some(values) = E::in_place(a.data) {
             Scalars::InPlace(values)
         } else {
-            let mut values = Buffer::new(m * steps * depth);
+            let mut values = Buffer::new(m * row_stride.max(steps * depth));
             if a.transposed && S::LEFT_STEPS_ADJOIN {
                 let mut turned = Buffer::new(m * k);
                 transpose(simd, a.data, k, m, &mut turned);
@@ -312,7 +314,7 @@ fn pack_rows<S: Simd>(
 ) {
     let rows = (TASK_LEN / stride).max(1);
     let pack = |values: &mut [S::Element], data: &[f32]| {
-        write_rows(simd, data, cols, values);
+        write_rows(simd, data, cols, stride, values);
     };
     match threads {
         Threads::Caller => pack(values, data),

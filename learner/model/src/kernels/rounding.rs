@@ -29,9 +29,15 @@ vectorized! {
 }
 
 vectorized! {
-    /// Rounds rows of `cols` scalars into rows of whole steps, with zeros after them.
-    pub(crate) fn write_rows<S>(simd, values: &'a [f32], cols: usize, rows: &'a mut [S::Element]) {
-        let rows = rows.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
+    /// Rounds rows of `cols` scalars into rows of `stride`, with zeros after them.
+    pub(crate) fn write_rows<S>(
+        simd,
+        values: &'a [f32],
+        cols: usize,
+        stride: usize,
+        rows: &'a mut [S::Element],
+    ) {
+        let rows = rows.chunks_exact_mut(stride);
         for (row, values) in rows.zip(values.chunks_exact(cols)) {
             let (begin, end) = row.split_at_mut(cols);
             S::Element::store(simd, values, begin);

@@ -121,15 +121,16 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
         let (simd, stages, inputs) = (self.simd, &self.stages, self.fc.inputs());
         let images = frames.chunks_exact(stages.image_len());
         let count = images.len();
-        let mut rows = Buffer::new(count * inputs.next_multiple_of(S::Element::DEPTH));
+        let stride = inputs.next_multiple_of(S::Element::DEPTH);
+        let mut rows = Buffer::new(count * stride);
         let (mut saved, mut f3) = (stages.saved(1), Buffer::new(stages.output_len()));
-        let each = rows.chunks_exact_mut(inputs.next_multiple_of(S::Element::DEPTH));
+        let each = rows.chunks_exact_mut(stride);
         for (image, row) in images.zip(each) {
             stages.forward(image, &mut saved, &mut f3);
             if self.takes_mean {
-                write_rows(simd, &mean_of_locations(&f3, inputs), inputs, row);
+                write_rows(simd, &mean_of_locations(&f3, inputs), inputs, stride, row);
             } else {
-                write_rows(simd, &f3, inputs, row);
+                write_rows(simd, &f3, inputs, stride, row);
             }
         }
         self.fc.forward(simd, &rows, count)

@@ -9,6 +9,7 @@ use super::{
     simd::{LANES, Mode, Simd},
     tile::{Columns, Left, multiply_tile},
 };
+use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
 
 /// Scalars along the sum: with a panel of one register of columns 16 KiB of f32.
@@ -24,11 +25,13 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
     let depth = S::Element::DEPTH;
     let threads = rayon::current_num_threads();
     (0..threads).into_par_iter().with_max_len(1).for_each(|_| {
-        let (left, panel) = (
-            vec![S::Element::of(1.0); rows * DEPTH],
-            vec![S::Element::of(1.0); DEPTH * LANES],
-        );
-        let mut out = vec![0.0; rows * LANES];
+        let ones = |len| {
+            let mut ones = Buffer::new(len);
+            ones.fill(S::Element::of(1.0));
+            ones
+        };
+        let (left, panel) = (ones(rows * DEPTH), ones(DEPTH * LANES));
+        let mut out = Buffer::zeros(rows * LANES);
         for _ in 0..times {
             let left = Left {
                 values: &left,
@@ -50,7 +53,8 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
         }
         assert!(
             out.iter().all(|&sum| sum == DEPTH as f32),
-            "sums of products of ones are {out:?}"
+            "sums of products of ones are {:?}",
+            &*out
         );
     });
     2.0 * (threads * times * rows * LANES * DEPTH) as f64

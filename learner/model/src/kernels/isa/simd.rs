@@ -43,7 +43,8 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
     /// Steps of a panel that are multiplied by all rows of a task before the next: 32 KiB of the widest panel.
     const STEPS_IN_CACHE: usize = 128;
 
-    /// Whether steps of a left operand are best side by side, even where copying them so means to transpose it.
+    /// Whether steps of a left operand are best side by side, even where copying them so means to transpose it, and begin with a line
+    /// of the cache.
     const LEFT_STEPS_ADJOIN: bool = false;
 
     /// Most rows of a tile that is `vecs` registers wide.
