@@ -1,5 +1,7 @@
 //! What a run in lockstep computes, and that one that was interrupted computes the same.
 
+use driml_model::{Precision, describe_kernels};
+
 use super::*;
 use crate::testing;
 
@@ -52,11 +54,15 @@ fn every_torso_learns_the_same_again() {
 #[test]
 fn a_border_that_no_convolution_reads_changes_no_bit() {
     let pacman = ["input.height=88", "input.width=90"];
+    // AMX sums 32 terms at a time, which are others where zeros stand between them.
+    let is_amx = describe_kernels(Precision::Bf16).starts_with("AMX");
+    let precisions = [Precision::F32, Precision::Bf16];
+    let precisions = &precisions[..if is_amx { 1 } else { 2 }];
     for (world, sets, cut, whole) in [
         ("chain", &WIDE_CHAIN[..], (14, 16), (15, 17)),
         ("mspacman", &pacman, (20, 18), (21, 19)),
     ] {
-        for precision in ["f32", "bf16"] {
+        for precision in precisions {
             let precision = ["learner", "actor"].map(|it| format!("{it}.precision={precision}"));
             let sets = [sets, &precision.each_ref().map(String::as_str)].concat();
             let config = config(world, "driml-ada", 400, &sets);
