@@ -193,7 +193,10 @@ impl Drop for ManagedProcess {
     fn drop(&mut self) {
         self.kill();
         // Without end where the kernel does not let it go, as a driver that hangs.
-        if self.wait_until(Instant::now() + KILLED_MAX, || false).is_none() {
+        if self
+            .wait_until(Instant::now() + KILLED_MAX, || false)
+            .is_none()
+        {
             tracing::warn!("{} (process {}) does not end", self.name, self.child.id());
         }
     }
