@@ -10,11 +10,11 @@ use std::{
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_000),
-    ("actor", 11_660),
-    ("replay-server", 11_260),
-    ("learner", 24_480),
-    ("deploy", 32_550),
-    ("tests", 11_390),
+    ("actor", 11_640),
+    ("replay-server", 11_220),
+    ("learner", 24_450),
+    ("deploy", 32_410),
+    ("tests", 11_180),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -4,6 +4,7 @@
 use std::{
     ffi::OsString,
     fs::{self, File},
+    io::{self, Write},
     path::Path,
 };
 
@@ -169,7 +170,7 @@ impl Candidate {
         }
         fs::create_dir_all(&new).with_context(doing)?;
         for (name, bytes) in &self.files {
-            fs::write(new.join(name), bytes).with_context(doing)?;
+            write_flushed(&new.join(name), bytes).with_context(doing)?;
         }
         let there = driml_learner::checkpoint::list(best)?;
         let there = there.into_iter().map(|(_, path)| path);
@@ -179,11 +180,20 @@ impl Candidate {
             fs::remove_dir_all(older).with_context(doing)?;
         }
         fs::rename(&new, &path).with_context(doing)?;
+        // The older best may be the only one that a power cut leaves.
+        let best = File::open(best).and_then(|folder| folder.sync_all());
+        best.with_context(doing)?;
         for older in others {
             fs::remove_dir_all(older).with_context(doing)?;
         }
         Ok(())
     }
+}
+
+fn write_flushed(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    file.write_all(bytes)?;
+    file.sync_all()
 }
 
 #[cfg(test)]
