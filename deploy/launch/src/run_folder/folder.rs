@@ -80,12 +80,6 @@ impl RunFolder {
     /// Refuses a folder in which something lies, and one that cannot be made. A run in which nothing was learned is nothing: the command
     /// that is corrected takes its folder again.
     pub fn check_free(&self) -> Result<(), Usage> {
-        let checkpoints = self.checkpoints();
-        if checkpoints.is_dir()
-            && let Err(e @ CheckpointError::InUse(_)) = checkpoint::lock(&checkpoints)
-        {
-            return Err(Usage(e.to_string()));
-        }
         let taken = match fs::read_dir(&self.path) {
             Ok(entries) => !self.is_empty_run(entries),
             Err(_) => self.path.exists(),
@@ -95,6 +89,12 @@ impl RunFolder {
                 "the run folder {} exists and is not empty: choose another --run-dir, or remove it",
                 self.display()
             ));
+        }
+        let checkpoints = self.checkpoints();
+        if checkpoints.is_dir()
+            && let Err(e @ CheckpointError::InUse(_)) = checkpoint::lock(&checkpoints)
+        {
+            return Err(Usage(e.to_string()));
         }
         self.check_writable()
     }

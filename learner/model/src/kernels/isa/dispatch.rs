@@ -225,7 +225,7 @@ mod tests {
         let mut tried = 0;
         let sizes = [1, 2, 4].into_iter().flat_map(|vecs| {
             (1..=8)
-                .chain([16, 17, 40, 64])
+                .chain([16, 17, 40, 50, 64])
                 .map(move |rows| (vecs, rows))
         });
         for ((vecs, rows), rows_inside) in sizes.flat_map(|size| [(size, false), (size, true)]) {
