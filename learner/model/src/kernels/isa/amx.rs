@@ -86,6 +86,7 @@ impl Simd for Amx {
     type Element = bf16;
     const VECS_MAX: usize = SUMS;
     const LEFT_STEPS_ADJOIN: bool = true;
+    /// The sum of most products, so that it leaves the registers once.
     const STEPS_IN_CACHE: usize = 1024;
 
     fn rows_max(_: usize) -> usize {
