@@ -61,8 +61,7 @@ impl Backward {
     }
 }
 
-/// The gradient of `parameter` that `add` makes, as [`add_in_place`] calls it; none where it is not wanted or went where that of a
-/// variable is summed.
+/// The gradient of `parameter` that `add` makes; none where it is not wanted or [`add_in_place`] added it to a variable's sum.
 pub(crate) fn summed(
     parameter: &Tensor,
     add: impl Fn(Option<Vec<f32>>) -> Vec<f32>,

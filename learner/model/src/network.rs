@@ -127,8 +127,7 @@ impl Network {
         self.head.logits(f4, noise)
     }
 
-    /// Of [`Network::logits`] those [B, atoms] of the actions [B] that were taken, each below the number of actions; the others
-    /// are not computed.
+    /// The rows [B, atoms] of [`Network::logits`] of the actions [B] that were taken, each below the number of actions.
     pub fn taken_logits(
         &self,
         f4: &Tensor,

@@ -6,7 +6,7 @@ use std::{
     collections::VecDeque,
     sync::{
         Arc, Condvar, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::{Duration, Instant},
 };
@@ -49,6 +49,7 @@ struct Newest<T> {
     waiting: Mutex<VecDeque<T>>,
     most: usize,
     filled: Condvar,
+    arrived: AtomicU64,
 }
 
 impl<T> Newest<T> {
@@ -57,6 +58,7 @@ impl<T> Newest<T> {
             waiting: Mutex::default(),
             most,
             filled: Condvar::new(),
+            arrived: AtomicU64::default(),
         })
     }
 
@@ -179,6 +181,11 @@ impl Publisher {
         self.priorities.put(update);
     }
 
+    /// Of how many updates all replay servers know the priorities.
+    pub(crate) fn priorities_arrived(&self) -> u64 {
+        self.priorities.arrived.load(Ordering::Relaxed)
+    }
+
     /// Waits until the status was fetched once after the learner finished, or for `wait_max`.
     pub(crate) fn wait_until_heard(&self, wait_max: Duration) {
         let started = Instant::now();
@@ -215,7 +222,11 @@ impl Sender {
                 fail_point::reach(&name);
                 let Some(value) = newest.take() else { continue };
                 match message(&value) {
-                    Ok(message) => self.send_to_all(&message, || newest.is_full()),
+                    Ok(message) => {
+                        if self.send_to_all(&message, || newest.is_full()) {
+                            newest.arrived.fetch_add(1, Ordering::Relaxed);
+                        }
+                    }
                     Err(e) => tracing::error!("the {} cannot be sent: {e}", self.what),
                 }
             }
@@ -223,11 +234,13 @@ impl Sender {
         Ok(())
     }
 
+    /// Whether all replay servers have it.
     fn send_to_all<R: Request<Reply = Ack>>(
         &mut self,
         message: &Sealed<R>,
         is_old: impl Fn() -> bool,
-    ) {
+    ) -> bool {
+        let mut arrived = true;
         for client in &self.clients {
             let send = || client.send(message.clone(), self.timeout)?.wait();
             while let Err(e) = send() {
@@ -236,6 +249,7 @@ impl Sender {
                     _ => RETRY_PAUSE,
                 };
                 if is_old() || self.shutdown.wait_timeout(pause) {
+                    arrived = false;
                     break;
                 }
                 if let Some(more) = self.said.due() {
@@ -243,5 +257,6 @@ impl Sender {
                 }
             }
         }
+        arrived
     }
 }

@@ -162,6 +162,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         shutdown.wait();
     }
     publisher.wait_until_heard(LAST_WORD_MAX);
+    if sampling.is_prioritised() {
+        let arrived = publisher.priorities_arrived();
+        tracing::info!("priorities of {arrived} updates have arrived");
+    }
     if !shutdown.is_set() {
         let updates = learner.updates();
         reporter::say_finished(&clients, Participant::Learner(requests.learner), updates);

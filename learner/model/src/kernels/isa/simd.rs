@@ -71,8 +71,7 @@ pub(crate) trait Simd: Rounding + Send + Sync + 'static {
 
 /// Loops over slices, made by `vectorized!`.
 pub(crate) trait Loop {
-    /// Runs them. To be `#[inline(always)]`: a separate function, or a closure, would be compiled for the least that any
-    /// processor has.
+    /// Runs them. `#[inline(always)]`, as a separate function or a closure would be compiled without the extensions.
     fn run(self);
 }
 
