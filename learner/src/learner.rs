@@ -115,11 +115,6 @@ impl Learner {
             agent: configured(restored.agent, &this.config),
             ..restored
         };
-        tracing::info!(
-            "resumed after {} updates from {}",
-            this.updates(),
-            folder.display()
-        );
         Ok(this)
     }
 

@@ -121,6 +121,33 @@ fn what_cannot_be_resumed() {
         let nothing = "nothing is left to do: the run in run has done 540 updates and 1280 frames";
         ended.expect_printed(nothing);
     }
+    system.run_ok(&format!("local --lockstep {SHORT} --run-dir step"));
+    system.run_ok("local --resume step --frames 1600 --set learner.batch_size=32");
+    let run = format!("local --agent c51 --durable {SHORT} --run-dir kept");
+    system.run_ok(&run);
+    system.run_ok("local --resume kept --frames 1600 --set local.durable=false");
+    system.refuses_each(
+        "
+        local --resume run --frames 2000 --set run.n_step=5 => belongs to a run with specification
+        local --resume run --frames 2000 --set model.atoms=31 => was saved with model.atoms = 51
+        local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => in memory alone; add --durable
+        local --resume step --frames 2000 --set local.actors=3 => this run in lockstep has 1
+        local --resume kept --frames 2000 --durable => lacks what the run did later
+        ",
+    );
+    // Nothing was changed.
+    for run in ["run", "step", "kept"] {
+        system.run_ok(&format!("evaluate {run} --episodes 2"));
+        system.run_ok(&format!("local --resume {run} --frames 2000"));
+    }
+    // The pace at which another run was resumed is its own.
+    let since = |run: &str| {
+        system.run_folder(run).config()["replay"]
+            .get("since")
+            .is_some()
+    };
+    system.run_ok("local --lockstep --config step/config.toml --run-dir new");
+    assert!(since("step") && !since("new"));
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     system.refuses("local --resume run --frames 2000", "there is no checkpoint");
 }

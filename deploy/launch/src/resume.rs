@@ -10,7 +10,10 @@ use std::{
 
 use anyhow::{Context, bail};
 use driml_envs::WorldConfig;
-use driml_learner::checkpoint::{self, CheckpointError};
+use driml_learner::{
+    DeviceName, Learner, LearnerConfig,
+    checkpoint::{self, CheckpointError},
+};
 use driml_machine::{
     error::{Interrupted, usage},
     resources::Machine,
@@ -135,6 +138,38 @@ pub struct Resumed {
     pub lockstep: bool,
 }
 
+/// Checks that the run in `folder`, which has had the settings `before`, can continue with `config`: before they are written there, as
+/// it could not be resumed afterwards.
+fn check_changes(
+    folder: &RunFolder,
+    newest: &Path,
+    before: &RunConfig,
+    config: &RunConfig,
+    lockstep: bool,
+) -> anyhow::Result<()> {
+    let parts = |it: &RunConfig| (it.run.clone(), it.model.clone(), it.learner.clone());
+    if parts(before) != parts(config) {
+        let settings = LearnerConfig::from_toml(&config.to_toml())?;
+        let compute = DeviceName::Cpu.open(config.learner.precision)?;
+        Learner::resume(settings, &compute, &folder.checkpoints()).map_err(|e| usage!("{e}"))?;
+    }
+    let (had, has) = (before.local.actors, config.local.actors);
+    if lockstep && had != has {
+        bail!(usage!(
+            "local.actors = {has}, but the checkpoint {} of this run in lockstep has {had}: resume with as many",
+            newest.display()
+        ));
+    }
+    let replay = folder.replay();
+    if !lockstep && config.local.durable && !before.local.durable && replay.is_dir() {
+        bail!(usage!(
+            "{} lacks what the run did later, without --durable: remove that folder, then resume",
+            replay.display()
+        ));
+    }
+    Ok(())
+}
+
 /// The settings with which the run in `folder` continues, and from which point.
 ///
 /// # Errors
@@ -173,6 +208,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
             folder.display()
         ));
     }
+    check_changes(folder, newest, &before, &config, lockstep)?;
     // Where nothing was learned, only a run in lockstep keeps what it has.
     let (frames, rows) = match updates {
         0 if !lockstep => (0, 0),
@@ -217,6 +253,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
         rows,
         frames,
         replay_is_kept: replay_is_kept && (lockstep || updates > 0),
+        after_updates: updates,
         frames_max: config.frames(),
     };
     Ok(Found::Resumed(Box::new(Resumed {

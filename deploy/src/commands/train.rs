@@ -113,7 +113,9 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
             (found.config, from, Some(found.point))
         }
         None => {
-            let (config, from) = resolve(&args.run, &machine)?;
+            let (mut config, from) = resolve(&args.run, &machine)?;
+            // Of the run that a file's settings are of.
+            config.replay.since = None;
             (config, from, None)
         }
     };
@@ -137,7 +139,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     check_ladder(&config)?;
     if args.lockstep {
         check_lockstep(&config)?;
-    } else if args.resume.is_none() && !config.local.durable {
+    } else if !config.local.durable {
         let checked = config.replay.check_in_memory("--durable");
         checked.map_err(|e| usage!("{e}"))?;
     }

@@ -87,6 +87,10 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let sampling = config.sampling;
     let mut learner = Learner::resume(config, &compute, &folder)?;
     let updates = learner.updates();
+    if updates > 0 {
+        let folder = folder.display();
+        tracing::info!("resumed after {updates} updates from {folder}");
+    }
     anyhow::ensure!(
         !args.restart || updates == 0,
         "--restart begins again from the first update, and {} holds a checkpoint after {updates}: choose an empty --run-dir",
