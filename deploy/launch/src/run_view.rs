@@ -11,7 +11,7 @@ use driml_protocol::{
     LearnerStatus, ProcessesStatus, RecoveryProgress, ReplayStatus, Silence, Waiting,
 };
 use driml_settings::config::RunConfig;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// What the settings say of a run.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -60,7 +60,7 @@ pub(crate) fn updates_served(config: &RunConfig, rows: u64) -> u64 {
 }
 
 /// Mean and standard deviation over the rows served.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Spread {
     pub(crate) mean: f64,
     pub(crate) sd: f64,

@@ -21,6 +21,9 @@ use crate::{metrics::rounded, run_view::Episodes};
 const ASKS_MAX: usize = 16;
 
 const HEADER: &str = "seconds,frames,episode,actor,env,return,length";
+/// Places in it.
+const EPISODE: usize = 2;
+const ACTOR: usize = 3;
 
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
@@ -35,21 +38,22 @@ pub(super) struct TrainingEpisodes {
     received: Vec<u64>,
     lost: u64,
     folder: RunFolder,
-    /// The rows with which it began, if the shards know of them, until their first status shows how many stay.
-    rows: Option<Table>,
+    /// The rows with which it began, and of how many the shards do not know, until their first status shows how many stay; none if they
+    /// know of none.
+    known: Option<(Table, u64)>,
 }
 
 impl TrainingEpisodes {
     pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::begin(folder, Table::default(), false)
+        Self::begin(folder, Table::default(), None)
     }
 
-    /// Of a run that is resumed: with what ended until it had `frames_max` frames; `is_known` if its replay knows of them. The others are
-    /// set aside.
+    /// Of a run that is resumed: with what ended until it had `frames_max` frames. The others are set aside. If its replay knows of them,
+    /// the number of the first ones of which it does not.
     pub(super) fn go_on(
         folder: &RunFolder,
         frames_max: u64,
-        is_known: bool,
+        unknown: Option<u64>,
     ) -> anyhow::Result<Self> {
         let path = folder.episodes();
         let mut rows = Table::read(&path)?;
@@ -57,12 +61,12 @@ impl TrainingEpisodes {
             let (frames, ..) = read(row)
                 .ok_or_else(|| usage!("{}: {row:?} is not a row of episodes", path.display()))?;
             // A replay that was kept says itself how far it is, once it answers.
-            Ok(is_known || frames <= frames_max)
+            Ok(unknown.is_some() || frames <= frames_max)
         })?;
-        Self::begin(folder, rows, is_known)
+        Self::begin(folder, rows, unknown)
     }
 
-    fn begin(folder: &RunFolder, mut rows: Table, is_known: bool) -> anyhow::Result<Self> {
+    fn begin(folder: &RunFolder, mut rows: Table, unknown: Option<u64>) -> anyhow::Result<Self> {
         rows.header = HEADER.split(',').map(String::from).collect();
         let table = AppendLog::create(&folder.episodes(), &rows.text())?;
         let known: Vec<_> = rows.rows.iter().filter_map(read).collect();
@@ -78,7 +82,7 @@ impl TrainingEpisodes {
             frames_at_status: None,
             received: Vec::new(),
             lost: 0,
-            rows: is_known.then_some(rows),
+            known: unknown.map(|unknown| (rows, unknown)),
             folder: folder.clone(),
         })
     }
@@ -100,9 +104,10 @@ impl TrainingEpisodes {
         self.received
             .resize(shards.len().max(self.received.len()), 0);
         let mut warnings = Vec::new();
-        if let Some(rows) = self.rows.take() {
-            warnings.extend(self.cut(rows, frames).err().map(|e| format!("{e:#}")));
-            self.take_as_received(shards);
+        if let Some((mut rows, unknown)) = self.known.take() {
+            let cut = self.cut(&mut rows, frames);
+            warnings.extend(cut.err().map(|e| format!("{e:#}")));
+            self.take_as_received(shards, &rows, unknown);
         }
         let mut rows = Vec::new();
         for (shard, status) in shards.iter().enumerate() {
@@ -143,7 +148,7 @@ impl TrainingEpisodes {
     }
 
     /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
-    fn cut(&mut self, mut rows: Table, frames_max: u64) -> anyhow::Result<()> {
+    fn cut(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
         let all = rows.rows.len();
         let is_kept = |row: &_| read(row).is_some_and(|it| it.0 <= frames_max);
         rows.keep(&self.folder.episodes(), |_, row| Ok(is_kept(row)))?;
@@ -152,18 +157,26 @@ impl TrainingEpisodes {
             *self = Self {
                 received,
                 frames_at_status: self.frames_at_status,
-                ..Self::begin(&self.folder, rows, false)?
+                ..Self::begin(&self.folder, rows.clone(), None)?
             };
         }
         Ok(())
     }
 
-    /// What the shards knew of when the last episode was received: all but the newest, which are shared out in order.
-    fn take_as_received(&mut self, shards: &[ReplayStatus]) {
+    /// What the shards knew of when the last episode was received, the first `unknown` apart: all but the newest, which are those of
+    /// shards with fewer rows.
+    fn take_as_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
+        let mut of_shards = vec![0; shards.len()];
+        for row in &rows.rows {
+            let number = |at: usize| row.get(at).and_then(|it| it.parse::<u64>().ok());
+            let (episode, actor) = (number(EPISODE), number(ACTOR).unwrap_or(0));
+            let shard = actor as usize % shards.len();
+            of_shards[shard] += u64::from(episode > Some(unknown));
+        }
         let mut left: u64 = shards.iter().map(|it| it.episodes).sum();
-        left = left.saturating_sub(self.episode);
-        for (received, status) in self.received.iter_mut().zip(shards) {
-            let here = left.min(status.episodes);
+        left = left.saturating_sub(self.episode.saturating_sub(unknown));
+        for ((received, status), rows) in self.received.iter_mut().zip(shards).zip(of_shards) {
+            let here = left.min(status.episodes.saturating_sub(rows));
             *received = status.episodes - here;
             left -= here;
         }

@@ -13,6 +13,7 @@ struct Shard {
     let_go: u64,
     ended: u64,
     first: u64,
+    actor: u32,
 }
 
 const fn shard(frames: u64, let_go: u64, ended: u64, first: u64) -> Shard {
@@ -21,6 +22,7 @@ const fn shard(frames: u64, let_go: u64, ended: u64, first: u64) -> Shard {
         let_go,
         ended,
         first,
+        actor: 4,
     }
 }
 
@@ -35,7 +37,7 @@ impl Shard {
     fn reply(&self, since: u64) -> EpisodesReply {
         let episode = |n| EndedEpisode {
             frames: self.frames,
-            actor: 4,
+            actor: self.actor,
             env: 2,
             played: Some(Played {
                 episode_return: (self.first + n) as f64,
@@ -126,7 +128,7 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     assert_eq!(rows(&folder), [",10,1,4,2,,"]);
     assert_eq!(mean(&episodes), (None, 0));
     drop(episodes);
-    let episodes = TrainingEpisodes::go_on(&folder, 10, true).unwrap();
+    let episodes = TrainingEpisodes::go_on(&folder, 10, Some(0)).unwrap();
     assert_eq!((mean(&episodes), episodes.episode), ((None, 0), 1));
 }
 
@@ -141,7 +143,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text + "1.5,3000,91").unwrap();
 
-    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, false).unwrap();
+    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, None).unwrap();
     assert_eq!(mean(&episodes), (Some(34.5), 70));
     // Another server, which counts from the start; the replay fills again.
     update(&mut episodes, &[shard(1_500, 0, 40, 1_000)]);
@@ -150,7 +152,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
     // A server that knows of those before, and of four more; it hands out all that it keeps.
-    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, true).unwrap();
+    let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, Some(0)).unwrap();
     update(&mut episodes, &[shard(2_600, 0, 114, 0)]);
     update(&mut episodes, &[shard(2_600, 114, 115, 0)]);
     let text = rows(&folder);
@@ -158,10 +160,39 @@ fn a_run_that_continues_has_the_episodes_before() {
     assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");
 
     fs::remove_file(&path).unwrap();
-    let nothing = TrainingEpisodes::go_on(&folder, 9, false).unwrap();
+    let nothing = TrainingEpisodes::go_on(&folder, 9, None).unwrap();
     assert_eq!(mean(&nothing), (None, 0));
     fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
-    let said = TrainingEpisodes::go_on(&folder, 9, false).unwrap_err();
+    let said = TrainingEpisodes::go_on(&folder, 9, None).unwrap_err();
     let said = said.to_string();
     assert!(said.contains("is not a row of episodes"), "{said}");
+}
+
+/// Its replay began to count after the first thirty.
+#[test]
+fn a_run_that_was_resumed_without_its_replay_and_then_with_it_has_each_once() {
+    let (_root, folder, mut episodes) = begun();
+    update(&mut episodes, &[shard(1_000, 0, 30, 0)]);
+    let mut episodes = TrainingEpisodes::go_on(&folder, 1_000, None).unwrap();
+    update(&mut episodes, &[shard(2_000, 0, 50, 1_000)]);
+    let mut episodes = TrainingEpisodes::go_on(&folder, 2_000, Some(30)).unwrap();
+    update(&mut episodes, &[shard(3_000, 0, 60, 1_000)]);
+    assert_eq!(rows(&folder).len(), 90);
+    assert_eq!(rows(&folder)[80], "1.500,3000,81,4,2,1050,9");
+}
+
+#[test]
+fn what_is_missing_of_one_shard_is_not_taken_from_another() {
+    let (_root, folder, mut episodes) = begun();
+    let shards = |second| {
+        let first = shard(1_000, 0, 100, 0);
+        let second = shard(1_000, 0, second, 1_000);
+        [first, Shard { actor: 1, ..second }]
+    };
+    update(&mut episodes, &shards(95));
+    let mut episodes = TrainingEpisodes::go_on(&folder, 0, Some(0)).unwrap();
+    update(&mut episodes, &shards(100));
+    let last: Vec<_> = rows(&folder).split_off(195);
+    assert_eq!(last.len(), 5);
+    assert_eq!(last[0], "1.500,1000,196,1,2,1095,9");
 }

@@ -37,6 +37,8 @@ paths! {
     pub episodes: "episodes.csv";
     /// How the run ended and what it counted, JSON; it is there once the run has ended.
     pub summary: "summary.json";
+    /// What a resumed run had done before its replay began to count, JSON.
+    pub(super) resumed: "resumed.json";
     /// The endpoints of the replay servers, a line each, while `driml train` runs here.
     pub endpoints: "endpoints";
     /// The folder in which the processes of `driml train` meet, while it runs here.

@@ -2,14 +2,20 @@
 //! The recorder writes it, with the columns of `crate::metrics`.
 
 use std::{
-    fs::File,
+    fs::{self, File},
     io::{BufRead, BufReader, Read, Seek, SeekFrom},
     path::Path,
 };
 
+use anyhow::Context;
 use driml_machine::error::usage;
+use serde::{Deserialize, Serialize};
 
-use super::{folder::RunFolder, table::Table};
+use super::{
+    folder::RunFolder,
+    table::{Table, write_whole},
+};
+use crate::run_view::Spread;
 
 /// What was done before a run starts: nothing, or what its newest checkpoint says.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -20,10 +26,38 @@ pub struct ResumePoint {
     pub(crate) rows: u64,
     /// Frames of the run by then.
     pub(crate) frames: u64,
-    /// The replay was kept, and counts all of the run.
+    /// The replay was kept, and counts all that [`Uncounted`] does not.
     pub(crate) replay_is_kept: bool,
+    /// Updates after which the replay began to count, where it was not kept.
+    pub(crate) after_updates: u64,
     /// Frames with which the run ends now.
     pub(crate) frames_max: u64,
+}
+
+/// What a run had done before its replay began to count: when it was last resumed without one, or nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Uncounted {
+    /// By which the replay is known.
+    pub(crate) after_updates: u64,
+    pub(crate) rows: u64,
+    pub(crate) episodes: u64,
+    /// Of those rows.
+    pub(crate) k: Option<Spread>,
+}
+
+impl Uncounted {
+    pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
+        let path = folder.resumed();
+        if !path.exists() {
+            return Ok(Self::default());
+        }
+        let text = fs::read(&path).with_context(|| format!("reading {}", path.display()))?;
+        serde_json::from_slice(&text).with_context(|| format!("reading {}", path.display()))
+    }
+
+    pub(crate) fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
+        write_whole(&folder.resumed(), &serde_json::to_vec(self)?)
+    }
 }
 
 /// Bytes at the end of the file in which its last row lies.
@@ -91,8 +125,6 @@ pub fn progress(folder: &RunFolder) -> Option<Progress> {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use super::*;
 
     #[test]

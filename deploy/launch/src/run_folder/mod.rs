@@ -9,6 +9,7 @@ mod recorder;
 mod summary;
 mod table;
 
+pub(crate) use self::metrics::Uncounted;
 pub(crate) use self::{
     evaluations::Candidate,
     summary::{Earned, LastPlay, commands, plot},

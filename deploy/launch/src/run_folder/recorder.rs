@@ -14,7 +14,7 @@ use super::{
     episodes::TrainingEpisodes,
     events::Events,
     folder::RunFolder,
-    metrics::{ResumePoint, rows_up_to},
+    metrics::{ResumePoint, Uncounted, rows_up_to},
     summary::{Outcome, Summary},
     table::{AppendLog, Table, csv_row},
 };
@@ -29,11 +29,9 @@ pub struct RunRecorder {
     /// No other launcher writes to the folder while this is held.
     _lock: File,
     resume_point: ResumePoint,
-    /// Seconds that the run took before it was resumed, and episodes in the last row that stays.
+    /// Seconds that the run took before it was resumed.
     seconds_before: f64,
-    episodes_before: u64,
-    /// The k of all rows up to there.
-    k_before: Option<Spread>,
+    uncounted: Uncounted,
     metrics: AppendLog,
     events: Option<Events>,
     episodes: TrainingEpisodes,
@@ -72,25 +70,36 @@ impl RunRecorder {
             }
             Some(point) => {
                 let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
-                let is_known = point.replay_is_kept;
-                let episodes = TrainingEpisodes::go_on(folder, point.frames, is_known)?;
+                let known = match point.replay_is_kept {
+                    true => Some(Uncounted::read(folder)?.episodes),
+                    false => None,
+                };
+                let episodes = TrainingEpisodes::go_on(folder, point.frames, known)?;
                 folder.write_config(config)?;
                 (rows, episodes, seconds)
             }
         };
         Summary::remove(folder)?;
         let resume_point = resumed.unwrap_or_default();
-        // A replay that was kept knows of all the run's episodes and k.
-        let is_kept = resume_point.replay_is_kept;
-        let before = |column| rows.last(column).filter(|_| !is_kept);
-        let rows_of_episodes = rows.last("episodes").unwrap_or(0).max(episodes.episode);
+        let uncounted = match resume_point.replay_is_kept {
+            true => Uncounted::read(folder)?,
+            false => Uncounted {
+                after_updates: resume_point.after_updates,
+                rows: resume_point.rows,
+                episodes: rows.last("episodes").unwrap_or(0).max(episodes.episode),
+                k: (rows.last("mean_k").zip(rows.last("sd_k")))
+                    .map(|(mean, sd)| Spread { mean, sd }),
+            },
+        };
+        if resumed.is_some() {
+            uncounted.write(folder)?;
+        }
         let events = events.then(|| Events::create(folder, resume_point.frames));
         Ok(Self {
             _lock: lock,
             resume_point,
             seconds_before: seconds,
-            episodes_before: if is_kept { 0 } else { rows_of_episodes },
-            k_before: (before("mean_k").zip(before("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
+            uncounted,
             metrics: AppendLog::create(&folder.metrics(), &rows.text())?,
             events: events.transpose()?,
             episodes,
@@ -110,11 +119,11 @@ impl RunRecorder {
     /// The k of all rows of the run, before it was resumed too.
     fn k(&self, replay: &ReplayStatus) -> Option<Spread> {
         let since = Spread::of_k(replay);
-        let (Some(before), Some(since)) = (self.k_before, since) else {
-            return since.or(self.k_before);
+        let (Some(before), Some(since)) = (self.uncounted.k, since) else {
+            return since.or(self.uncounted.k);
         };
-        let rows = replay.rows_sampled.max(self.resume_point.rows).max(1);
-        let share = self.resume_point.rows as f64 / rows as f64;
+        let rows = replay.rows_sampled.max(self.uncounted.rows).max(1);
+        let share = self.uncounted.rows as f64 / rows as f64;
         let mixed = |before: f64, since: f64| share * before + (1.0 - share) * since;
         let square = |it: Spread| it.mean * it.mean + it.sd * it.sd;
         let mean = mixed(before.mean, since.mean);
@@ -182,7 +191,8 @@ impl RunRecorder {
     }
 
     pub(crate) fn episodes(&self, replay: &ReplayStatus) -> Episodes {
-        self.episodes.so_far(self.episodes_before + replay.episodes)
+        self.episodes
+            .so_far(self.uncounted.episodes + replay.episodes)
     }
 
     /// What there is to say of the run, which ended so.

@@ -173,6 +173,15 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(counts, (2_100, 62, 7 + 2));
     assert_eq!(summary.mean_k, Some(1.75), "31 updates at 1.5, 31 at 2");
     assert_eq!(summary.resumed_after_updates, 31);
+    drop(recorder);
+    // Its replay, which is kept from now on, counts what came after the first resumption.
+    let kept = ResumePoint {
+        replay_is_kept: true,
+        ..point(62)
+    };
+    let recorder = open(&run, &processes, Some(kept)).unwrap();
+    assert_eq!(recorder.episodes(&replay).count, 7 + 2);
+    assert_eq!(recorder.k(&replay).map(|it| it.mean), Some(1.75));
     let header = header_of(&processes);
     let read = |frames_max| {
         let all = ResumePoint {

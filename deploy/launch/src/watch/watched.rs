@@ -15,7 +15,7 @@ use crate::{
     chosen::config_of,
     console,
     launcher::process_names,
-    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table},
+    run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, Table, Uncounted},
     run_view::{RunView, updates_served},
     view::{Display, Poller},
 };
@@ -151,6 +151,14 @@ fn record(
     }
     let processes = process_names(config);
     let mut recorder = RunRecorder::open(folder, config, processes, resumed, events)?;
+    if resumed.is_none() {
+        let after_updates = view.after_updates.unwrap_or(0);
+        let of_replay = Uncounted {
+            after_updates,
+            ..Uncounted::default()
+        };
+        of_replay.write(folder)?;
+    }
     recorder.count_seconds_from(view.up_s().unwrap_or(0.0));
     Ok(recorder)
 }
@@ -193,7 +201,8 @@ fn resume_point(folder: &RunFolder, view: &RunView) -> anyhow::Result<ResumePoin
         },
         rows: view.replay.rows_sampled,
         frames: now,
-        replay_is_kept: after_updates == 0,
+        replay_is_kept: after_updates == Uncounted::read(folder)?.after_updates,
+        after_updates,
         frames_max: u64::MAX,
     })
 }
