@@ -154,6 +154,7 @@ fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
         ("learner", "checkpoints_kept"),
         ("actor", "world_threads"),
         ("replay", "capacity_transitions"),
+        ("replay", "compressed_bytes_max"),
     ] {
         if let Some(part) = table.get_mut(part).and_then(toml::Value::as_table_mut) {
             part.remove(key);

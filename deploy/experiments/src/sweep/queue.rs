@@ -63,7 +63,11 @@ pub(crate) fn make<P>(
         if queue.runs.finished(plan).is_some() {
             progress.find(plan.units);
         } else if !report {
-            queue.waiting.push_back((0, plan.clone()));
+            queue.waiting.push_back(Waiting {
+                plan: plan.clone(),
+                tried: 0,
+                anew: false,
+            });
         }
     }
     if let Err(e) = queue.make(progress) {
@@ -118,9 +122,16 @@ struct Queue {
     jobs: u32,
     /// Of this program.
     commit: String,
-    /// How often each was tried, and its plan.
-    waiting: VecDeque<(u32, PlannedRun)>,
+    waiting: VecDeque<Waiting>,
     running: Vec<Running>,
+}
+
+struct Waiting {
+    plan: PlannedRun,
+    /// How often it was tried.
+    tried: u32,
+    /// Its checkpoint may be what fails.
+    anew: bool,
 }
 
 struct Running {
@@ -140,9 +151,9 @@ impl Queue {
     fn make(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         loop {
             while self.running.len() < self.jobs as usize
-                && let Some((tried, plan)) = self.waiting.pop_front()
+                && let Some(next) = self.waiting.pop_front()
             {
-                let running = self.start(plan, tried + 1, progress)?;
+                let running = self.start(next, progress)?;
                 self.running.extend(running);
             }
             if self.running.is_empty() {
@@ -228,7 +239,11 @@ impl Queue {
         ));
         if *tried < TRIES {
             progress.again(ended.done);
-            self.waiting.push_back((*tried, ended.plan));
+            self.waiting.push_back(Waiting {
+                tried: *tried,
+                anew: ended.resumed,
+                plan: ended.plan,
+            });
             return Ok(());
         }
         Ok(progress.advance(plan.units - ended.done)?)
@@ -237,8 +252,7 @@ impl Queue {
     /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone; none if another process finished it.
     fn start(
         &self,
-        plan: PlannedRun,
-        tried: u32,
+        Waiting { plan, tried, anew }: Waiting,
         progress: &mut Progress,
     ) -> anyhow::Result<Option<Running>> {
         let path = self.runs.log(&plan);
@@ -252,7 +266,7 @@ impl Queue {
         }
         log.set_len(0).with_context(doing)?;
         let folder = self.runs.folder(&plan).path().to_owned();
-        let resumed = folder.exists() && self.is_resumable(&plan, tried, progress)?;
+        let resumed = folder.exists() && !anew && self.is_resumable(&plan, progress)?;
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
@@ -284,7 +298,7 @@ impl Queue {
         };
         Ok(Some(Running {
             plan,
-            tried,
+            tried: tried + 1,
             resumed,
             child,
             done,
@@ -292,16 +306,11 @@ impl Queue {
         }))
     }
 
-    /// Whether what lies in the plan's folder can be resumed: at the first try alone, as its checkpoint may be what fails.
-    fn is_resumable(
-        &self,
-        plan: &PlannedRun,
-        tried: u32,
-        progress: &mut Progress,
-    ) -> anyhow::Result<bool> {
+    /// Whether what lies in the plan's folder can be resumed.
+    fn is_resumable(&self, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<bool> {
         let folder = self.runs.folder(plan);
         resume::wait_until_free(&folder)?;
-        if tried > 1 || !self.runs.is_made_by(plan) {
+        if !self.runs.is_made_by(plan) {
             return Ok(false);
         }
         let found = resume::find(&folder, &Flags::default(), &Machine::this());
@@ -392,7 +401,12 @@ mod tests {
             runs,
             jobs: 1,
             commit: "def".into(),
-            waiting: [(0, plan.clone())].into(),
+            waiting: [Waiting {
+                plan: plan.clone(),
+                tried: 0,
+                anew: false,
+            }]
+            .into(),
             running: Vec::new(),
         };
         (queue, plan)
