@@ -72,7 +72,7 @@ pub fn episode_returns(
     if returns.len() < episodes {
         let ended = returns.len();
         return Err(ActError::Other(format!(
-            "only {ended} of {episodes} episodes ended within {steps_max} steps of each environment: ask for fewer"
+            "only {ended} of {episodes} episodes ended within {steps_max} steps of each environment: the world may need a step limit"
         )));
     }
     Ok(returns)
@@ -227,7 +227,7 @@ mod tests {
         let said = play(&[LONG], 2, 7).unwrap_err().to_string();
         assert_eq!(
             said,
-            "only 1 of 2 episodes ended within 7 steps of each environment: ask for fewer"
+            "only 1 of 2 episodes ended within 7 steps of each environment: the world may need a step limit"
         );
         let endless: &[_] = &[(1.0, StepEnd::LevelChange)];
         assert!(play(&[endless], 1, 50).is_err());

@@ -60,6 +60,12 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
         // The table has six decimals.
         assert!((returns.iter().sum::<f64>() / 7.0 - mean).abs() < 1e-6);
     }
+    // A call that fails leaves what was there.
+    system.refuses(
+        "evaluate run --levels unseen --returns returns.csv",
+        "use --levels train",
+    );
+    assert_eq!(system.read("returns.csv"), table);
     system
         .run("evaluate run --returns none/returns.csv")
         .expect_error("--returns none/returns.csv");

@@ -25,8 +25,9 @@ use crate::{
 /// Probability of a random action where none is asked for. Source: section 2 of the project's specification, after rlpyt.
 pub const EPSILON: f64 = 0.001;
 const COPIES_MAX: usize = 32;
-/// Steps of each environment after which an evaluation is given up; Procgen's longest episode has 6,000.
-const STEPS_A_ROUND_MAX: u64 = 20_000;
+/// Steps of each environment after which an evaluation is given up: an episode of Atari has up to 27,000, one of Procgen whose levels
+/// follow one another has no bound.
+const STEPS_A_ROUND_MAX: u64 = 200_000;
 /// The stream of the exploring policy's generator. A world seeded alike gives its environments streams that count from 0.
 const POLICY_STREAM: u64 = u64::MAX;
 

@@ -123,9 +123,9 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::line)?;
-    // Before an hour of playing.
+    // Before an hour of playing, after which what it holds is replaced.
     let table = args.returns.as_ref().map(|path| {
-        let file = File::create(path);
+        let file = File::options().create(true).append(true).open(path);
         let file = file.with_context(|| format!("--returns {}", path.display()))?;
         anyhow::Ok((path, file))
     });
@@ -231,6 +231,9 @@ fn write_returns(mut file: &File, played: &[Played<'_>]) -> io::Result<()> {
         for (episode, value) in (1..).zip(returns) {
             text += &format!("{name},{episode},{}\n", rounded(*value));
         }
+    }
+    if file.metadata()?.is_file() {
+        file.set_len(0)?;
     }
     file.write_all(text.as_bytes())
 }
