@@ -158,9 +158,11 @@ impl Replay {
             ));
         }
         let bytes = transitions * frame_bytes as u64;
-        if let Some(max) = self.config.compressed_bytes_max.filter(|&max| max < bytes) {
+        let max = self.config.compressed_bytes_max;
+        let share = max.map(|max| max / u64::from(self.config.shards));
+        if let Some(share) = share.filter(|&share| share < bytes) {
             return Err(format!(
-                "a chunk that may take {bytes} bytes; compressed_bytes_max is {max}"
+                "a chunk that may take {bytes} bytes; this shard's share of compressed_bytes_max is {share}"
             ));
         }
         let (sequence, first) = (header.sequence, header.first_transition);
