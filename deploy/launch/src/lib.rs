@@ -36,7 +36,6 @@ pub mod panics;
 pub mod plan;
 pub mod pretrained;
 mod process_log;
-mod processes;
 pub mod rendezvous;
 pub mod resume;
 pub mod run_folder;

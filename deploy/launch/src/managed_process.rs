@@ -1,4 +1,4 @@
-//! A child process of a run: started, watched, asked to stop.
+//! A child process of a run: started, watched, asked to stop, and some of them together waited for.
 //! It does not know what the processes do or in which order they end.
 
 use std::{
@@ -10,7 +10,10 @@ use std::{
 };
 
 use anyhow::{Context, ensure};
-use driml_machine::{process_env::program, units::kib};
+use driml_machine::{
+    process_env::program,
+    units::{duration, kib},
+};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
@@ -21,7 +24,7 @@ use crate::{console::Screen, process_log::ProcessLog, rendezvous::Rendezvous};
 /// A process that ends with an error within this time of its start would do so again.
 const AT_ONCE: Duration = Duration::from_secs(10);
 /// How long a process may take to end once it was killed.
-pub(crate) const KILLED_MAX: Duration = Duration::from_secs(30);
+const KILLED_MAX: Duration = Duration::from_secs(30);
 const POLL: Duration = Duration::from_millis(20);
 
 /// A process that was started.
@@ -92,15 +95,6 @@ impl ManagedProcess {
             end: None,
             log,
         })
-    }
-
-    /// A process that runs a shell's `script`, for tests.
-    #[cfg(test)]
-    pub(crate) fn of_script(script: &str, logs: &Path) -> Self {
-        let mut command = Command::new("sh");
-        command.args(["-c", script]).stdin(Stdio::null());
-        let log = ProcessLog::open("script", logs).unwrap();
-        Self::spawn("script", command, log, &Screen::default()).unwrap()
     }
 
     /// Whether it has ended in a way that a restart may mend: in order, killed, or after it had run for a while. A broken
@@ -199,5 +193,66 @@ impl Drop for ManagedProcess {
         {
             tracing::warn!("{} (process {}) does not end", self.name, self.child.id());
         }
+    }
+}
+
+/// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
+/// asked before it listens for signals dies of the request, and has nothing to save.
+pub(crate) fn stop(
+    processes: &mut [ManagedProcess],
+    ask: bool,
+    drain_max: Duration,
+    abort: &impl Fn() -> bool,
+) -> Vec<String> {
+    if ask {
+        processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
+    }
+    let deadline = Instant::now() + drain_max;
+    let mut late = Vec::new();
+    for process in processes {
+        match process.wait_until(deadline, abort) {
+            Some(status) if status.success() => {}
+            Some(status) if ask && status.signal() == Some(Signal::SIGTERM as i32) => {}
+            Some(_) => late.push(process.exit_report()),
+            None => {
+                if !abort() {
+                    late.push(format!(
+                        "{} did not end within {} and was killed",
+                        process.name,
+                        duration(drain_max)
+                    ));
+                }
+                process.kill();
+                process.wait_until(Instant::now() + KILLED_MAX, || false);
+            }
+        }
+    }
+    late
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_dies_of_the_request_to_stop_has_stopped() {
+        let logs = tempfile::tempdir().unwrap();
+        let stopped = |script: &str, ask| {
+            let mut command = Command::new("sh");
+            command.args(["-c", script]).stdin(Stdio::null());
+            let log = ProcessLog::open("script", logs.path()).unwrap();
+            let screen = Screen::default();
+            let process = ManagedProcess::spawn("script", command, log, &screen).unwrap();
+            stop(&mut [process], ask, Duration::from_secs(60), &|| false)
+        };
+        assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
+        let killed = stopped("kill -TERM $$", false);
+        assert!(killed[0].contains("signal 15 SIGTERM"), "{killed:?}");
+        let failed = stopped("echo 'error: no room' >&2; exit 3", false);
+        let said = "script exited with code 3";
+        assert!(
+            failed[0].starts_with(said) && failed[0].ends_with(".log): no room"),
+            "{failed:?}"
+        );
     }
 }

@@ -20,9 +20,8 @@ use crate::{
     endpoint::wait_until_listening,
     evaluator::Evaluator,
     last_play,
-    managed_process::ManagedProcess,
+    managed_process::{ManagedProcess, stop},
     open_files,
-    processes::{Processes, stop},
     rendezvous::Rendezvous,
     resume,
     run_folder::{Outcome, ResumePoint, RunFolder, RunRecorder, Summary, write_whole},
@@ -180,6 +179,21 @@ struct Launch<'a> {
     server_restarts: u32,
     actor_restarts: u32,
     poller: Option<Poller>,
+}
+
+#[derive(Default)]
+struct Processes {
+    replay_servers: Vec<ManagedProcess>,
+    learner: Option<ManagedProcess>,
+    actors: Vec<ManagedProcess>,
+}
+
+impl Processes {
+    /// Replay servers, learner, actors, in the order of their names.
+    fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
+        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
+        first.chain(&mut self.actors)
+    }
 }
 
 /// The processes of a run that is started on one machine: replay servers, learner, actors.
