@@ -5,13 +5,13 @@ use std::{
     collections::BTreeMap,
     fmt,
     io::{self, ErrorKind, IsTerminal, Write, stderr},
-    sync::{Arc, Mutex, MutexGuard},
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
 use anyhow::Context as _;
 use console::Term;
-use driml_protocol::last_warning;
+use driml_protocol::{last_warning, lock};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use tracing::{
     Event, Level, Subscriber,
@@ -280,14 +280,9 @@ impl Screen {
         self.bar.as_ref()
     }
 
-    fn full_disk(&self) -> MutexGuard<'_, FullDisk> {
-        let full_disk = self.full_disk.lock();
-        full_disk.expect("a panic has ended the process")
-    }
-
     /// Writes one line. Of many about a full disk the first stands for all.
     pub fn line(&self, text: &str) {
-        if !self.full_disk().is_due(text, Instant::now()) {
+        if !lock(&self.full_disk).is_due(text, Instant::now()) {
             return;
         }
         match &self.bar {
@@ -318,7 +313,7 @@ impl Screen {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        let more = std::mem::take(&mut self.full_disk().left_out);
+        let more = std::mem::take(&mut lock(&self.full_disk).left_out);
         if more > 0 {
             line(&format!("and {more} more about the full disk"));
         }

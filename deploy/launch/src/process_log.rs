@@ -5,12 +5,12 @@ use std::{
     collections::VecDeque,
     io::{BufRead, BufReader, Read},
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, MutexGuard},
+    sync::{Arc, Mutex},
     thread::JoinHandle,
 };
 
 use anyhow::Context;
-use driml_protocol::fail_point;
+use driml_protocol::{fail_point, lock};
 
 use crate::{console::Screen, run_folder::AppendLog};
 
@@ -102,10 +102,6 @@ impl ProcessLog {
             thread.join().expect("a panic has ended the process");
         }
     }
-}
-
-fn lock(kept: &Mutex<Kept>) -> MutexGuard<'_, Kept> {
-    kept.lock().expect("a panic has ended the process")
 }
 
 impl Kept {
