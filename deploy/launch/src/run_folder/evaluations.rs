@@ -4,13 +4,13 @@
 use std::{
     ffi::OsString,
     fs::{self, File},
-    io::{self, Write},
     path::Path,
 };
 
 use anyhow::Context;
 use csv::StringRecord;
 use driml_machine::error::usage;
+use driml_protocol::atomic_write;
 use serde::Deserialize;
 
 use super::{
@@ -170,7 +170,7 @@ impl Candidate {
         }
         fs::create_dir_all(&new).with_context(doing)?;
         for (name, bytes) in &self.files {
-            write_flushed(&new.join(name), bytes).with_context(doing)?;
+            atomic_write::write(&new.join(name), bytes).with_context(doing)?;
         }
         let there = driml_learner::checkpoint::list(best)?;
         let there = there.into_iter().map(|(_, path)| path);
@@ -188,12 +188,6 @@ impl Candidate {
         }
         Ok(())
     }
-}
-
-fn write_flushed(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = File::create(path)?;
-    file.write_all(bytes)?;
-    file.sync_all()
 }
 
 #[cfg(test)]
