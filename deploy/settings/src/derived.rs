@@ -1,4 +1,4 @@
-//! The settings that follow from others: filled in, checked when read back, refused when set by hand.
+//! The settings that follow from others: filled in, checked when read back, and known by name, as none is set by hand.
 //! It makes no choice itself.
 
 use driml_envs::{ActionSet, WorldConfig, WorldName};
@@ -109,21 +109,8 @@ fn torso(table: &Table) -> Result<TorsoName, Usage> {
     Ok(optional(table, "model.torso")?.unwrap_or(TorsoName::Nature))
 }
 
-/// Refuses a `--set` of something that follows from something else.
-pub(crate) fn refuse(path: &str) -> Result<(), Usage> {
-    match followed(path) {
-        Some((known, how)) => Err(usage!("{known} cannot be set by hand: it {how}")),
-        None => Ok(()),
-    }
-}
-
-/// How a setting follows from others; none of one that does not.
-pub(crate) fn follows(path: &str) -> Option<&'static str> {
-    followed(path).map(|(_, how)| how)
-}
-
-/// The entry of [`FOLLOWS`] that is `path` or a table around it.
-fn followed(path: &str) -> Option<(&'static str, &'static str)> {
+/// The setting that follows from others, which is `path` or a table around it, and how; none where it does not follow.
+pub(crate) fn follows(path: &str) -> Option<(&'static str, &'static str)> {
     let inside = |known: &str| {
         let rest = path.strip_prefix(known);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))

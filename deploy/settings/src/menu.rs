@@ -137,7 +137,7 @@ fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: 
         Some(source) => source,
         None if is_one(BY_MACHINE) => "this machine",
         None if is_process && is_one(DECLARED) => "the world declares it",
-        None => derived::follows(path).unwrap_or("not said"),
+        None => derived::follows(path).map_or("not said", |(_, how)| how),
     }
 }
 

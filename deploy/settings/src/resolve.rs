@@ -130,7 +130,9 @@ fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
     let mut paths = Vec::with_capacity(sets.len());
     for text in sets {
         let one = Override::parse(text)?;
-        derived::refuse(&one.path)?;
+        if let Some((known, how)) = derived::follows(&one.path) {
+            return Err(usage!("{known} cannot be set by hand: it {how}"));
+        }
         let mut tried = table.clone();
         let new = one.apply(&mut tried)?;
         // A key that was not there may be an optional one. The type of its table decides.
