@@ -334,35 +334,4 @@ mod tests {
         let said = world("bigfihs").unwrap_err().to_string();
         assert!(said.contains("did you mean"), "{said}");
     }
-
-    /// The worlds in which an agent's settings pass `test`.
-    fn worlds(name: &str, test: impl Fn(&Table) -> bool) -> String {
-        let agent = agent(name).unwrap();
-        let settings = |&world: &WorldName| layers(&PRESETS[0], world, agent).unwrap();
-        let chosen = WorldName::all().filter(|world| test(&settings(world)));
-        let chosen: Vec<_> = chosen.map(|world| world.to_string()).collect();
-        chosen.join(" ")
-    }
-
-    #[test]
-    fn states_are_augmented_where_the_paper_says() {
-        let augments = |table: &Table| table["learner"].get("augment").is_some();
-        expect_test::expect!["procgen:bigfish procgen:bossfight procgen:chaser procgen:coinrun procgen:jumper procgen:leaper procgen:ninja"]
-            .assert_eq(&worlds("driml-fix", augments));
-        let all = WorldName::all().count();
-        assert_eq!(worlds("curl", augments).split(' ').count(), all);
-        let others = AGENTS.iter().map(|it| it.name);
-        for name in others.filter(|it| !["driml-fix", "curl"].contains(it)) {
-            assert_eq!(worlds(name, augments), "", "{name}");
-        }
-    }
-
-    #[test]
-    fn agents_look_five_steps_ahead_where_the_paper_says() {
-        let five = |table: &Table| table["run"]["horizon"]["k"].as_integer() == Some(5);
-        expect_test::expect!["procgen:bossfight procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"]
-            .assert_eq(&worlds("driml-noact", five));
-        expect_test::expect!["procgen:bigfish procgen:chaser procgen:climber procgen:fruitbot procgen:jumper procgen:maze procgen:miner procgen:plunder"]
-            .assert_eq(&worlds("driml-fix", five));
-    }
 }

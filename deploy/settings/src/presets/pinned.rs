@@ -1,6 +1,6 @@
 //! The settings of every preset as a snapshot, `tests/snapshots/presets.txt`: a changed number shows in it (`UPDATE_EXPECT=1`
 //! rewrites it). Every number has its source beside it. `chain` and `smoke` are left out: their numbers are for tests.
-//! That later layers win, and which games an `[[only]]` block names, is tested with `presets`.
+//! That later layers win is tested with `presets`, which games an `[[only]]` block names with `menu`.
 
 use std::{collections::BTreeMap, fmt::Write};
 
