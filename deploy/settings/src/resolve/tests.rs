@@ -77,13 +77,6 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
     assert_eq!(resolved, (5 * all + 3 * games) * AGENTS.len());
 }
 
-#[test]
-fn the_default_run_has_the_papers_updates() {
-    let config = with("procgen:bigfish", "driml-ada", &[]).unwrap();
-    // 199_000 transitions after the warm-up at 8 rows each, in batches of 256.
-    assert_eq!(config.updates(), 6_218);
-}
-
 /// Settings of earlier versions have frames whole, and stay as they are.
 #[test]
 fn frames_that_are_whole_stay_whole() {
