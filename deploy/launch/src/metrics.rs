@@ -367,9 +367,13 @@ mod tests {
         assert!(column("dim_4t4").is_none());
     }
 
-    fn markdown() -> String {
-        let mut table =
-            "| column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
+    /// `UPDATE_EXPECT=1` writes the page anew.
+    #[test]
+    fn the_page_has_every_metric() {
+        let mut page = "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n\
+             `metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
+             names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n\
+             | column | unit | meaning | Prometheus |\n| --- | --- | --- | --- |\n".to_owned();
         for column in COLUMNS {
             let prometheus = match column.value {
                 Value::Counter(_) => format!("`driml_{}_total`", column.name),
@@ -380,19 +384,8 @@ mod tests {
             let Column {
                 name, unit, help, ..
             } = column;
-            table += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
+            page += &format!("| `{name}` | {unit} | {help} | {prometheus} |\n");
         }
-        table
-    }
-
-    /// `UPDATE_EXPECT=1` writes the page anew.
-    #[test]
-    fn the_page_has_every_metric() {
-        let page = format!(
-            "<!-- Generated: `UPDATE_EXPECT=1 cargo test -p driml-launch --lib metrics` rewrites this page. -->\n\n# Metrics\n\n`metrics.csv` in the run folder has a row per second with these columns. `driml watch --once --json` has the same \
-             names. The last column is the name in the file of `driml watch --prometheus FILE`.\n\n{}",
-            markdown()
-        );
         expect_file!["../../docs/src/reference/metrics.md"].assert_eq(&page);
     }
 }
