@@ -50,19 +50,24 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     });
     let mut actors = Vec::new();
     for role in roles {
-        match (role, Credentials::examine(folder, role)) {
-            (_, Err(e)) => facts.push(Fact::missing(&what(role), e.to_string())),
-            (Role::Actor(number), Ok(it)) if complaint(&it).is_none() => actors.push((number, it)),
-            (_, Ok(it)) => facts.push(fact(role, &it)),
+        let what = format!("tls {role}");
+        match Credentials::examine(folder, role) {
+            Err(e) => facts.push(Fact::missing(&what, e.to_string())),
+            Ok(it) => match (complaint(&it), role) {
+                (Some(text), _) => facts.push(Fact::note(&what, text)),
+                (None, Role::Actor(number)) => actors.push((number, it)),
+                (None, Role::ReplayServer) => {
+                    let (until, names) = (good_until(&it), it.hosts.join(", "));
+                    let text = format!("{until}, for {names}: connect to one of these names");
+                    facts.push(Fact::ok(&what, text));
+                }
+                (None, _) => facts.push(Fact::ok(&what, good_until(&it))),
+            },
         }
     }
     facts.extend(all_well(&actors));
     facts.extend(authority(folder));
     facts
-}
-
-fn what(role: Role) -> String {
-    format!("tls {role}")
 }
 
 /// What is to be done about a certificate that is good.
@@ -87,20 +92,6 @@ fn complaint(credentials: &Credentials) -> Option<String> {
     } else {
         None
     }
-}
-
-fn fact(role: Role, credentials: &Credentials) -> Fact {
-    if let Some(text) = complaint(credentials) {
-        return Fact::note(&what(role), text);
-    }
-    let mut text = good_until(credentials);
-    if role == Role::ReplayServer {
-        text += &format!(
-            ", for {}: connect to one of these names",
-            credentials.hosts.join(", ")
-        );
-    }
-    Fact::ok(&what(role), text)
 }
 
 fn good_until(credentials: &Credentials) -> String {
