@@ -13,7 +13,7 @@ fn find<'a>(lines: &'a [Line], what: &str) -> &'a Line {
 }
 
 #[test]
-fn the_paper_s_agent_is_described() {
+fn the_paper_s_agent_is_described_in_a_table_and_in_a_line_of_sums() {
     let inspection = Inspection::of(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
     expect![[r#"
         driml-ada on procgen:bigfish
@@ -65,11 +65,7 @@ fn the_paper_s_agent_is_described() {
     "#]].assert_eq(&inspection.describe());
     let json = serde_json::to_value(&inspection).unwrap();
     assert_eq!(json["bytes"][0]["what"], "a transition in a chunk");
-}
 
-#[test]
-fn a_line_a_world_has_the_sums() {
-    let inspection = Inspection::of(&config("paper", "procgen:bigfish", "driml-ada", &[])).unwrap();
     let text = describe_worlds(&[inspection.clone(), inspection]);
     assert_eq!(text.matches("\nprocgen:bigfish ").count(), 2, "{text}");
     for sum in [
