@@ -275,7 +275,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        run_view::{Episodes, Plan, Recorded},
+        run_view::{Plan, Recorded},
         testing::with,
     };
 
@@ -286,9 +286,8 @@ mod tests {
         view.take_replay(vec![replay]);
         view.recorded = learner.is_some().then(|| Recorded {
             seconds: 12.5,
-            episodes: Episodes::default(),
-            k: None,
             rss_mib: vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)],
+            ..Recorded::default()
         });
         view.take_learner(learner);
         view

@@ -98,7 +98,7 @@ impl Episodes {
 }
 
 /// What a recorder knows beside its processes: of the whole run, before it was resumed too.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Recorded {
     pub(crate) seconds: f64,
     pub(crate) episodes: Episodes,

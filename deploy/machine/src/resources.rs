@@ -16,16 +16,13 @@ const REPLAY_SHARE_MAX: f64 = 0.9;
 
 /// What a learner takes on Procgen (266 MiB measured), and some room.
 pub const LEARNER_BYTES: u64 = 512 << 20;
-/// What an actor of 16 environments takes on Procgen, whose engine holds its pictures (410 to 423 MiB measured), and elsewhere (97 MiB
-/// on Ms. PacMan).
-const ACTOR_BYTES: (u64, u64) = (430 << 20, 100 << 20);
 
-/// About the bytes that `actors` processes take in a world.
+/// About the bytes that `actors` processes of 16 environments take in a world: on Procgen the engine holds its pictures (410 to 423 MiB
+/// measured; 97 MiB on Ms. PacMan).
 pub fn actors_bytes(actors: u32, world: &str) -> u64 {
-    let (procgen, other) = ACTOR_BYTES;
-    let each = match world.starts_with("procgen") {
-        true => procgen,
-        false => other,
+    let each: u64 = match world.starts_with("procgen") {
+        true => 430 << 20,
+        false => 100 << 20,
     };
     u64::from(actors) * each
 }
@@ -90,7 +87,6 @@ pub struct MachineNote {
     /// Mean number of tasks that wanted a core in the minute before.
     pub load: f64,
     /// The GPU that computed, with its memory; none if the processor did.
-    #[serde(default)]
     pub gpu: Option<String>,
 }
 

@@ -210,10 +210,8 @@ impl RunRecorder {
 fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
     let mut nothing = RunView::new(Plan::of(config));
     nothing.recorded = Some(Recorded {
-        seconds: 0.0,
-        episodes: Episodes::default(),
-        k: None,
         rss_mib: processes.iter().map(|it| (it.clone(), None)).collect(),
+        ..Recorded::default()
     });
     cells(&nothing).into_iter().map(|(name, _)| name).collect()
 }
