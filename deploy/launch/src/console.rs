@@ -13,10 +13,7 @@ use anyhow::Context as _;
 use console::Term;
 use driml_protocol::{last_warning, lock};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use tracing::{
-    Event, Level, Subscriber,
-    field::{Field, Visit},
-};
+use tracing::{Event, Level, Subscriber, field::Field};
 use tracing_subscriber::{
     EnvFilter, Layer,
     layer::{Context as LayerContext, SubscriberExt},
@@ -201,23 +198,15 @@ struct LastWarning;
 impl<S: Subscriber> Layer<S> for LastWarning {
     fn on_event(&self, event: &Event<'_>, _: LayerContext<'_, S>) {
         if *event.metadata().level() <= Level::WARN {
-            last_warning::note(text(event));
+            let mut text = String::new();
+            event.record(&mut |field: &Field, value: &dyn fmt::Debug| {
+                if field.name() == "message" {
+                    text = format!("{value:?}");
+                }
+            });
+            last_warning::note(text);
         }
     }
-}
-
-fn text(event: &Event<'_>) -> String {
-    struct Text(String);
-    impl Visit for Text {
-        fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-            if field.name() == "message" {
-                self.0 = format!("{value:?}");
-            }
-        }
-    }
-    let mut text = Text(String::new());
-    event.record(&mut text);
-    text.0
 }
 
 /// How long one line about a full disk stands for those of all processes and files.

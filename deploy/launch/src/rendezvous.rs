@@ -84,8 +84,8 @@ fn place_under(folder: PathBuf) -> PathBuf {
 
 /// What a process does at its orderly end: uses no such folder any more, and sweeps, as its launcher may have been killed.
 pub fn leave() {
-    let nothing = File::open("/dev/null").map_err(|e| e.to_string());
-    match nothing.and_then(|nothing| dup2_stdin(nothing).map_err(|e| e.to_string())) {
+    let nothing = File::open("/dev/null");
+    match nothing.and_then(|nothing| Ok(dup2_stdin(nothing)?)) {
         Ok(()) => sweep(&place_under(std::env::temp_dir())),
         Err(e) => tracing::debug!("leaving the folder of the socket: {e}"),
     }
