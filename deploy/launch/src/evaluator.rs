@@ -102,10 +102,13 @@ impl Due {
         Ok(Self { config, newest })
     }
 
-    /// How many episodes the checkpoint after so many updates is now played for, if it is due.
+    /// How many episodes the checkpoint after so many updates is now played for, if it is due: the last one of a run unless it was played.
     pub(crate) fn take(&mut self, updates: u64, is_last: bool) -> Option<u32> {
-        let is_due = |it: &EvaluationConfig| it.is_due(updates, self.newest, is_last);
-        let config = self.config.filter(is_due)?;
+        let config = self.config?;
+        let step = if is_last { 1 } else { config.every_updates };
+        if updates / step <= self.newest / step {
+            return None;
+        }
         self.newest = updates;
         Some(config.episodes)
     }

@@ -53,13 +53,6 @@ pub struct EvaluationConfig {
 }
 
 impl EvaluationConfig {
-    /// Whether a checkpoint after so many updates is to be played, where the newest that was played is after `played`; the last one
-    /// of a run is if it was not.
-    pub const fn is_due(&self, updates: u64, played: u64, is_last: bool) -> bool {
-        let step = if is_last { 1 } else { self.every_updates };
-        updates / step > played / step
-    }
-
     fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
         let (every_updates, episodes) = (self.every_updates, self.episodes);
         if every_updates == 0 || !every_updates.is_multiple_of(checkpoint_period_updates) {
