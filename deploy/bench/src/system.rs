@@ -49,26 +49,21 @@ pub(super) fn measure(frames: Option<u64>, flags: &BenchFlags) -> anyhow::Result
     });
     let threads = format!("local.learner_threads={}", flags.threads);
     let mut run = Run::start(&["--frames", &frames.to_string()], &[&threads])?;
-    let [first, last] = run.watch_to_end()?;
-    let watched = Watched {
-        all_act_after_s: 0.0,
-        first,
-        last,
-        summary: run.finish(0)?,
-    };
-    let [before, after] = [&watched.first.learner, &watched.last.learner];
+    let seen = run.watch_to_end()?;
+    let summary = run.finish(0)?;
+    let [before, after] = seen.each_ref().map(|it| &it.learner);
     let computing = after.computing_s - before.computing_s;
     let waiting = after.waiting_s - before.waiting_s;
     let share = 100.0 * computing / (computing + waiting);
-    let updates = watched.rate(|it| it.learner.updates);
-    let frames = watched.rate(|it| it.replay.transitions_inserted);
+    let updates = rate(&seen, |it| it.learner.updates);
+    let frames = rate(&seen, |it| it.replay.transitions_inserted);
     let computes = "share of its time in which the learner computes";
     let mut figures = vec![
         Measurement::found("updates", updates, "updates/s"),
         Measurement::found("frames", frames, "frames/s"),
         Measurement::found(computes, share, "%"),
     ];
-    for (process, mib) in &watched.summary.rss_mib_max {
+    for (process, mib) in &summary.rss_mib_max {
         let what = format!("memory of {process}");
         figures.extend(mib.map(|mib| Measurement::found(what, mib, "MiB")));
     }
@@ -93,7 +88,7 @@ pub(super) fn scale(
         for &actors in actors {
             let mut heads = ["ratio", "actors"].map(String::from).to_vec();
             let mut row = vec![ratio.to_string(), actors.to_string()];
-            for (column, value) in Watched::new(actors, ratio, slack, seconds)?.columns() {
+            for (column, value) in columns(actors, ratio, slack, seconds)? {
                 row.push(value.map_or("-".into(), number));
                 let what = format!("ratio {ratio}, {actors} actors: {column}");
                 let unit = column.clone();
@@ -111,74 +106,61 @@ pub(super) fn scale(
     Ok((figures, aligned(&rows, &columns)))
 }
 
-/// What was seen of a run.
-struct Watched {
-    /// From the launcher's start to the last actor's first frame.
-    all_act_after_s: f64,
-    first: Moment,
-    last: Moment,
-    summary: Summary,
+/// A row of the table of actors: what is seen of a run with so many, from its start until it has been watched for `seconds`.
+fn columns(
+    actors: u32,
+    ratio: f64,
+    slack: u64,
+    seconds: u32,
+) -> anyhow::Result<Vec<(String, Option<f64>)>> {
+    let ratio = format!("replay.replay_ratio={ratio}");
+    let slack = format!("replay.slack_transitions={slack}");
+    let sets = [
+        &*ratio,
+        &*slack,
+        "replay.capacity_transitions=20000",
+        "replay.transitions_max=1000000000000",
+    ];
+    let started = Instant::now();
+    let mut run = Run::start(&["--actors", &actors.to_string()], &sets)?;
+    let acting = run.wait_until(|now| now.replay.actors_acting >= actors)?;
+    let first = run.wait_until(|now| now.learner.updates > 2)?;
+    let until = first.at + Duration::from_secs(seconds.into());
+    thread::sleep(until.saturating_duration_since(Instant::now()));
+    let seen = [first, run.wait_until(|_| true)?];
+    run.launcher.ask_to_stop();
+    let summary = run.finish(INTERRUPTED)?;
+    let frames = rate(&seen, |it| it.replay.transitions_inserted);
+    let updates = rate(&seen, |it| it.learner.updates);
+    // From the launcher's start to the last actor's first frame.
+    let all_act_after_s = (acting.at - started).as_secs_f64();
+    let mut columns = vec![
+        ("frames/s".to_owned(), Some(frames)),
+        ("updates/s".to_owned(), Some(updates)),
+        ("all act after s".to_owned(), Some(all_act_after_s)),
+    ];
+    let replay = &seen[1].replay;
+    for (name, unit, quantiles) in [
+        ("answer", "ms", replay.answer_ms),
+        ("insert", "ms", replay.insert_ms),
+        ("weights behind", "s", replay.weights_behind_s),
+        ("weights behind", "updates", replay.weights_behind_updates),
+    ] {
+        columns.push((format!("{name} p50 {unit}"), quantiles.map(|it| it.p50)));
+        columns.push((format!("{name} p99 {unit}"), quantiles.map(|it| it.p99)));
+    }
+    let memory = summary.rss_mib_max.values().flatten().sum();
+    columns.push(("MiB of all".to_owned(), Some(memory)));
+    let whole = &summary.replay;
+    columns.push(("retried".to_owned(), Some(whole.chunks_retried as f64)));
+    columns.push(("lost".to_owned(), Some(whole.transitions_lost as f64)));
+    Ok(columns)
 }
 
-impl Watched {
-    /// A run with so many actors, from its start until it has been watched for `seconds`.
-    fn new(actors: u32, ratio: f64, slack: u64, seconds: u32) -> anyhow::Result<Self> {
-        let ratio = format!("replay.replay_ratio={ratio}");
-        let slack = format!("replay.slack_transitions={slack}");
-        let sets = [
-            &*ratio,
-            &*slack,
-            "replay.capacity_transitions=20000",
-            "replay.transitions_max=1000000000000",
-        ];
-        let started = Instant::now();
-        let mut run = Run::start(&["--actors", &actors.to_string()], &sets)?;
-        let acting = run.wait_until(|now| now.replay.actors_acting >= actors)?;
-        let first = run.wait_until(|now| now.learner.updates > 2)?;
-        let until = first.at + Duration::from_secs(seconds.into());
-        thread::sleep(until.saturating_duration_since(Instant::now()));
-        let last = run.wait_until(|_| true)?;
-        run.launcher.ask_to_stop();
-        Ok(Self {
-            all_act_after_s: (acting.at - started).as_secs_f64(),
-            first,
-            last,
-            summary: run.finish(INTERRUPTED)?,
-        })
-    }
-
-    /// A row of the table of actors.
-    fn columns(&self) -> Vec<(String, Option<f64>)> {
-        let frames = self.rate(|it| it.replay.transitions_inserted);
-        let updates = self.rate(|it| it.learner.updates);
-        let mut columns = vec![
-            ("frames/s".to_owned(), Some(frames)),
-            ("updates/s".to_owned(), Some(updates)),
-            ("all act after s".to_owned(), Some(self.all_act_after_s)),
-        ];
-        let replay = &self.last.replay;
-        for (name, unit, quantiles) in [
-            ("answer", "ms", replay.answer_ms),
-            ("insert", "ms", replay.insert_ms),
-            ("weights behind", "s", replay.weights_behind_s),
-            ("weights behind", "updates", replay.weights_behind_updates),
-        ] {
-            columns.push((format!("{name} p50 {unit}"), quantiles.map(|it| it.p50)));
-            columns.push((format!("{name} p99 {unit}"), quantiles.map(|it| it.p99)));
-        }
-        let memory = self.summary.rss_mib_max.values().flatten().sum();
-        columns.push(("MiB of all".to_owned(), Some(memory)));
-        let whole = &self.summary.replay;
-        columns.push(("retried".to_owned(), Some(whole.chunks_retried as f64)));
-        columns.push(("lost".to_owned(), Some(whole.transitions_lost as f64)));
-        columns
-    }
-
-    /// What `count` counts, a second.
-    fn rate(&self, count: fn(&Moment) -> u64) -> f64 {
-        let seconds = (self.last.at - self.first.at).as_secs_f64();
-        (count(&self.last) - count(&self.first)) as f64 / seconds
-    }
+/// What `count` counts from the first moment to the last, a second.
+fn rate([first, last]: &[Moment; 2], count: fn(&Moment) -> u64) -> f64 {
+    let seconds = (last.at - first.at).as_secs_f64();
+    (count(last) - count(first)) as f64 / seconds
 }
 
 /// What the processes report, and when.
