@@ -17,15 +17,6 @@ pub(crate) const SPACE_OBSERVATION: u32 = 1;
 pub(crate) const SPACE_ACTION: u32 = 2;
 pub(crate) const SPACE_INFO: u32 = 3;
 
-/// A bound of a tensor's values; the tensor's dtype says which field holds it.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub(crate) union LibenvValue {
-    pub(crate) uint8: u8,
-    pub(crate) int32: i32,
-    pub(crate) float32: f32,
-}
-
 /// One tensor of a space. The engine leaves the bytes after the name's NUL and the shape past `ndim` unset.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -35,8 +26,9 @@ pub(crate) struct LibenvTensortype {
     pub(crate) dtype: u32,
     pub(crate) shape: [i32; DIMENSIONS_MAX],
     pub(crate) ndim: i32,
-    pub(crate) low: LibenvValue,
-    pub(crate) high: LibenvValue,
+    /// The bounds of its values, unions of which `dtype` says the type; nothing here reads them.
+    pub(crate) low: u32,
+    pub(crate) high: u32,
 }
 
 /// One setting: `count` values of `dtype` at `data`.
@@ -66,7 +58,6 @@ pub(crate) struct LibenvBuffers {
 }
 
 const _: () = {
-    assert!(size_of::<LibenvValue>() == 4);
     assert!(size_of::<LibenvTensortype>() == 212);
     assert!(offset_of!(LibenvTensortype, scalar_type) == 128);
     assert!(offset_of!(LibenvTensortype, dtype) == 132);
@@ -109,15 +100,14 @@ pub(crate) fn name(text: &str) -> [c_char; NAME_BYTES] {
 impl LibenvTensortype {
     /// An all-zero value for the engine to write over.
     pub(crate) const fn zeroed() -> LibenvTensortype {
-        let zero = LibenvValue { int32: 0 };
         LibenvTensortype {
             name: [0; NAME_BYTES],
             scalar_type: 0,
             dtype: 0,
             shape: [0; DIMENSIONS_MAX],
             ndim: 0,
-            low: zero,
-            high: zero,
+            low: 0,
+            high: 0,
         }
     }
 

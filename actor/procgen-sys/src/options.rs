@@ -116,13 +116,11 @@ impl RawOptions {
         ];
         let (items, values) = table
             .map(|(name, (dtype, count, mut value))| {
-                let data = value.as_mut_ptr().cast::<c_void>();
-                let (name, count) = (ffi::name(name), i32(count));
                 let item = LibenvOption {
-                    name,
+                    name: ffi::name(name),
                     dtype,
-                    count,
-                    data,
+                    count: i32(count),
+                    data: value.as_mut_ptr().cast::<c_void>(),
                 };
                 (item, value)
             })
