@@ -316,7 +316,8 @@ mod tests {
         cache.offline = false;
         says(&cache, 1, "fetching procgen's engine: no route");
         let error = install(&cache, LIBRARY_SHA256).unwrap_err().to_string();
-        assert!(error.contains("libenv.so: its SHA-256 is"), "{error}");
+        let text = format!("libenv.so: its SHA-256 is {LIBRARY_HASH}, expected {LIBRARY_SHA256}");
+        assert!(error.contains(&text), "{error}");
         fs::write(cache.folder.join(WHEEL_NAME), b"no wheel").unwrap();
         says(&cache, 1, &format!("expected {WHEEL_SHA256}"));
         assert_eq!(left(&cache), ["install.lock"]);

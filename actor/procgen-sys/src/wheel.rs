@@ -135,17 +135,6 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn a_hash_is_sha256() {
-        let file = tempfile::NamedTempFile::new().unwrap();
-        fs::write(file.path(), b"abc").unwrap();
-        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
-        check_hash(file.path(), abc).unwrap();
-        let error = check_hash(file.path(), WHEEL_SHA256).unwrap_err();
-        let text = format!("its SHA-256 is {abc}, expected {WHEEL_SHA256}");
-        assert!(error.to_string().contains(&text), "{error}");
-    }
-
     /// Unpacks into the folder's `fresh` with a Python that is this script, which runs in the folder.
     fn unpack_by(script: &str, folder: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
         let python = folder.join("python3");
