@@ -45,15 +45,9 @@ mod tests {
         Duration::from_micros(us)
     }
 
-    fn after(steps: &[u64]) -> Option<Duration> {
-        let mut nap = Nap::default();
-        steps.iter().for_each(|&step| nap.learn(us(step)));
-        nap.duration()
-    }
-
     #[test]
     fn a_nap_is_half_a_fast_step_and_left_out_where_steps_are_short() {
-        for (steps, nap) in [
+        for (steps, duration) in [
             (&[][..], None),
             (&[400], Some(us(200))),
             (&[400, 4_000], Some(us(225))),
@@ -61,7 +55,9 @@ mod tests {
             (&[199], None),
             (&[400, 150], None),
         ] {
-            assert_eq!(after(steps), nap, "{steps:?}");
+            let mut nap = Nap::default();
+            steps.iter().for_each(|&step| nap.learn(us(step)));
+            assert_eq!(nap.duration(), duration, "{steps:?}");
         }
     }
 
