@@ -14,18 +14,16 @@ use std::{
 use driml_protocol::{
     Ack, AffinityUpdate, CodecError, Incoming, LearnerStatus, LogLimiter, PriorityUpdate,
     QueryWorkers, Request, RunClient, Sampling, Sealed, Shutdown, Weights, WeightsUpload,
-    fail_point, session::SessionError,
+    fail_point, lock, session::SessionError,
 };
 use zenoh::query::Queryable;
 
-use super::lock;
-
-const AFFINITY_TIMEOUT: Duration = Duration::from_secs(5);
-const PRIORITIES_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long affinity or priorities may take to arrive, and how long weights.
+const TIMEOUT: Duration = Duration::from_secs(5);
+const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Updates whose priorities may wait to be sent. More than batches can be on their way: a replay server that answers to the one
 /// answers to the other. Beyond it the oldest are given up: their transitions keep the priorities that they have.
 const PRIORITIES_MAX: usize = 128;
-const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Pause between two tries.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// The same while the replay server reads its replay back from disk: weights are megabytes.
@@ -35,21 +33,24 @@ const TICK: Duration = Duration::from_millis(200);
 
 /// The learner's publisher; dropping it closes them.
 pub(crate) struct Publisher {
-    learner: u64,
+    /// The number by which the replay server knows this learner.
+    pub(crate) learner: u64,
     status: Arc<Mutex<LearnerStatus>>,
     fetched: Arc<AtomicBool>,
     weights: Arc<Newest<Weights>>,
-    affinity: Arc<Newest<AffinityUpdate>>,
-    priorities: Arc<Newest<PriorityUpdate>>,
+    pub(crate) affinity: Arc<Newest<AffinityUpdate>>,
+    /// Of an update's rows each, sent in order, each until every shard has said that it has it.
+    pub(crate) priorities: Arc<Newest<PriorityUpdate>>,
     _queryables: Vec<Queryable<()>>,
 }
 
 /// Keeps the newest of its kind until they are sent, the oldest first.
-struct Newest<T> {
+pub(crate) struct Newest<T> {
     waiting: Mutex<VecDeque<T>>,
     most: usize,
     filled: Condvar,
-    arrived: AtomicU64,
+    /// How many all replay servers have.
+    pub(crate) arrived: AtomicU64,
 }
 
 impl<T> Newest<T> {
@@ -62,8 +63,8 @@ impl<T> Newest<T> {
         })
     }
 
-    /// In place of the oldest, where there is no room.
-    fn put(&self, value: T) {
+    /// Hands it over, in place of the oldest that was not sent yet where there is no room.
+    pub(crate) fn put(&self, value: T) {
         let mut waiting = lock(&self.waiting);
         if waiting.len() == self.most {
             waiting.pop_front();
@@ -138,22 +139,17 @@ impl Publisher {
             };
             Sealed::with_payload(&upload, weights.safetensors.clone().into(), spec_hash)
         })?;
-        let affinity = to_all("affinity", AFFINITY_TIMEOUT);
+        let affinity = to_all("affinity", TIMEOUT);
         affinity.start(this.affinity.clone(), move |update| {
             Sealed::new(update, spec_hash)
         })?;
         if sampling.is_prioritised() {
-            let priorities = to_all("priorities", PRIORITIES_TIMEOUT);
+            let priorities = to_all("priorities", TIMEOUT);
             priorities.start(this.priorities.clone(), move |update| {
                 Sealed::new(update, spec_hash)
             })?;
         }
         Ok(this)
-    }
-
-    /// The number by which the replay server knows this learner.
-    pub(crate) const fn learner(&self) -> u64 {
-        self.learner
     }
 
     /// Hands the weights over to the replay server, which announces them and gives them to actors; those that were not sent yet
@@ -169,21 +165,6 @@ impl Publisher {
             weights.header.updates
         );
         self.weights.put(weights);
-    }
-
-    /// Hands over the newest affinity; one that was not sent yet is replaced.
-    pub(crate) fn send_affinity(&self, update: AffinityUpdate) {
-        self.affinity.put(update);
-    }
-
-    /// Hands over the priorities of an update's rows. They are sent in order, each until every shard has said that it has it.
-    pub(crate) fn send_priorities(&self, update: PriorityUpdate) {
-        self.priorities.put(update);
-    }
-
-    /// Of how many updates all replay servers know the priorities.
-    pub(crate) fn priorities_arrived(&self) -> u64 {
-        self.priorities.arrived.load(Ordering::Relaxed)
     }
 
     /// Waits until the status was fetched once after the learner finished, or for `wait_max`.

@@ -114,8 +114,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     publisher.publish(learner.next_weights()?);
     if updates > 0 {
         publisher.with_status(|status| status.updates = updates);
-        if let Some(affinity) = learner.affinity_update(publisher.learner()) {
-            publisher.send_affinity(affinity);
+        if let Some(affinity) = learner.affinity_update(publisher.learner) {
+            publisher.affinity.put(affinity);
         }
     }
     let activity = Activity::new("waits for its first batch");
@@ -167,7 +167,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     }
     publisher.wait_until_heard(LAST_WORD_MAX);
     if sampling.is_prioritised() {
-        let arrived = publisher.priorities_arrived();
+        let arrived = publisher.priorities.arrived.load(Ordering::Relaxed);
         tracing::info!("priorities of {arrived} updates have arrived");
     }
     if !shutdown.is_set() {
@@ -214,12 +214,12 @@ fn learn(
         let counters = &checkpointer.counters;
         counters.updates.store(learner.updates(), Ordering::Release);
         // Numbered by updates, which no life of the learner counts backwards.
-        let (by, number) = (publisher.learner(), learner.updates());
+        let (by, number) = (publisher.learner, learner.updates());
         if let Some(priorities) = batch.priority_update(by, number, &report.row_kls) {
-            publisher.send_priorities(priorities);
+            publisher.priorities.put(priorities);
         }
-        if let Some(affinity) = learner.affinity_update(publisher.learner()) {
-            publisher.send_affinity(affinity);
+        if let Some(affinity) = learner.affinity_update(by) {
+            publisher.affinity.put(affinity);
         }
         if learner.publication_is_due() {
             publisher.publish(learner.next_weights()?);
