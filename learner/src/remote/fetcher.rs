@@ -12,7 +12,7 @@ use std::{
 
 use driml_protocol::{
     Batch, BatchReply, BatchRequest, BufferPool, Learned, LogLimiter, NotReady, PendingReply,
-    ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point,
+    ReplayStatus, RequestId, RunClient, ShardCounts, Shutdown, Silence, Waiting, fail_point, lock,
     session::SessionError, shared_memory::Trust,
 };
 use rand::{Rng, SeedableRng};
@@ -20,7 +20,6 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{
     error::BatchError,
-    lock,
     shards::{PartialBatch, Portion},
 };
 use crate::progress::{Progress, ServedPart};

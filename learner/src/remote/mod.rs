@@ -8,10 +8,4 @@ mod publish;
 pub mod run;
 mod shards;
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
-
 pub use error::BatchError;
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}

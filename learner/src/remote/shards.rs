@@ -334,21 +334,11 @@ mod tests {
             portion(2, 20, 200, 6),
             portion(3, 30, 300, 7),
         ]);
-        let told = |this| batch.other_shards(this);
-        assert_eq!(
-            told(1),
-            ShardCounts {
-                inserted: 40,
-                rows_sampled: 412
-            }
-        );
-        assert_eq!(
-            told(2),
-            ShardCounts {
-                inserted: 30,
-                rows_sampled: 311
-            }
-        );
+        let told = |this| {
+            let others = batch.other_shards(this);
+            (others.inserted, others.rows_sampled)
+        };
+        assert_eq!((told(1), told(2)), ((40, 412), (30, 311)));
     }
 
     #[test]
