@@ -21,9 +21,6 @@ pub struct UpdateNoise {
 impl UpdateNoise {
     /// That of the update after this many; the same for the same seed.
     pub fn draw(model: &ModelConfig, seed: [u8; 32], updates: u64) -> Self {
-        if model.head.noisy_sigma.is_none() {
-            return Self::default();
-        }
         // A generator by counting: update and position are what it is a function of.
         let mut rng = ChaCha8Rng::from_seed(seed);
         rng.set_stream(updates);
