@@ -145,6 +145,16 @@ mod tests {
         episodes: usize,
         steps_max: u64,
     ) -> Result<Vec<f64>, ActError> {
+        play_until(usize::MAX, scripts, episodes, steps_max)
+    }
+
+    /// The same, broken off where as many as `ended` episodes have ended.
+    fn play_until(
+        ended: usize,
+        scripts: &[&[(f32, StepEnd)]],
+        episodes: usize,
+        steps_max: u64,
+    ) -> Result<Vec<f64>, ActError> {
         let scripts = scripts.iter().map(|script| script.to_vec()).collect();
         let world = Box::new(Scripted { scripts, step: 0 });
         let (mut policy, rng) = (Tape::default(), ChaCha8Rng::seed_from_u64(1));
@@ -158,7 +168,10 @@ mod tests {
         let returns = episode_returns(world, &mut policy, evaluation, rng, &mut |_, returns| {
             seen += 1;
             shown = returns.to_vec();
-            ControlFlow::Continue(())
+            match returns.len() == ended {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            }
         });
         assert_eq!(seen, policy.0.len(), "every step is shown");
         assert!(returns.as_ref().is_ok_and(|it| *it == shown) || returns.is_err());
@@ -194,23 +207,7 @@ mod tests {
 
     #[test]
     fn a_watch_that_breaks_ends_the_play() {
-        let world = Box::new(Scripted {
-            scripts: vec![SHORT.to_vec()],
-            step: 0,
-        });
-        let evaluation = Evaluation {
-            frame_stack: 1,
-            epsilon: 0.0,
-            episodes: 9,
-            steps_max: 100,
-        };
-        let rng = ChaCha8Rng::seed_from_u64(1);
-        let watch = &mut |_: &Step<'_>, returns: &[f64]| match returns.len() {
-            3 => ControlFlow::Break(()),
-            _ => ControlFlow::Continue(()),
-        };
-        let returns = episode_returns(world, &mut Tape::default(), evaluation, rng, watch);
-        assert_eq!(returns.unwrap(), [1.0; 3]);
+        assert_eq!(play_until(3, &[SHORT], 9, 100).unwrap(), [1.0; 3]);
     }
 
     #[test]

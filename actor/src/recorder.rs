@@ -105,7 +105,11 @@ impl ChunkRecorder {
         ends: &[StepEnd],
     ) -> Option<Chunk> {
         let (pool, header) = (&self.pool, self.header);
-        let chunk = self.chunk.get_or_insert_with(|| fresh(pool, header));
+        let chunk = self.chunk.get_or_insert_with(|| {
+            let bytes = header.payload_bytes();
+            let bytes = bytes.expect("an actor's chunk is far below the address space");
+            Chunk::in_memory(header, pool.take(bytes))
+        });
         let frame_bytes = header.frame_bytes as usize;
         for (stream, frame) in frames.chunks_exact(frame_bytes).enumerate() {
             let row = stream * header.steps as usize + self.filled_steps as usize;
@@ -126,12 +130,6 @@ impl ChunkRecorder {
         self.filled_steps = 0;
         self.chunk.take()
     }
-}
-
-fn fresh(pool: &BufferPool, header: ChunkHeader) -> Chunk {
-    let bytes = header.payload_bytes();
-    let bytes = bytes.expect("an actor's chunk is far below the address space");
-    Chunk::in_memory(header, pool.take(bytes))
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, lock};
 
 use state::DeliveryState;
 use worker::DeliveryWorker;
@@ -83,7 +83,7 @@ impl Delivery {
 
     /// What the next chunk would wait for now; none if it would not.
     pub fn describe_wait(&self) -> Option<&'static str> {
-        let waiting = *self.state.waiting();
+        let waiting = *lock(&self.state.waiting);
         match self.state.is_held() {
             true if waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
             false if waiting >= self.limit => Some("waits for the replay server's answer"),
@@ -94,7 +94,7 @@ impl Delivery {
     /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
     /// thread has ended; [`Self::finish`] says why.
     pub fn send(&self, chunk: Chunk) -> bool {
-        let mut waiting = self.state.waiting();
+        let mut waiting = lock(&self.state.waiting);
         loop {
             let limit = if self.state.is_held() { 1 } else { self.limit };
             if *waiting < limit || self.thread.is_finished() {

@@ -3,13 +3,13 @@
 
 use std::{
     sync::{
-        Condvar, Mutex, MutexGuard, PoisonError,
+        Condvar, Mutex,
         atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
     },
     time::Duration,
 };
 
-use driml_protocol::session::SessionError;
+use driml_protocol::{lock, session::SessionError};
 
 use crate::config::Config;
 
@@ -49,12 +49,8 @@ pub(super) struct DeliveryState {
 }
 
 impl DeliveryState {
-    pub(super) fn waiting(&self) -> MutexGuard<'_, usize> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     pub(super) fn settle(&self) {
-        *self.waiting() -= 1;
+        *lock(&self.waiting) -= 1;
         self.settled.notify_all();
     }
 
