@@ -192,37 +192,15 @@ impl Block {
     }
 }
 
-/// Memory for a state of a world, whose length is that of the state. It goes when this is dropped.
-pub(super) struct StateMemory {
-    file: File,
-}
-
-impl StateMemory {
-    pub(super) fn new(state: &[u8]) -> io::Result<Self> {
-        let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
-        file.write_all_at(state, 0)?;
-        Ok(Self { file })
-    }
-
-    pub(super) fn path(&self) -> String {
-        path(&self.file)
-    }
-
-    /// How long the state is that lies there, bytes.
-    pub(super) fn len(&self) -> io::Result<u64> {
-        Ok(self.file.metadata()?.len())
-    }
-
-    /// Reads the first `len` bytes.
-    pub(super) fn read(&self, len: usize) -> io::Result<Vec<u8>> {
-        let mut state = vec![0; len];
-        self.file.read_exact_at(&mut state, 0)?;
-        Ok(state)
-    }
+/// Memory that holds a state of a world and is as long. It goes when this is dropped.
+pub(super) fn state_memory(state: &[u8]) -> io::Result<File> {
+    let file = File::from(memfd_create(c"driml-world-state", MFdFlags::MFD_CLOEXEC)?);
+    file.write_all_at(state, 0)?;
+    Ok(file)
 }
 
 /// Under which name another process of the same user opens a file without one, as long as this process lives.
-fn path(file: &File) -> String {
+pub(super) fn path(file: &File) -> String {
     format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }
 

@@ -1,13 +1,18 @@
 //! Copies of a game in a process of their own, as the trait has them: a byte to the process and one back for each step.
 //! What passes between them is for `protocol`. A command is asked here what world it is.
 
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+
 use rand::Rng;
 use serde_json::json;
 use tracing::Level;
 
 use super::config::ExecConfig;
 use super::process::{Patience, WorldProcess};
-use super::protocol::{Block, Declaration, SavedExec, StateMemory, VERSION, WORLD_STATE_BYTES_MAX};
+use super::protocol::{
+    Block, Declaration, SavedExec, VERSION, WORLD_STATE_BYTES_MAX, path, state_memory,
+};
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
 use crate::error::EnvError;
@@ -106,13 +111,8 @@ impl ExecWorld {
     }
 
     /// Says that a state is to be saved or loaded, and where it lies.
-    fn say_state(
-        &mut self,
-        what: u8,
-        memory: &StateMemory,
-        doing: &'static str,
-    ) -> Result<(), EnvError> {
-        let place = json!({"state": memory.path(), "bytes_max": WORLD_STATE_BYTES_MAX});
+    fn say_state(&mut self, what: u8, memory: &File, doing: &'static str) -> Result<(), EnvError> {
+        let place = json!({"state": path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
         self.process.say_line(&[what], &place, doing)
     }
 
@@ -120,7 +120,7 @@ impl ExecWorld {
     fn save_process(&mut self) -> Result<Vec<u8>, EnvError> {
         let doing = "in the middle of saving its state";
         let patience = self.config.step_patience();
-        let memory = StateMemory::new(&[]).map_err(|e| self.process.system(doing, &e))?;
+        let memory = state_memory(&[]).map_err(|e| self.process.system(doing, &e))?;
         self.say_state(SAVE, &memory, doing)?;
         match self.process.byte(patience, doing)? {
             DONE => {}
@@ -134,7 +134,9 @@ impl ExecWorld {
             }
             byte => return Err(self.other_byte(doing, byte)),
         }
-        let bytes = memory.len().map_err(|e| self.process.system(doing, &e))?;
+        let written = memory.metadata();
+        let written = written.map_err(|e| self.process.system(doing, &e))?;
+        let bytes = written.len();
         if bytes == 0 {
             return Err(self.process.fail(&format!(
                 "wrote no state: where it says `.` {doing}, the bytes have to lie in \"state\""
@@ -145,14 +147,16 @@ impl ExecWorld {
                 "wrote a state of {bytes} bytes; {WORLD_STATE_BYTES_MAX} are possible for all its copies together"
             )));
         }
-        let state = memory.read(bytes as usize);
-        state.map_err(|e| self.process.system(doing, &e))
+        let mut state = vec![0; bytes as usize];
+        let read = memory.read_exact_at(&mut state, 0);
+        read.map_err(|e| self.process.system(doing, &e))?;
+        Ok(state)
     }
 
     fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), EnvError> {
         let doing = "in the middle of loading its state";
-        let written = StateMemory::new(state)
-            .and_then(|memory| self.block.write_frames(frames).map(|()| memory));
+        let written =
+            state_memory(state).and_then(|memory| self.block.write_frames(frames).map(|()| memory));
         let memory = written.map_err(|e| self.process.system(doing, &e))?;
         self.say_state(LOAD, &memory, doing)?;
         // It belongs to a start, and may take as long: a world may have to play an episode again.
