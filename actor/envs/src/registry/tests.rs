@@ -166,7 +166,19 @@ fn settings_are_read_by_kind_and_unknown_keys_are_rejected() {
     assert_eq!(config.name(), "mspacman".parse().unwrap());
     check_round_trip(&config);
 
+    let config = procgen(0, 500);
+    check_round_trip(&config);
+    let coinrun = toml::to_string(&config).unwrap();
+    for line in ["game = \"coinrun\"", "distribution_mode = \"easy\""] {
+        assert!(coinrun.lines().any(|it| it == line), "{coinrun}");
+    }
+
+    let no_count = "missing field `num_levels`";
     for (wrong, word) in [
+        (coinrun.replace("num_levels = 500\n", ""), no_count),
+        (format!("{coinrun}\nlevels = 1"), "unknown field `levels`"),
+        (coinrun.replace("coinrun", "coinrum"), "variant `coinrum`"),
+        (coinrun.replace("\"easy\"", "\"medium\""), "medium"),
         (format!("{chain}colour = 1"), "colour"),
         (chain.replace("cells = 8\n", ""), "cells"),
         (chain.replace("'chain'", "'chian'"), "chian"),

@@ -156,30 +156,6 @@ fn wrong_settings_are_refused_without_an_engine() {
 }
 
 #[test]
-fn settings_are_read_in_full_or_not_at_all() {
-    let text = toml::to_string(&config(Game::Maze)).unwrap();
-    for line in ["game = \"maze\"", "distribution_mode = \"easy\""] {
-        assert!(text.lines().any(|it| it == line), "{text}");
-    }
-    let read: ProcgenConfig = toml::from_str(&text).unwrap();
-    assert_eq!(read, config(Game::Maze));
-    for (text, words) in [
-        (
-            text.replace("num_levels = 500\n", ""),
-            "missing field `num_levels`",
-        ),
-        (format!("{text}\nlevels = 1"), "unknown field `levels`"),
-        (
-            text.replace("\"maze\"", "\"mase\""),
-            "unknown variant `mase`, expected one of",
-        ),
-        (text.replace("\"easy\"", "\"medium\""), "medium"),
-    ] {
-        fails(toml::from_str::<ProcgenConfig>(&text), &[words]);
-    }
-}
-
-#[test]
 fn seeds_are_mixed_and_not_negative() {
     let seeds: std::collections::BTreeSet<i32> = (0..1000)
         .map(|seed| config(Game::Maze).options(1, seed, 0).unwrap().rand_seed)
