@@ -4,8 +4,8 @@
 use std::fmt;
 use std::sync::{Arc, OnceLock};
 
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Serialize, Serializer};
 use toml::{Table, Value};
 
 use crate::settings::WorldSettings;
@@ -66,11 +66,14 @@ pub fn preset(name: &str) -> Option<&'static str> {
 }
 
 /// The settings of a world that a program added: as they were read, and what its code made of them.
-#[derive(Clone)]
+#[derive(Clone, Serialize)]
+#[serde(transparent)]
 pub struct CustomWorld {
+    #[serde(skip)]
     kind: &'static str,
     /// With `kind`, so that they are written as they were read.
     table: Table,
+    #[serde(skip)]
     settings: Settings,
 }
 
@@ -107,11 +110,5 @@ impl fmt::Debug for CustomWorld {
 impl PartialEq for CustomWorld {
     fn eq(&self, other: &Self) -> bool {
         self.table == other.table
-    }
-}
-
-impl Serialize for CustomWorld {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.table.serialize(serializer)
     }
 }

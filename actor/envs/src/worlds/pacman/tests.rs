@@ -32,15 +32,6 @@ fn harmless() -> PacmanConfig {
     }
 }
 
-/// Ghosts that keep to the mode they are put into.
-fn steady(config: &PacmanConfig) -> PacmanConfig {
-    PacmanConfig {
-        epsilon: 0.0,
-        switch_probability: 0.0,
-        ..config.clone()
-    }
-}
-
 fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
     let places = world.maze.items.len() as u16;
     (0..places)
@@ -55,7 +46,13 @@ fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
 
 /// The bottom corridor, agent in column 9 and ghost 0 `apart` to the right, sure to come closer; the rest far away.
 fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
-    let mut world = PacmanWorld::new(&steady(config), 1, 0).unwrap();
+    // Ghosts keep to the mode they are put into.
+    let steady = PacmanConfig {
+        epsilon: 0.0,
+        switch_probability: 0.0,
+        ..config.clone()
+    };
+    let mut world = PacmanWorld::new(&steady, 1, 0).unwrap();
     let (agent, hunter, far) = (
         at(&world, 19, 9),
         at(&world, 19, 9 + apart),
