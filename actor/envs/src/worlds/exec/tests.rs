@@ -126,62 +126,35 @@ fn faulty(arguments: &str) -> Result<(), EnvError> {
     world.step(&[0, 1], &mut [0.0; 2], &mut [StepEnd::Running; 2])
 }
 
+/// How a world fails by its arguments, and the sentences that say so.
+const FAULTS: &str = "
+raise 3       => ended in the middle of a step (exit status: 1) | RuntimeError: the dragon got out
+kill 3        => ended in the middle of a step (signal: 9
+small 3       => (exit status: 1) | Error:
+nan 3         => gave copy 1 the reward NaN
+end 3         => ended the step of copy 1 with 7; 0 runs on
+hang 3        => --set world.step_timeout_ms=N | sleeping
+saves never   => cannot save its state: the dragon sits on it
+saves nothing => wrote no state
+saves large   => wrote a state of 67108865 bytes; 67108864 are possible
+saves byte    => answered in the middle of saving its state with the byte 0x3f
+saves raise   => ended in the middle of saving its state (exit status: 1) | RuntimeError: the dragon ate it
+saves hang    => has not answered for 0.7 s in the middle of saving its state | --set world.step_timeout_ms=N
+saves lost    => ended in the middle of loading its state | the dragon does not give it back
+";
+
 #[test]
 fn each_way_a_process_can_fail_has_its_sentence() {
-    for (arguments, sentences) in [
-        (
-            "raise 3",
-            &[
-                "ended in the middle of a step (exit status: 1)",
-                "RuntimeError: the dragon got out",
-            ][..],
-        ),
-        ("kill 3", &["ended in the middle of a step (signal: 9"]),
-        ("small 3", &["(exit status: 1)", "Error: "]),
-        ("nan 3", &["gave copy 1 the reward NaN"]),
-        ("end 3", &["ended the step of copy 1 with 7; 0 runs on"]),
-        ("hang 3", &["--set world.step_timeout_ms=N", "sleeping"]),
-        (
-            "saves never",
-            &["cannot save its state: the dragon sits on it"],
-        ),
-        ("saves nothing", &["wrote no state"]),
-        (
-            "saves large",
-            &["wrote a state of 67108865 bytes; 67108864 are possible"],
-        ),
-        (
-            "saves byte",
-            &["answered in the middle of saving its state with the byte 0x3f"],
-        ),
-        (
-            "saves raise",
-            &[
-                "ended in the middle of saving its state (exit status: 1)",
-                "RuntimeError: the dragon ate it",
-            ],
-        ),
-        (
-            "saves hang",
-            &[
-                "has not answered for 0.7 s in the middle of saving its state",
-                "--set world.step_timeout_ms=N",
-            ],
-        ),
-        (
-            "saves lost",
-            &[
-                "ended in the middle of loading its state",
-                "the dragon does not give it back",
-            ],
-        ),
-    ] {
+    for line in FAULTS.trim().lines() {
+        let (arguments, sentences) = line.split_once("=>").unwrap();
+        let arguments = arguments.trim();
+        let sentences: Vec<&str> = sentences.split('|').map(str::trim).collect();
         let started = Instant::now();
         let failed = faulty(arguments);
         assert!(started.elapsed() < Duration::from_secs(50), "{arguments}");
         let not_saved = matches!(failed, Err(EnvError::NotSaved(_)));
         assert_eq!(not_saved, arguments == "saves never", "{arguments}");
-        let text = fails(failed, sentences);
+        let text = fails(failed, &sentences);
         assert!(text.starts_with("the world `exec python3 "), "{text}");
     }
 }

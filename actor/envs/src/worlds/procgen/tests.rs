@@ -203,24 +203,22 @@ fn ends_are_told_apart() {
         let mut world = ProcgenWorld::new(&config, 2, 1, 0).unwrap();
         for t in 1..=1000 {
             let (_, _, ends) = step(&mut world, &[4, 4]);
-            let expected = if t % 500 == 0 {
-                StepEnd::TimedOut
-            } else {
-                StepEnd::Running
+            let expected = match t % 500 {
+                0 => StepEnd::TimedOut,
+                _ => StepEnd::Running,
             };
             assert_eq!(ends, [expected; 2], "step {t}");
         }
         // Random play: the goal is the only other end.
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let mut reached = 0;
+        let goal = match use_sequential_levels {
+            true => StepEnd::LevelChange,
+            false => StepEnd::Terminal,
+        };
         for _ in 0..2000 {
             let (_, rewards, ends) = step(&mut world, &draw(&mut rng, 2));
             for (reward, end) in rewards.into_iter().zip(ends) {
-                let goal = if use_sequential_levels {
-                    StepEnd::LevelChange
-                } else {
-                    StepEnd::Terminal
-                };
                 assert_eq!(reward == 10.0, end == goal);
                 reached += usize::from(end == goal);
             }
