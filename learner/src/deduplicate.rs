@@ -35,8 +35,9 @@ impl<'a> PassInput<'a> {
         once: bool,
     ) -> Self {
         if once && let Some(distinct) = Distinct::of(states) {
+            let firsts = distinct.firsts.iter().map(|&first| states[first]);
             return Self {
-                bytes: Cow::Owned(distinct.gather(states, state_bytes)),
+                bytes: Cow::Owned(one_after_another(firsts, state_bytes)),
                 places: Some(distinct.places),
             };
         }
@@ -64,12 +65,6 @@ struct Distinct {
 impl Distinct {
     /// That of `states`, if it pays to compute the distinct ones alone.
     fn of(states: &[State<'_>]) -> Option<Self> {
-        let distinct = Self::find(states);
-        let repeats = distinct.repeats();
-        (repeats > 0 && repeats * PAYS_ONE_IN >= states.len()).then_some(distinct)
-    }
-
-    fn find(states: &[State<'_>]) -> Self {
         let sums: Vec<u32> = states
             .par_iter()
             .with_min_len(TASK_STATES)
@@ -90,17 +85,9 @@ impl Distinct {
             }
             distinct.places.push(if known { place } else { new });
         }
-        distinct
-    }
-
-    /// States that are equal to one before them.
-    fn repeats(&self) -> usize {
-        self.places.len() - self.firsts.len()
-    }
-
-    /// The distinct ones of the pass's `states`, one after the other.
-    fn gather(&self, states: &[State<'_>], state_bytes: usize) -> Vec<u8> {
-        one_after_another(self.firsts.iter().map(|&first| states[first]), state_bytes)
+        // States that are equal to one before them.
+        let repeats = states.len() - distinct.firsts.len();
+        (repeats > 0 && repeats * PAYS_ONE_IN >= states.len()).then_some(distinct)
     }
 }
 
@@ -129,11 +116,9 @@ mod tests {
             .iter()
             .map(|state| state.as_ref().map(|it: &[u8; 2]| &it[..]))
             .collect();
-        let distinct = Distinct::of(&states).unwrap();
-        assert_eq!(distinct.firsts, [0, 1, 2]);
-        assert_eq!(distinct.places, [0, 1, 2, 0, 1]);
-        assert_eq!(distinct.repeats(), 2);
-        assert_eq!(distinct.gather(&states, 2), [1, 1, 0, 0, 2, 2]);
+        let input = PassInput::of(&states, &[], 2, true);
+        assert_eq!(input.places.unwrap(), [0, 1, 2, 0, 1]);
+        assert_eq!(*input.bytes, [1, 1, 0, 0, 2, 2]);
     }
 
     #[test]
@@ -142,9 +127,9 @@ mod tests {
         let [a, b] = [b"plumless", b"buckeroo"].map(|it| Some(&it[..]));
         let states = [a, b, a, b];
         assert_eq!(crc32fast::hash(b"plumless"), crc32fast::hash(b"buckeroo"));
-        let distinct = Distinct::of(&states).unwrap();
-        assert_eq!(distinct.places, [0, 1, 0, 2]);
-        assert_eq!(distinct.gather(&states, 8), *b"plumlessbuckeroobuckeroo");
+        let input = PassInput::of(&states, &[], 8, true);
+        assert_eq!(input.places.unwrap(), [0, 1, 0, 2]);
+        assert_eq!(*input.bytes, *b"plumlessbuckeroobuckeroo");
     }
 
     #[test]
@@ -160,6 +145,7 @@ mod tests {
         }
         assert_eq!(Distinct::of(&states), None);
         states[150] = states[0];
-        assert_eq!(Distinct::of(&states).unwrap().repeats(), enough);
+        let distinct = Distinct::of(&states).unwrap();
+        assert_eq!(states.len() - distinct.firsts.len(), enough);
     }
 }
