@@ -132,7 +132,12 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         args.device,
     );
 
-    let mut checkpointer = Checkpointer::new(folder, counters.clone());
+    let mut checkpointer = Checkpointer {
+        folder,
+        counters,
+        saved: None,
+        failed: None,
+    };
     let learned = learn(
         &mut learner,
         &mut batches,
@@ -250,15 +255,6 @@ struct Checkpointer {
 }
 
 impl Checkpointer {
-    const fn new(folder: PathBuf, counters: Arc<Counters>) -> Self {
-        Self {
-            folder,
-            counters,
-            saved: None,
-            failed: None,
-        }
-    }
-
     fn save(&mut self, learner: &Learner) {
         match learner.save(&self.folder) {
             Ok(()) => {
