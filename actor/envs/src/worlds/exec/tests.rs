@@ -126,6 +126,15 @@ fn faulty(arguments: &str) -> Result<(), EnvError> {
     world.step(&[0, 1], &mut [0.0; 2], &mut [StepEnd::Running; 2])
 }
 
+/// Lines of `what => sentence | sentence ..`.
+fn rows(table: &'static str) -> impl Iterator<Item = (&'static str, Vec<&'static str>)> {
+    table.trim().lines().map(|line| {
+        let (what, sentences) = line.split_once("=>").unwrap();
+        let sentences = sentences.split('|').map(str::trim);
+        (what.trim(), sentences.collect())
+    })
+}
+
 /// How a world fails by its arguments, and the sentences that say so.
 const FAULTS: &str = "
 raise 3       => ended in the middle of a step (exit status: 1) | RuntimeError: the dragon got out
@@ -145,10 +154,7 @@ saves lost    => ended in the middle of loading its state | the dragon does not 
 
 #[test]
 fn each_way_a_process_can_fail_has_its_sentence() {
-    for line in FAULTS.trim().lines() {
-        let (arguments, sentences) = line.split_once("=>").unwrap();
-        let arguments = arguments.trim();
-        let sentences: Vec<&str> = sentences.split('|').map(str::trim).collect();
+    for (arguments, sentences) in rows(FAULTS) {
         let started = Instant::now();
         let failed = faulty(arguments);
         assert!(started.elapsed() < Duration::from_secs(50), "{arguments}");
@@ -159,50 +165,34 @@ fn each_way_a_process_can_fail_has_its_sentence() {
     }
 }
 
+/// Commands that are no worlds, and the sentences that say so.
+const NO_WORLDS: &str = r#"
+no-such-command --now               => exit status 127: the shell found no such command
+exit 3                              => ended before it declared itself (exit status: 3)
+echo the ROM is missing >&2; exit 4 => Its last words: | the ROM is missing
+sleep 60                            => --set world.start_timeout_ms=N
+exec >&-; sleep 60                  => closed its stdout before it declared itself
+echo hello; read -r line            => does not declare itself as a world: its first line on stdout is "hello"
+"#;
+
 #[test]
 fn each_way_a_start_can_fail_has_its_sentence() {
-    let no_actions = ONE.replace(r#""no-op", "left", "right""#, "");
-    for (command, sentence) in [
-        (
-            "no-such-command --now".into(),
-            "exit status 127: the shell found no such command",
-        ),
-        (
-            "exit 3".into(),
-            "ended before it declared itself (exit status: 3)",
-        ),
-        (
-            "echo the ROM is missing >&2; exit 4".into(),
-            "Its last words:\n  the ROM is missing",
-        ),
-        ("sleep 60".into(), "--set world.start_timeout_ms=N"),
-        (
-            "exec >&-; sleep 60".into(),
-            "closed its stdout before it declared itself",
-        ),
-        (
-            "echo hello; read -r line".into(),
-            "does not declare itself as a world: its first line on stdout is \"hello\"",
-        ),
-        (declares("{}"), "\"driml_env\" is missing"),
-        (
-            declares(r#"{"driml_env": 1, "copies": 1}"#),
-            "missing field",
-        ),
-        (
-            declares(r#"{"driml_env": 2, "colour": 3}"#),
-            "speaks version 2 of the protocol, and this driml speaks version 1",
-        ),
-        (
-            declares(&ONE.replace("12", "0")),
-            "declares frames of 0 x 0 x 1",
-        ),
-        (declares(&no_actions), "declares 0 actions"),
-    ] {
+    let says = |command: &str, sentences: &[&str]| {
         // Long enough for everything that answers at all.
         let limit = if command == "sleep 60" { 500 } else { 60_000 };
-        fails(declaration(&command, limit, 1000), &[sentence]);
+        fails(declaration(command, limit, 1000), sentences);
+    };
+    for (command, sentences) in rows(NO_WORLDS) {
+        says(command, &sentences);
     }
+    let refused = |line: &str, sentence| says(&declares(line), &[sentence]);
+    refused("{}", "\"driml_env\" is missing");
+    refused(r#"{"driml_env": 1, "copies": 1}"#, "missing field");
+    let versions = "speaks version 2 of the protocol, and this driml speaks version 1";
+    refused(r#"{"driml_env": 2, "colour": 3}"#, versions);
+    refused(&ONE.replace("12", "0"), "declares frames of 0 x 0 x 1");
+    let no_actions = ONE.replace(r#""no-op", "left", "right""#, "");
+    refused(&no_actions, "declares 0 actions");
 }
 
 #[test]

@@ -152,16 +152,6 @@ impl ExecWorld {
         read.map_err(|e| self.process.system(doing, &e))?;
         Ok(state)
     }
-
-    fn load_process(&mut self, state: &[u8], frames: &[u8]) -> Result<(), EnvError> {
-        let doing = "in the middle of loading its state";
-        let written =
-            state_memory(state).and_then(|memory| self.block.write_frames(frames).map(|()| memory));
-        let memory = written.map_err(|e| self.process.system(doing, &e))?;
-        self.say_state(LOAD, &memory, doing)?;
-        // It belongs to a start, and may take as long: a world may have to play an episode again.
-        self.hear_done(self.config.start_patience(), doing)
-    }
 }
 
 /// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
@@ -351,6 +341,12 @@ impl Environment for ExecWorld {
         if !self.saves {
             return Err(EnvError::not_saved());
         }
-        self.load_process(&state, &frames)
+        let doing = "in the middle of loading its state";
+        let written = state_memory(&state)
+            .and_then(|memory| self.block.write_frames(&frames).map(|()| memory));
+        let memory = written.map_err(|e| self.process.system(doing, &e))?;
+        self.say_state(LOAD, &memory, doing)?;
+        // It belongs to a start, and may take as long: a world may have to play an episode again.
+        self.hear_done(self.config.start_patience(), doing)
     }
 }
