@@ -72,28 +72,23 @@ impl ChainWorld {
 
 impl WorldSettings for ChainConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        if self.cells < 3
-            || self.width < self.cells
-            || self.height == 0
-            || self.width.max(self.height) > 1024
-        {
-            return Err(EnvError::Config(format!(
-                "the chain needs cells >= 3, cells <= width <= 1024 and 1 <= height <= 1024, got cells = {}, width = {}, height = {}",
-                self.cells, self.width, self.height
-            )));
-        }
-        if self.step_limit == 0 {
-            return Err(EnvError::Config(
-                "the chain's step_limit must be at least 1, got 0".into(),
-            ));
-        }
-        if !self.reward_left.is_finite() || !self.reward_right.is_finite() {
-            return Err(EnvError::Config(format!(
-                "the chain's rewards must be finite, got reward_left = {} and reward_right = {}",
-                self.reward_left, self.reward_right
-            )));
-        }
-        Ok(())
+        let (cells, width, height) = (self.cells, self.width, self.height);
+        let (left, right) = (self.reward_left, self.reward_right);
+        let text = if cells < 3 || width < cells || height == 0 || width.max(height) > 1024 {
+            format!(
+                "the chain needs cells >= 3, cells <= width <= 1024 and 1 <= height <= 1024, got cells = {cells}, width = {width}, \
+                 height = {height}"
+            )
+        } else if self.step_limit == 0 {
+            "the chain's step_limit must be at least 1, got 0".into()
+        } else if !left.is_finite() || !right.is_finite() {
+            format!(
+                "the chain's rewards must be finite, got reward_left = {left} and reward_right = {right}"
+            )
+        } else {
+            return Ok(());
+        };
+        Err(EnvError::Config(text))
     }
 
     /// `height` x `width` x 1.
