@@ -187,12 +187,10 @@ impl Adam {
             };
             match moments {
                 Moments::Fused { m, v } => {
-                    let moments = Mutex::new((m.as_mut_slice(), v.as_mut_slice()));
-                    let all_finite = AtomicBool::new(true);
                     let step = Step {
                         rule,
-                        moments,
-                        all_finite,
+                        moments: Mutex::new((m.as_mut_slice(), v.as_mut_slice())),
+                        all_finite: AtomicBool::new(true),
                     };
                     var.inplace_op2(gradient, &step)?;
                     if !step.all_finite.into_inner() {
