@@ -15,8 +15,8 @@ pub enum UpdateError {
     /// State that does not fit the network, as from another run's checkpoint.
     #[error("learner state does not fit: {0}")]
     State(String),
-    #[error("{what} is not finite; the update is not taken")]
-    NonFinite { what: String },
+    #[error("{0} is not finite; the update is not taken")]
+    NonFinite(String),
     /// The step itself left the finite numbers: this learner can neither continue nor be published or saved.
     #[error(
         "update {update} took {name} beyond the finite numbers; the learner cannot continue: resume from the newest checkpoint with \

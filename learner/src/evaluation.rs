@@ -187,9 +187,8 @@ impl Networks {
             }
         }
         if !probs.iter().all(|p| p.is_finite()) {
-            return Err(UpdateError::NonFinite {
-                what: "the target network's distribution".to_owned(),
-            });
+            let what = "the target network's distribution";
+            return Err(UpdateError::NonFinite(what.to_owned()));
         }
         let mut projection = vec![0f32; probs.len()];
         project(
@@ -229,9 +228,8 @@ impl Networks {
         };
         let values = flat(&values)?;
         if !values.iter().all(|q| q.is_finite()) {
-            return Err(UpdateError::NonFinite {
-                what: format!("the {network} network's value of an s_{{t+n}}"),
-            });
+            let what = format!("the {network} network's value of an s_{{t+n}}");
+            return Err(UpdateError::NonFinite(what));
         }
         let of_state: Vec<u8> = values.chunks_exact(num_actions).map(greedy).collect();
         let logits = flat(&target_logits)?;

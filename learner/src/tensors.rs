@@ -49,11 +49,8 @@ pub(crate) fn floats_mut<'a>(
 /// A loss as a number; an error that names it unless it is finite.
 pub(crate) fn finite(what: &str, loss: &Tensor) -> Result<f32, UpdateError> {
     let value = loss.to_scalar::<f32>()?;
-    if value.is_finite() {
-        Ok(value)
-    } else {
-        Err(UpdateError::NonFinite {
-            what: what.to_owned(),
-        })
+    match value.is_finite() {
+        true => Ok(value),
+        false => Err(UpdateError::NonFinite(what.to_owned())),
     }
 }

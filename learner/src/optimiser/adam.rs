@@ -176,9 +176,8 @@ impl Adam {
         let lr = self.settings.lr;
         let rule = Rule::new(self.settings, step, factor);
         if !rule.step_size.is_finite() {
-            return Err(UpdateError::NonFinite {
-                what: format!("a step of Adam with lr = {lr:e}"),
-            });
+            let what = format!("a step of Adam with lr = {lr:e}");
+            return Err(UpdateError::NonFinite(what));
         }
         self.step = step;
         for (name, (_, moments)) in &mut self.moments {

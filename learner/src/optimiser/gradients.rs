@@ -60,9 +60,7 @@ impl Gradients {
         };
         let bad = self.by_name.keys().zip(&squares);
         if let Some((name, _)) = bad.into_iter().find(|(_, it)| !it.is_finite()) {
-            return Err(UpdateError::NonFinite {
-                what: format!("the gradient of {name}"),
-            });
+            return Err(UpdateError::NonFinite(format!("the gradient of {name}")));
         }
         Ok(squares.iter().sum::<f64>().sqrt())
     }
