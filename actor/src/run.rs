@@ -110,7 +110,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         return Ok(());
     };
     let limits = DeliveryLimits::of(&settings.actor);
-    let config = settings.actor.clone();
+    let (actor, config) = (args.actor, settings.actor.clone());
     let actors_planned = settings.actors_planned;
     let pool = settings.chunk_memory();
     let mut collector = Collector::new(
@@ -133,11 +133,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         pool,
         shutdown.clone(),
     )?;
-    tracing::info!(
-        "actor {} steps {} environments, run {spec_hash:016x}",
-        args.actor,
-        config.envs
-    );
+    let envs = config.envs;
+    tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
     // At the start not all are connected yet.
     let chunk_steps = |actors: u32| config.chunk_steps(actors.max(actors_planned));
     let played = play(
@@ -159,12 +156,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         tracing::warn!("not all that was played before could be delivered: {e}");
     }
     played?;
-    let unwanted = delivered?;
-    tracing::info!(
-        "actor {} leaves: {} transitions delivered",
-        args.actor,
-        produced - unwanted
-    );
+    let stored = produced - delivered?;
+    tracing::info!("actor {actor} leaves: {stored} transitions delivered");
     drop(alive);
     let closed = client.session().close().wait();
     closed.map_err(|e| anyhow::anyhow!("closing the session: {e}"))

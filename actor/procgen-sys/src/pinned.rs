@@ -21,11 +21,8 @@ impl<T: Copy> Pinned<T> {
 
     /// Address of element `index`, for the library to keep.
     pub(crate) fn address(&self, index: usize) -> *mut T {
-        assert!(
-            index < self.slice.len(),
-            "address of element {index} of {}",
-            self.slice.len()
-        );
+        let len = self.slice.len();
+        assert!(index < len, "address of element {index} of {len}");
         // SAFETY: the index was just checked, so the address lies within the allocation.
         unsafe { self.slice.cast::<T>().as_ptr().add(index) }
     }

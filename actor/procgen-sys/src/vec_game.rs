@@ -163,11 +163,9 @@ impl VecGame {
     pub fn act(&mut self, actions: &[i32]) -> Result<(), ProcgenError> {
         let (n, game) = (self.num_envs, self.game);
         let wrong = |text| Err(ProcgenError::Action(text));
-        if actions.len() != n {
-            return wrong(format!(
-                "{} actions for {n} environments of {game}",
-                actions.len()
-            ));
+        let count = actions.len();
+        if count != n {
+            return wrong(format!("{count} actions for {n} environments of {game}"));
         }
         let valid = RESET..NUM_ACTIONS as i32;
         if let Some(env) = actions.iter().position(|action| !valid.contains(action)) {

@@ -19,11 +19,9 @@ impl Alphabet {
     /// # Errors
     /// A table that is empty, longer than 255, or maps to an action that does not stand for itself.
     pub fn new(map: &[u8]) -> Result<Self, AffinityError> {
-        if map.is_empty() || map.len() > 255 {
-            return Err(AffinityError(format!(
-                "an alphabet of {} actions",
-                map.len()
-            )));
+        let count = map.len();
+        if !(1..=255).contains(&count) {
+            return Err(AffinityError(format!("an alphabet of {count} actions")));
         }
         for (raw, &visible) in map.iter().enumerate() {
             if map.get(usize::from(visible)) != Some(&visible) {

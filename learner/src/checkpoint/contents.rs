@@ -84,11 +84,9 @@ impl StateFile {
                 return Err(format!("{name} is {count}, more than {COUNT_MAX}"));
             }
         }
-        if !self.progress.is_sane() {
-            return Err(format!(
-                "{:?} are counts that no run reaches",
-                self.progress
-            ));
+        let progress = &self.progress;
+        if !progress.is_sane() {
+            return Err(format!("{progress:?} are counts that no run reaches"));
         }
         let valid = self.affinity.as_ref().map(AffinityEstimator::check_valid);
         valid.transpose().map_err(|why| why.to_string())?;

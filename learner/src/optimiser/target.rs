@@ -67,12 +67,9 @@ impl InplaceOp2 for Follow {
         l2: &Layout,
     ) -> candle_core::Result<()> {
         let (target, online) = (floats_mut(target, l1)?, floats(online, l2)?);
-        if target.len() != online.len() {
-            bail!(
-                "a target of {} values follows {}",
-                target.len(),
-                online.len()
-            );
+        let (len, followed) = (target.len(), online.len());
+        if len != followed {
+            bail!("a target of {len} values follows {followed}");
         }
         if self.tau >= 1.0 {
             target.copy_from_slice(online);

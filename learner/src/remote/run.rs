@@ -127,10 +127,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     )?;
     let counters = Counters::of(updates, learner.progress());
     let mut batches = BatchSource::start(&clients, requests, &counters, shutdown)?;
-    tracing::info!(
-        "learning on {} from batches of {rows} rows, run {spec_hash:016x}",
-        args.device,
-    );
+    let device = args.device;
+    tracing::info!("learning on {device} from batches of {rows} rows, run {spec_hash:016x}");
 
     let mut checkpointer = Checkpointer {
         folder,
