@@ -273,6 +273,7 @@ fn ask(
         .send(request, PIECE_TIMEOUT)
         .map_err(|e| WeightsError::Failed(format!("asking for weights: {e}")))
 }
+
 #[cfg(test)]
 mod tests {
     use driml_protocol::WeightsHeader;

@@ -152,11 +152,7 @@ mod tests {
         };
         assert_eq!(UpdateCost::of(&model(DimHeads::NONE), &c51), plain);
 
-        let lambda = Lambda {
-            l3t3: 1.0,
-            l4t4: 1.0,
-            ..Lambda::NONE
-        };
+        let lambda = Lambda::of([1.0, 0.0, 0.0, 1.0]);
         let passes = Passes::of_pairs(lambda, 2, true);
         let dim = UpdateShape {
             every_action: true,

@@ -29,20 +29,20 @@ pub struct Lambda {
 
 impl Lambda {
     /// Every pair with a weight of 1.
-    pub const EVERY: Self = Self {
-        l3t3: 1.0,
-        l3t4: 1.0,
-        l4t3: 1.0,
-        l4t4: 1.0,
-    };
+    pub const EVERY: Self = Self::of([1.0; 4]);
 
     /// No pair: every weight is 0.
-    pub const NONE: Self = Self {
-        l3t3: 0.0,
-        l3t4: 0.0,
-        l4t3: 0.0,
-        l4t4: 0.0,
-    };
+    pub const NONE: Self = Self::of([0.0; 4]);
+
+    /// Weights in the order of [`PAIRS`].
+    pub const fn of([l3t3, l3t4, l4t3, l4t4]: [f64; 4]) -> Self {
+        Self {
+            l3t3,
+            l3t4,
+            l4t3,
+            l4t4,
+        }
+    }
 
     /// In the order of [`PAIRS`].
     pub const fn values(&self) -> [f64; 4] {
@@ -136,25 +136,15 @@ mod tests {
 
     #[test]
     fn only_the_heads_of_weighted_pairs_are_needed() {
-        let lambda = |l3t3, l3t4, l4t3, l4t4| Lambda {
-            l3t3,
-            l3t4,
-            l4t3,
-            l4t4,
-        };
-        let parts = |lambda: Lambda| {
-            let p = lambda.dim_heads(true);
-            [p.psi3, p.phi3, p.psi4, p.phi4, p.action]
-        };
-        assert_eq!(parts(lambda(0.0, 0.0, 0.0, 0.0)), [false; 5]);
-        assert_eq!(
-            parts(lambda(0.0, 0.0, 0.0, 1.0)),
-            [false, false, true, true, true]
-        );
-        assert_eq!(
-            parts(lambda(0.0, 0.5, 0.0, 0.0)),
-            [true, false, false, true, true]
-        );
-        assert_eq!(parts(lambda(1.0, 0.0, 0.0, 1.0)), [true; 5]);
+        for (weights, needed) in [
+            ([0.0; 4], [false; 5]),
+            ([0.0, 0.0, 0.0, 1.0], [false, false, true, true, true]),
+            ([0.0, 0.5, 0.0, 0.0], [true, false, false, true, true]),
+            ([1.0, 0.0, 0.0, 1.0], [true; 5]),
+        ] {
+            let it = Lambda::of(weights).dim_heads(true);
+            let parts = [it.psi3, it.phi3, it.psi4, it.phi4, it.action];
+            assert_eq!(parts, needed, "{weights:?}");
+        }
     }
 }
