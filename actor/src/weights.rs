@@ -28,12 +28,10 @@ const SILENT_MAX: Duration = Duration::from_secs(5);
 /// Why there are no weights, or no newer ones.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum WeightsError {
-    /// The learner has sent none yet, or they could not be pulled in the time given.
     #[error(
         "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
     )]
     NoneInTime {
-        /// How long they were waited for.
         wait_max: Duration,
         /// Why the last pull failed, if it did.
         source: Option<Box<Self>>,
@@ -47,7 +45,6 @@ pub(crate) enum WeightsError {
     /// A request that cannot be sent, pieces that are missing or of another version, or announcements that cannot be received.
     #[error("{0}")]
     Failed(String),
-    /// The system starts no thread.
     #[error(transparent)]
     NoThread(#[from] std::io::Error),
 }

@@ -9,6 +9,7 @@ pub const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no e
 
 /// Why the engine is not there, could not be put there, made or driven.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum ProcgenError {
     /// The engine is not installed, or something of it is gone; and how to get it, with and without a network.
     #[error(
@@ -17,30 +18,22 @@ pub enum ProcgenError {
         .root.display(), .fetched_by, .root.parent().unwrap_or(.root).display()
     )]
     Missing {
-        /// Where it would lie.
         root: PathBuf,
-        /// What is missing.
         reason: String,
-        /// The command that fetches the wheel.
         fetched_by: String,
     },
     /// The cache folder cannot be used: no variable names it, or others can change it.
     #[error("procgen's engine has no safe place: {0} {WITHOUT_ENGINE}")]
     Cache(String),
-    /// pip is missing, or failed.
     #[error("fetching procgen's engine: {0} {WITHOUT_ENGINE}")]
     Fetch(String),
     /// The wheel, or the library in it, is not the pinned one.
     #[error("unpacking {0}; delete it and fetch it again {WITHOUT_ENGINE}")]
     Wheel(String),
-    /// The file system reports an error, such as a full disk.
     #[error("installing procgen's engine: {doing} {}: {source} {WITHOUT_ENGINE}", .path.display())]
     Io {
-        /// What was being done.
         doing: &'static str,
-        /// With which file or folder.
         path: PathBuf,
-        /// What the system reported.
         source: io::Error,
     },
     /// The engine is built for Linux on x86-64 with AVX only.

@@ -61,13 +61,11 @@ impl DeliveryState {
 
 /// Why chunks could not be delivered.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message says it")]
 pub enum DeliveryError {
-    /// No answer for too long.
     #[error("the replay server was out of reach for {within:?}")]
     OutOfReach {
-        /// How long it was tried.
         within: Duration,
-        /// The last try's error.
         source: SessionError,
     },
     /// Anything else: a chunk was refused, or not stored in the time that an actor has which was told to stop.

@@ -256,7 +256,6 @@ impl Config {
     }
 }
 
-/// The batch of a case.
 fn inputs(
     tensors: &Tensors,
     obs: &Observation,
@@ -301,7 +300,6 @@ fn inputs(
     })
 }
 
-/// The tensors of a file by name.
 struct Tensors(BTreeMap<String, Tensor>);
 
 impl Tensors {

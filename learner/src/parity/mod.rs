@@ -404,7 +404,6 @@ mod tests {
 
     use super::*;
 
-    /// Beside the report.
     #[test]
     fn an_actor_s_values_agree_with_every_case() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/parity");

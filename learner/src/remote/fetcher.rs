@@ -101,7 +101,6 @@ pub(super) enum Fetched {
     Failed(BatchError),
 }
 
-/// What all fetching threads share.
 pub(super) struct Shared {
     clients: Vec<RunClient>,
     requests: Requests,
@@ -345,7 +344,6 @@ impl Fetcher {
         Ok(())
     }
 
-    /// Asks a shard for `rows` rows.
     fn ask(
         &mut self,
         shard: usize,

@@ -188,7 +188,6 @@ impl Portion {
 /// The one batch that is assembled from the parts of several shards. It outlives a failed try, because a part that was
 /// given is counted as sampled.
 pub(super) struct PartialBatch {
-    /// Of each shard.
     pub(super) portions: Vec<Portion>,
     pub(super) parts: Vec<Batch>,
     pub(super) from: Vec<ServedPart>,

@@ -65,7 +65,6 @@ pub struct IsingOverlay {
 }
 
 impl PacmanConfig {
-    /// Whether every value is within its range.
     pub(super) fn check(&self) -> Result<(), EnvError> {
         for (name, value) in [
             ("epsilon", self.epsilon),

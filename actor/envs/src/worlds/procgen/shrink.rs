@@ -43,7 +43,6 @@ impl Shrink {
         }
     }
 
-    /// What it makes.
     pub(super) const fn shape(side: usize, grey: bool) -> FrameShape {
         FrameShape::new(side, side, if grey { 1 } else { RGB })
     }
