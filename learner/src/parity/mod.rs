@@ -6,6 +6,7 @@ pub mod deviation;
 mod tolerance;
 
 use std::{
+    collections::BTreeMap,
     fmt,
     path::{Path, PathBuf},
 };
@@ -214,8 +215,8 @@ impl Check<'_> {
                 angles.add("1 - cosine", name, 1.0 - cosine, angle);
             }
         }
-        self.lines
-            .extend(worst.lines.into_iter().chain(angles.lines));
+        self.lines.extend(worst.0.into_values());
+        self.lines.extend(angles.0.into_values());
         Ok(())
     }
 
@@ -235,8 +236,8 @@ impl Check<'_> {
             let error = largest(&flat_f64(var)?, &expected);
             keys.add("updated_key", name, error, tolerance);
         }
-        self.lines
-            .extend(online.lines.into_iter().chain(keys.lines));
+        self.lines.extend(online.0.into_values());
+        self.lines.extend(keys.0.into_values());
         Ok(())
     }
 }
@@ -341,31 +342,20 @@ fn line(name: &str, error: f64, tolerance: f64) -> ParityLine {
     }
 }
 
-/// Lines of parameter groups (`torso`, `head`, `dim.psi3`, ..): of each, the tensor nearest to its tolerance.
+/// Lines of parameter groups (`torso`, `head`, `dim.psi3`, ..), by group: of each, the tensor nearest to its tolerance.
 #[derive(Default)]
-struct Worst {
-    lines: Vec<ParityLine>,
-    groups: Vec<String>,
-}
+struct Worst(BTreeMap<String, ParityLine>);
 
 impl Worst {
     fn add(&mut self, what: &str, name: &str, error: f64, tolerance: f64) {
         let parts = if name.starts_with("dim.") { 2 } else { 1 };
         let group = name.split('.').take(parts).collect::<Vec<_>>().join(".");
         let new = line(&format!("{what}.{name}"), error, tolerance);
-        match self.groups.iter().position(|known| *known == group) {
-            None => {
-                self.groups.push(group);
-                self.lines.push(new);
-            }
-            Some(at) => {
-                let old = &self.lines[at];
-                // A NaN, once there, stays.
-                let nearer = error * old.tolerance > old.error * tolerance;
-                if !old.error.is_nan() && (nearer || error.is_nan()) {
-                    self.lines[at] = new;
-                }
-            }
+        let worst = self.0.entry(group).or_insert_with(|| new.clone());
+        // A NaN, once there, stays.
+        let nearer = error * worst.tolerance > worst.error * tolerance;
+        if !worst.error.is_nan() && (nearer || error.is_nan()) {
+            *worst = new;
         }
     }
 }
