@@ -41,11 +41,8 @@ pub fn list(folder: &Path) -> Result<Vec<(u64, PathBuf)>, CheckpointError> {
     let mut all = Vec::new();
     for entry in entries {
         let path = entry.map_err(io_error("read", folder))?.path();
-        let name = path
-            .file_name()
-            .and_then(|name| name.to_str())
-            .unwrap_or_default();
-        let Some(rest) = name.strip_prefix(PREFIX) else {
+        let name = path.file_name().and_then(|name| name.to_str());
+        let Some(rest) = name.and_then(|name| name.strip_prefix(PREFIX)) else {
             continue;
         };
         // One that is being replaced counts as long as the new one does not have its name.

@@ -1,10 +1,11 @@
 //! A loss as a candle operation: the forward pass computes value and gradient at once, the backward pass hands the gradient out.
 //! It is for the CPU, and for one backward pass.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use driml_model::floats;
+use driml_protocol::lock;
 
 /// The scalar `loss(input)`, differentiable in `input`.
 ///
@@ -38,18 +39,13 @@ impl<F: Fn(&[f32], &mut [f32]) -> f64 + Send + Sync> CustomOp1 for ScalarOp<F> {
         let input = floats(storage, layout)?;
         let mut gradient = vec![0f32; input.len()];
         let value = (self.loss)(input, &mut gradient);
-        *self.gradient.lock().unwrap_or_else(PoisonError::into_inner) = Some(gradient);
+        *lock(&self.gradient) = Some(gradient);
         Ok((CpuStorage::F32(vec![value as f32]), Shape::from(())))
     }
 
     /// The stored gradient times the scalar `grad_res`.
     fn bwd(&self, arg: &Tensor, _: &Tensor, grad_res: &Tensor) -> Result<Option<Tensor>> {
-        let stored = self
-            .gradient
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .take();
-        let Some(mut gradient) = stored else {
+        let Some(mut gradient) = lock(&self.gradient).take() else {
             bail!("{} has one backward pass", self.name);
         };
         let factor = grad_res.to_scalar::<f32>()?;

@@ -12,6 +12,7 @@ use std::{
 
 use candle_core::{CpuStorage, DType, Device, InplaceOp2, Layout, Tensor, Var, bail};
 use driml_model::{Kernels, Parameters, floats};
+use driml_protocol::lock;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -388,10 +389,7 @@ impl InplaceOp2 for Step<'_> {
     ) -> candle_core::Result<()> {
         let parameter = floats_mut(parameter, l1)?;
         let gradient = floats(gradient, l2)?;
-        let mut moments = self
-            .moments
-            .lock()
-            .expect("nothing panics while it holds this lock");
+        let mut moments = lock(&self.moments);
         let (m, v) = &mut *moments;
         if parameter.len() != m.len() || gradient.len() != m.len() {
             bail!(

@@ -120,12 +120,8 @@ impl Case {
         let config: Config = serde_json::from_str(text.ok_or_else(|| bad("it is missing"))?)
             .map_err(|why| bad(&why.to_string()))?;
         let tensors = candle_core::safetensors::load_buffer(bytes, &Device::Cpu);
-        let tensors = Tensors(
-            tensors
-                .map_err(|e| cut(e.to_string()))?
-                .into_iter()
-                .collect(),
-        );
+        let tensors = tensors.map_err(|e| cut(e.to_string()))?;
+        let tensors = Tensors(tensors.into_iter().collect());
         let settings = config.settings();
         let expectations = tensors.0.keys().filter(|name| name.starts_with("expect."));
         Ok(Self {
@@ -191,11 +187,8 @@ impl Case {
 
     /// The parameters under `prefix` that `model` builds: heads that no lambda uses are left out.
     pub(super) fn parameters(&self, prefix: &str, model: &ModelConfig) -> HashMap<String, Tensor> {
-        let built: BTreeSet<_> = model
-            .parameter_shapes()
-            .into_iter()
-            .map(|it| it.0)
-            .collect();
+        let shapes = model.parameter_shapes().into_iter();
+        let built: BTreeSet<_> = shapes.map(|it| it.0).collect();
         let named = self.under(prefix).filter(|(name, _)| built.contains(*name));
         named
             .map(|(name, it)| (name.to_owned(), it.clone()))

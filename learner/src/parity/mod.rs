@@ -316,11 +316,8 @@ fn forward_losses(case: &Case, compute: &Compute) -> Result<Vec<Forward>, Parity
     })?;
     let saturates = |it: &Dots| -> Result<bool, ParityError> {
         let scores = Scores::new(it.width, settings.tanh_clip);
-        let largest = flat_f64(&it.dots)?
-            .into_iter()
-            .map(f64::abs)
-            .fold(0.0, f64::max);
-        Ok(largest * scores.scale > scores.tanh_clip)
+        let mut dots = flat_f64(&it.dots)?.into_iter();
+        Ok(dots.any(|dot| dot.abs() * scores.scale > scores.tanh_clip))
     };
     let mut forward = Vec::new();
     for it in &losses {

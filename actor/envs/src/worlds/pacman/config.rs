@@ -121,11 +121,8 @@ impl LethalSchedule {
                 "lethal_schedule.episodes_per_task must be at least 1, got 0".into(),
             ));
         }
-        let unknown = self
-            .order
-            .iter()
-            .find(|&&ghost| usize::from(ghost) >= GHOSTS);
-        match unknown {
+        let mut ghosts = self.order.iter();
+        match ghosts.find(|&&ghost| usize::from(ghost) >= GHOSTS) {
             Some(ghost) => Err(invalid(format!(
                 "lethal_schedule.order names ghost {ghost}, but they are 0 to 3"
             ))),
