@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    affinity::AffinityError,
+    affinity::{AffinityError, AffinityEstimator},
     agent::Agent,
     checkpoint::{self, CheckpointError, Label, LearnerState},
     config::LearnerConfig,
@@ -103,12 +103,11 @@ impl Learner {
         let Some(restored) = restored else {
             return Ok(this);
         };
-        let same_affinity = match (&this.state.affinity, &restored.affinity) {
-            (Some(fresh), Some(found)) => found.has_settings_of(fresh),
-            (None, None) => true,
-            _ => false,
-        };
-        if !same_affinity {
+        let [fresh, found] = [&this.state, &restored].map(|it| {
+            let affinity = it.affinity.as_ref();
+            affinity.map(AffinityEstimator::settings)
+        });
+        if fresh != found {
             return Err(LearnerError::OtherAffinity(folder.to_owned()));
         }
         this.state = LearnerState {

@@ -63,25 +63,17 @@ impl AffinityEstimator {
         }
     }
 
-    /// Whether both estimate in the same way over the same actions, however far each has come.
-    pub fn has_settings_of(&self, other: &Self) -> bool {
-        match (self, other) {
-            (Self::Learned(a), Self::Learned(b)) => {
-                a.alphabet == b.alphabet && a.settings == b.settings
-            }
-            (Self::Exact(a), Self::Exact(b)) => {
-                a.alphabet == b.alphabet && a.settings == b.settings
-            }
-            _ => false,
+    /// In which way it estimates, and over which actions, however far it has come.
+    pub(crate) fn settings(&self) -> (&Alphabet, Option<LearnedSettings>, Option<ExactSettings>) {
+        match self {
+            Self::Learned(learned) => (&learned.alphabet, Some(learned.settings), None),
+            Self::Exact(exact) => (&exact.alphabet, None, Some(exact.settings)),
         }
     }
 
     /// Raw actions n, the side of the matrix.
     pub fn num_actions(&self) -> usize {
-        match self {
-            Self::Learned(learned) => learned.alphabet.num_actions(),
-            Self::Exact(exact) => exact.alphabet.num_actions(),
-        }
+        self.settings().0.num_actions()
     }
 }
 
