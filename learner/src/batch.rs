@@ -171,13 +171,8 @@ impl<'a> Batch<'a> {
         in_places(self.states_k, state_bytes, valid).collect()
     }
 
-    /// The pairs (a_t, a_{t+1}) of the rows that have both.
-    pub fn action_pairs(&self) -> Vec<(u8, u8)> {
-        self.action_pairs_of(0..self.action.len())
-    }
-
-    /// The same of these rows, of which some may come twice.
-    pub fn action_pairs_of(&self, rows: impl IntoIterator<Item = usize>) -> Vec<(u8, u8)> {
+    /// The pairs (a_t, a_{t+1}) of those of `rows` that have both; some may come twice.
+    pub fn action_pairs(&self, rows: impl IntoIterator<Item = usize>) -> Vec<(u8, u8)> {
         let pairs = rows
             .into_iter()
             .map(|row| (self.action[row], self.next_action[row]));

@@ -159,8 +159,8 @@ impl Learner {
         if let Some(affinity) = &mut affinity {
             // Of rows drawn by priority it would be the affinity of surprising transitions.
             let pairs = match &columns.probabilities {
-                None => batch.action_pairs(),
-                Some(it) => batch.action_pairs_of(drawn_evenly(it, &mut rng)),
+                None => batch.action_pairs(0..batch.rows),
+                Some(it) => batch.action_pairs(drawn_evenly(it, &mut rng)),
             };
             affinity.observe(&pairs, &mut rng)?;
         }

@@ -59,7 +59,7 @@ pub(crate) fn learn(run: &mut LearnerState, updates: u64) {
         let rows = random_batch(6, run.agent.updates());
         run.agent.update(&rows.batch()).unwrap();
         let affinity = run.affinity.as_mut().unwrap();
-        let pairs = rows.batch().action_pairs();
+        let pairs = rows.batch().action_pairs(0..6);
         affinity.observe(&pairs, &mut run.rng).unwrap();
     }
 }
