@@ -135,7 +135,6 @@ impl Layout {
 pub(super) struct Block {
     file: File,
     layout: Layout,
-    copies: usize,
     /// Rewards, padding, ends: memory to use again.
     results: Vec<u8>,
 }
@@ -152,7 +151,6 @@ impl Block {
         Ok(Self {
             file,
             layout,
-            copies,
             results: vec![0; layout.ends + copies - layout.rewards],
         })
     }
@@ -178,7 +176,7 @@ impl Block {
         for (reward, bytes) in rewards.iter_mut().zip(numbers) {
             *reward = f32::from_ne_bytes(bytes.try_into().expect("four bytes"));
         }
-        Ok(&ends[..self.copies])
+        Ok(ends)
     }
 
     /// Reads the frames [N, H, W, C].
