@@ -7,10 +7,7 @@ use zenoh::{Session, bytes::ZBytes};
 
 use crate::{
     client::RunClient,
-    messages::{
-        join::{JoinReply, Welcome},
-        run_info::RunInfo,
-    },
+    messages::join::{JoinReply, RunInfo, Welcome},
     process::{log_limiter::LogLimiter, shutdown::Shutdown, silence::Silence},
     session::{self, SessionError},
     wire::{

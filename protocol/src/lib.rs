@@ -40,26 +40,20 @@ mod wire;
 
 pub use client::{Announcer, PendingReply, RunClient, Sealed};
 pub use messages::{
-    ack::Ack,
     affinity::AffinityUpdate,
-    batch::{Batch, NO_ACTION},
+    batch::{Batch, BatchStatesMut, NO_ACTION, RowScalars},
     batch_frames::StackedFrames,
     batch_header::{BatchHeader, BatchReply, NotReady, POOL_BATCHES},
-    batch_request::{BatchRequest, Learned, RequestId},
-    batch_rows::{BatchStatesMut, RowScalars},
-    chunk::{Chunk, ChunkHeader, End, TRANSITION_BYTES, transitions_max},
+    batch_request::{BatchRequest, Learned, RequestId, ShardCounts},
+    chunk::{Chunk, ChunkHeader, ChunkPoll, End, InsertReply, TRANSITION_BYTES, transitions_max},
     episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
-    insert_reply::{ChunkPoll, InsertReply},
-    join::{ActorJoin, JoinReply, LearnerJoin, Welcome},
-    leave::Leave,
+    join::{ActorJoin, JoinReply, LearnerJoin, Leave, RunInfo, Welcome},
     priorities::{Origin, PriorityPart, PriorityUpdate},
     processes::{LogStatus, ProcessStatus, ProcessesStatus, WARNINGS_MAX},
     recovering::{Recovering, RecoveryProgress},
     report::{Participant, Report, Warning},
-    run_info::RunInfo,
-    shard_counts::ShardCounts,
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
-    table::Kind,
+    table::{Ack, Kind},
     weights::{
         Assembly, PIECE_BYTES, Weights, WeightsHeader, WeightsReply, WeightsRequest, WeightsUpload,
         WeightsVersion,
@@ -67,9 +61,8 @@ pub use messages::{
 };
 pub use process::{
     activity::Activity,
-    atomic_write, fail_point, last_warning, lock_file,
+    atomic_write, fail_point, last_warning, lock, lock_file,
     log_limiter::{LogLimiter, LogLimiters},
-    mutex::lock,
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
 };

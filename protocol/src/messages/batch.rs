@@ -1,13 +1,11 @@
-//! Batches on their way from the replay server to the learner.
+//! Batches on their way from the replay server to the learner: how they are written, merged of parts, and read.
 //! It does not sample: which rows and which k are the replay server's choice.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, ops::Range};
 
 use super::{
     batch_frames::StackedFrames,
-    batch_header::BatchHeader,
-    batch_layout::Column,
-    batch_rows::{BatchStatesMut, RowScalars},
+    batch_header::{BatchHeader, Column},
     priorities::{Origin, PriorityPart, PriorityUpdate},
 };
 use crate::wire::{buffers::Buffer, error::CodecError};
@@ -52,9 +50,33 @@ impl Batch {
         };
         let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
         for (row, scalars) in rows.iter().enumerate() {
-            scalars.write(&header, &mut batch.payload, row);
+            batch.set_scalars(row, scalars);
         }
         batch
+    }
+
+    fn set_scalars(&mut self, row: usize, scalars: &RowScalars) {
+        let (rows, positives) = (self.rows(), self.header.positives);
+        assert!(scalars.positives <= positives, "at most P");
+        let n_step_return = scalars.n_step_return.to_le_bytes();
+        let discount = scalars.bootstrap_discount.to_le_bytes();
+        self.put(Column::NStepReturn, row, &n_step_return);
+        self.put(Column::BootstrapDiscount, row, &discount);
+        self.put(Column::Action, row, &[scalars.action]);
+        self.put(Column::NextAction, row, &[scalars.next_action]);
+        for p in 0..positives {
+            let there = p < scalars.positives;
+            let k = u8::try_from(scalars.k_first + p).unwrap_or(u8::MAX);
+            let at = p as usize * rows + row;
+            self.put(Column::PositiveValid, at, &[there.into()]);
+            self.put(Column::K, at, &[if there { k } else { 0 }]);
+        }
+    }
+
+    /// Writes one value of a column that is neither of states nor of frames.
+    fn put(&mut self, column: Column, at: usize, value: &[u8]) {
+        let column = &mut self.payload[self.header.range(column)];
+        column[at * value.len()..][..value.len()].copy_from_slice(value);
     }
 
     /// A batch in memory that may hold anything.
@@ -75,13 +97,14 @@ impl Batch {
     pub fn merge(parts: &[Self], memory: Buffer) -> Self {
         let header = Self::merged_header(parts).expect("parts of one batch");
         let mut merged = Self::in_memory(header, memory);
-        for column in Column::ALL {
+        for (column, _) in header.columns() {
             let mut to = &mut merged.payload[header.range(column)];
+            let pieces: Vec<_> = parts.iter().map(|part| part.pieces(column)).collect();
             // Of each positive, the rows of the part come together.
-            for positive in 0..header.values_a_row(column) {
+            for piece in 0..pieces[0].len() {
                 let mut frames_before = 0;
-                for part in parts {
-                    let from = part.of_positive(column, positive);
+                for (part, pieces) in parts.iter().zip(&pieces) {
+                    let from = pieces[piece];
                     let place = to.split_off_mut(..from.len());
                     let place = place.expect("the parts fill the column");
                     place.copy_from_slice(from);
@@ -98,20 +121,23 @@ impl Batch {
         merged
     }
 
-    /// The values of a column that are of this positive; all of a column that is not of positives.
-    fn of_positive(&self, column: Column, positive: usize) -> &[u8] {
+    /// The values of a column, those of each positive for themselves; all at once where a column is not of positives.
+    fn pieces(&self, column: Column) -> Vec<&[u8]> {
         let values = self.column(column);
         match column {
             Column::StatesK => {
                 let valid = self.positive_valid().chunks_exact(self.rows());
-                let there = |valid: &[u8]| valid.iter().filter(|valid| **valid != 0).count();
-                let before: usize = valid.clone().take(positive).map(there).sum();
-                let own = valid.clone().nth(positive).map_or(0, there);
-                let bytes = self.header.value_bytes();
-                &values[before * bytes..(before + own) * bytes]
+                let mut rest = values;
+                let own = |valid: &[u8]| {
+                    let there = valid.iter().filter(|valid| **valid != 0).count();
+                    let (own, others) = rest.split_at(there * self.header.value_bytes());
+                    rest = others;
+                    own
+                };
+                valid.map(own).collect()
             }
-            Column::PositiveValid | Column::K => &values[positive * self.rows()..][..self.rows()],
-            _ => values,
+            Column::PositiveValid | Column::K => values.chunks_exact(self.rows()).collect(),
+            _ => vec![values],
         }
     }
 
@@ -161,8 +187,7 @@ impl Batch {
     }
 
     fn column_f32(&self, column: Column) -> Vec<f32> {
-        let (values, _) = self.column(column).as_chunks();
-        values.iter().copied().map(f32::from_le_bytes).collect()
+        self.header.f32s(column, &self.payload).collect()
     }
 
     /// The states of a column; where they are stacks of frames, put together now.
@@ -238,14 +263,9 @@ impl Batch {
     pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
-        let header = self.header;
         for (row, (transition, probability)) in draws.enumerate() {
-            let mut put = |column, bytes: &[u8]| {
-                let column = &mut self.payload[header.range(column)];
-                column[row * bytes.len()..][..bytes.len()].copy_from_slice(bytes);
-            };
-            put(Column::Transition, &transition.to_le_bytes());
-            put(Column::Probability, &probability.to_le_bytes());
+            self.put(Column::Transition, row, &transition.to_le_bytes());
+            self.put(Column::Probability, row, &probability.to_le_bytes());
         }
     }
 
@@ -301,4 +321,110 @@ impl Batch {
         header.check_payload(&payload)?;
         Ok(Self::in_memory(header, payload))
     }
+}
+
+/// All of a row but its states.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RowScalars {
+    /// a_t.
+    pub action: u8,
+    /// a_{t+1}, or [`NO_ACTION`].
+    pub next_action: u8,
+    /// Sum of gamma^i r_{t+i} over i < n, stopped at the episode's end.
+    pub n_step_return: f32,
+    /// gamma^n, or 0 where the row does not bootstrap.
+    pub bootstrap_discount: f32,
+    /// Positives that the row has: the first so many of P.
+    pub positives: u32,
+    /// k of the first of them; the others follow it step by step. It travels capped at 255.
+    pub k_first: u32,
+}
+
+impl RowScalars {
+    /// Whether the row has an s_{t+n}.
+    pub fn bootstraps(&self) -> bool {
+        self.bootstrap_discount != 0.0
+    }
+
+    /// k of each positive that the row has.
+    pub const fn ks(&self) -> Range<u32> {
+        self.k_first..self.k_first + self.positives
+    }
+}
+
+/// The places of a batch's states and their frames, borrowed for writing.
+///
+/// States have numbers: those of s_t, then those of s_{t+k}, then those of s_{t+n}. Where a state is one frame, that has its number.
+#[derive(Debug)]
+pub struct BatchStatesMut<'a> {
+    rows: usize,
+    frame_bytes: usize,
+    /// The frames that travel.
+    frames: &'a mut [u8],
+    /// Of each state, which of them it is made of; none where states are one frame each.
+    stacks: &'a mut [u8],
+    stack_bytes: usize,
+    /// Of each positive [P, B] the number of its state.
+    numbers_k: Vec<Option<usize>>,
+    /// Of each row the number of its s_{t+n}.
+    numbers_n: Vec<Option<usize>>,
+}
+
+impl<'a> BatchStatesMut<'a> {
+    /// Those of a payload whose scalars are written.
+    fn new(header: BatchHeader, payload: &'a mut [u8]) -> Self {
+        let rows = header.rows as usize;
+        let first_n = rows + header.states_k as usize;
+        let numbers_k = numbers(&header.positives_there(payload), rows);
+        let numbers_n = numbers(&header.bootstraps(payload), first_n);
+        let (count, frame_bytes) = header.frames();
+        let (frames, rest) = payload.split_at_mut(count * frame_bytes);
+        let (stack_bytes, stacks) = match header.stacked {
+            None => (0, &mut [][..]),
+            Some(_) => {
+                let bytes = header.value_bytes();
+                let states = first_n + header.states_n as usize;
+                (bytes, &mut rest[..states * bytes])
+            }
+        };
+        Self {
+            rows,
+            frame_bytes,
+            frames,
+            stacks,
+            stack_bytes,
+            numbers_k,
+            numbers_n,
+        }
+    }
+
+    /// The numbers of the states that `row` has, in this order: of s_t, of s_{t+n}, and of s_{t+k} of each positive.
+    pub fn of_row(&self, row: usize) -> impl Iterator<Item = usize> {
+        let of_positives = self.numbers_k.iter().skip(row).step_by(self.rows);
+        let first = [Some(row), self.numbers_n[row]];
+        first.into_iter().chain(of_positives.copied()).flatten()
+    }
+
+    /// Where frame `number` is written.
+    pub fn frame(&mut self, number: usize) -> &mut [u8] {
+        &mut self.frames[number * self.frame_bytes..][..self.frame_bytes]
+    }
+
+    /// Says of which frames state `number` is made, oldest first.
+    pub fn set_stack(&mut self, number: usize, frames: &[u32]) {
+        let stack = &mut self.stacks[number * self.stack_bytes..][..self.stack_bytes];
+        StackedFrames::write(stack, frames);
+    }
+}
+
+/// Of each its number, counted from `first` over those that are there.
+fn numbers(there: &[bool], first: usize) -> Vec<Option<usize>> {
+    let mut next = first;
+    let number = |&there: &bool| {
+        there.then(|| {
+            next += 1;
+            next - 1
+        })
+    };
+    there.iter().map(number).collect()
 }

@@ -1,10 +1,12 @@
-//! What a batch says of itself, and the reply that it travels in.
+//! What a batch says of itself, how its columns lie in its payload, and the reply that it travels in.
 //! It knows how many bytes a batch has and which are absurd; what they mean is `batch`'s.
+
+use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 use super::{
-    batch_frames::StackedFrames, priorities::Origin, shard_counts::ShardCounts, status::Waiting,
+    batch_frames::StackedFrames, batch_request::ShardCounts, priorities::Origin, status::Waiting,
 };
 use crate::{
     run_spec::RunSpec,
@@ -114,13 +116,135 @@ impl BatchHeader {
                 counted.0, counted.1, self.states_k, self.states_n
             )));
         }
-        let mut chances = self.probabilities(payload);
+        let mut chances = self.f32s(Column::Probability, payload);
         if let Some(chance) = chances.find(|chance| !(*chance > 0.0 && *chance <= 1.0)) {
             return Err(CodecError::Header(format!(
                 "a row that was drawn with the probability {chance}"
             )));
         }
         Ok(())
+    }
+}
+
+/// The columns of a batch, in the order in which they lie one after the other. Each has a value for every row; those of the
+/// positives have one for every row of the first positive, then of the second, and so on. States that a row does not have are left out.
+/// Where states are stacks of frames, each frame is there once, and the columns of states say which of them each is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Column {
+    Frames,
+    StatesT,
+    StatesK,
+    StatesN,
+    NStepReturn,
+    BootstrapDiscount,
+    Action,
+    NextAction,
+    PositiveValid,
+    K,
+    Transition,
+    Probability,
+}
+
+impl Column {
+    pub(super) const fn is_of_states(self) -> bool {
+        matches!(self, Self::StatesT | Self::StatesK | Self::StatesN)
+    }
+}
+
+/// Where everything lies in the payload.
+impl BatchHeader {
+    /// All columns in their order, and the bytes of each. A return, a discount and a probability are an f32, a transition is a u64, all
+    /// else that is neither a state nor a frame is a u8. Of numbers of 32 bits, no three make an overflow.
+    pub(super) fn columns(&self) -> [(Column, u128); 12] {
+        let rows = u128::from(self.rows);
+        let of_positives = rows * u128::from(self.positives);
+        let by_priority = self.origin.map_or(0, |_| rows);
+        let frames = |it: StackedFrames| {
+            u128::from(it.frames) * it.frame_bytes(self.state_bytes as usize) as u128
+        };
+        let states = |count: u32| u128::from(count) * self.value_bytes() as u128;
+        [
+            (Column::Frames, self.stacked.map_or(0, frames)),
+            (Column::StatesT, states(self.rows)),
+            (Column::StatesK, states(self.states_k)),
+            (Column::StatesN, states(self.states_n)),
+            (Column::NStepReturn, 4 * rows),
+            (Column::BootstrapDiscount, 4 * rows),
+            (Column::Action, rows),
+            (Column::NextAction, rows),
+            (Column::PositiveValid, of_positives),
+            (Column::K, of_positives),
+            (Column::Transition, 8 * by_priority),
+            (Column::Probability, 4 * by_priority),
+        ]
+    }
+
+    /// Where a column lies, in a payload of so many bytes.
+    pub(super) fn range(&self, column: Column) -> Range<usize> {
+        let mut end = 0;
+        for (each, bytes) in self.columns() {
+            let start = end;
+            end += bytes as usize;
+            if each == column {
+                return start..end;
+            }
+        }
+        unreachable!("{column:?} is listed")
+    }
+
+    /// Bytes of all columns; none if they are more than the address space, if there are more states than rows can have, or if
+    /// states are no stacks of the frames.
+    fn bytes(&self) -> Option<usize> {
+        let positives = u64::from(self.rows) * u64::from(self.positives);
+        let states = self.states().try_into().ok()?;
+        let fits = u64::from(self.states_k) <= positives
+            && self.states_n <= self.rows
+            && self
+                .stacked
+                .is_none_or(|it| it.fit(states, self.state_bytes as usize));
+        let bytes = || self.columns().iter().map(|(_, bytes)| bytes).sum::<u128>();
+        fits.then(bytes).and_then(|it| it.try_into().ok())
+    }
+
+    fn states(&self) -> u64 {
+        u64::from(self.rows) + u64::from(self.states_k) + u64::from(self.states_n)
+    }
+
+    /// The values of a column of f32 [B].
+    pub(super) fn f32s(&self, column: Column, payload: &[u8]) -> impl Iterator<Item = f32> {
+        let (values, _) = payload[self.range(column)].as_chunks();
+        values.iter().copied().map(f32::from_le_bytes)
+    }
+
+    /// Whether each row [B] bootstraps, in a payload whose scalars are written.
+    pub(super) fn bootstraps(&self, payload: &[u8]) -> Vec<bool> {
+        let discounts = self.f32s(Column::BootstrapDiscount, payload);
+        discounts.map(|discount| discount != 0.0).collect()
+    }
+
+    /// Whether each positive [P, B] is there, in a payload whose scalars are written.
+    pub(super) fn positives_there(&self, payload: &[u8]) -> Vec<bool> {
+        let valid = payload[self.range(Column::PositiveValid)].iter();
+        valid.map(|&valid| valid != 0).collect()
+    }
+
+    fn of_states<'a>(&self, payload: &'a [u8]) -> &'a [u8] {
+        &payload[self.range(Column::StatesT).start..self.range(Column::StatesN).end]
+    }
+
+    /// Bytes of a value in a column of states: all of a state, or what says of which frames it is made.
+    pub(super) fn value_bytes(&self) -> usize {
+        let stacked = self.stacked.as_ref();
+        stacked.map_or(self.state_bytes as usize, StackedFrames::stack_bytes)
+    }
+
+    /// Frames that travel, and bytes of each: states where they are one frame.
+    pub(super) fn frames(&self) -> (usize, usize) {
+        let state_bytes = self.state_bytes as usize;
+        match self.stacked {
+            None => (self.states() as usize, state_bytes),
+            Some(stacked) => (stacked.frames as usize, stacked.frame_bytes(state_bytes)),
+        }
     }
 }
 

@@ -3,8 +3,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::shard_counts::ShardCounts;
-
 /// The learner's request.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BatchRequest {
@@ -46,7 +44,7 @@ pub struct RequestId {
 }
 
 impl RequestId {
-    /// The first request of an client.
+    /// The first request of a client.
     pub const fn first(client_id: u64) -> Self {
         Self {
             client_id,
@@ -71,6 +69,26 @@ impl RequestId {
             number: self.number + 1,
             attempt: 0,
             ..self
+        }
+    }
+}
+
+/// What the rate limiter of each replay server counts. The learner tells each of the others, so that all decide as one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ShardCounts {
+    /// Transitions stored since the start of the run.
+    pub inserted: u64,
+    /// Rows sampled since the start of the run.
+    pub rows_sampled: u64,
+}
+
+impl std::ops::Add for ShardCounts {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            inserted: self.inserted.saturating_add(other.inserted),
+            rows_sampled: self.rows_sampled.saturating_add(other.rows_sampled),
         }
     }
 }

@@ -1,9 +1,26 @@
-//! Taking part in a run, as an actor or as its learner, and the answer.
+//! Taking part in a run: its settings, joining it as an actor or as its learner, and an actor's end.
 //! It does not start or stop processes: that is the launcher's.
 
 use serde::{Deserialize, Serialize};
 
-use super::shard_counts::ShardCounts;
+use super::batch_request::ShardCounts;
+
+/// What a joining process needs: the run's resolved settings, from the replay server.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunInfo {
+    /// The resolved configuration, TOML.
+    pub config_toml: String,
+    /// Transitions that the run has stored, for the exploration schedule.
+    pub inserted_total: u64,
+    /// Whether a learner has joined.
+    pub has_learner: bool,
+    /// Updates after which the run was resumed, which its learner says; 0 in a run from its start.
+    pub after_updates: u64,
+    /// Which of the replay's shards this is, from 0, and how many there are.
+    pub shard: (u32, u32),
+    /// Whether chunks may come through shared memory: the replay server can read it.
+    pub shared_memory: bool,
+}
 
 /// An actor starts: from now on the replay server takes its chunks. The same one may be sent any number of times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -57,4 +74,15 @@ pub struct Welcome {
     pub weights_version: u64,
     /// Lives of this actor that were there before this one; 0 for a learner.
     pub earlier_incarnations: u32,
+}
+
+/// An actor's last word: its own count of what it produced, against which the replay server checks its count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Leave {
+    /// The actor's number in the run.
+    pub actor: u32,
+    /// Which life of it.
+    pub incarnation: u64,
+    /// Transitions produced, less those that the replay server answered with `Finished` or `Refused`.
+    pub produced: u64,
 }

@@ -1,23 +1,20 @@
 //! All messages: number, type, key, priority and reply of each. What each is made of is in its own file.
 //! `wire` turns them into bytes; each process decides what it answers.
 
+use serde::{Deserialize, Serialize};
 use zenoh::qos::Priority;
 
 use super::{
-    ack::Ack,
     affinity::AffinityUpdate,
     batch_header::BatchReply,
     batch_request::BatchRequest,
-    chunk::ChunkHeader,
+    chunk::{ChunkHeader, ChunkPoll, InsertReply},
     episodes::{EpisodesReply, EpisodesRequest},
-    insert_reply::{ChunkPoll, InsertReply},
-    join::{ActorJoin, JoinReply, LearnerJoin},
-    leave::Leave,
+    join::{ActorJoin, JoinReply, LearnerJoin, Leave, RunInfo},
     priorities::PriorityUpdate,
     processes::ProcessesStatus,
     recovering::Recovering,
     report::Report,
-    run_info::RunInfo,
     status::{LearnerStatus, ReplayStatus},
     weights::{WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion},
 };
@@ -25,6 +22,10 @@ use crate::wire::{
     error::CodecError,
     message::{Keyed, Message, Request},
 };
+
+/// "Understood".
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ack;
 
 /// `NUMBER NAME: TYPE [checked], at KEY of its actor (PRIORITY) -> REPLY;`
 ///

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::mutex::lock;
+use super::lock;
 
 /// What a process is doing now. Clones are the same.
 #[derive(Clone, Debug)]

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::mutex::lock;
+use super::lock;
 
 static LAST: Mutex<Option<(String, Instant)>> = Mutex::new(None);
 

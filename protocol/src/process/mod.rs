@@ -7,7 +7,13 @@ pub mod fail_point;
 pub mod last_warning;
 pub mod lock_file;
 pub(crate) mod log_limiter;
-pub(crate) mod mutex;
 pub(crate) mod shutdown;
 pub(crate) mod silence;
 pub(crate) mod termination;
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Locks `mutex`, also if a thread panicked while it held it: that panic ends the process, so nothing is done about it here.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -9,8 +9,7 @@ use std::{
 };
 
 use super::{
-    fail_point,
-    mutex::lock,
+    fail_point, lock,
     termination::{self, EndSign},
 };
 

@@ -20,7 +20,7 @@ use zenoh::{
 };
 
 use super::shared_memory::{self, METADATA_BYTES, Trust};
-use crate::process::mutex::lock;
+use crate::process::lock;
 
 /// Memory for the payload of a message. Clones have memory of their own.
 pub struct Buffer(Memory);

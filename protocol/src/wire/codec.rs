@@ -1,24 +1,22 @@
 //! The bytes of a message: a fixed prefix, a bincode header, then a raw payload that serde never touches.
-//! It does not know what a message means; it and `prefix` alone call bincode for what travels.
-//!
-//! The prefix's fields are in `prefix`.
+//! It does not know what a message means; it alone calls bincode for what travels.
 
 use std::io::Read;
 
-use serde::{Serialize, de::DeserializeOwned};
+use bincode::config::{Configuration, Fixint, LittleEndian};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::{
     buffers::{Buffer, BufferPool},
     error::CodecError,
     message::Message,
-    prefix::Prefix,
 };
 
 /// The version of every message in this crate; processes of different versions reject each other.
 pub const PROTOCOL_VERSION: u16 = 8;
 
-/// Length of the fixed prefix, bytes.
-pub const PREFIX_BYTES: usize = Prefix::BYTES;
+/// Length of the fixed prefix, bytes: the widths of its fields.
+pub const PREFIX_BYTES: usize = 32;
 /// Longest header, bytes; a longer one is refused by both sides.
 pub const HEADER_BYTES_MAX: usize = 1 << 20;
 /// Longest payload, bytes; a longer one is refused by both sides.
@@ -28,6 +26,10 @@ pub const PAYLOAD_BYTES_MAX: usize = 1 << 29;
 const BLOCK_BYTES: usize = 1 << 14;
 
 const VALUE_BYTES_MAX: usize = 1 << 28;
+
+/// The prefix's integers: of fixed width, without gaps.
+const FIXED: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
 
 fn encode_within<T: Serialize>(value: &T, max: usize) -> Result<Vec<u8>, CodecError> {
     let bytes = bincode::serde::encode_to_vec(value, bincode::config::standard())
@@ -137,7 +139,46 @@ fn copy(bytes: &mut impl Read, out: &mut [u8], sum: &mut crc32fast::Hasher) {
     }
 }
 
+/// The first bytes of every message: each field with its width, in the order in which they travel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Prefix {
+    /// `DRML`, so that strangers are told from us.
+    magic: u32,
+    /// The protocol's version; others are refused.
+    version: u16,
+    /// Which message it is: a [`Kind`](crate::Kind).
+    kind: u16,
+    /// The hash of the run's spec, so that runs are not mixed.
+    spec_hash: u64,
+    header_bytes: u32,
+    payload_bytes: u64,
+    /// CRC-32 of the prefix before it, the header and the payload. It stays the last field.
+    checksum: u32,
+}
+
 impl Prefix {
+    const MAGIC: u32 = u32::from_le_bytes(*b"DRML");
+
+    fn to_bytes(self) -> [u8; PREFIX_BYTES] {
+        let mut bytes = [0; PREFIX_BYTES];
+        let written = bincode::serde::encode_into_slice(self, &mut bytes, FIXED);
+        debug_assert_eq!(written.ok(), Some(PREFIX_BYTES));
+        bytes
+    }
+
+    /// The fields of bytes that came, whatever they say.
+    fn from_bytes(bytes: &[u8; PREFIX_BYTES]) -> Self {
+        let read = bincode::serde::decode_from_slice(bytes, FIXED);
+        read.expect("any 32 bytes are seven integers").0
+    }
+
+    /// A checksum over the fields before it, to which header and payload are to be added.
+    fn checksum_begun(self) -> crc32fast::Hasher {
+        let mut sum = crc32fast::Hasher::new();
+        sum.update(&self.to_bytes()[..PREFIX_BYTES - size_of::<u32>()]);
+        sum
+    }
+
     /// The prefix of a message of `len` bytes in all, if its magic, version and lengths are in order.
     fn read(bytes: Option<&[u8; PREFIX_BYTES]>, len: usize) -> Result<Self, CodecError> {
         let this = Self::from_bytes(bytes.ok_or(CodecError::Length {

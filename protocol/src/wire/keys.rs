@@ -150,7 +150,7 @@ fn mark(number: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::messages::{affinity::AffinityUpdate, leave::Leave, report::Report};
+    use crate::messages::{affinity::AffinityUpdate, join::Leave, report::Report};
 
     #[test]
     fn what_an_actor_says_stands_under_its_number() {

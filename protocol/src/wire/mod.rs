@@ -6,5 +6,4 @@ pub mod codec;
 pub(crate) mod error;
 pub(crate) mod keys;
 pub(crate) mod message;
-mod prefix;
 pub mod shared_memory;
