@@ -63,9 +63,9 @@ pub use persist::{KeptReplay, Mark, PersistArgs, PersistError, Reading, Recovery
 pub use rate_limiter::RateLimiter;
 pub use replay::Replay;
 pub use sampling::{
-    assemble::{RETURN_ERROR, return_sum_error},
+    batch::PackedBatch,
+    episodes::{RETURN_ERROR, return_sum_error},
     horizon,
-    packed_batch::PackedBatch,
     rows::{
         PriorityCounts,
         prioritised::{CHANCE_ERROR, PRIORITY_MIN},

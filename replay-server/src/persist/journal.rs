@@ -19,7 +19,7 @@ use super::{
     snapshot::{Note, Snapshot},
     sync::Syncer,
 };
-use crate::storage::frame_store::PackedChunk;
+use crate::storage::pack::PackedChunk;
 
 /// A segment is at least this many times as long as the state that it begins with.
 const SNAPSHOTS: u64 = 4;

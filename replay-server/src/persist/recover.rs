@@ -17,7 +17,7 @@ use super::{
     record::{self, Broken, ORDINAL_MAX, Record, RecordKind},
     snapshot::Note,
 };
-use crate::{replay::Replay, storage::frame_store::Packer};
+use crate::{replay::Replay, storage::pack::Packer};
 
 /// What a segment's name ends in that cannot be used.
 const UNUSABLE: &str = "unusable";

@@ -10,7 +10,7 @@ use crate::{
     ledger::actors::{Difference, Verdict},
     persist::{journal::Journal, snapshot::Note},
     storage::{
-        frame_store::{PackedChunk, Packer},
+        pack::{PackedChunk, Packer},
         ring::Step,
     },
 };

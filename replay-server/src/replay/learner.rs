@@ -11,7 +11,7 @@ use crate::{
     config,
     ledger::requests::Requests,
     persist::snapshot::Note,
-    sampling::{packed_batch::PackedBatch, rows::PriorityCounts},
+    sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
 
 /// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not

@@ -1,9 +1,7 @@
 //! From the transitions held to a batch: anchors, the episode around each, the row made of it, and k.
 //! Nothing here changes what is stored or decides whether a batch may be served.
 
-pub(crate) mod assemble;
 pub(crate) mod batch;
-mod episodes;
+pub(crate) mod episodes;
 pub mod horizon;
-pub(crate) mod packed_batch;
 pub(crate) mod rows;

@@ -11,7 +11,7 @@ use super::{
     parked::{ParkedRequest, park_request},
     server::{Service, State},
 };
-use crate::sampling::packed_batch::PackedBatch;
+use crate::sampling::batch::PackedBatch;
 
 /// A request that waits, and who for.
 type Parked = ParkedRequest<Responder<BatchReply>>;

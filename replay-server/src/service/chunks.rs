@@ -11,7 +11,7 @@ use super::{
     parked::ParkedChunk,
     server::{Question, Service, State},
 };
-use crate::storage::frame_store::PackedChunk;
+use crate::storage::pack::PackedChunk;
 
 /// How far the version that acted may be ahead of the newest that is here.
 const VERSION_AHEAD_MAX: u64 = 1 << 32;

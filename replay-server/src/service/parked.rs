@@ -8,7 +8,7 @@ use std::{
 
 use driml_protocol::{BatchRequest, ChunkHeader, ChunkPoll};
 
-use crate::storage::frame_store::PackedChunk;
+use crate::storage::pack::PackedChunk;
 
 /// Bytes of the chunks kept; an actor that sends one more is told to send it again later.
 const CHUNK_BYTES_MAX: usize = 1 << 28;
@@ -150,7 +150,7 @@ mod tests {
     use driml_protocol::{Chunk, RequestId};
 
     use super::*;
-    use crate::{config::Compression, storage::frame_store::Packer};
+    use crate::{config::Compression, storage::pack::Packer};
 
     const SECOND: Duration = Duration::from_secs(1);
 

@@ -19,7 +19,7 @@ use super::{
     timings::Timings,
     weights_store::WeightsStore,
 };
-use crate::{persist::Reading, replay::Replay, storage::frame_store::Packer};
+use crate::{persist::Reading, replay::Replay, storage::pack::Packer};
 
 /// How long a thread sleeps when nothing is parked; it is woken when something is.
 const IDLE: Duration = Duration::from_secs(60);

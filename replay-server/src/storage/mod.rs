@@ -2,4 +2,5 @@
 //! Nothing here draws a sample or knows which actor sent what.
 
 pub(crate) mod frame_store;
+pub(crate) mod pack;
 pub(crate) mod ring;

@@ -4,7 +4,7 @@
 use driml_protocol::End;
 use serde::{Deserialize, Serialize};
 
-use super::frame_store::{Frames, Run};
+use super::{frame_store::Frames, pack::Run};
 
 /// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

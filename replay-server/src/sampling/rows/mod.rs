@@ -1,5 +1,5 @@
 //! Which transitions are drawn as anchors: what a rule of `replay.sampling` does, what of it is kept, and a file for each.
-//! What can be an anchor is decided in `episodes`; what is made of one, in `assemble`.
+//! What can be an anchor is decided in `episodes`, and so is what is made of one.
 
 pub(crate) mod prioritised;
 mod sum_tree;

@@ -1,7 +1,12 @@
 //! Compresses a chunk before it is stored, and unpacks frames after they are drawn, so that the replay is not locked meanwhile.
 //! It stores nothing and does not judge the chunk.
+//!
+//! What is compressed is a block: consecutive frames of one stream, of which the first is the key of the others.
+//! A block's parts are LZ4 blocks of their own: the key alone, then a few frames each with the key as LZ4's dictionary. To
+//! read a frame, its part and the key are unpacked and no more. There are no differences between frames: LZ4 finds what
+//! frames have in common also where the picture scrolls, where differences would destroy it.
 
-use std::{borrow::Cow, sync::Arc};
+use std::{borrow::Cow, ops::Range, sync::Arc};
 
 use driml_protocol::{Chunk, codec};
 use lz4_flex::block::{
@@ -9,8 +14,14 @@ use lz4_flex::block::{
     get_maximum_output_size,
 };
 
-use super::layout::{Layout, PartEnds};
 use crate::config::Compression;
+
+/// Longest part before compression, unless one frame is longer: three frames of Procgen.
+///
+/// Longer parts compress better, shorter ones are faster to take a single frame from.
+const PART_BYTES_MAX: usize = 36 << 10;
+/// Parts of a block beside its key: with three frames each, a block has 16 frames, as an actor's chunk has steps.
+const PARTS_MAX: usize = 5;
 
 /// Prepares chunks for one replay.
 #[derive(Clone, Copy, Debug)]
@@ -32,7 +43,8 @@ pub(crate) struct PackedChunk<'a> {
 /// Consecutive frames of one stream, compressed.
 pub(crate) struct Block {
     pub(crate) frames: usize,
-    part_ends: PartEnds,
+    /// Bytes up to the end of each part, from its start; 0 for parts that it does not have.
+    part_ends: [u32; 1 + PARTS_MAX],
     /// Its parts, one after the other. A part is the frames themselves if it has as many bytes.
     pub(crate) bytes: Box<[u8]>,
 }
@@ -95,12 +107,55 @@ fn blocks(frames: &[u8], layout: Layout) -> Vec<Arc<Block>> {
     packed.collect()
 }
 
+/// How a block is divided into parts.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Layout {
+    pub(crate) frame_bytes: usize,
+    /// Frames of each part but the key; the last part may have fewer.
+    part_frames: usize,
+}
+
+impl Layout {
+    pub(crate) fn new(frame_bytes: usize) -> Self {
+        Self {
+            frame_bytes,
+            part_frames: (PART_BYTES_MAX / frame_bytes).max(1),
+        }
+    }
+
+    /// Most frames of a block.
+    const fn block_frames_max(&self) -> usize {
+        1 + PARTS_MAX * self.part_frames
+    }
+
+    /// Parts of a block of `frames` frames, key included.
+    const fn parts(&self, frames: usize) -> usize {
+        1 + (frames - 1).div_ceil(self.part_frames)
+    }
+
+    /// The part that holds a frame of the block; 0 is the key.
+    pub(crate) const fn part_of(&self, frame: usize) -> usize {
+        frame.div_ceil(self.part_frames)
+    }
+
+    /// The frames of one part of a block of `frames` frames.
+    pub(crate) fn frames_of(&self, part: usize, frames: usize) -> Range<usize> {
+        match part {
+            0 => 0..1,
+            _ => {
+                let start = 1 + (part - 1) * self.part_frames;
+                start..(start + self.part_frames).min(frames)
+            }
+        }
+    }
+}
+
 impl Block {
     fn new(frames: &[u8], layout: Layout) -> Self {
         let key = &frames[..layout.frame_bytes];
         let count = frames.len() / layout.frame_bytes;
         let (mut bytes, mut scratch) = (Vec::new(), Vec::new());
-        let mut part_ends = PartEnds::default();
+        let mut part_ends = [0; 1 + PARTS_MAX];
         let parts = layout.parts(count);
         for (part, end) in part_ends.iter_mut().enumerate().take(parts) {
             let range = layout.frames_of(part, count);
