@@ -13,7 +13,6 @@
 
 pub(crate) mod folder;
 pub(crate) mod journal;
-mod opening;
 mod record;
 mod recover;
 pub(crate) mod snapshot;
@@ -24,6 +23,6 @@ mod upkeep;
 mod tests;
 
 pub use folder::{Mark, PersistError};
-pub(crate) use opening::shard_dir;
-pub use opening::{KeptReplay, PersistArgs};
 pub use recover::{Reading, Recovery};
+pub(crate) use upkeep::shard_dir;
+pub use upkeep::{KeptReplay, PersistArgs};
