@@ -62,7 +62,7 @@ pub use messages::{
 pub use process::{
     activity::Activity,
     atomic_write, fail_point, last_warning, lock, lock_file,
-    log_limiter::{LogLimiter, LogLimiters},
+    log_limiter::LogLimiter,
     shutdown::{GracefulShutdown, Shutdown, join_within},
     silence::Silence,
 };

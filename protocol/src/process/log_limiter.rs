@@ -1,36 +1,10 @@
 //! Log lines that could come many times a second: the first of a kind at once, then one in a while with a count.
 //! It does not log by itself.
 
-use std::{
-    collections::HashMap,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 /// How long one line stands for those like it.
 const PERIOD: Duration = Duration::from_secs(10);
-
-/// Kinds of lines that are told apart; those of all further ones count as one kind.
-const KINDS_MAX: usize = 64;
-
-/// Decides which lines are written, of several kinds that each have a name.
-#[derive(Debug, Default)]
-pub struct LogLimiters {
-    by_kind: HashMap<String, LogLimiter>,
-    others: LogLimiter,
-}
-
-impl LogLimiters {
-    /// As [`LogLimiter::due`], of the lines of this kind.
-    pub fn due(&mut self, kind: &str) -> Option<String> {
-        if let Some(known) = self.by_kind.get_mut(kind) {
-            return known.due();
-        }
-        if self.by_kind.len() >= KINDS_MAX {
-            return self.others.due();
-        }
-        self.by_kind.entry(kind.to_owned()).or_default().due()
-    }
-}
 
 /// Decides which lines of one kind are written.
 #[derive(Debug, Default)]
@@ -62,19 +36,6 @@ impl LogLimiter {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn kinds_are_told_apart_up_to_a_number() {
-        let mut each = LogLimiters::default();
-        for _ in 0..3 {
-            for kind in 0..KINDS_MAX + 9 {
-                each.due(&kind.to_string());
-            }
-        }
-        assert_eq!(each.by_kind.len(), KINDS_MAX);
-        assert_eq!(each.due("0"), None);
-        assert_eq!(each.due("one more"), None);
-    }
 
     #[test]
     fn the_first_line_comes_at_once_and_the_others_are_counted() {

@@ -2,7 +2,7 @@
 //! What an answer is, is in the files named for the messages.
 
 use std::{
-    collections::VecDeque,
+    collections::{HashMap, VecDeque},
     path::PathBuf,
     sync::{Arc, Condvar, Mutex, OnceLock, mpsc},
     thread::JoinHandle,
@@ -10,8 +10,8 @@ use std::{
 };
 
 use driml_protocol::{
-    Alive, BatchHeader, BufferPool, Incoming, Keys, LogLimiters, POOL_BATCHES, QueryWorkers,
-    Request, RunClient, RunSpec, Sampling, Shutdown,
+    Alive, BatchHeader, BufferPool, Incoming, Keys, POOL_BATCHES, QueryWorkers, Request, RunClient,
+    RunSpec, Sampling, Shutdown,
     config::{Settings, TransportConfig},
     fail_point, join_within,
     session::{self, Endpoints},
@@ -172,7 +172,7 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
             chunks: ParkedChunks::new(),
             requests: VecDeque::new(),
             timings: Timings::default(),
-            said: LogLimiters::default(),
+            said: HashMap::new(),
         }),
         changed: Condvar::new(),
         weights: Mutex::new(weights),

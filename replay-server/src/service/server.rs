@@ -2,13 +2,13 @@
 //! What each message does is in the file named for it.
 
 use std::{
-    collections::VecDeque,
+    collections::{HashMap, VecDeque},
     sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError},
     time::{Duration, Instant},
 };
 
 use driml_protocol::{
-    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiters, Recovering,
+    Announcer, BatchReply, BufferPool, CodecError, Incoming, InsertReply, LogLimiter, Recovering,
     Request, Responder, Shutdown, WeightsVersion, lock,
 };
 
@@ -51,8 +51,8 @@ pub(super) struct State {
     /// At most one a client: the newest attempt.
     pub(super) requests: VecDeque<ParkedRequest<Responder<BatchReply>>>,
     pub(super) timings: Timings,
-    /// Lines about what was refused, which a stranger could make come at any rate.
-    pub(super) said: LogLimiters,
+    /// By their kind, lines about what was refused, which a stranger could make come at any rate.
+    pub(super) said: HashMap<&'static str, LogLimiter>,
 }
 
 /// Who asks about a chunk, and since when.
@@ -67,7 +67,7 @@ impl Service {
     }
 
     /// Counts and logs a message that cannot be read.
-    pub(super) fn refuse(&self, what: &str, e: &CodecError) {
+    pub(super) fn refuse(&self, what: &'static str, e: &CodecError) {
         let line = format!("{what} was refused: {e}");
         self.state().refuse(what, &line);
     }
@@ -82,10 +82,11 @@ impl Service {
 
     /// Reads a request without payload, or counts it as refused.
     pub(super) fn read<R: Request>(&self, incoming: &Incoming<R>) -> Option<R> {
-        incoming
-            .read()
-            .inspect_err(|e| self.refuse(&format!("a message of kind {}", R::NAME), e))
-            .ok()
+        let refuse = |e: &CodecError| {
+            let line = format!("a message of kind {} was refused: {e}", R::NAME);
+            self.state().refuse(R::NAME, &line);
+        };
+        incoming.read().inspect_err(refuse).ok()
     }
 
     /// Answers a request without payload with what `answer` makes of it, once the lock is free again: nothing if it makes nothing.
@@ -125,14 +126,14 @@ impl State {
     }
 
     /// Counts a message that was refused, and logs a line of this kind.
-    pub(super) fn refuse(&mut self, kind: &str, line: &str) {
+    pub(super) fn refuse(&mut self, kind: &'static str, line: &str) {
         self.replay.counted().messages_refused += 1;
         self.say(kind, line);
     }
 
     /// Logs a line of this kind, or counts it where one was logged a short while ago.
-    pub(super) fn say(&mut self, kind: &str, line: &str) {
-        if let Some(more) = self.said.due(kind) {
+    pub(super) fn say(&mut self, kind: &'static str, line: &str) {
+        if let Some(more) = self.said.entry(kind).or_default().due() {
             tracing::warn!("{line}{more}");
         }
     }

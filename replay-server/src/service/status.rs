@@ -59,7 +59,7 @@ impl Service {
     fn take<R: Request<Reply = Ack>>(
         &self,
         incoming: Incoming<R>,
-        what: &str,
+        what: &'static str,
         take: impl FnOnce(&mut State, R) -> Result<(), String>,
     ) {
         self.answer(incoming, |state, update| {
