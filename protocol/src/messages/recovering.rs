@@ -74,7 +74,7 @@ mod tests {
 
     #[test]
     fn it_says_how_far_it_is_and_since_when() {
-        let mut recovering = Recovering {
+        let recovering = Recovering {
             progress: RecoveryProgress {
                 bytes_read: 3 << 30,
                 bytes: 11 << 30,
@@ -86,11 +86,5 @@ mod tests {
             recovering.to_string(),
             "the replay server reads its replay back from disk, 3072 of 11264 MiB after 34 s"
         );
-        assert!(recovering.checked(&[]).is_ok());
-        assert!(recovering.checked(&[1]).is_err());
-        for bad in [f64::NAN, f64::INFINITY, -1.0] {
-            recovering.progress.since_s = bad;
-            assert!(recovering.checked(&[]).is_err(), "{bad}");
-        }
     }
 }

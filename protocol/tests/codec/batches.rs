@@ -1,13 +1,13 @@
 //! Batches of all kinds: drawn by priority, made of stacks of frames, merged of parts; and those that cannot be.
 
 use driml_protocol::{
-    Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, PriorityUpdate, RowScalars,
-    ShardCounts, StackedFrames, codec,
+    Batch, BatchHeader, BatchReply, Buffer, Origin, PriorityPart, RowScalars, ShardCounts,
+    StackedFrames, codec,
 };
 
 use crate::samples::{
-    ORIGIN, SPEC, STACKED, batch, batch_from, prioritised_batch, priority_update, read_batch, rows,
-    sealed, stacked_batch,
+    ORIGIN, SPEC, STACKED, batch, batch_from, prioritised_batch, refusal, rows, sealed,
+    stacked_batch,
 };
 
 fn received(bytes: &[u8]) -> Batch {
@@ -139,10 +139,7 @@ fn parts_of_stacks_are_merged() {
 
 #[test]
 fn stacks_that_cannot_be_are_refused() {
-    let said = |header, payload: Buffer| {
-        let message = codec::encode(SPEC, &BatchReply::Batch(header), &payload).unwrap();
-        read_batch(&message).unwrap_err().to_string()
-    };
+    let said = |header, payload: Buffer| refusal(&BatchReply::Batch(header), &payload);
     for number in [5, 6, u32::MAX] {
         let mut wrong = stacked_batch(None);
         wrong.states_mut().set_stack(5, &[0, number]);
@@ -221,35 +218,6 @@ fn few_frames_do_not_make_more_than_a_message_may_have() {
             }
         }
     }
-}
-
-#[test]
-fn draws_and_priorities_that_cannot_be_are_refused() {
-    for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
-        let mut batch = prioritised_batch();
-        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
-        let refused = read_batch(&sealed(batch)).unwrap_err().to_string();
-        assert!(
-            refused.contains("was drawn with the probability"),
-            "{refused}"
-        );
-    }
-    for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let mut update = priority_update();
-        update.parts[0].priorities[1] = priority;
-        let bytes = codec::encode(SPEC, &update, &[]).unwrap();
-        let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
-        let said = refused.to_string();
-        assert!(said.contains("not a number from 0 on"), "{said}");
-    }
-    let mut update = priority_update();
-    update.parts[0].priorities.pop();
-    let bytes = codec::encode(SPEC, &update, &[]).unwrap();
-    let refused = codec::decode::<PriorityUpdate>(&bytes, Some(SPEC)).unwrap_err();
-    assert!(
-        refused.to_string().contains("1 priorities of 2"),
-        "{refused}"
-    );
 }
 
 #[test]

@@ -2,41 +2,17 @@
 //! What fuzzers find beyond these is `decoders`' business.
 
 use driml_protocol::{
-    AffinityUpdate, Batch, BatchHeader, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
-    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Played, RunInfo, WeightsHeader,
-    WeightsUpload, WeightsVersion,
+    AffinityUpdate, Batch, BatchHeader, BatchReply, Buffer, ChunkHeader, CodecError, EPISODES_MAX,
+    EndedEpisode, EpisodesReply, Kind, PROTOCOL_VERSION, Participant, Played, Recovering,
+    RecoveryProgress, Report, RunInfo, Warning, WeightsHeader, WeightsUpload, WeightsVersion,
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 
 use crate::forged::{forge, forge_whole};
-use crate::samples::{SPEC, Sample, batch, chunk, episodes, read_chunk, samples};
-
-#[test]
-fn episodes_that_did_not_end_are_refused() {
-    let fewer = EpisodesReply {
-        ended: 8,
-        ..episodes()
-    };
-    let bytes = codec::encode(SPEC, &fewer, &[]).unwrap();
-    let refused = codec::decode::<EpisodesReply>(&bytes, Some(SPEC)).unwrap_err();
-    assert!(matches!(refused, CodecError::Header(_)), "{refused}");
-    // The longest answer is one that can be sent.
-    let most = EndedEpisode {
-        frames: u64::MAX,
-        actor: u32::MAX,
-        env: u32::MAX,
-        played: Some(Played {
-            episode_return: f64::MAX,
-            steps: u64::MAX,
-        }),
-    };
-    let longest = EpisodesReply {
-        ended: u64::MAX,
-        before: u64::MAX - EPISODES_MAX as u64,
-        episodes: vec![most; EPISODES_MAX],
-    };
-    assert!(codec::encode(SPEC, &longest, &[]).is_ok());
-}
+use crate::samples::{
+    SPEC, Sample, batch, chunk, episodes, prioritised_batch, priority_update, read_chunk, refusal,
+    samples,
+};
 
 #[test]
 fn every_truncation_and_every_padding_is_refused() {
@@ -244,11 +220,91 @@ fn what_no_world_gives_is_refused() {
         let reward = reward.to_le_bytes();
         refused(&|it| it[42 + 4..42 + 8].copy_from_slice(&reward), "row 1");
     }
+}
+
+#[test]
+fn what_no_process_says_is_refused() {
+    let episodes = EpisodesReply {
+        ended: 8,
+        ..episodes()
+    };
     let upload = WeightsUpload {
         learner: 5,
         weights: WeightsHeader::new(1, 1, b"these"),
     };
-    let bytes = codec::encode(SPEC, &upload, b"those").unwrap();
-    let read = codec::decode::<WeightsUpload>(&bytes, Some(SPEC));
-    assert!(matches!(read, Err(CodecError::Header(_))), "{read:?}");
+    let long = "x".repeat(401);
+    let report = |doing: &str, since_s, text: &str, age_s| Report {
+        who: Participant::Learner(1),
+        doing: doing.into(),
+        since_s,
+        last_warning: Some(Warning {
+            text: text.into(),
+            age_s,
+        }),
+        finished: None,
+    };
+    let good = report("plays", 1.0, "lost", 2.0);
+    let recovering = |since_s| Recovering {
+        progress: RecoveryProgress {
+            bytes_read: 1,
+            bytes: 2,
+            since_s,
+        },
+        config_toml: String::new(),
+    };
+    let mut fewer = priority_update();
+    fewer.parts[0].priorities.pop();
+    let mut refused = vec![
+        (refusal(&episodes, &[]), "2 episodes after 7, where 8"),
+        (refusal(&upload, b"those"), "not the one announced"),
+        (refusal(&good, &[1]), "1 bytes of payload follow"),
+        (refusal(&recovering(1.0), &[1]), "1 bytes of payload follow"),
+        (refusal(&fewer, &[]), "1 priorities of 2"),
+    ];
+    for report in [report(&long, 1.0, "", 0.0), report("", 1.0, &long, 0.0)] {
+        refused.push((refusal(&report, &[]), "more than 80 bytes"));
+    }
+    for time in [f64::NAN, f64::INFINITY, -1.0] {
+        for report in [report("", time, "", 0.0), report("", 0.0, "", time)] {
+            refused.push((refusal(&report, &[]), "seconds ago"));
+        }
+        refused.push((refusal(&recovering(time), &[]), "a recovery that began"));
+    }
+    for priority in [-1.0, -1e-30, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut update = priority_update();
+        update.parts[0].priorities[1] = priority;
+        refused.push((refusal(&update, &[]), "not a number from 0 on"));
+    }
+    for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
+        let mut batch = prioritised_batch();
+        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
+        let (header, payload) = batch.into_payload();
+        let said = refusal(&BatchReply::Batch(header), &payload);
+        refused.push((said, "was drawn with the probability"));
+    }
+    for (said, words) in refused {
+        assert!(said.contains(words), "{said}");
+    }
+}
+
+/// What is cut before it is sent, and as many episodes as an answer may have.
+#[test]
+fn the_longest_messages_can_be_sent() {
+    let long = "x".repeat(401);
+    let warning = Some(Warning::new(&long, 0.0));
+    Sample::of(&Report::new(Participant::Learner(1), &long, 0.0, warning));
+    let most = EndedEpisode {
+        frames: u64::MAX,
+        actor: u32::MAX,
+        env: u32::MAX,
+        played: Some(Played {
+            episode_return: f64::MAX,
+            steps: u64::MAX,
+        }),
+    };
+    Sample::of(&EpisodesReply {
+        ended: u64::MAX,
+        before: u64::MAX - EPISODES_MAX as u64,
+        episodes: vec![most; EPISODES_MAX],
+    });
 }

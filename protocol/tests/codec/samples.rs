@@ -65,6 +65,13 @@ pub(crate) fn read_batch(bytes: &[u8]) -> Result<(), CodecError> {
     }
 }
 
+/// Why a message is refused where it is received.
+pub(crate) fn refusal<M: Message>(message: &M, payload: &[u8]) -> String {
+    let bytes = codec::encode(SPEC, message, payload).unwrap();
+    let received = codec::decode::<M>(&bytes, Some(SPEC)).map(drop);
+    received.unwrap_err().to_string()
+}
+
 pub(crate) fn chunk() -> Chunk {
     let mut chunk = Chunk::zeroed(ChunkHeader {
         actor: 3,
