@@ -169,12 +169,8 @@ impl RateLimiter {
 
     /// Who waits, for batches of `rows`.
     pub fn waiting(&self, rows: u32) -> Waiting {
-        let Counts {
-            refilled,
-            refill_left,
-            ..
-        } = self.counts;
-        let (have, need) = match refill_left {
+        let refilled = self.counts.refilled;
+        let (have, need) = match self.counts.refill_left {
             0 => (self.inserted_total(), self.config.warmup_transitions),
             left => (refilled, refilled + left),
         };

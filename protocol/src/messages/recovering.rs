@@ -27,13 +27,8 @@ impl RecoveryProgress {
 
 impl fmt::Display for RecoveryProgress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            bytes_read,
-            bytes,
-            since_s,
-        } = self;
-        let (read, all) = (bytes_read >> 20, bytes >> 20);
-        write!(f, "{read} of {all} MiB after {since_s:.0} s")
+        let (read, all) = (self.bytes_read >> 20, self.bytes >> 20);
+        write!(f, "{read} of {all} MiB after {:.0} s", self.since_s)
     }
 }
 

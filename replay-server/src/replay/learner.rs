@@ -3,7 +3,7 @@
 
 use driml_protocol::{
     AffinityUpdate, Batch, BatchHeader, Buffer, Learned, LearnerJoin, NotReady, PriorityUpdate,
-    RequestId, ShardCounts, Waiting,
+    RequestId, Waiting,
 };
 
 use super::Replay;
@@ -29,11 +29,8 @@ impl Replay {
     /// # Errors
     /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
     pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
-        let ShardCounts {
-            inserted,
-            rows_sampled,
-        } = join.counts + join.other_shards;
-        if join.updates.max(inserted).max(rows_sampled) > LEARNED_MAX {
+        let counted = join.counts + join.other_shards;
+        if join.updates.max(counted.inserted).max(counted.rows_sampled) > LEARNED_MAX {
             return Err(format!(
                 "a learner after {} updates, {:?} and {:?}: counts that no run reaches",
                 join.updates, join.counts, join.other_shards

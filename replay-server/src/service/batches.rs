@@ -102,17 +102,12 @@ impl State {
     ) -> Option<(Parked, Result<PackedBatch, NotReady>)> {
         for at in 0..self.requests.len() {
             let parked = &self.requests[at];
-            let BatchRequest {
-                id,
-                rows,
-                shared_memory,
-                ..
-            } = parked.request;
-            let memory = |bytes| match shared_memory {
+            let request = parked.request;
+            let memory = |bytes| match request.shared_memory {
                 true => pool.take(bytes),
                 false => pool.take_own(bytes),
             };
-            let drawn = self.replay.draw_for(id, rows, memory);
+            let drawn = self.replay.draw_for(request.id, request.rows, memory);
             if !matches!(drawn, Err(NotReady::Wait(_))) || parked.left(now).is_zero() {
                 let parked = self.requests.remove(at);
                 return parked.map(|parked| (parked, drawn));

@@ -32,7 +32,6 @@ use crate::{
     config::Config,
     persist::{KeptReplay, PersistArgs, PersistError, Reading, shard_dir},
     replay::Replay,
-    sampling::rows::PriorityCounts,
 };
 
 /// Threads that make batches: one assembles while another's reply is being sent.
@@ -128,11 +127,8 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         reading: Reading::begin(args.ending.clone()),
         config_toml: args.config_toml.clone(),
     });
-    let Answers {
-        queryables,
-        mut threads,
-        ..
-    } = Answers::declare(&client, &admission, limits, &config.sampling).map_err(declaring)?;
+    let answers = Answers::declare(&client, &admission, limits, &config.sampling);
+    let (queryables, mut threads) = answers.map_err(declaring)?;
     tracing::info!(
         "replay server listens on {:?}, run {:016x}",
         args.listen,
@@ -200,13 +196,11 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
         log.flush();
     }
     if let Some(counts) = state.replay.priority_counts() {
-        let PriorityCounts {
-            set,
-            gone,
-            repeated,
-        } = counts;
         tracing::info!(
-            "priorities of {set} rows were set, {gone} came too late for their transition, {repeated} came twice"
+            "priorities of {} rows were set, {} came too late for their transition, {} came twice",
+            counts.set,
+            counts.gone,
+            counts.repeated
         );
     }
     closed
@@ -261,19 +255,19 @@ type Threads = Vec<JoinHandle<()>>;
 struct Answers<'a> {
     client: &'a RunClient,
     admission: &'a Arc<Admission>,
-    /// Dropping them ends the answers, and with them the threads.
     queryables: Queryables,
     threads: Threads,
 }
 
 impl<'a> Answers<'a> {
-    /// Declares all of it, where rows are drawn by `sampling`. Until the admission is open every query is answered with "retry".
+    /// Declares all of it, where rows are drawn by `sampling`. Until the admission is open every query is answered with "retry". Dropping
+    /// the queryables ends the answers, and with them the threads.
     fn declare(
         client: &'a RunClient,
         admission: &'a Arc<Admission>,
         limits: Limits,
         sampling: &Sampling,
-    ) -> zenoh::Result<Self> {
+    ) -> zenoh::Result<(Queryables, Threads)> {
         let mut this = Self {
             client,
             admission,
@@ -298,7 +292,7 @@ impl<'a> Answers<'a> {
         this.answer("status", 1, small, Service::status)?;
         this.answer("processes", 1, small, Service::processes)?;
         this.answer("episodes", 1, small, Service::episodes)?;
-        Ok(this)
+        Ok((this.queryables, this.threads))
     }
 
     /// Answers requests `R` of at most `bytes_max` bytes with `answer`, on so many threads of this name.
