@@ -49,9 +49,10 @@ pub use messages::{
     episodes::{EPISODES_MAX, EndedEpisode, EpisodesReply, EpisodesRequest, Played},
     join::{ActorJoin, JoinReply, LearnerJoin, Leave, RunInfo, Welcome},
     priorities::{Origin, PriorityPart, PriorityUpdate},
-    processes::{LogStatus, ProcessStatus, ProcessesStatus, WARNINGS_MAX},
     recovering::{Recovering, RecoveryProgress},
-    report::{Participant, Report, Warning},
+    report::{
+        LogStatus, Participant, ProcessStatus, ProcessesStatus, Report, WARNINGS_MAX, Warning,
+    },
     status::{LearnerStatus, Quantiles, RETURNS_OF, ReplayStatus, Returns, Waiting},
     table::{Ack, Kind},
     weights::{

@@ -10,7 +10,6 @@ pub(crate) mod chunk;
 pub(crate) mod episodes;
 pub(crate) mod join;
 pub(crate) mod priorities;
-pub(crate) mod processes;
 pub(crate) mod recovering;
 pub(crate) mod report;
 pub(crate) mod status;

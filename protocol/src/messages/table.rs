@@ -12,9 +12,8 @@ use super::{
     episodes::{EpisodesReply, EpisodesRequest},
     join::{ActorJoin, JoinReply, LearnerJoin, Leave, RunInfo},
     priorities::PriorityUpdate,
-    processes::ProcessesStatus,
     recovering::Recovering,
-    report::Report,
+    report::{ProcessesStatus, Report},
     status::{LearnerStatus, ReplayStatus},
     weights::{WeightsReply, WeightsRequest, WeightsUpload, WeightsVersion},
 };

@@ -1,18 +1,14 @@
 //! Opening a zenoh session that suits large, acknowledged messages, and the two ways to talk over it.
 //! It does not scout, gossip or mesh: one process listens, the others connect and redial.
 
-mod error;
 mod questions;
 
 use std::{sync::Arc, time::Duration};
 
 use zenoh::{Session, Wait};
 
-pub use self::{
-    error::SessionError,
-    questions::{answer, ask},
-};
 pub(crate) use questions::{PendingBytes, put_off, send};
+pub use questions::{SessionError, answer, ask};
 
 use crate::{
     process::shutdown::Shutdown,

@@ -8,7 +8,6 @@ use driml_protocol::{
     codec::{self, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, PREFIX_BYTES},
 };
 
-use crate::forged::{forge, forge_whole};
 use crate::samples::{
     SPEC, Sample, batch, chunk, episodes, prioritised_batch, priority_update, read_chunk, refusal,
     samples,
@@ -70,6 +69,34 @@ fn every_flipped_bit_is_refused() {
             bytes[bit / 8] ^= 1 << (bit % 8);
         }
     }
+}
+
+/// A message that no process of this project sends: a right checksum over whatever header and payload.
+fn forge(version: u16, kind: u16, lengths: (u32, u64), header: &[u8], payload: &[u8]) -> Vec<u8> {
+    let mut bytes = b"DRML".to_vec();
+    bytes.extend(version.to_le_bytes());
+    bytes.extend(kind.to_le_bytes());
+    bytes.extend(SPEC.to_le_bytes());
+    bytes.extend(lengths.0.to_le_bytes());
+    bytes.extend(lengths.1.to_le_bytes());
+    let mut hasher = crc32fast::Hasher::new();
+    [&bytes, header, payload]
+        .iter()
+        .for_each(|part| hasher.update(part));
+    bytes.extend(hasher.finalize().to_le_bytes());
+    bytes.extend_from_slice(header);
+    bytes.extend_from_slice(payload);
+    bytes
+}
+
+fn forge_whole(kind: u16, header: &[u8], payload: &[u8]) -> Vec<u8> {
+    forge(
+        PROTOCOL_VERSION,
+        kind,
+        (header.len() as u32, payload.len() as u64),
+        header,
+        payload,
+    )
 }
 
 #[test]

@@ -4,7 +4,6 @@
 
 mod batches;
 mod damaged;
-mod forged;
 mod run_hash;
 mod samples;
 
