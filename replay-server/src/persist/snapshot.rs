@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// Most of anything that a run counts.
-const COUNT_MAX: u64 = 1 << 60;
+pub(crate) const COUNT_MAX: u64 = 1 << 60;
 
 /// The replay server's own stream of the run's seed, so that no other process draws the same numbers.
 const RNG_STREAM: u64 = u64::from_be_bytes(*b"replay-1");

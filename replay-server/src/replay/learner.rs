@@ -10,15 +10,13 @@ use super::Replay;
 use crate::{
     config,
     ledger::requests::Requests,
-    persist::snapshot::Note,
+    persist::snapshot::{COUNT_MAX, Note},
     sampling::{batch::PackedBatch, rows::PriorityCounts},
 };
 
 /// How far the version of an affinity matrix may be ahead of the rows served, of which a replay that was started anew may not
 /// know all.
 const VERSION_AHEAD_MAX: u64 = 1 << 32;
-/// Most updates and rows that a learner can have behind it.
-const LEARNED_MAX: u64 = 1 << 60;
 
 /// Who learns, and what it says it has learned.
 impl Replay {
@@ -30,7 +28,7 @@ impl Replay {
     /// Another learner has learned in this run, and this one has no checkpoint of it; what to do, for a person.
     pub fn join_learner(&mut self, join: LearnerJoin) -> Result<u64, String> {
         let counted = join.counts + join.other_shards;
-        if join.updates.max(counted.inserted).max(counted.rows_sampled) > LEARNED_MAX {
+        if join.updates.max(counted.inserted).max(counted.rows_sampled) > COUNT_MAX {
             return Err(format!(
                 "a learner after {} updates, {:?} and {:?}: counts that no run reaches",
                 join.updates, join.counts, join.other_shards
@@ -115,7 +113,7 @@ impl Replay {
     pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
         let (updates, saved_updates) = (learned.updates, learned.saved_updates);
         let rows_received = learned.rows_received;
-        if updates.max(saved_updates).max(rows_received) > LEARNED_MAX {
+        if updates.max(saved_updates).max(rows_received) > COUNT_MAX {
             return Err(format!(
                 "a learner with {updates} updates and {rows_received} rows, counts that no run reaches"
             ));
@@ -136,7 +134,7 @@ impl Replay {
 
     pub(crate) fn note_updates(&mut self, updates: u64) {
         let done = &mut self.state.learned.updates;
-        *done = updates.min(LEARNED_MAX).max(*done);
+        *done = updates.min(COUNT_MAX).max(*done);
     }
 
     /// Takes a newer affinity matrix; one that is not newer than this learner's last is ignored.

@@ -6,7 +6,6 @@ use driml_protocol::{
     Ack, BufferPool, Incoming, PIECE_BYTES, WeightsReply, WeightsRequest, WeightsUpload,
     WeightsVersion, lock,
 };
-use zenoh::bytes::ZBytes;
 
 use super::{server::Service, weights_store::WeightsStore};
 
@@ -51,19 +50,18 @@ impl Service {
             return;
         };
         let found = self.weights().find(request, Instant::now());
-        let (reply, piece) = match &found {
+        let (reply, piece) = match found {
             Ok((weights, offset)) => {
-                let rest = &weights.safetensors[*offset..];
+                let rest = &weights.safetensors[offset..];
                 let reply = WeightsReply::Piece {
                     weights: weights.header,
                     bytes: weights.safetensors.len() as u64,
-                    offset: *offset as u64,
+                    offset: offset as u64,
                 };
-                (reply, &rest[..rest.len().min(PIECE_BYTES)])
+                (reply, rest[..rest.len().min(PIECE_BYTES)].to_vec())
             }
-            Err(reply) => (*reply, &[][..]),
+            Err(reply) => (reply, Vec::new()),
         };
-        let piece = ZBytes::from(piece.to_vec());
-        incoming.into_responder().reply_with(&reply, piece);
+        incoming.into_responder().reply_with(&reply, piece.into());
     }
 }

@@ -3,7 +3,10 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
-use super::pack::{Block, Run};
+use super::{
+    pack::{Block, Run},
+    reserve,
+};
 use crate::config::Compression;
 
 pub(crate) enum Frames {
@@ -81,21 +84,16 @@ impl Frames {
 pub(crate) struct PlainFrames {
     capacity: u64,
     frame_bytes: usize,
-    /// Grows into its reservation, so that memory is taken only as transitions come.
     bytes: Vec<u8>,
 }
 
 impl PlainFrames {
     /// An empty buffer for `capacity` frames. An error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(capacity: u64, frame_bytes: usize) -> Result<Self, u64> {
-        let asked = capacity.saturating_mul(frame_bytes as u64);
-        let length = usize::try_from(asked).map_err(|_| asked)?;
-        let mut bytes = Vec::new();
-        bytes.try_reserve_exact(length).map_err(|_| asked)?;
         Ok(Self {
             capacity,
             frame_bytes,
-            bytes,
+            bytes: reserve(capacity.saturating_mul(frame_bytes as u64))?,
         })
     }
 

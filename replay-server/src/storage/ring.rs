@@ -4,7 +4,7 @@
 use driml_protocol::End;
 use serde::{Deserialize, Serialize};
 
-use super::{frame_store::Frames, pack::Run};
+use super::{frame_store::Frames, pack::Run, reserve};
 
 /// How a transition hangs together with what its stream stored before; `after` is the index of the one just before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -103,7 +103,6 @@ pub(crate) struct Ring {
     first: u64,
     oldest: u64,
     inserted: u64,
-    /// Grows into its reservation, so that memory is taken only as transitions come.
     steps: Vec<Step>,
     frames: Frames,
 }
@@ -111,16 +110,12 @@ pub(crate) struct Ring {
 impl Ring {
     /// An empty ring of `capacity` transitions with their `frames`. An error gives the bytes that the system refuses to reserve.
     pub(crate) fn new(capacity: u64, frames: Frames) -> Result<Self, u64> {
-        let asked = capacity.saturating_mul(size_of::<Step>() as u64);
-        let mut steps = Vec::new();
-        let length = usize::try_from(capacity).map_err(|_| asked)?;
-        steps.try_reserve_exact(length).map_err(|_| asked)?;
         Ok(Self {
             capacity,
             first: 0,
             oldest: 0,
             inserted: 0,
-            steps,
+            steps: reserve(capacity)?,
             frames,
         })
     }

@@ -6,6 +6,8 @@
 
 use rand::Rng;
 
+use crate::storage::reserve;
+
 /// Numbers that are not negative, at places `0..capacity`; 0 at first.
 pub(super) struct SumTree {
     /// Places, rounded up to a power of two.
@@ -18,14 +20,10 @@ impl SumTree {
     /// All 0. Its memory is taken as places are used. An error gives the bytes that the system refuses to reserve.
     pub(super) fn new(capacity: u64) -> Result<Self, u64> {
         let leaves = capacity.checked_next_power_of_two().unwrap_or(u64::MAX);
-        let asked = leaves.saturating_mul(2 * size_of::<f64>() as u64);
-        let leaves = usize::try_from(leaves).map_err(|_| asked)?;
-        let length = leaves.checked_mul(2).ok_or(asked)?;
         // Zeros that come from the system are not touched; whether it grants them is asked first, as that ends no process.
-        Vec::<f64>::new()
-            .try_reserve_exact(length)
-            .map_err(|_| asked)?;
-        let nodes = vec![0.0; length];
+        drop(reserve::<f64>(leaves.saturating_mul(2))?);
+        let leaves = leaves as usize;
+        let nodes = vec![0.0; 2 * leaves];
         Ok(Self { leaves, nodes })
     }
 
