@@ -55,25 +55,19 @@ impl<R: Request> Incoming<R> {
         read.map(|(request, _)| request)
     }
 
-    /// Reads a request and copies its payload into own memory of `pool`.
+    /// Reads a request and copies its payload into own memory of `pool`; one that came at another process's key is an error.
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
         let (request, payload) =
             codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
-        self.check_actor(&request)?;
-        Ok((request, payload))
-    }
-
-    /// Checks that a request that speaks for an actor, or for the learner beside them, came at its own key, which others may have
-    /// no access to.
-    fn check_actor(&self, request: &R) -> Result<(), CodecError> {
+        // One that speaks for an actor, or for the learner beside them, comes at its own key, which others may have no access to.
         let (key, actor) = (self.query.key_expr().as_str(), request.actor());
         if R::BY_ACTOR && Keys::actor(key) != actor {
             let key = key.to_owned();
             return Err(CodecError::Actor { actor, key });
         }
-        Ok(())
+        Ok((request, payload))
     }
 
     /// What the reply goes through.

@@ -19,7 +19,7 @@ use rustls::{
 };
 use x509_parser::prelude::{FromDer, GeneralName, X509Certificate};
 
-use super::role::{ACTORS_MAX, Role};
+use super::access::{ACTORS_MAX, Role};
 
 /// Why a process cannot use its certificate or its key, and what to do.
 #[derive(Debug, thiserror::Error)]

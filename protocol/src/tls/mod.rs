@@ -10,8 +10,7 @@
 
 mod access;
 mod credentials;
-mod role;
 
 pub(crate) use access::rules;
+pub use access::{ACTORS_MAX, Role};
 pub use credentials::{Credentials, TlsError, authority_path};
-pub use role::{ACTORS_MAX, Role};
