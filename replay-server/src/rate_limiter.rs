@@ -16,8 +16,6 @@ use crate::config::Config;
 #[derive(Clone, Debug)]
 pub struct RateLimiter {
     config: Config,
-    /// The point from which the ratio holds: no row for the transitions before it beyond those sampled then.
-    since: ShardCounts,
     pub(crate) counts: Counts,
 }
 
@@ -35,13 +33,8 @@ pub(crate) struct Counts {
 impl RateLimiter {
     /// Nothing stored, nothing sampled, in a run with these settings, whose ratio may have been another before it was resumed.
     pub fn new(config: &Config) -> Self {
-        let start = config.ratio_start();
         Self {
             config: config.clone(),
-            since: ShardCounts {
-                inserted: start.transitions,
-                rows_sampled: start.rows,
-            },
             counts: Counts::default(),
         }
     }
@@ -82,7 +75,8 @@ impl RateLimiter {
         // Of more rows the learner would wait for transitions that never come.
         let inserted = others.inserted.max(before.inserted);
         let inserted = inserted.saturating_add(self.counts.this_shard.inserted);
-        let allowed = self.since.rows_sampled as f64 + self.config.replay_ratio * inserted as f64;
+        let start = self.config.ratio_start();
+        let allowed = start.rows as f64 + self.config.replay_ratio * inserted as f64;
         let ahead = self.config.slack_transitions.saturating_add(held_max) as f64
             * self.config.replay_ratio;
         let most_rows = allowed.max(before.rows_sampled as f64) + ahead;
@@ -97,8 +91,10 @@ impl RateLimiter {
     }
 
     fn credit(&self) -> f64 {
-        let after = self.inserted_total().saturating_sub(self.since.inserted);
-        let allowed = self.since.rows_sampled as f64 + self.config.replay_ratio * after as f64;
+        // No row for the transitions before it beyond those sampled then.
+        let start = self.config.ratio_start();
+        let after = self.inserted_total().saturating_sub(start.transitions);
+        let allowed = start.rows as f64 + self.config.replay_ratio * after as f64;
         allowed - self.rows_sampled_total() as f64
     }
 

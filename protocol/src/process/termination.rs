@@ -48,10 +48,10 @@ pub(super) fn listen(
         (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,
-            if hangup_is_ignored() {
-                None
-            } else {
-                Some(signal(SignalKind::hangup())?)
+            // By the kernel's own table.
+            match is_set("SigIgn:", Number::SIGHUP as u32 - 1) {
+                true => None,
+                false => Some(signal(SignalKind::hangup())?),
             },
         )
     };
@@ -92,11 +92,6 @@ async fn received(signal: &mut Option<Signal>) {
         }
         None => std::future::pending().await,
     }
-}
-
-/// Whether SIGHUP was set to be ignored before this process started, by the kernel's own table.
-fn hangup_is_ignored() -> bool {
-    is_set("SigIgn:", Number::SIGHUP as u32 - 1)
 }
 
 /// Whether a bit of one of this process's masks is set, by the name of the mask in `/proc/PID/status`.

@@ -323,20 +323,20 @@ impl Reader<'_> {
     }
 
     fn finish(mut self) -> Result<(Place, Recovery), PersistError> {
+        let unusable = |why: String| {
+            let why = format!("cannot be used: {why}; to begin a new replay there, remove them");
+            Err(PersistError::Unusable(self.folder.path.clone(), why))
+        };
         if !self.recovery.found && !self.recovery.warnings.is_empty() {
             let why = self.recovery.warnings.join("; ");
-            let why = format!(
-                "cannot be used: no segment can be read ({why}); to begin a new replay there, remove them"
-            );
-            return Err(PersistError::Unusable(self.folder.path.clone(), why));
+            return unusable(format!("no segment can be read ({why})"));
         }
         // What is written next must be readable too.
         if self.place.ordinal > ORDINAL_MAX / 2 {
-            let why = format!(
-                "cannot be used: its records are numbered up to {}, which no replay reaches; to begin a new replay there, remove them",
-                self.place.ordinal - 1
-            );
-            return Err(PersistError::Unusable(self.folder.path.clone(), why));
+            let last = self.place.ordinal - 1;
+            return unusable(format!(
+                "its records are numbered up to {last}, which no replay reaches"
+            ));
         }
         for path in std::mem::take(&mut self.aside) {
             let (name, aside) = (file_name(&path), path.with_extension(UNUSABLE));
@@ -355,9 +355,12 @@ impl Reader<'_> {
                 first - 1
             ));
         }
-        self.replay.quiet = false;
+        let replay = self.replay;
+        replay.quiet = false;
         if self.recovery.found && self.mark.is_none() {
-            self.replay.await_learner();
+            // What was drawn since the last snapshot is not known: the learner says it, and other numbers are drawn from here on.
+            replay.awaits_learner = replay.state.learner.is_some();
+            replay.state.draw_anew(replay.origin.shard, end);
         }
         Ok((self.place, self.recovery))
     }

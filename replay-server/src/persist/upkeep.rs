@@ -281,13 +281,6 @@ impl Replay {
         }
     }
 
-    /// What was drawn since the last snapshot is not known: the learner says it, and other numbers are drawn from here on.
-    pub(super) fn await_learner(&mut self) {
-        self.awaits_learner = self.state.learner.is_some();
-        let stored = self.ring.inserted();
-        self.state.draw_anew(self.origin.shard, stored);
-    }
-
     /// All but the transitions, as bytes that are the same where it is: what a mark brings back. For tests.
     pub fn state_bytes(&self) -> Result<Vec<u8>, CodecError> {
         let mut snapshot = self.snapshot();

@@ -13,7 +13,7 @@ use super::{
 };
 use crate::storage::pack::PackedChunk;
 
-/// How far the version that acted may be ahead of the newest that is here.
+/// How far the version that acted may be ahead of the newest that is here, where this server was started anew.
 const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
 /// Answers that are to be sent once the lock is free.
@@ -23,7 +23,11 @@ impl Service {
     pub(super) fn insert(&self, incoming: Incoming<ChunkHeader>) {
         let arrived = Instant::now();
         let chunk = incoming.receive(&self.pool).and_then(|(header, payload)| {
-            self.check_version(&header)?;
+            let (acted, newest) = (header.weights_version, self.weights().version());
+            if acted.saturating_sub(newest) > VERSION_AHEAD_MAX {
+                let why = format!("weights {acted} acted, and the newest are {newest}");
+                return Err(CodecError::Header(why));
+            }
             Chunk::from_payload(header, payload)
         });
         let responder = incoming.into_responder();
@@ -44,16 +48,6 @@ impl Service {
             self.changed.notify_all();
         }
         self.answer_all(answers);
-    }
-
-    /// Weights that acted may be newer than those that are here, where this server was started anew, but not by any number.
-    fn check_version(&self, header: &ChunkHeader) -> Result<(), CodecError> {
-        let (acted, newest) = (header.weights_version, self.weights().version());
-        if acted.saturating_sub(newest) <= VERSION_AHEAD_MAX {
-            return Ok(());
-        }
-        let why = format!("weights {acted} acted, and the newest are {newest}");
-        Err(CodecError::Header(why))
     }
 
     pub(super) fn poll(&self, incoming: Incoming<ChunkPoll>) {

@@ -18,8 +18,12 @@ impl Service {
         let (mut state, now) = (self.state(), Instant::now());
         let is_connected = kind == SampleKind::Put;
         state.participants.note_connected(who, is_connected, now);
+        let joined = match who.process {
+            ProcessName::Actor(actor) => state.replay.actor_incarnation(actor),
+            ProcessName::Learner => state.replay.learner(),
+        };
         // A process that joined this server's predecessor, whose replay it has, does not join again.
-        if state.takes_part(who) {
+        if joined.is_some_and(|number| Alive::of(who.process, number) == who) {
             state.participants.joined(who, now);
         }
         state.count_actors();
@@ -84,15 +88,6 @@ fn refused(why: String) -> JoinReply {
 impl State {
     fn count_actors(&mut self) {
         self.replay.counted().actors = self.participants.actors_connected();
-    }
-
-    /// Whether this incarnation of a process is the one that has joined.
-    fn takes_part(&self, who: Alive) -> bool {
-        let known = match who.process {
-            ProcessName::Actor(actor) => self.replay.actor_incarnation(actor),
-            ProcessName::Learner => self.replay.learner(),
-        };
-        known.is_some_and(|number| Alive::of(who.process, number) == who)
     }
 
     /// Checks that `learner` is the one that is served; if not, the error says to a person what happened.
