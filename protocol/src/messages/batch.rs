@@ -287,16 +287,14 @@ impl Batch {
     ) -> Option<PriorityUpdate> {
         self.header.origin?;
         assert_eq!(priorities.len(), self.rows(), "a priority a row");
-        let (mut transitions, mut priorities) = (&self.transitions()[..], priorities);
+        let transitions = self.transitions().into_iter();
+        let mut found = transitions.zip(priorities.iter().copied());
         let part = |&(origin, rows): &(Origin, usize)| {
-            let (own, rest) = transitions.split_at(rows);
-            transitions = rest;
-            let (found, rest) = priorities.split_at(rows);
-            priorities = rest;
+            let (transitions, priorities) = found.by_ref().take(rows).unzip();
             PriorityPart {
                 origin,
-                transitions: own.to_vec(),
-                priorities: found.to_vec(),
+                transitions,
+                priorities,
             }
         };
         Some(PriorityUpdate {
@@ -379,19 +377,13 @@ impl<'a> BatchStatesMut<'a> {
         let numbers_n = numbers(&header.bootstraps(payload), first_n);
         let (count, frame_bytes) = header.frames();
         let (frames, rest) = payload.split_at_mut(count * frame_bytes);
-        let (stack_bytes, stacks) = match header.stacked {
-            None => (0, &mut [][..]),
-            Some(_) => {
-                let bytes = header.value_bytes();
-                let states = first_n + header.states_n as usize;
-                (bytes, &mut rest[..states * bytes])
-            }
-        };
+        let stack_bytes = header.stacked.map_or(0, |it| it.stack_bytes());
+        let states = first_n + header.states_n as usize;
         Self {
             rows,
             frame_bytes,
             frames,
-            stacks,
+            stacks: &mut rest[..states * stack_bytes],
             stack_bytes,
             numbers_k,
             numbers_n,
@@ -419,12 +411,7 @@ impl<'a> BatchStatesMut<'a> {
 
 /// Of each its number, counted from `first` over those that are there.
 fn numbers(there: &[bool], first: usize) -> Vec<Option<usize>> {
-    let mut next = first;
-    let number = |&there: &bool| {
-        there.then(|| {
-            next += 1;
-            next - 1
-        })
-    };
+    let mut numbers = first..;
+    let number = |&there: &bool| there.then(|| numbers.next()).flatten();
     there.iter().map(number).collect()
 }
