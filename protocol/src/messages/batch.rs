@@ -48,35 +48,36 @@ impl Batch {
             states_n: rows.iter().filter(|row| row.bootstraps()).count() as u32,
             ..header
         };
+        let positives = header.positives;
+        let fits = rows.iter().all(|row| row.positives <= positives);
+        assert!(fits, "a row has at most P positives");
         let mut batch = Self::in_memory(header, memory(header.payload_bytes()));
-        for (row, scalars) in rows.iter().enumerate() {
-            batch.set_scalars(row, scalars);
-        }
+        let returns = rows.iter().map(|row| row.n_step_return.to_le_bytes());
+        batch.fill(Column::NStepReturn, returns);
+        let discounts = rows.iter().map(|row| row.bootstrap_discount.to_le_bytes());
+        batch.fill(Column::BootstrapDiscount, discounts);
+        batch.fill(Column::Action, rows.iter().map(|row| [row.action]));
+        batch.fill(Column::NextAction, rows.iter().map(|row| [row.next_action]));
+        // Of each positive [P, B] the k, if it is there.
+        let k = |p: u32, row: &RowScalars| (p < row.positives).then_some(row.k_first + p);
+        let ks = (0..positives).flat_map(|p| rows.iter().map(move |row| k(p, row)));
+        let valid = ks.clone().map(|k| [u8::from(k.is_some())]);
+        batch.fill(Column::PositiveValid, valid);
+        let capped = |k: Option<u32>| [k.map_or(0, |k| u8::try_from(k).unwrap_or(u8::MAX))];
+        batch.fill(Column::K, ks.map(capped));
         batch
     }
 
-    fn set_scalars(&mut self, row: usize, scalars: &RowScalars) {
-        let (rows, positives) = (self.rows(), self.header.positives);
-        assert!(scalars.positives <= positives, "at most P");
-        let n_step_return = scalars.n_step_return.to_le_bytes();
-        let discount = scalars.bootstrap_discount.to_le_bytes();
-        self.put(Column::NStepReturn, row, &n_step_return);
-        self.put(Column::BootstrapDiscount, row, &discount);
-        self.put(Column::Action, row, &[scalars.action]);
-        self.put(Column::NextAction, row, &[scalars.next_action]);
-        for p in 0..positives {
-            let there = p < scalars.positives;
-            let k = u8::try_from(scalars.k_first + p).unwrap_or(u8::MAX);
-            let at = p as usize * rows + row;
-            self.put(Column::PositiveValid, at, &[there.into()]);
-            self.put(Column::K, at, &[if there { k } else { 0 }]);
+    /// Writes the values of a column that is neither of states nor of frames.
+    fn fill<const BYTES: usize>(
+        &mut self,
+        column: Column,
+        values: impl Iterator<Item = [u8; BYTES]>,
+    ) {
+        let (places, _) = self.payload[self.header.range(column)].as_chunks_mut();
+        for (place, value) in places.iter_mut().zip(values) {
+            *place = value;
         }
-    }
-
-    /// Writes one value of a column that is neither of states nor of frames.
-    fn put(&mut self, column: Column, at: usize, value: &[u8]) {
-        let column = &mut self.payload[self.header.range(column)];
-        column[at * value.len()..][..value.len()].copy_from_slice(value);
     }
 
     /// A batch in memory that may hold anything.
@@ -260,21 +261,20 @@ impl Batch {
     }
 
     /// Writes of each row which transition it is, and the chance with which it was drawn.
-    pub fn set_draws(&mut self, draws: impl ExactSizeIterator<Item = (u64, f32)>) {
+    pub fn set_draws(&mut self, draws: &[(u64, f32)]) {
         assert!(self.header.origin.is_some(), "rows drawn by priority");
         assert_eq!(draws.len(), self.rows(), "a draw a row");
-        for (row, (transition, probability)) in draws.enumerate() {
-            self.put(Column::Transition, row, &transition.to_le_bytes());
-            self.put(Column::Probability, row, &probability.to_le_bytes());
-        }
+        let transitions = draws.iter().map(|draw| draw.0.to_le_bytes());
+        self.fill(Column::Transition, transitions);
+        let chances = draws.iter().map(|draw| draw.1.to_le_bytes());
+        self.fill(Column::Probability, chances);
     }
 
     /// Makes the chance of each row `share` of what it was: that its replay server was chosen.
     pub fn scale_probabilities(&mut self, share: f32) {
         let chances = self.probabilities().expect("rows drawn by priority");
-        let scaled = chances.into_iter().map(|chance| chance * share);
-        let draws: Vec<_> = self.transitions().into_iter().zip(scaled).collect();
-        self.set_draws(draws.into_iter());
+        let scaled = chances.into_iter().map(|it| (it * share).to_le_bytes());
+        self.fill(Column::Probability, scaled);
     }
 
     /// What `learner` says back of rows that were drawn by priority: update `number`, with the `priorities` [B]; none where rows

@@ -54,7 +54,7 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
         incarnation: 3,
     };
     let mut second = batch_from(Some(other));
-    second.set_draws([(10, 0.5), (11, 0.25), (12, 0.25)].into_iter());
+    second.set_draws(&[(10, 0.5), (11, 0.25), (12, 0.25)]);
     back.scale_probabilities(0.25);
     second.scale_probabilities(0.75);
     let parts = [back, second];

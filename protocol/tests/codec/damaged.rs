@@ -304,7 +304,7 @@ fn what_no_process_says_is_refused() {
     }
     for chance in [0.0, -0.5, 1.5, f32::NAN, f32::INFINITY] {
         let mut batch = prioritised_batch();
-        batch.set_draws([(1, 0.5), (2, chance), (3, 0.5)].into_iter());
+        batch.set_draws(&[(1, 0.5), (2, chance), (3, 0.5)]);
         let (header, payload) = batch.into_payload();
         let said = refusal(&BatchReply::Batch(header), &payload);
         refused.push((said, "was drawn with the probability"));

@@ -99,8 +99,7 @@ pub(crate) fn batch() -> Batch {
 /// Its rows drawn by priority.
 pub(crate) fn prioritised_batch() -> Batch {
     let mut batch = batch_from(Some(ORIGIN));
-    let draws = [(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)];
-    batch.set_draws(draws.into_iter());
+    batch.set_draws(&[(1 << 40, 0.5), (7, 1.0), (u64::MAX, 1e-30)]);
     batch
 }
 
@@ -175,7 +174,7 @@ pub(crate) fn stacked_batch(origin: Option<Origin>) -> Batch {
         places.set_stack(state, stack);
     }
     if origin.is_some() {
-        batch.set_draws([(1, 0.5), (2, 0.5), (3, 0.5)].into_iter());
+        batch.set_draws(&[(1, 0.5), (2, 0.5), (3, 0.5)]);
     }
     batch
 }

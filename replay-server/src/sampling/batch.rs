@@ -93,7 +93,7 @@ impl BatchSampler {
         };
         let draws = anchors.into_iter().map(probability);
         if let Some(draws) = draws.collect::<Option<Vec<_>>>() {
-            batch.set_draws(draws.into_iter());
+            batch.set_draws(&draws);
         }
         let mut places = batch.states_mut();
         let numbers: Vec<usize> = (0..rows).flat_map(|row| places.of_row(row)).collect();
