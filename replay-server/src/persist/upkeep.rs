@@ -8,7 +8,7 @@ use std::{
 };
 
 use driml_protocol::{
-    Chunk, ChunkHeader, CodecError, End, RunSpec, ShardCounts, Shutdown, TRANSITION_BYTES, codec,
+    Chunk, ChunkHeader, CodecError, End, RunSpec, Shutdown, TRANSITION_BYTES, codec,
 };
 
 use super::{
@@ -20,7 +20,6 @@ use super::{
 use crate::{
     config::{Config, SEGMENT_BYTES_MIN},
     replay::Replay,
-    sampling::rows::RowsState,
     storage::ring::{Link, Step},
 };
 
@@ -233,12 +232,8 @@ impl Replay {
     /// where it is larger than the ring, an empty ring. The error says for a person why the snapshot is not of this run.
     pub(super) fn restore(&mut self, snapshot: Snapshot) -> Result<(), String> {
         snapshot.check(&self.state)?;
-        let Snapshot {
-            inserted,
-            oldest,
-            mut state,
-            ..
-        } = snapshot;
+        let (inserted, oldest) = (snapshot.inserted, snapshot.oldest);
+        let mut state = snapshot.state;
         let stored = self.ring.inserted();
         let is_empty = self.ring.first() == stored;
         if !is_empty && inserted < stored {
@@ -290,23 +285,14 @@ impl Replay {
 
     /// The same without what was drawn: what a log brings back after its server died at any moment. For tests.
     pub fn stored_bytes(&self) -> Result<Vec<u8>, CodecError> {
-        let Snapshot {
-            mut counts, state, ..
-        } = self.snapshot();
-        counts.this_shard.rows_sampled = 0;
-        counts.other_shards = ShardCounts::default();
-        codec::encode_value(&Snapshot {
-            counts,
-            rows: RowsState::Uniform { are_listed: false },
-            state: ReplayState {
-                actors: state.actors,
-                learner: state.learner,
-                resumed_after: state.resumed_after,
-                inserted_before: state.inserted_before,
-                statistics: state.statistics.of_stored(),
-                ..ReplayState::new(&self.spec, self.origin.shard)
-            },
-            ..self.snapshot()
-        })
+        let snapshot = self.snapshot();
+        let (counts, state) = (snapshot.counts, snapshot.state);
+        codec::encode_value(&(
+            (snapshot.inserted, snapshot.oldest, snapshot.capacity),
+            (counts.this_shard.inserted, counts.refilled),
+            (counts.refill_left, state.resumed_after),
+            (state.actors, state.learner, state.inserted_before),
+            state.statistics.of_stored(),
+        ))
     }
 }

@@ -111,19 +111,18 @@ impl Replay {
 
     /// Takes what the learner says it has done. If it has saved a checkpoint, so does a replay that is kept on disk.
     pub fn note_learned(&mut self, learned: Learned) -> Result<(), String> {
-        let (updates, saved_updates) = (learned.updates, learned.saved_updates);
-        let rows_received = learned.rows_received;
-        if updates.max(saved_updates).max(rows_received) > COUNT_MAX {
+        let (updates, rows) = (learned.updates, learned.rows_received);
+        if updates.max(learned.saved_updates).max(rows) > COUNT_MAX {
             return Err(format!(
-                "a learner with {updates} updates and {rows_received} rows, counts that no run reaches"
+                "a learner with {updates} updates and {rows} rows, counts that no run reaches"
             ));
         }
         if std::mem::take(&mut self.awaits_learner) {
-            self.set_rows_sampled(rows_received);
+            self.set_rows_sampled(rows);
         }
         // A request may overtake another.
         if updates >= self.state.learned.updates {
-            let has_saved = saved_updates > self.state.learned.saved_updates;
+            let has_saved = learned.saved_updates > self.state.learned.saved_updates;
             self.state.learned = learned;
             if has_saved {
                 self.begin_segment();
