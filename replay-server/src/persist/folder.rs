@@ -2,6 +2,7 @@
 //! How segments are written is for `journal`, what they hold for `recover`.
 
 use std::{
+    ffi::OsStr,
     fs::{self, File},
     io,
     path::{Path, PathBuf},
@@ -108,7 +109,12 @@ impl LogFolder {
             let name = name.to_str();
             let digits = name.and_then(|it| it.strip_prefix("segment-")?.strip_suffix(".log"));
             let number = digits.and_then(|digits| digits.parse().ok());
-            Ok(number.filter(|&number| number <= NUMBER_MAX))
+            // A copy named without the zeros is none of the log's: its number is another segment's.
+            let is_own = |&number: &u64| {
+                let own = self.segment(number);
+                number <= NUMBER_MAX && own.file_name().and_then(OsStr::to_str) == name
+            };
+            Ok(number.filter(is_own))
         };
         let numbers = fs::read_dir(&self.path)
             .and_then(|entries| entries.map(number).collect::<io::Result<Vec<_>>>())

@@ -196,6 +196,7 @@ fn damage_costs_what_it_hits_and_is_said() {
     let begin_one: Spoil = |it| copy_to(it, 999, 20);
     let misplace: Spoil = |it| copy_to(it, 600, 1 << 20);
     let forget_id: Spoil = |it| remove(&it.with_file_name("log.toml"));
+    let back_up: Spoil = |it| drop(fs::copy(it, it.with_file_name("segment-3.log")).unwrap());
     let early = &["its beginning is damaged", "is now", gone];
     let cases: &[(usize, Spoil, &[&str], Left)] = &[
         (5, flip_late, &["damaged at byte", gone], Counts),
@@ -205,9 +206,10 @@ fn damage_costs_what_it_hits_and_is_said() {
         (last, remove, &[next], Beginning),
         (last, lengthen_a_record, &["are cut off"], Beginning),
         (last, append_zeros, &[], All),
-        // One that was just begun, one under another's name, and who it is: that is in the segments, too.
+        // One that was just begun, one under another's name, a copy of one, and who it is: that is in the segments, too.
         (3, begin_one, &[], All),
         (3, misplace, &[misplaced], All),
+        (3, back_up, &[], All),
         (0, forget_id, &[], All),
     ];
     for (number, (segment, spoil, words, left)) in cases.iter().enumerate() {
