@@ -8,8 +8,8 @@ use driml_model::{
 };
 
 use crate::support::{
-    DUELING, NOISY, NOISY_DUELING, assert_close, bits, floats, frames, parameters, residual, rng,
-    small, small_with, variable, with_biases,
+    assert_close, bits, floats, frames, kinds, parameters, pool, residual, rng, small, variable,
+    with_biases,
 };
 
 /// Every output of the network for a batch, one after the other, and the gradients of their weighted sum.
@@ -43,9 +43,8 @@ fn outputs_and_gradients(
 
 #[test]
 fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
-    // Strides that divide their kernels and one that does not; a stride of 1; a kernel of 1.
-    let odd = small();
-    // In its second layer, rows are left over and columns are not.
+    // The small ones have strides that divide their kernels and one that does not. In the second layer of this one, rows are left over
+    // and columns are not.
     let uneven = ModelConfig {
         width: 48,
         ..small()
@@ -56,16 +55,7 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
             .to_vec(),
         ..small()
     };
-    for config in [
-        odd,
-        uneven,
-        even,
-        small_with(DUELING),
-        small_with(NOISY),
-        small_with(NOISY_DUELING),
-        residual(TorsoName::Impala),
-        residual(TorsoName::Impoola),
-    ] {
+    for config in kinds().chain([uneven, even]) {
         let parameters = with_biases(&config);
         let (ours, mut our_gradients) =
             outputs_and_gradients(&config, &parameters, Kernels::FUSED)?;
@@ -84,49 +74,37 @@ fn candle_s_own_operations_give_the_same_with_gradients() -> Result<()> {
 
 #[test]
 fn features_and_gradients_have_the_same_bits_for_any_number_of_threads() {
-    for precision in Precision::ALL {
-        the_same_bits_for_any_number_of_threads(precision, &small());
-        the_same_bits_for_any_number_of_threads(precision, &small_with(DUELING));
-        the_same_bits_for_any_number_of_threads(precision, &small_with(NOISY_DUELING));
-        the_same_bits_for_any_number_of_threads(precision, &residual(TorsoName::Impala));
-        the_same_bits_for_any_number_of_threads(precision, &residual(TorsoName::Impoola));
-    }
-}
-
-fn the_same_bits_for_any_number_of_threads(precision: Precision, config: &ModelConfig) {
-    let streams = if config.head.dueling { 2 } else { 1 };
-    let noise = HeadNoise::draw(config, &mut rng(3));
-    let head = streams * if noise.is_some() { 4 } else { 2 };
-    let parameters = with_biases(config);
-    let kernels = Kernels::Fused(precision);
-    let network = Network::with_kernels(config, &parameters, kernels).unwrap();
-    let batch = frames(config, 61, &mut rng(2));
-    let run = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build()
-            .unwrap();
-        pool.install(|| {
+    for (precision, config) in Precision::ALL
+        .into_iter()
+        .flat_map(|precision| kinds().map(move |config| (precision, config)))
+    {
+        let streams = if config.head.dueling { 2 } else { 1 };
+        let noise = HeadNoise::draw(&config, &mut rng(3));
+        let head = streams * if noise.is_some() { 4 } else { 2 };
+        let parameters = with_biases(&config);
+        let kernels = Kernels::Fused(precision);
+        let network = Network::with_kernels(&config, &parameters, kernels).unwrap();
+        let batch = frames(&config, 61, &mut rng(2));
+        let run = || {
             let features = network.features(&batch).unwrap();
             let logits = network.logits(&features.f4, noise.as_ref()).unwrap();
             let phi3 = network.phi3(features.local().unwrap()).unwrap();
-            let loss = (logits.sqr().unwrap().sum_all().unwrap()
-                + phi3.sqr().unwrap().sum_all().unwrap())
-            .unwrap();
-            let mut grads = Backward::of(&loss).unwrap();
+            let [logits_loss, phi3_loss] =
+                [&logits, &phi3].map(|it| it.sqr().unwrap().sum_all().unwrap());
+            let mut grads = Backward::of(&(logits_loss + phi3_loss).unwrap()).unwrap();
             let grads = parameters
                 .iter()
                 .filter_map(|(_, var)| grads.remove(var).unwrap().as_ref().map(bits))
                 .collect::<Vec<_>>();
             (bits(&logits), grads)
-        })
-    };
-    let one = run(1);
-    let shapes = config.parameter_shapes();
-    let torso = shapes.iter().filter(|it| it.0.starts_with("torso."));
-    assert_eq!(one.1.len(), torso.count() + head + 5, "torso, head, phi3");
-    for threads in [2, 3] {
-        assert!(run(threads) == one, "{threads} threads");
+        };
+        let one = pool(1).install(run);
+        let shapes = config.parameter_shapes();
+        let torso = shapes.iter().filter(|it| it.0.starts_with("torso."));
+        assert_eq!(one.1.len(), torso.count() + head + 5, "torso, head, phi3");
+        for threads in [2, 3] {
+            assert!(pool(threads).install(run) == one, "{threads} threads");
+        }
     }
 }
 

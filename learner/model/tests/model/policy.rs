@@ -1,62 +1,44 @@
 //! The policy against the network it must agree with.
 //! Loading broken weights is tested with the weights.
 
-use candle_core::{Device, Tensor};
-use driml_model::{
-    HeadConfig, HeadNoise, ModelConfig, Network, PolicyNetwork, Precision, TorsoName,
-};
+use driml_model::{HeadNoise, Network, PolicyNetwork, Precision, TorsoName};
 
 use crate::support::{
-    DUELING, NOISY, NOISY_DUELING, bytes, parameters, policy, q_values, residual, rng, small,
+    NOISY_DUELING, bytes, frames, kinds, parameters, policy, pool, q_values, residual, rng, small,
     small_with, values,
 };
 
 #[test]
 fn it_agrees_with_the_network_for_any_batch_and_number_of_threads() {
-    for head in [HeadConfig::PLAIN, DUELING, NOISY, NOISY_DUELING] {
-        it_agrees_with_the_network(small_with(head));
-    }
-    for torso in [TorsoName::Impala, TorsoName::Impoola] {
-        it_agrees_with_the_network(residual(torso));
-    }
-}
-
-fn it_agrees_with_the_network(config: ModelConfig) {
-    let parameters = parameters(&config, 3);
-    let network = Network::new(&config, &parameters).unwrap();
-    let mut policy = policy(&config, &parameters, Precision::F32);
-    for batch in [1, 2, 5, 33, 70] {
-        let frames = bytes(batch * config.frame_len(), &mut rng(batch as u64));
-        let shape = (batch, config.height, config.width, config.input_channels);
-        let tensor = Tensor::from_slice(&frames, shape, &Device::Cpu).unwrap();
-        let noise = HeadNoise::draw(&config, &mut rng(7 + batch as u64));
-        policy.set_noise(noise.as_ref());
-        let f4 = network.features(&tensor).unwrap().f4;
-        let logits = network.logits(&f4, noise.as_ref()).unwrap();
-        let wanted = values(&network.q_values(&logits).unwrap());
-        for threads in [1, 2, 3] {
-            let pool = rayon::ThreadPoolBuilder::new()
-                .num_threads(threads)
-                .build()
-                .unwrap();
-            let mut values = vec![0.0; batch * 5];
-            let mut actions = vec![0; batch];
-            pool.install(|| {
-                policy.q_values(&frames, &mut values).unwrap();
-                policy.greedy_actions(&frames, &mut actions).unwrap();
-            });
-            for (value, wanted) in values.iter().zip(&wanted) {
-                assert!(
-                    (f64::from(*value) - wanted).abs() < 1e-5,
-                    "batch {batch}, {threads} threads: {value}, {wanted}"
-                );
-            }
-            for (action, values) in actions.iter().zip(values.chunks(5)) {
-                assert!(
-                    values
-                        .iter()
-                        .all(|&value| value <= values[usize::from(*action)])
-                );
+    for config in kinds() {
+        let parameters = parameters(&config, 3);
+        let network = Network::new(&config, &parameters).unwrap();
+        let mut policy = policy(&config, &parameters, Precision::F32);
+        for batch in [1, 2, 5, 33, 70] {
+            let states = bytes(batch * config.frame_len(), &mut rng(batch as u64));
+            let tensor = frames(&config, batch, &mut rng(batch as u64));
+            let noise = HeadNoise::draw(&config, &mut rng(7 + batch as u64));
+            policy.set_noise(noise.as_ref());
+            let f4 = network.features(&tensor).unwrap().f4;
+            let logits = network.logits(&f4, noise.as_ref()).unwrap();
+            let wanted = values(&network.q_values(&logits).unwrap());
+            for threads in [1, 2, 3] {
+                let mut values = vec![0.0; batch * 5];
+                let mut actions = vec![0; batch];
+                pool(threads).install(|| {
+                    policy.q_values(&states, &mut values).unwrap();
+                    policy.greedy_actions(&states, &mut actions).unwrap();
+                });
+                for (value, wanted) in values.iter().zip(&wanted) {
+                    assert!(
+                        (f64::from(*value) - wanted).abs() < 1e-5,
+                        "batch {batch}, {threads} threads: {value}, {wanted}"
+                    );
+                }
+                for (action, values) in actions.iter().zip(values.chunks(5)) {
+                    let chosen = values[usize::from(*action)];
+                    assert!(values.iter().all(|&value| value <= chosen));
+                }
             }
         }
     }
@@ -69,28 +51,23 @@ fn a_state_has_the_same_values_in_any_company() {
     let mut odd = small();
     (odd.conv[2].out, odd.conv[2].kernel, odd.conv[2].stride) = (7, 3, 2);
     for config in [small(), odd, residual(TorsoName::Impala)] {
-        has_the_same_values_in_any_company(&config);
-    }
-}
-
-fn has_the_same_values_in_any_company(config: &ModelConfig) {
-    let parameters = parameters(config, 3);
-    let frames = bytes(70 * config.frame_len(), &mut rng(1));
-    for precision in Precision::ALL {
-        let mut policy = policy(config, &parameters, precision);
-        let all = q_values(&mut policy, config, &frames);
-        for step in [2, 3, 7, 69] {
-            let some: Vec<usize> = (0..70).step_by(step).collect();
-            let states: Vec<u8> = some
-                .iter()
-                .flat_map(|&at| &frames[at * config.frame_len()..][..config.frame_len()])
-                .copied()
-                .collect();
-            let values = q_values(&mut policy, config, &states);
-            for (&at, values) in some.iter().zip(values.chunks(5)) {
-                let bits =
-                    |values: &[f32]| values.iter().map(|it| it.to_bits()).collect::<Vec<_>>();
-                assert_eq!(bits(values), bits(&all[at * 5..][..5]), "{precision}, {at}");
+        let parameters = parameters(&config, 3);
+        let frames = bytes(70 * config.frame_len(), &mut rng(1));
+        for precision in Precision::ALL {
+            let mut policy = policy(&config, &parameters, precision);
+            let mut bits = |states: &[u8]| -> Vec<u32> {
+                let values = q_values(&mut policy, &config, states);
+                values.iter().map(|it| it.to_bits()).collect()
+            };
+            let all = bits(&frames);
+            for step in [2, 3, 7, 69] {
+                let some = (0..70usize).step_by(step);
+                let states = some.clone().map(|at| at * config.frame_len());
+                let states = states.flat_map(|from| &frames[from..][..config.frame_len()]);
+                let values = bits(&states.copied().collect::<Vec<_>>());
+                for (at, values) in some.zip(values.chunks(5)) {
+                    assert_eq!(values, &all[at * 5..][..5], "{precision}, {at}");
+                }
             }
         }
     }

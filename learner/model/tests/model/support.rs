@@ -162,8 +162,20 @@ pub(crate) const NOISY_DUELING: HeadConfig = HeadConfig {
     noisy_sigma: Some(0.5),
 };
 
+/// Small networks with every kind of head, and with every torso.
+pub(crate) fn kinds() -> impl Iterator<Item = ModelConfig> {
+    let heads = [HeadConfig::PLAIN, DUELING, NOISY, NOISY_DUELING].map(small_with);
+    let torsos = [TorsoName::Impala, TorsoName::Impoola].map(residual);
+    heads.into_iter().chain(torsos)
+}
+
 pub(crate) fn parameters(config: &ModelConfig, seed: u64) -> Parameters {
     Parameters::init(config, &mut rng(seed), &Device::Cpu).unwrap()
+}
+
+pub(crate) fn pool(threads: usize) -> rayon::ThreadPool {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+    pool.build().unwrap()
 }
 
 pub(crate) fn policy(
