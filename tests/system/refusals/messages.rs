@@ -35,14 +35,6 @@ fn served() -> Served {
     }
 }
 
-fn stored(inserted_total: u64) -> InsertReply {
-    InsertReply::Stored {
-        inserted_total,
-        actors: 0,
-        waited: false,
-    }
-}
-
 impl Served {
     /// The next chunk of actor 0: two streams of three steps, the last one ending an episode.
     fn chunk(&self, sequence: u64) -> Chunk {
@@ -83,10 +75,14 @@ impl Served {
     /// The server still stores: chunk `sequence` arrives, once.
     fn stores(&self, sequence: u64) {
         let inserted_total = 6 * (sequence + 1);
+        let stored = InsertReply::Stored {
+            inserted_total,
+            actors: 0,
+            waited: false,
+        };
         let retried = self.client.replay().unwrap().chunks_retried;
         for _ in 0..2 {
-            let reply = self.client.insert(&self.chunk(sequence));
-            assert_eq!(reply, stored(inserted_total));
+            assert_eq!(self.client.insert(&self.chunk(sequence)), stored);
         }
         let status = self.client.check_nothing_lost();
         assert_eq!(status.transitions_inserted, inserted_total);
@@ -129,6 +125,7 @@ fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
     served.stores(0);
 }
 
+/// All that makes no sense is tested beside the codec and the replay; here is some of what each of them refuses.
 #[test]
 fn chunks_that_make_no_sense_in_this_run() {
     let served = served();
@@ -137,45 +134,21 @@ fn chunks_that_make_no_sense_in_this_run() {
         change(&mut chunk);
         (served.client.seal(&chunk), why)
     };
-    let smaller = ChunkHeader {
-        frame_bytes: 1,
-        ..served.chunk(0).header
-    };
     served.refuses_chunks([
-        row("action 3; this run has 3", &|it| {
-            it.set(4, 3, 0.0, End::Running)
-        }),
+        row("do not fill", &|it| it.header.steps = 4),
         row("the reward of row 5 is not finite", &|it| {
             it.set(5, 0, f32::NAN, End::Running)
         }),
-        row("do not fill", &|it| it.header.steps = 4),
-        row("do not fill", &|it| it.header.streams = u32::MAX),
-        row("do not fill", &|it| it.header.frame_bytes = 1),
-        row("frames of 1 bytes; this run has 144", &|it| {
-            *it = Chunk::zeroed(smaller)
+        row("action 3; this run has 3", &|it| {
+            it.set(4, 3, 0.0, End::Running)
         }),
-        row("counts that no run reaches", &|it| {
-            it.header.sequence = u64::MAX
+        row("does not know this life of actor 0", &|it| {
+            it.header.incarnation = 10
         }),
     ]);
-
-    // Not refused, but not stored either: what comes before it is missing.
-    let out_of_order = |sequence, expected| {
-        let reply = served.client.insert(&served.chunk(sequence));
-        assert_eq!(reply, InsertReply::OutOfOrder { expected });
-    };
-    out_of_order(1, 0);
     served.stores(0);
-    served.stores(1);
-    out_of_order(3, 2);
-    // Another life of the actor, and then a late message of the first.
-    let mut second_life = served.chunk(0);
-    second_life.header.incarnation = 10;
-    let unknown = served.client.seal(&second_life);
-    served.refuses_chunks([(unknown, "does not know this life of actor 0")]);
     served.client.join_as_actor(0, 10);
-    assert_eq!(served.client.insert(&second_life), stored(18));
-    let late = served.client.seal(&served.chunk(2));
+    let late = served.client.seal(&served.chunk(1));
     served.refuses_chunks([(late, "give each actor another number (--id)")]);
 }
 
