@@ -15,14 +15,10 @@ pub struct Certificates {
     folder: PathBuf,
 }
 
-/// When a certificate is good.
-#[derive(Clone, Copy, Debug)]
-pub enum Valid {
-    /// No longer.
-    UntilYesterday,
-    /// Not before the year 2090.
-    From2090,
-}
+/// From when to when a certificate is good, as openssl writes it: one that is so no longer, and one that is not before the year 2090.
+pub const EXPIRED: [&str; 2] = ["20200101000000Z", "20200201000000Z"];
+/// See [`EXPIRED`].
+pub const FUTURE: [&str; 2] = ["20900101000000Z", "20910101000000Z"];
 
 impl Certificates {
     /// Calls `deploy/certs.sh` for a folder, which may be there; `args` are split at blanks.
@@ -63,23 +59,19 @@ impl Certificates {
     }
 
     /// Signs the certificate of `role` anew, valid at another time.
-    pub fn sign_again(&self, role: &str, valid: Valid) {
-        let old = run(Command::new("openssl")
-            .args([
-                "x509",
-                "-noout",
-                "-ext",
-                "extendedKeyUsage,subjectAltName",
-                "-in",
-            ])
-            .arg(self.path(&format!("{role}.pem"))));
+    pub fn sign_again(&self, role: &str, [start, end]: [&str; 2]) {
+        let openssl = |args: String| {
+            let mut command = Command::new("openssl");
+            run(command
+                .current_dir(&self.folder)
+                .args(args.split_whitespace()))
+        };
+        let old = openssl(format!(
+            "x509 -noout -ext extendedKeyUsage,subjectAltName -in {role}.pem"
+        ));
         let usage = match old.contains("Server") {
             true => "extendedKeyUsage=serverAuth\nsubjectAltName=IP:127.0.0.1",
             false => "extendedKeyUsage=clientAuth",
-        };
-        let (start, end) = match valid {
-            Valid::UntilYesterday => ("20200101000000Z", "20200201000000Z"),
-            Valid::From2090 => ("20900101000000Z", "20910101000000Z"),
         };
         let config = format!(
             "[ca]\ndefault_ca=a\n[a]\nnew_certs_dir=.\ndatabase=index\nrand_serial=yes\ndefault_md=sha256\npolicy=p\nunique_subject=no\n\
@@ -87,12 +79,6 @@ impl Certificates {
         );
         fs::write(self.path("config"), config).unwrap();
         fs::write(self.path("index"), "").unwrap();
-        let openssl = |args: String| {
-            let mut command = Command::new("openssl");
-            run(command
-                .current_dir(&self.folder)
-                .args(args.split_whitespace()))
-        };
         openssl(format!(
             "req -new -key {role}.key -subj /CN={role} -out request"
         ));

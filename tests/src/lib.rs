@@ -19,7 +19,7 @@ mod slow_machine;
 mod system;
 mod waiting;
 
-pub use certificates::{Certificates, Valid};
+pub use certificates::{Certificates, EXPIRED, FUTURE};
 pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
 pub use network::Network;
 pub use process::{Ended, Process, check_has};

@@ -5,7 +5,7 @@ use std::{
     io::{BufRead, BufReader, Read},
     os::unix::process::ExitStatusExt,
     process::{Child, Command, Stdio},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex},
     thread::{self, JoinHandle},
 };
 
@@ -52,7 +52,7 @@ impl Output {
         let reader = thread::spawn(move || {
             for line in BufReader::new(pipe).split(b'\n') {
                 let Ok(line) = line else { return };
-                let mut sink = sink.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut sink = sink.lock().unwrap();
                 sink.push_str(&String::from_utf8_lossy(&line));
                 sink.push('\n');
             }
@@ -61,10 +61,7 @@ impl Output {
     }
 
     fn so_far(&self) -> String {
-        self.text
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone()
+        self.text.lock().unwrap().clone()
     }
 }
 
@@ -157,6 +154,18 @@ impl Process {
         }
     }
 
+    /// Waits for its end, which must be a success.
+    #[track_caller]
+    pub fn wait_ok(self) -> Ended {
+        self.wait().expect_code(0)
+    }
+
+    /// Waits for its end, which must be an error with `words` on standard error.
+    #[track_caller]
+    pub fn fails(self, words: &str) -> Ended {
+        self.wait().expect_error(words)
+    }
+
     /// Kills it and waits for its end.
     pub fn kill(self) {
         self.signal(Signal::SIGKILL);
@@ -173,6 +182,12 @@ impl Process {
     pub fn stop(self) -> Ended {
         self.signal(Signal::SIGTERM);
         self.wait()
+    }
+
+    /// Asks it to stop and waits for its end, which must be a success.
+    #[track_caller]
+    pub fn stop_ok(self) -> Ended {
+        self.stop().expect_code(0)
     }
 }
 

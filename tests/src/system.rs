@@ -120,42 +120,33 @@ impl TestSystem {
         format!("local {flags} --listen {} --run-dir run", self.endpoint())
     }
 
-    /// Starts the program in the system's folder. Arguments are as in a shell, with quotes around those that have blanks.
-    pub fn start(&self, args: &str) -> Process {
-        self.start_after("", args)
-    }
-
-    /// [`Self::start`] with other words before the program, such as those that put it on another machine, or `env` with variables, which
+    /// Starts the program in the system's folder, with these arguments as in a shell: quotes are around those that have blanks.
+    ///
+    /// Or a whole line in which the word `DRIML` is the program: after words that put it on another machine, or `env` with variables, which
     /// all processes of a run inherit.
-    pub fn start_after(&self, words: &str, args: &str) -> Process {
-        Process::start(args.to_owned(), self.command_after(words, args))
+    pub fn start(&self, args: &str) -> Process {
+        Process::start(args.to_owned(), self.command(args))
     }
 
-    /// How the program is started, for tests that do it in their own way.
+    /// How [`Self::start`] does it, for tests that start the program in their own way.
     pub fn command(&self, args: &str) -> Command {
-        self.command_after("", args)
-    }
-
-    fn command_after(&self, words: &str, args: &str) -> Command {
-        let split = |text: &str| shlex::split(text).expect("quotes are closed");
-        let mut line = split(words);
-        line.push(self.program.clone());
-        line.extend(split(args));
+        let mut line = shlex::split(args).expect("quotes are closed");
+        match line.iter().position(|word| word == "DRIML") {
+            Some(at) => line[at].clone_from(&self.program),
+            None => line.insert(0, self.program.clone()),
+        }
         let mut command = Command::new(&line[0]);
         command
             .args(&line[1..])
             .current_dir(self.folder.path())
             .env(MARK, &self.mark)
-            .envs(self.hold())
             .env_remove("DRIML_LOG");
-        command
-    }
-
-    /// The variable that holds learners, if they are to be.
-    fn hold(&self) -> Option<(&'static str, String)> {
         let updates = self.held_at.load(Ordering::Relaxed);
-        let go = self.path(GO);
-        (updates != NEVER).then(|| (fail_point::HOLD, format!("{updates} {}", go.display())))
+        if updates != NEVER {
+            let go = self.path(GO);
+            command.env(fail_point::HOLD, format!("{updates} {}", go.display()));
+        }
+        command
     }
 
     /// Runs the program to its end.
@@ -167,6 +158,19 @@ impl TestSystem {
     #[track_caller]
     pub fn run_ok(&self, args: &str) -> Ended {
         self.run(args).expect_code(0)
+    }
+
+    /// Runs `local` into the run folder `run_dir` to its end, and gives its summary after [`RunFolder::check_finished`].
+    #[track_caller]
+    pub fn train(&self, flags: &str, run_dir: &str) -> Summary {
+        self.run_ok(&format!("local {flags} --run-dir {run_dir}"));
+        self.run_folder(run_dir).check_finished()
+    }
+
+    /// Runs the program to its end, which must be an error with `words` on standard error.
+    #[track_caller]
+    pub fn fails(&self, args: &str, words: &str) -> Ended {
+        self.run(args).expect_error(words)
     }
 
     /// Runs the program to its end, which must be that of a wrong configuration, with `words` on standard error.
@@ -186,31 +190,20 @@ impl TestSystem {
 
     /// Starts a process that would wait for signals forever; it ends with this test, however that ends.
     pub fn start_process(&self, args: &str) -> Process {
-        self.start_process_after("", args)
-    }
-
-    /// [`Self::start_process`] with other words before the program.
-    pub fn start_process_after(&self, words: &str, args: &str) -> Process {
         let parent = std::process::id();
-        self.start_after(words, &format!("{args} --exit-with-parent {parent}"))
+        self.start(&format!("{args} --exit-with-parent {parent}"))
     }
 
-    /// Runs the program to its end, with other words before it.
-    pub fn run_after(&self, words: &str, args: &str) -> Ended {
-        self.start_after(words, args).wait()
-    }
-
-    /// Starts a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
+    /// The call of a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
     /// asked, as the learner does.
-    pub fn start_replay_server(&self, flags: &str) -> Process {
-        self.start_replay_server_after("", flags)
+    pub fn replay_server(&self, flags: &str) -> String {
+        let endpoint = self.endpoint();
+        format!("replay-server --keep-alive --listen {endpoint} {flags}")
     }
 
-    /// [`Self::start_replay_server`] with other words before the program.
-    pub fn start_replay_server_after(&self, words: &str, flags: &str) -> Process {
-        let endpoint = self.endpoint();
-        let args = format!("replay-server --keep-alive --listen {endpoint} {flags}");
-        self.start_process_after(words, &args)
+    /// Starts such a replay server.
+    pub fn start_replay_server(&self, flags: &str) -> Process {
+        self.start_process(&self.replay_server(flags))
     }
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.

@@ -18,8 +18,8 @@ fn processes_find_each_other_and_end_in_order() {
     let client = system.connect();
 
     // Actors learn from the replay server that the run is complete, and exit.
-    first.wait().expect_code(0).expect_said("actor 0 leaves");
-    second.wait().expect_code(0).expect_said("actor 7 leaves");
+    first.wait_ok().expect_said("actor 0 leaves");
+    second.wait_ok().expect_said("actor 7 leaves");
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.check_nothing_lost();
     assert_eq!(replay.waiting, Waiting::Finished);
@@ -35,16 +35,12 @@ fn processes_find_each_other_and_end_in_order() {
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
-    learner
-        .stop()
-        .expect_code(0)
-        .expect_said("finished after 540 updates");
+    learner.stop_ok().expect_said("finished after 540 updates");
     // Its folder is as good as a launched run's for an evaluation.
     system.run_ok("evaluate --run run --episodes 5");
     drop(client);
     server
-        .stop()
-        .expect_code(0)
+        .stop_ok()
         .expect_said("stops with 1280 transitions stored");
     assert_eq!(system.survivors(), []);
 }
@@ -77,7 +73,7 @@ fn processes_end_by_themselves_when_the_run_is_over() {
             processes.push(system.start_process(&format!("actor {connect} --id {id}")));
         }
         for process in processes {
-            process.wait().expect_code(0);
+            process.wait_ok();
         }
         assert_eq!(system.survivors(), []);
         system.run_ok("evaluate --run run --episodes 2");
@@ -98,7 +94,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
 
     for actor in actors {
-        actor.stop().expect_code(0).expect_said("leaves: ");
+        actor.stop_ok().expect_said("leaves: ");
     }
     let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
     check_nothing_lost(&replay);
@@ -112,8 +108,7 @@ fn processes_that_are_told_to_stop_lose_nothing() {
         replay.waiting == Waiting::LearnerWaitsForActors
     });
     learner
-        .stop()
-        .expect_code(0)
+        .stop_ok()
         .expect_said("saved run/checkpoints/checkpoint-");
     assert!(!system.run_folder("run").checkpoints().is_empty());
     drop(client);
@@ -139,25 +134,26 @@ fn an_actor_killed_and_started_again_continues() {
 
     system.let_go();
     let again = system.start_actor(3);
-    again.wait().expect_code(0);
+    again.wait_ok();
     client.wait_for_learner("the learner's last update", |learner| learner.finished);
     // A killed actor sends no `Leave`: what it had and did not deliver was never announced, and is in no count.
     let replay = client.check_nothing_lost();
     assert!(replay.transitions_inserted >= 4_008 && replay.finished);
     assert_eq!(replay.messages_refused, 0);
-    learner.stop().expect_code(0);
+    learner.stop_ok();
 }
 
 /// However it is started, a process has the environment that candle and the C library read; what the user has set stays.
 #[test]
 fn a_process_by_hand_settles_its_environment() {
     let system = system();
+    let server = system.replay_server("--env chain --preset smoke");
     let variables = "env -u MALLOC_ARENA_MAX CANDLE_NUM_THREADS=3";
-    let mut server = system.start_replay_server_after(variables, "--env chain --preset smoke");
+    let mut server = system.start_process(&format!("{variables} DRIML {server}"));
     server.wait_for_stderr("replay server listens on ");
     let environ = fs::read_to_string(format!("/proc/{}/environ", server.pid())).unwrap();
     let has = |variable: &str| environ.split('\0').any(|it| it == variable);
     assert!(has("MALLOC_ARENA_MAX=2") && has("MALLOC_TRIM_THRESHOLD_=10000000000"));
     assert!(has("CANDLE_NUM_THREADS=3"));
-    server.stop().expect_code(0);
+    server.stop_ok();
 }

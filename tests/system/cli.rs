@@ -75,7 +75,7 @@ fn files_and_runs_that_are_not_there() {
             "making odd/pieces",
         ),
     ] {
-        system.run(call).expect_error(why);
+        system.fails(call, why);
     }
 }
 

@@ -161,7 +161,7 @@ fn a_hangup_ends_processes_in_order() {
         (server, "replay server stops"),
     ] {
         role.signal(Signal::SIGHUP);
-        role.wait().expect_code(0).expect_said(says);
+        role.wait_ok().expect_said(says);
     }
     assert!(!system.run_folder("run").checkpoints().is_empty());
 }
@@ -186,7 +186,9 @@ fn a_hangup_ends_a_launched_run_once() {
 fn a_run_that_is_to_ignore_hangups_does() {
     let system = system();
     let run = system.local(&format!("--agent driml-ada {LONG}"));
-    let process = system.start_after("sh -c 'trap \"\" HUP; exec \"$0\" \"$@\"'", &run);
+    let process = system.start(&format!(
+        "sh -c 'trap \"\" HUP; exec \"$0\" \"$@\"' DRIML {run}"
+    ));
     let client = system.connect();
     let before = client.wait_for_updates(100);
     process.signal(Signal::SIGHUP);

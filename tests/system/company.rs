@@ -24,7 +24,7 @@ fn twenty_four_actors_wait_for_one_learner() {
         .connect()
         .wait_for_replay("24 actors that wait", |replay| replay.actors_waiting == 24);
     system.let_go();
-    let ended = process.wait().expect_code(0);
+    let ended = process.wait_ok();
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.replay.chunks_retried, 0, "{summary:#?}");
     assert!(!ended.stderr.contains("WARN"), "{}", ended.stderr);
@@ -119,12 +119,12 @@ fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
     // The first one still plays.
     let before = client.replay().unwrap();
     client.wait_for_transitions(before.transitions_inserted);
-    first.stop().expect_code(0).expect_said("leaves: ");
+    first.stop_ok().expect_said("leaves: ");
     second.wait_for_stderr("actor 3 steps 4 environments");
-    second.stop().expect_code(0);
+    second.stop_ok();
     let status = client.replay().unwrap();
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
-    learner.stop().expect_code(0);
+    learner.stop_ok();
 }
 
 #[test]
@@ -137,9 +137,9 @@ fn a_second_learner_gets_nothing_while_the_first_is_there() {
     client.wait_for_updates(10);
     let mut second = system.start_learner("second");
     second.wait_for_stderr("another learner takes part in this run, which has one alone");
-    second.stop().expect_code(0);
+    second.stop_ok();
     assert!(system.run_folder("second").checkpoints().is_empty());
-    actor.stop().expect_code(0);
-    first.stop().expect_code(0);
+    actor.stop_ok();
+    first.stop_ok();
     assert_eq!(client.replay().unwrap().messages_refused, 0);
 }

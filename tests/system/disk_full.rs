@@ -197,8 +197,8 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
         said.contains("replay on disk: ") && !said.contains("REFUSED"),
         "{said}"
     );
-    actor.stop().expect_code(0);
-    learner.stop().expect_code(0);
+    actor.stop_ok();
+    learner.stop_ok();
     let before = client.check_nothing_lost();
     server.kill();
     let server = system.start_replay_server(&flags);
@@ -212,9 +212,9 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     });
     assert_eq!(after.updates_relearned, 0, "{after:#?}");
     client.wait_for_learner("the learner", |_| true);
-    learner.stop().expect_code(0);
+    learner.stop_ok();
     drop(client);
-    server.stop().expect_code(0);
+    server.stop_ok();
 }
 
 #[test]
@@ -230,12 +230,10 @@ fn a_folder_that_cannot_be_used_is_said() {
         ))
     };
     other(&flags)
-        .wait()
-        .expect_error("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
-    server.stop().expect_code(0);
+        .fails("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");
+    server.stop_ok();
     other(&flags.replace("c51", "driml-ada"))
-        .wait()
-        .expect_error("replay holds the replay of another run (its run spec has the hash");
+        .fails("replay holds the replay of another run (its run spec has the hash");
 
     let Some(disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
@@ -246,8 +244,7 @@ fn a_folder_that_cannot_be_used_is_said() {
         return;
     }
     other(&flags.replace("--replay-dir replay", "--replay-dir disk/replay"))
-        .wait()
-        .expect_error("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
+        .fails("Read-only file system (os error 30); --replay-dir needs a folder with room that this process may write");
     drop(disk);
     assert!(system.names("replay").len() > 2);
 }

@@ -74,8 +74,7 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
     }
     system.let_go();
     process
-        .wait()
-        .expect_code(0)
+        .wait_ok()
         .expect_said("replay-server was killed by signal 9 SIGKILL")
         .expect_said("replay-server is started again with what it has kept (3 of 8 times in a run)")
         .expect_printed("of disk, in the run folder");
@@ -91,7 +90,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     for _ in 0..=8 {
         kill_server(&system);
     }
-    process.wait().expect_error("(8 of 8 times in a run)");
+    process.fails("(8 of 8 times in a run)");
     system.check_over(Outcome::Failed);
     assert!(
         !system.run_folder("run").checkpoints().is_empty(),
@@ -120,16 +119,15 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     let server = system.start_replay_server(&flags);
     let actors = [system.start_actor(0), system.start_actor(1)];
     for actor in actors {
-        actor.wait().expect_code(0);
+        actor.wait_ok();
     }
     let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned(replay.transitions_inserted));
-    learner.stop().expect_code(0);
+    learner.stop_ok();
     drop(client);
     server
-        .stop()
-        .expect_code(0)
+        .stop_ok()
         .expect_said("continues with the replay in replay");
 }
 
@@ -156,7 +154,7 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
         kills += 1;
     }
     system.let_go();
-    process.wait().expect_code(0).expect_said(&format!(
+    process.wait_ok().expect_said(&format!(
         "is started again with what it has kept ({kills} of 8"
     ));
     check_exactly_once(&run);

@@ -66,9 +66,8 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
         "use --levels train",
     );
     assert_eq!(system.read("returns.csv"), table);
-    system
-        .run("evaluate run --returns none/returns.csv")
-        .expect_error("--returns none/returns.csv");
+    let nowhere = "--returns none/returns.csv";
+    system.fails(&format!("evaluate run {nowhere}"), nowhere);
 
     // Any checkpoint that is there is played.
     let kept = system.run_folder("run").checkpoints();
@@ -338,11 +337,9 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named()
     let whole = fs::read(&path).unwrap();
     fs::write(&path, &whole[..whole.len() / 2]).unwrap();
     let call = "evaluate --run run --episodes 1";
+    let damaged = format!("error: run/checkpoints/{name}/online.safetensors is damaged: ");
     system
-        .run(call)
-        .expect_error(&format!(
-            "error: run/checkpoints/{name}/online.safetensors is damaged: "
-        ))
+        .fails(call, &damaged)
         .expect_said("remove the folder it is in");
     fs::write(&path, &whole).unwrap();
     system.run_ok(call);
@@ -351,8 +348,7 @@ fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named()
     let other = text.replace("seed = 1", "seed = 2");
     fs::write(system.path("run/config.toml"), other).unwrap();
     system
-        .run(call)
-        .expect_error("belongs to a run with specification")
+        .fails(call, "belongs to a run with specification")
         .expect_said("resume with the settings it was made with");
     fs::remove_dir_all(system.path("run/checkpoints")).unwrap();
     system.refuses(call, "has no checkpoint yet");

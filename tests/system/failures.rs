@@ -53,9 +53,8 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
     let system = system();
     let process = launched(&system, 100);
     fs::rename(system.path("run"), system.path("elsewhere")).unwrap();
-    let ended = process
-        .wait()
-        .expect_error("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
+    let ended =
+        process.fails("missing: run/config.toml, run/metrics.csv, run/episodes.csv, run/logs");
     assert!(!ended.stderr.contains("resumes it"), "{}", ended.stderr);
     assert_eq!(system.survivors(), []);
 }
@@ -67,8 +66,7 @@ fn a_dead_learner_or_replay_server_ends_the_run() {
         let process = launched(&system, 100);
         system.find_process(role).signal(Signal::SIGKILL);
         process
-            .wait()
-            .expect_error(&format!(
+            .fails(&format!(
                 "error: {role} was killed by signal 9 SIGKILL (log: "
             ))
             .expect_said("`driml train --resume run` resumes it");
@@ -96,8 +94,7 @@ fn a_dead_actor_is_started_again() {
     system.let_go();
     drop(client);
     process
-        .wait()
-        .expect_code(0)
+        .wait_ok()
         .expect_said("was killed by signal 9 SIGKILL (log: ");
     let summary = system.run_folder("run").check_finished();
     assert_eq!(summary.actors_restarted, 2);
@@ -118,8 +115,7 @@ fn a_dead_actor_whose_ghosts_change_ends_the_run() {
     system.connect().wait_for_transitions(0);
     system.find_process("actor").signal(Signal::SIGKILL);
     process
-        .wait()
-        .expect_error("error: actor-0 was killed by signal 9 SIGKILL (log: ")
+        .fails("error: actor-0 was killed by signal 9 SIGKILL (log: ")
         .expect_said("actor-0 is not started again: the ghosts of this run change");
     system.check_over(Outcome::Failed);
 }
@@ -136,7 +132,7 @@ fn processes_whose_launcher_died_deliver_what_they_have() {
         wait' sh";
     let system = system();
     let args = format!("{} --agent c51 {LONG}", system.endpoint());
-    let launcher = system.start_after(LAUNCHER, &args);
+    let launcher = system.start(&format!("{LAUNCHER} DRIML {args}"));
     system.connect().wait_for_updates(100);
     launcher.signal(Signal::SIGKILL);
     system.wait_until_all_have_ended();

@@ -38,8 +38,7 @@ fn complete_but_for_an_actor(system: &TestSystem) -> Process {
 fn a_complete_run_is_finished() {
     let system = system();
     complete_but_for_an_actor(&system)
-        .wait()
-        .expect_code(0)
+        .wait_ok()
         .expect_said("did not end within 1 min 0 s and was killed")
         .expect_printed("finished: ");
     system.check_over(Outcome::Finished);
@@ -64,12 +63,9 @@ fn a_replay_server_ends_without_its_actor() {
     frozen.wait_for_stderr("waiting for the learner's first weights");
     frozen.signal(Signal::SIGSTOP);
     let learner = system.start_process(&format!("learner --connect {listen} --run-dir run"));
-    system.start_actor(0).wait().expect_code(0);
-    learner.wait().expect_code(0);
-    server
-        .wait()
-        .expect_code(0)
-        .expect_said("the run is over, and ");
+    system.start_actor(0).wait_ok();
+    learner.wait_ok();
+    server.wait_ok().expect_said("the run is over, and ");
     frozen.kill();
 }
 
@@ -116,8 +112,8 @@ fn a_frozen_actor_does_not_stop_the_others() {
     let others = client.replay().unwrap().transitions_inserted;
     client.wait_for_transitions(others + 500);
     for actor in [healthy, frozen] {
-        actor.stop().expect_code(0).expect_said("leaves: ");
+        actor.stop_ok().expect_said("leaves: ");
     }
     client.check_nothing_lost();
-    learner.stop().expect_code(0);
+    learner.stop_ok();
 }

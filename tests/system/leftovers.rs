@@ -8,17 +8,18 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, launched, system};
 
-/// The word before the program that makes `tmp` in the system's folder its temporary folder.
-fn in_temporary(system: &TestSystem) -> String {
-    format!("env TMPDIR={}", system.path("tmp").display())
+/// A run whose temporary folder is `tmp` in the system's.
+fn local(system: &TestSystem, flags: &str) -> String {
+    let folder = system.path("tmp");
+    format!("env TMPDIR={} DRIML local {flags}", folder.display())
 }
 
-/// A run that has learned something and saved nothing, whose temporary folder is `tmp` in the system's; and its processes.
+/// A run of [`local`] that has learned something and saved nothing, and its processes.
 fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
     fs::create_dir(system.path("tmp")).unwrap();
     let never = format!("--set learner.checkpoint_period_updates={NEVER}");
-    let run = format!("local --agent driml-ada {LONG} {never} --run-dir run");
-    let process = system.start_after(&in_temporary(system), &run);
+    let flags = format!("--agent driml-ada {LONG} {never} --run-dir run");
+    let process = system.start(&local(system, &flags));
     let run = system.run_folder("run");
     run.wait_for_updates(100);
     (process, PROCESSES.map(|role| system.find_process(role)))
@@ -51,10 +52,8 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     process.wait();
     system.wait_until_all_have_ended();
     assert_eq!(temporary(&system).len(), 1, "nothing could remove it");
-    let next = format!("local --agent c51 {SHORT} --run-dir next");
-    system
-        .run_after(&in_temporary(&system), &next)
-        .expect_code(0);
+    let next = format!("--agent c51 {SHORT} --run-dir next");
+    system.run_ok(&local(&system, &next));
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);
 }
@@ -71,7 +70,7 @@ fn processes_started_by_hand_leave_no_shared_memory() {
     // A client may hold what it has seen.
     drop(client);
     for process in [actor, learner, server] {
-        process.stop().expect_code(0);
+        process.stop_ok();
     }
     check_gone(&segments);
 }

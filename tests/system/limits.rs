@@ -5,48 +5,46 @@ use std::fs;
 
 use crate::{LONG, SHORT, system};
 
-/// Words before a command that set a limit of the shell's `ulimit`, for it and its children.
-fn limited(limit: &str) -> String {
-    format!("sh -c 'ulimit {limit} && exec \"$0\" \"$@\"'")
+/// A call of the program with a limit of the shell's `ulimit`, for it and its children.
+fn limited(limit: &str, call: &str) -> String {
+    format!("sh -c 'ulimit {limit} && exec \"$0\" \"$@\"' DRIML {call}")
 }
 
 #[test]
 fn a_run_with_more_actors_than_files_may_be_open_does_not_start() {
     let system = system();
     let run = |actors| format!("local --agent c51 {SHORT} --actors {actors} --run-dir run");
-    system
-        .run_after(&limited("-n 60"), &run(20))
-        .expect_code(64)
-        .expect_said("the replay server of a run with 20 actors needs 128 open files, and the system allows 60: raise the limit");
+    let why = "the replay server of a run with 20 actors needs 128 open files, and the system allows 60: raise the limit";
+    system.refuses(&limited("-n 60", &run(20)), why);
     assert!(!system.path("run").exists());
-    system.run_after(&limited("-n 60"), &run(2)).expect_code(0);
+    system.run_ok(&limited("-n 60", &run(2)));
     // What may be raised is.
     let more = run(4).replace("--run-dir run", "--run-dir more");
-    system.run_after(&limited("-S -n 60"), &more).expect_code(0);
+    system.run_ok(&limited("-S -n 60", &more));
 }
 
 #[test]
 fn a_replay_server_warns_if_it_may_not_open_enough_files() {
     let system = system();
-    let flags = format!("--agent c51 {LONG} --actors 20");
-    let mut server = system.start_replay_server_after(&limited("-n 60"), &flags);
+    let server = system.replay_server(&format!("--agent c51 {LONG} --actors 20"));
+    let mut server = system.start_process(&limited("-n 60", &server));
     server.wait_for_stderr(
         "a replay server for 20 actors needs 128 open files, and the system allows 60: ",
     );
     server.wait_for_stderr("replay server listens on ");
-    server.stop().expect_code(0);
+    server.stop_ok();
 }
 
 #[test]
 fn a_file_that_may_not_grow_is_an_error_and_no_end() {
     let system = system();
-    let flags = format!("--agent c51 {LONG} --replay-dir replay");
+    let server = system.replay_server(&format!("--agent c51 {LONG} --replay-dir replay"));
     // Half a block of the system's is too little for a segment of shared memory, too.
-    let mut server = system.start_replay_server_after(&limited("-f 64"), &flags);
+    let mut server = system.start_process(&limited("-f 64", &server));
     server.wait_for_stderr("replay server listens on ");
     let (_learner, _actor) = (system.start_learner("run"), system.start_actor(0));
     server.wait_for_stderr("cannot be written: File too large (os error 27)");
-    server.stop().expect_code(0);
+    server.stop_ok();
 }
 
 #[test]
@@ -59,9 +57,9 @@ fn a_temporary_folder_may_have_a_name_too_long_for_a_socket() {
         "t".repeat(95 - start.as_os_str().len())
     );
     fs::create_dir(&folder).unwrap();
-    let run = format!("local --agent c51 {SHORT} --run-dir run");
-    let temporary = format!("env TMPDIR={folder}");
-    system.run_after(&temporary, &run).expect_code(0);
+    system.run_ok(&format!(
+        "env TMPDIR={folder} DRIML local --agent c51 {SHORT} --run-dir run"
+    ));
     let endpoint = format!("unixsock-stream/{folder}/{}", "s".repeat(20));
     system
         .refuses(&format!("replay-server --agent c51 {SHORT} --listen {endpoint}"), "the path of a unix socket has at most 107 bytes, and this one has 116: choose a shorter one");

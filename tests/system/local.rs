@@ -44,11 +44,10 @@ fn c51_leaves_a_whole_run_folder() {
     let events = names.filter(|name| name.contains("tfevents"));
     assert_eq!(events.count(), 0, "there are none without the flag");
     // The settings that it left repeat it. Processes race, so the weights differ; the counts do not.
-    system.run_ok("local --config run/config.toml --run-dir again");
-    let again = system.run_folder("again");
-    assert_eq!(again.config(), run.config());
+    let again = system.train("--config run/config.toml", "again");
+    assert_eq!(system.run_folder("again").config(), run.config());
     let counts = |it: &Summary| (it.frames, it.updates, it.replay.rows_sampled);
-    assert_eq!(counts(&again.check_finished()), counts(&summary));
+    assert_eq!(counts(&again), counts(&summary));
 }
 
 #[test]
@@ -65,7 +64,7 @@ fn driml_ada_with_two_actors_over_tcp() {
     let process = system.start(&format!("local --agent driml-ada {alphabet} {flags}"));
     Client::join(&endpoint).wait_for_replay("both actors", |replay| replay.actors == 2);
     system.let_go();
-    process.wait().expect_code(0);
+    process.wait_ok();
     let run = system.run_folder("run");
     let summary = run.check_finished();
     assert_eq!(summary.replay_ratio, Some(8.0));
@@ -98,7 +97,7 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
     let folder = system.run_folder("run");
     let actors = || -> BTreeSet<_> { folder.episodes().iter().map(|it| it.actor).collect() };
     wait_until("an episode that it played", || actors().contains(&5));
-    outside.stop().expect_code(0).expect_said("actor 5 leaves");
+    outside.stop_ok().expect_said("actor 5 leaves");
     run.interrupt().expect_code(130);
     folder.check(Outcome::Interrupted);
     assert_eq!(actors(), BTreeSet::from([0, 5]));
@@ -106,10 +105,8 @@ fn an_actor_from_elsewhere_plays_in_a_launched_run() {
 
 #[test]
 fn mspacman_with_stacked_and_enlarged_frames() {
-    let system = system();
-    system
-        .run_ok("local --env mspacman --agent driml-fix --preset smoke --frames 320 --run-dir run");
-    let summary = system.run_folder("run").check_finished();
+    let flags = "--env mspacman --agent driml-fix --preset smoke --frames 320";
+    let summary = system().train(flags, "run");
     assert_eq!(summary.updates, 7);
     assert_eq!(summary.mean_k, Some(1.0), "driml-fix serves k = 1 here");
 }
@@ -119,14 +116,13 @@ fn mspacman_with_stacked_and_enlarged_frames() {
 fn cpc_and_curl_get_what_they_need_and_no_more() {
     let system = system();
     for (agent, served, loss) in [("cpc", 5, "cpc_4t4"), ("curl", 0, "curl")] {
-        system.run_ok(&format!("local --agent {agent} {SHORT} --run-dir {agent}"));
-        let run = system.run_folder(agent);
-        let summary = run.check_finished();
+        let summary = system.train(&format!("--agent {agent} {SHORT}"), agent);
         assert_eq!((summary.frames, summary.updates), (1280, 540));
         // Rows by their furthest k: every one up to 5 is served where the episode is long enough.
         assert_eq!(summary.replay.k_histogram.len(), served + 1);
         assert!(summary.replay.k_histogram.iter().all(|&count| count > 0));
-        let last = run.table("metrics.csv").last::<f64>(loss).unwrap();
+        let metrics = system.run_folder(agent).table("metrics.csv");
+        let last: f64 = metrics.last(loss).unwrap();
         assert!(last > 0.0, "{agent}: {last}");
         system
             .run_ok(&format!("evaluate --run {agent} --episodes 3"))
@@ -144,12 +140,10 @@ fn what_is_learned_tells_the_positive_from_other_rows() {
         let system = system();
         let longer = SHORT.replace("replay_ratio=8", "replay_ratio=32");
         assert_ne!(longer, SHORT);
-        system.run_ok(&format!(
-            "local --agent {agent} {longer} --set learner.batch_size=64 --run-dir run"
-        ));
-        let run = system.run_folder("run");
-        assert_eq!(run.check_finished().updates, 540);
-        let last: f64 = run.table("metrics.csv").last(loss).unwrap();
+        let flags = format!("--agent {agent} {longer} --set learner.batch_size=64");
+        assert_eq!(system.train(&flags, "run").updates, 540);
+        let metrics = system.run_folder("run").table("metrics.csv");
+        let last: f64 = metrics.last(loss).unwrap();
         assert!(last > 0.0 && last < 0.75 * 64f64.ln(), "{agent}: {last}");
     }
 }

@@ -9,8 +9,7 @@ use nix::sys::signal::Signal;
 use crate::{PRIORITISED, chain, system};
 
 fn run(system: &TestSystem, flags: &str, name: &str) -> Summary {
-    system.run_ok(&format!("local --lockstep {flags} --run-dir {name}"));
-    system.run_folder(name).check_finished()
+    system.train(&format!("--lockstep {flags}"), name)
 }
 
 /// Each row: the flags of two runs that are the same, what makes both so, and what makes a third one another.
@@ -69,7 +68,7 @@ pub(crate) fn continues_exactly(flags: &str) {
     };
     let system = system();
     let run = |frames: u64, name: &str| {
-        start(&system, frames, name).wait().expect_code(0);
+        start(&system, frames, name).wait_ok();
         system.run_folder(name).check_finished()
     };
     let whole = run(FRAMES, "whole");
@@ -153,17 +152,6 @@ fn a_run_that_is_prolonged_is_a_longer_one() {
         assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{world}");
         assert_eq!(resumed.mean_return, whole.mean_return, "{world}");
     }
-}
-
-#[test]
-fn a_compressed_replay_leads_to_the_same_weights() {
-    let system = system();
-    let flags = "--env mspacman --agent driml-ada --preset smoke --frames 512";
-    let plain = run(&system, flags, "plain");
-    let lz4 = format!("{flags} --set replay.compression=lz4");
-    let lz4 = run(&system, &lz4, "lz4");
-    assert_eq!(plain.weights_sha256, lz4.weights_sha256);
-    assert_eq!(plain.replay.k_histogram, lz4.replay.k_histogram);
 }
 
 #[test]

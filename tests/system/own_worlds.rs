@@ -29,20 +29,19 @@ fn a_process_of_one_s_own_trains_repeats_and_is_evaluated() {
     let system = system();
     let env = numbered("");
     let flags = format!("{SMALL} --agent driml-ada --frames 1280 --env '{env}'");
-    system.run_ok(&format!("local {flags} --actors 2 --run-dir run"));
-    let run = system.run_folder("run");
-    let summary = run.check_finished();
+    let summary = system.train(&format!("{flags} --actors 2"), "run");
     assert_eq!(summary.frames, 1280);
     // Every third to sixth step of a copy ends an episode.
     assert!(summary.episodes > 200, "{summary:#?}");
+    let run = system.run_folder("run");
     let config = run.config();
     assert_eq!(config["run"]["world"].as_str(), Some(env.as_str()));
     assert_eq!(config["world"]["actions"].as_array().unwrap().len(), 3);
     assert!(run.log("actor-0").contains("a line on stdout does no harm"));
 
     let lockstep = |args: &str, name: &str| {
-        system.run_ok(&format!("local --lockstep {args} --run-dir {name}"));
-        system.run_folder(name).check_finished().weights_sha256
+        let run = system.train(&format!("--lockstep {args}"), name);
+        run.weights_sha256
     };
     let first = lockstep(&flags, "first");
     assert_eq!(first, lockstep("--config first/config.toml", "again"));
@@ -89,16 +88,18 @@ fn a_process_that_cannot_save_its_state_says_so_and_is_repeated() {
         assert!(!run.path().join("replay").exists());
     }
     // One that fails in it ends the run.
-    let system = system();
-    system
-        .run(&run("saves large"))
-        .expect_error("wrote a state of 67108865 bytes; 67108864 are possible");
+    let why = "wrote a state of 67108865 bytes; 67108864 are possible";
+    system().fails(&run("saves large"), why);
 }
 
+/// Chunks are of eight steps of four copies; the last waits for thousands of updates when the world fails.
+const SLOW: &str = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
+
 #[test]
-fn a_world_that_fails_ends_the_run_with_a_sentence() {
+fn a_world_that_fails_ends_the_run_with_a_sentence_and_what_was_played_is_stored() {
     for (fault, limit, sentence) in [
         ("kill 20", "", "ended in the middle of a step (signal: 9"),
+        ("raise 25", SLOW, "the dragon got out"),
         (
             "hang 20",
             "--set world.step_timeout_ms=1500",
@@ -108,27 +109,14 @@ fn a_world_that_fails_ends_the_run_with_a_sentence() {
         let system = system();
         let env = numbered(fault);
         let flags = format!("{SMALL} {limit} --agent c51 --frames 100000 --env '{env}'");
-        system
-            .run(&format!("local {flags} --run-dir run"))
-            .expect_error(sentence);
+        system.fails(&format!("local {flags} --run-dir run"), sentence);
         assert_eq!(system.survivors(), [], "{fault}");
+        if limit == SLOW {
+            // On a slow machine the actor is started again, and plays as much once more.
+            let frames = system.run_folder("run").summary().frames;
+            assert!(frames > 0 && frames.is_multiple_of(3 * 8 * 4), "{frames}");
+        }
     }
-}
-
-/// Chunks are of eight steps of four copies; the last waits for thousands of updates when the world fails.
-#[test]
-fn what_was_played_before_a_world_failed_is_stored() {
-    let system = system();
-    let slow = "--set replay.replay_ratio=8192 --set replay.warmup_transitions=32 --set replay.slack_transitions=1";
-    let env = numbered("raise 25");
-    let flags = format!("{SMALL} {slow} --agent c51 --frames 100000 --env '{env}'");
-    system
-        .run(&format!("local {flags} --run-dir run"))
-        .expect_error("the dragon got out");
-    assert_eq!(system.survivors(), []);
-    // On a slow machine the actor is started again, and plays as much once more.
-    let frames = system.run_folder("run").summary().frames;
-    assert!(frames > 0 && frames.is_multiple_of(3 * 8 * 4), "{frames}");
 }
 
 #[test]
@@ -155,14 +143,13 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     let learner = system.start_learner("run");
     system
         .start_actor(0)
-        .wait()
-        .expect_error("an actor starts none because a replay server says so")
+        .fails("an actor starts none because a replay server says so")
         .expect_said("--env \"exec:exec python3 ");
     let actor = |flags: &str| {
         let endpoint = system.endpoint();
         system.start_process(&format!("actor --connect {endpoint} {flags}"))
     };
-    actor("--env chain").wait().expect_error("and not chain");
+    actor("--env chain").fails("and not chain");
     // The same world by another command, as another machine may have it; it will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));
     let client = system.connect();
@@ -180,8 +167,8 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
     hanging.kill();
     wait_until("the world's end", || worlds() == 0);
     drop(client);
-    learner.stop().expect_code(0);
-    server.stop().expect_code(0);
+    learner.stop_ok();
+    server.stop_ok();
     system.wait_until_all_have_ended();
 }
 
@@ -221,12 +208,10 @@ fn atari_by_gymnasium_trains() {
     let Some(python) = gymnasium() else { return };
     let system = system();
     let script = file("deploy/python/driml_env.py");
-    system.run_ok(&format!(
-        "local --preset smoke --agent c51 --frames 480 --run-dir run --env 'exec:{python} {script} ALE/Pong-v5 --atari'"
-    ));
-    let run = system.run_folder("run");
-    assert_eq!(run.check_finished().frames, 480);
-    let config = run.config();
+    let env = format!("exec:{python} {script} ALE/Pong-v5 --atari");
+    let flags = format!("--preset smoke --agent c51 --frames 480 --env '{env}'");
+    assert_eq!(system.train(&flags, "run").frames, 480);
+    let config = system.run_folder("run").config();
     let names = config["world"]["actions"].as_array().unwrap();
     assert_eq!((names.len(), names[0].as_str()), (6, Some("NOOP")));
     for side in ["height", "width"] {

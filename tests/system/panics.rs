@@ -34,9 +34,10 @@ static THREADS: [(&str, &str, &str); 8] = [
 /// A run with a panic at `point`, to the end.
 fn ends_the_run((process, point, flags): (&str, &str, &str)) {
     let system = system();
-    let run = format!("local --agent driml-ada {LONG} {flags} --run-dir run");
-    let panics = format!("env '{}={point}'", fail_point::VARIABLE);
-    let ended = system.run_after(&panics, &run);
+    let ended = system.run(&format!(
+        "env '{}={point}' DRIML local --agent driml-ada {LONG} {flags} --run-dir run",
+        fail_point::VARIABLE
+    ));
     let contains = |line: &str, words: &str| {
         assert!(line.contains(words), "{point}: {words:?} in {ended:#?}");
     };

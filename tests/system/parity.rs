@@ -25,9 +25,7 @@ fn a_case_with_another_expectation_fails() {
         fs::write(system.path(tensor), bytes).unwrap();
         call += &format!(" {tensor}");
     }
-    let ended = system
-        .run(&call)
-        .expect_error("error: 5 of 6 files are out of tolerance");
+    let ended = system.fails(&call, "error: 5 of 6 files are out of tolerance");
     let said = &ended.stdout;
     let failed: Vec<_> = said.lines().filter(|it| it.ends_with("FAILED")).collect();
     assert_eq!(failed.len(), CHANGED.len(), "{said}");

@@ -66,8 +66,7 @@ fn a_replay_server_that_dies_continues_with_equal_priorities() {
     system.find_process("replay-server").signal(Signal::SIGKILL);
     system.let_go();
     process
-        .wait()
-        .expect_code(0)
+        .wait_ok()
         .expect_said("is started again with what it has kept");
     let run = system.run_folder("run");
     run.check(Outcome::Finished);

@@ -14,9 +14,8 @@ fn with_engine() -> Option<TestSystem> {
 #[test]
 fn bigfish_trains_and_is_evaluated_on_unseen_levels() {
     let Some(system) = with_engine() else { return };
-    system
-        .run_ok("local --env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2 --run-dir run");
-    let summary = system.run_folder("run").check_finished();
+    let flags = "--env procgen:bigfish --agent driml-ada --preset smoke --frames 608 --actors 2";
+    let summary = system.train(flags, "run");
     assert_eq!((summary.frames, summary.updates), (608, 25));
     assert!(summary.mean_k.is_some());
     system
@@ -37,21 +36,19 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
         ),
     ] {
         let flags = "--env procgen:coinrun --agent driml-ada --preset smoke --frames 416";
-        system.run_ok(&format!(
-            "local --lockstep {flags} {sets} --run-dir cut-{name}"
-        ));
-        let folder = system.run_folder(&format!("cut-{name}"));
+        let trained = system.train(
+            &format!("--lockstep {flags} {sets}"),
+            &format!("cut-{name}"),
+        );
         let text = system.read(&format!("cut-{name}/config.toml"));
         let config = RunConfig::parse("config.toml", &text).unwrap();
         assert_eq!([config.run.frame_height, config.run.frame_width], cut);
         let whole = config.with_whole_frames().unwrap();
         assert_eq!([whole.run.frame_height, whole.run.frame_width], [64, 64]);
         std::fs::write(system.path(&format!("{name}.toml")), whole.to_toml()).unwrap();
-        system.run_ok(&format!(
-            "local --lockstep --config {name}.toml --run-dir whole-{name}"
-        ));
-        let whole = system.run_folder(&format!("whole-{name}")).check_finished();
-        assert_eq!(folder.check_finished().weights_sha256, whole.weights_sha256);
+        let config = format!("--lockstep --config {name}.toml");
+        let whole = system.train(&config, &format!("whole-{name}"));
+        assert_eq!(trained.weights_sha256, whole.weights_sha256);
         let played = ["cut", "whole"].map(|run| {
             let ended = system.run_ok(&format!("evaluate --run {run}-{name} --episodes 2"));
             ended.stdout
@@ -63,11 +60,9 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
     let Some(system) = with_engine() else { return };
-    system.run_ok(
-        "local --lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
-             --set actor.actions=visible --set learner.affinity.alphabet=visible --run-dir run",
-    );
-    system.run_folder("run").check_finished();
+    let flags = "--lockstep --env procgen:plunder --agent driml-ada --preset smoke --frames 416 \
+                 --set actor.actions=visible --set learner.affinity.alphabet=visible";
+    system.train(flags, "run");
     let config = system.run_folder("run").config();
     assert_eq!(config["model"]["num_actions"].as_integer(), Some(4));
     system.run_ok("evaluate --run run --episodes 2 --levels unseen");

@@ -92,7 +92,7 @@ fn keep_for(system: &TestSystem, kept: u64) -> (RunSpec, String) {
     let client = system.connect();
     let spec = keep(kept, &system.path("replay"), &client.config_toml);
     drop(client);
-    server.stop().expect_code(0);
+    server.stop_ok();
     (spec, format!("{flags} --replay-dir replay"))
 }
 
@@ -105,7 +105,10 @@ fn slow_down(server: &mut Process) -> SlowMachine {
 
 /// Starts a replay server that stands still until its machine is slowed down: it cannot have read all before.
 fn start_stopped(system: &TestSystem, flags: &str) -> Process {
-    system.start_replay_server_after("sh -c 'kill -STOP $$; exec \"$0\" \"$@\"'", flags)
+    let server = system.replay_server(flags);
+    system.start_process(&format!(
+        "sh -c 'kill -STOP $$; exec \"$0\" \"$@\"' DRIML {server}"
+    ))
 }
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
@@ -191,9 +194,8 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
         "no action needed",
     ];
     check_has(&said, &words);
-    system
-        .run(&format!("watch --once --connect {endpoint}"))
-        .expect_error("reads its replay back from disk");
+    let look = format!("watch --once --connect {endpoint}");
+    system.fails(&look, "reads its replay back from disk");
     let mut watched = system.start(&format!("watch --connect {endpoint} --run-dir seen"));
     watched.wait_for_stderr(": reads its replay back from disk, ");
     actors.push(system.start_actor(1));
@@ -210,7 +212,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     drop(slow);
 
     for actor in actors {
-        actor.wait().expect_code(0);
+        actor.wait_ok();
     }
     let client = system.connect();
     let status = client.wait_for_learner("the learner's last update", |it| it.finished);
@@ -221,14 +223,13 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     );
     assert_eq!(replay.transitions_inserted, frames(LONG));
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
-    watched.wait().expect_code(0);
+    watched.wait_ok();
     let seen = system.run_folder("seen").summary();
     assert_eq!(seen.updates, updates(LONG));
-    learner.stop().expect_code(0);
+    learner.stop_ok();
     drop(client);
     server
-        .stop()
-        .expect_code(0)
+        .stop_ok()
         .expect_said("continues with the replay in replay");
 }
 
@@ -242,15 +243,14 @@ fn a_server_that_reads_is_stopped_and_started_again() {
     let mut actor = system.start_actor(0);
     actor.wait_for_stderr(WAITING);
     server
-        .stop()
-        .expect_code(0)
+        .stop_ok()
         .expect_said("it was told to end while it read its replay back");
     drop(slow);
-    actor.stop().expect_code(0);
+    actor.stop_ok();
     let server = system.start_replay_server(&serve);
     let replay = system.connect().replay().unwrap();
     assert_eq!(replay.transitions_inserted, SHORTER);
-    server.stop().expect_code(0);
+    server.stop_ok();
 
     // An unreadable log ends it with an error, and no process waits for it any more.
     for entry in fs::read_dir(system.path("replay")).unwrap() {
@@ -279,7 +279,7 @@ fn a_resumed_run_shows_how_far_its_server_is() {
     let slow = SlowMachine::for_process(system.find_process("replay-server").pid);
     process.wait_for_stderr("replay-server: reads its replay back from disk, ");
     drop(slow);
-    process.wait().expect_code(0);
+    process.wait_ok();
     let summary = run.check_finished();
     let updates = (frames - WARMUP) / 1024;
     assert_eq!((summary.frames, summary.updates), (frames, updates));
@@ -305,7 +305,7 @@ fn roles_are_told_too() {
     assert!(said.contains("reads its replay back"), "{said}");
     drop(slow);
     let [actor, learner] = processes;
-    actor.wait().expect_code(0);
-    learner.stop().expect_code(0);
-    server.stop().expect_code(0);
+    actor.wait_ok();
+    learner.stop_ok();
+    server.stop_ok();
 }

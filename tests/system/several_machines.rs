@@ -63,14 +63,15 @@ impl Run {
             1 => format!("learner --keep-alive --connect {endpoint} --run-dir run"),
             _ => format!("actor --connect {endpoint} --id {}", machine - 2),
         };
-        let words = self.network.on(MACHINES[machine]);
-        self.system.start_process_after(&words, &args)
+        let on = self.network.on(MACHINES[machine]);
+        self.system.start_process(&format!("{on} DRIML {args}"))
     }
 
     /// The status of the run, fetched from the router; none while no process answers.
     fn status(&self) -> Option<Value> {
-        let args = format!("status --json --connect {}", self.endpoint());
-        let ended = self.system.run_after(&self.network.on("router"), &args);
+        let (on, endpoint) = (self.network.on("router"), self.endpoint());
+        let status = format!("{on} DRIML status --json --connect {endpoint}");
+        let ended = self.system.run(&status);
         let status: Value = serde_json::from_str(ended.stdout.lines().next()?).unwrap();
         status["servers"][0]["replay"].is_object().then_some(status)
     }
@@ -115,11 +116,11 @@ impl Run {
             assert_eq!(count("replay", what), 0, "{what}");
         }
         for actor in self.processes.drain(2..) {
-            actor.wait().expect_code(0);
+            actor.wait_ok();
         }
         // The learner, then the server.
         for process in self.processes.into_iter().rev() {
-            process.stop().expect_code(0);
+            process.stop_ok();
         }
         assert_eq!(self.system.survivors(), []);
     }

@@ -8,13 +8,14 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, chain, disk_full::fill, system};
 
-/// Words before a command that give it a `/dev/shm` of this size, for itself and its children; none, and a line that the test is skipped, if
-/// that is not permitted.
-fn with_shared_memory(size: &str) -> Option<String> {
+/// A call of the program in which it and its children have a `/dev/shm` of this size; none, and a line that the test is skipped, if that is
+/// not permitted.
+fn with_shared_memory(size: &str, call: &str) -> Option<String> {
     let mount = format!("mount -t tmpfs -o size={size} tmpfs /dev/shm");
     let mut tried = Command::new("unshare");
     tried.args(["-m", "sh", "-c", &mount]);
-    succeeds(&mut tried).then(|| format!("unshare -m sh -c '{mount} && exec \"$0\" \"$@\"'"))
+    succeeds(&mut tried)
+        .then(|| format!("unshare -m sh -c '{mount} && exec \"$0\" \"$@\"' DRIML {call}"))
 }
 
 /// How often it was said that there is too little, or that what was sent so does not arrive.
@@ -34,15 +35,15 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
         ("9m", 8, false),
         ("64m", 2, true),
     ] {
-        let Some(words) = with_shared_memory(size) else {
-            return;
-        };
-        let system = system();
         let run = format!(
             "local --agent c51 {} --actors {actors} --run-dir run",
             chain(640)
         );
-        let ended = system.run_after(&words, &run).expect_code(0);
+        let Some(run) = with_shared_memory(size, &run) else {
+            return;
+        };
+        let system = system();
+        let ended = system.run_ok(&run);
         assert_eq!(warnings(&ended), usize::from(!enough), "{size}: {ended:#?}");
         if !enough {
             ended
@@ -57,12 +58,12 @@ fn too_little_for_all_processes_is_said_once_and_sockets_serve() {
 
 #[test]
 fn a_run_continues_when_others_fill_it_up() {
-    let Some(words) = with_shared_memory("64m") else {
-        return;
-    };
     let system = system();
     let run = system.local(&format!("--agent c51 {LONG} --actors 2"));
-    let mut process = system.start_after(&words, &run);
+    let Some(run) = with_shared_memory("64m", &run) else {
+        return;
+    };
+    let mut process = system.start(&run);
     let client = system.connect();
     client.wait_for_updates(100);
     // One that starts when it is full warns, too.

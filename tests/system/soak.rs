@@ -59,7 +59,7 @@ fn nothing_grows() {
                 deaths += 1;
             }
             Some(actor) => {
-                actor.stop().expect_code(0);
+                actor.stop_ok();
                 ends += 1;
             }
         }
@@ -95,9 +95,9 @@ fn nothing_grows() {
     assert!(last.2 <= first.2 + 3 * ACTORS, "{first:?}, then {last:?}");
     drop(client);
     actors.into_iter().flatten().for_each(|actor| {
-        actor.stop().expect_code(0);
+        actor.stop_ok();
     });
-    learner.stop().expect_code(0);
-    server.stop().expect_code(0);
+    learner.stop_ok();
+    server.stop_ok();
     assert_eq!(system.survivors(), []);
 }

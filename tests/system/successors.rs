@@ -49,18 +49,16 @@ fn killed_learners_cost_no_update_of_the_plan() {
     let planned = (replay.transitions_inserted - 200) * 8 / 16;
     assert_eq!(learned.updates, planned, "{replay:#?}");
     assert_eq!(replay.rows_sampled, 16 * planned);
-    actor.wait().expect_code(0);
-    learner.stop().expect_code(0).expect_said("resumed after ");
+    actor.wait_ok();
+    learner.stop_ok().expect_said("resumed after ");
     drop(client);
-    server.stop().expect_code(0);
+    server.stop_ok();
 
     // What is in the folder is another run's to a run with other settings.
     let server = system.start_replay_server(&format!("--agent c51 {LONG}"));
     let learner = system.start_learner("run");
-    learner
-        .wait()
-        .expect_error("resume with the settings it was made with");
-    server.stop().expect_code(0);
+    learner.fails("resume with the settings it was made with");
+    server.stop_ok();
 }
 
 /// A run by hand whose learner has made more than 75 updates since its last checkpoint.
@@ -83,7 +81,7 @@ fn a_learner_whose_replay_server_is_gone_saves() {
     let (server, learner, client) = between_checkpoints(&system, patience);
     drop(client);
     server.kill();
-    learner.wait().expect_error("no batch and no answer for 1s");
+    learner.fails("no batch and no answer for 1s");
     assert!(system.run_folder("run").saved_updates() > 75);
 }
 
@@ -103,14 +101,10 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     let server = system.start_replay_server(&format!(
         "--agent c51 {LONG} --set learner.checkpoint_period_updates=1000"
     ));
-    learner
-        .wait()
-        .expect_error("this replay server does not know the learner: it was started again");
+    learner.fails("this replay server does not know the learner: it was started again");
     let saved = system.run_folder("run").saved_updates();
     assert!(saved > 75);
-    actor
-        .wait()
-        .expect_error("does not know this life of actor 1: it was started anew");
+    actor.fails("does not know this life of actor 1: it was started anew");
 
     let learner = system.start_learner("run");
     let actor = system.start_actor(0);
@@ -122,7 +116,7 @@ fn a_run_whose_replay_server_was_started_again_is_resumed_by_its_learner() {
     assert!(replay.rows_sampled >= 16 * saved, "{replay:#?}");
     assert_eq!(replay.updates_relearned, 0, "{replay:#?}");
     for process in [actor, learner, server] {
-        process.stop().expect_code(0);
+        process.stop_ok();
     }
 }
 
@@ -137,9 +131,8 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
         let connect = system.endpoint();
         format!("learner --connect {connect} --run-dir elsewhere {flags}")
     };
-    system
-        .run(&stranger(""))
-        .expect_error("and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints");
+    let why = "and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints";
+    system.fails(&stranger(""), why);
     let before = client.replay().unwrap();
     assert!(before.updates > 75, "{before:#?}");
     let restarted = system.start(&stranger("--keep-alive --restart"));
@@ -147,8 +140,8 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
         replay.updates_relearned > 75
     });
     assert!(replay.rows_unlearned >= 16 * 75, "{replay:#?}");
-    restarted.stop().expect_code(0);
-    server.stop().expect_code(0);
+    restarted.stop_ok();
+    server.stop_ok();
     drop(client);
 
     let server = system.start_replay_server(&format!("--agent c51 {SHORT}"));
@@ -158,10 +151,8 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let client = system.connect();
     let replay = client.wait_for_replay("the run's end", |replay| replay.learner_finished);
     assert_eq!(replay.updates, 540);
-    system
-        .run(&stranger(""))
-        .expect_error("the run is finished, with 540 updates");
-    learner.wait().expect_code(0);
-    actor.wait().expect_code(0);
-    server.stop().expect_code(0);
+    system.fails(&stranger(""), "the run is finished, with 540 updates");
+    learner.wait_ok();
+    actor.wait_ok();
+    server.stop_ok();
 }

@@ -74,9 +74,9 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
         return;
     };
     let system = system();
-    let flags = "local --lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --tensorboard --run-dir run";
-    system.run_ok(flags);
-    let summary = system.run_folder("run").check_finished();
+    let flags =
+        "--lockstep --env mspacman --agent driml-ada --preset smoke --frames 320 --tensorboard";
+    let summary = system.train(flags, "run");
     let first = read(&python, &system);
     check_points(&first, &columns(&system));
     let counted = |tag: &str| -> u64 {

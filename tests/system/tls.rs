@@ -13,7 +13,8 @@ use driml_protocol::{
     tls::{Credentials, Role},
 };
 use driml_tests::{
-    Certificates, Client, Outcome, Process, TestSystem, Valid, at_once, succeeds, wait_until,
+    Certificates, Client, EXPIRED, FUTURE, Outcome, Process, TestSystem, at_once, succeeds,
+    wait_until,
 };
 use nix::sys::signal::Signal;
 use zenoh::{Session, Wait};
@@ -135,7 +136,7 @@ fn a_run_over_tls() {
         tls.start("actor --id 2", "tls"),
     ];
     for actor in actors {
-        actor.wait().expect_code(0).expect_said("leaves: ");
+        actor.wait_ok().expect_said("leaves: ");
     }
     observer.wait_for_learner("the learner's last update", |learner| learner.finished);
     let replay = observer.check_nothing_lost();
@@ -149,12 +150,9 @@ fn a_run_over_tls() {
         replay.affinity_version > 0,
         "the learner's affinity arrived"
     );
-    learner
-        .stop()
-        .expect_code(0)
-        .expect_said("finished after 540");
+    learner.stop_ok().expect_said("finished after 540");
     drop(observer);
-    server.stop().expect_code(0);
+    server.stop_ok();
 }
 
 /// Its processes meet at a unix socket, and one more comes from outside.
@@ -183,7 +181,7 @@ fn a_launched_run_with_an_actor_from_outside() {
     watched.signal(Signal::SIGINT);
     watched.wait_for_stderr("the run continues without being watched");
     watched.wait().expect_code(130);
-    outside.stop().expect_code(0).expect_said("leaves: ");
+    outside.stop_ok().expect_said("leaves: ");
     drop(observer);
     run.stop().expect_code(130);
     tls.system.run_folder("run").check(Outcome::Interrupted);
@@ -199,8 +197,8 @@ fn own_files_that_cannot_be_used() {
     let key = spoiled("key");
     std::fs::copy(tls.good.path("actor-1.key"), key.path("actor-0.key")).unwrap();
     std::fs::write(spoiled("garbage").path("learner.key"), "no key").unwrap();
-    spoiled("old").sign_again("learner", Valid::UntilYesterday);
-    spoiled("new").sign_again("learner", Valid::From2090);
+    spoiled("old").sign_again("learner", EXPIRED);
+    spoiled("new").sign_again("learner", FUTURE);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     std::fs::copy(foreign.path("ca.pem"), spoiled("mixed").path("ca.pem")).unwrap();
     let [actor, learner] = ["actor --id 0", "learner --run-dir run"]
@@ -244,9 +242,9 @@ fn strangers_at_a_replay_server() {
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     std::fs::copy(tls.good.path("ca.pem"), foreign.path("ca.pem")).unwrap();
     let old = tls.good.copy(tls.system.path("old"));
-    old.sign_again("learner", Valid::UntilYesterday);
+    old.sign_again("learner", EXPIRED);
     let new = tls.good.copy(tls.system.path("new"));
-    new.sign_again("learner", Valid::From2090);
+    new.sign_again("learner", FUTURE);
     let endpoint = &tls.endpoint;
     let attempts = [
         ("none", &tls.good, None),
@@ -267,16 +265,16 @@ fn strangers_at_a_replay_server() {
     // Without QUIC, at whose port nothing listens.
     let plain = tls.endpoint.replace("quic/", "tcp/");
     let started = Instant::now();
-    let actor = tls.system.run(&format!("actor --connect {plain}"));
-    actor.expect_error("One with --tls-dir is reached with quic/HOST:PORT");
+    let why = "One with --tls-dir is reached with quic/HOST:PORT";
+    tls.system.fails(&format!("actor --connect {plain}"), why);
     assert!(started.elapsed() < SECONDS);
 
     // Who is let in is not disturbed.
     let learner = tls.start("learner --keep-alive --run-dir run", "tls");
     let actor = tls.start("actor --id 1", "tls");
     observer.wait_for_updates(10);
-    actor.stop().expect_code(0);
-    learner.stop().expect_code(0);
+    actor.stop_ok();
+    learner.stop_ok();
 }
 
 /// A process does not follow a stranger in the place of its replay server, and names the endpoint.
@@ -285,9 +283,9 @@ fn strangers_in_the_place_of_a_replay_server() {
     let Some(tls) = TlsSystem::new() else { return };
     let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
     let old = spoiled("old");
-    old.sign_again("replay-server", Valid::UntilYesterday);
+    old.sign_again("replay-server", EXPIRED);
     let new = spoiled("new");
-    new.sign_again("replay-server", Valid::From2090);
+    new.sign_again("replay-server", FUTURE);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     let [named, unknowing] = ["named", "unknowing"].map(spoiled);
     for ending in ["pem", "key"] {
@@ -349,7 +347,7 @@ fn the_doctor_looks_at_certificates() {
     assert!(!well.stderr.contains("--tls-dir"), "{}", well.stderr);
 
     let bad = tls.good.copy(tls.system.path("bad"));
-    bad.sign_again("learner", Valid::UntilYesterday);
+    bad.sign_again("learner", EXPIRED);
     bad.pass_off("actor-0", "observer");
     std::fs::remove_file(bad.path("actor-1.key")).unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);

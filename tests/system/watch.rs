@@ -35,12 +35,11 @@ fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     // Into the same folder, which is then as good as a launched run's.
     let learner = system.start_process(&format!("learner --connect {endpoint} --run-dir run"));
     watch
-        .wait()
-        .expect_code(0)
+        .wait_ok()
         .expect_printed("finished: 1280 frames and 540 updates");
     drop(client);
     for process in actors.into_iter().chain([learner, server]) {
-        process.wait().expect_code(0);
+        process.wait_ok();
     }
     let watched = system.run_folder("run");
     let summary = watched.check_finished();

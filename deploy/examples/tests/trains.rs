@@ -7,21 +7,20 @@ fn the_world_and_the_loss_train_as_built_in_ones_do() {
     let system = TestSystem::new(env!("CARGO_BIN_EXE_driml-with-island"));
     let flags =
         "--env island --agent predictive --preset smoke --frames 1280 --set replay.replay_ratio=8";
-    system.run_ok(&format!("local {flags} --actors 2 --run-dir run"));
-    let run = system.run_folder("run");
-    let trained = run.check_finished();
+    let trained = system.train(&format!("{flags} --actors 2"), "run");
     assert!(
         trained.updates == 540 && trained.episodes > 10,
         "{trained:#?}"
     );
+    let run = system.run_folder("run");
     let last = run.column("prediction").pop().expect("there is a row");
     let last: f64 = last.parse().expect("it is a number");
     assert!(last.is_finite() && last >= 0.0, "{last}");
 
     // The settings hold all that another run needs.
     let hashes = [("first", flags), ("again", "--config first/config.toml")].map(|(name, args)| {
-        system.run_ok(&format!("local --lockstep {args} --run-dir {name}"));
-        system.run_folder(name).summary().weights_sha256
+        let trained = system.train(&format!("--lockstep {args}"), name);
+        trained.weights_sha256
     });
     assert_eq!(hashes[0], hashes[1]);
     let played = system.run_ok("evaluate --run run --episodes 4").stdout;

@@ -226,7 +226,7 @@ fn of_4096_strangers() {
     let mut actor = lied.system.start_actor(7);
     actor.wait_for_stderr("actor 7 steps");
     client.wait_for_replay("two actors", |replay| replay.actors_acting == 2);
-    actor.stop().expect_code(0).expect_said("leaves: ");
+    actor.stop_ok().expect_said("leaves: ");
     client.wait_for_replay("one actor", |replay| replay.actors == 1);
     // Those who were forgotten, and who say what they will.
     let leave = leave(STRANGER, LIFE, 1 << 60);

@@ -94,7 +94,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
 
     let before = client.replay().unwrap().transitions_inserted;
     client.wait_for_transitions(before + 1000);
-    let said = actor.stop().expect_code(0).stderr;
+    let said = actor.stop_ok().stderr;
     assert!(!said.contains("newer ones did not come"), "{said}");
     assert_eq!(client.replay().unwrap().transitions_lost, 0);
 }
@@ -129,7 +129,7 @@ fn processes_of_another_protocol_version_do_not_join() {
             .wait()
             .unwrap();
         for process in [system.start_actor(0), system.start_learner("run")] {
-            process.wait().expect_error(reason);
+            process.fails(reason);
         }
         queryable.undeclare().wait().unwrap();
     }

@@ -118,13 +118,13 @@ fn a_process_that_waits_for_its_server_ends_when_it_is_told_to() {
             let mut process = system.start(&format!("{command} {}", system.endpoint()));
             process.wait_for_stderr("waiting for 30 s: nothing listens on ");
             process.signal(signal);
-            process.wait().expect_code(0);
+            process.wait_ok();
             // Something listens, and sends nothing.
             let (endpoint, listener) = listener();
             let process = system.start(&format!("{command} {endpoint}"));
             let connection = listener.accept().unwrap();
             process.signal(signal);
-            process.wait().expect_code(0);
+            process.wait_ok();
             drop(connection);
         }
     });
