@@ -54,11 +54,10 @@ fn so_it_is_in_bf16() {
 
 #[test]
 fn a_broken_file_is_a_clear_error() {
-    let folder = std::env::temp_dir().join(format!("driml-parity-{}", std::process::id()));
-    fs::create_dir_all(&folder).unwrap();
+    let folder = tempfile::tempdir().unwrap();
     let whole = fs::read(&cases()[0]).unwrap();
     let says = |bytes: &[u8]| {
-        let file = folder.join("broken.safetensors");
+        let file = folder.path().join("broken.safetensors");
         fs::write(&file, bytes).unwrap();
         let error = check_file(&file, &Compute::CPU)
             .expect_err("broken")
@@ -104,6 +103,6 @@ fn a_broken_file_is_a_clear_error() {
         let error = says(&broken);
         assert!(error.contains(said), "{from} as {to}: {error}");
     }
-    fs::remove_dir_all(&folder).unwrap();
-    assert!(check_file(folder.join("none.safetensors"), &Compute::CPU).is_err());
+    let none = folder.path().join("none.safetensors");
+    assert!(check_file(none, &Compute::CPU).is_err());
 }

@@ -15,30 +15,13 @@ use driml_protocol::ShardCounts;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sha2::{Digest, Sha256};
+use tempfile::tempdir;
 
 use crate::synthetic::{
     ACTIONS, ALL_DIM, CANDLE, LEARNED, agent, agent_on, made, model, random_batch, settings,
 };
 
 pub(crate) const SPEC: u64 = 0x0123_4567_89ab_cdef;
-
-/// A folder of this test's own, removed at its end.
-pub(crate) struct Folder(pub(crate) PathBuf);
-
-impl Folder {
-    pub(crate) fn new(name: &str) -> Self {
-        let path =
-            std::env::temp_dir().join(format!("driml-checkpoint-{name}-{}", std::process::id()));
-        let _ = fs::remove_dir_all(&path);
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
-    }
-}
 
 /// A learner's state at the start of a run that others have begun.
 pub(crate) fn start() -> LearnerState {
@@ -89,8 +72,8 @@ fn resume(folder: &Path) -> LearnerState {
 }
 
 /// The updates of the checkpoints that there are.
-fn listed(folder: &Folder) -> Vec<u64> {
-    let all = list(&folder.0).unwrap();
+fn listed(folder: &Path) -> Vec<u64> {
+    let all = list(folder).unwrap();
     all.iter().map(|(updates, _)| *updates).collect()
 }
 
@@ -140,11 +123,11 @@ pub(crate) fn change_state(path: &Path, change: impl Fn(&mut serde_json::Value))
 /// A network of other sizes is not damage: the setting that differs is named.
 #[test]
 fn a_checkpoint_of_another_network_says_which_setting_differs() {
-    let folder = Folder::new("model");
+    let folder = tempdir().unwrap();
     let run = start();
     let ours = model(ALL_DIM);
     let description = serde_json::json!({ "model": ours }).to_string();
-    let path = try_save(&run, &folder.0, 1, &description).unwrap();
+    let path = try_save(&run, folder.path(), 1, &description).unwrap();
     let load = |model: &ModelConfig| {
         checkpoint::load(&path, model, &settings(ALL_DIM), &Compute::CPU, SPEC)
     };
@@ -184,13 +167,13 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
         (&Compute::CPU, &BF16, rounded),
         (&BF16, &Compute::CPU, rounded),
     ] {
-        let folder = Folder::new("operations");
+        let folder = tempdir().unwrap();
         let mut run = start();
         run.agent = agent_on(saver, ALL_DIM, 1);
         learn(&mut run, 4);
-        save(&run, &folder.0, 1);
+        save(&run, folder.path(), 1);
         let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
-        let restored = load_latest(&folder.0, &model, &settings, loader, SPEC).unwrap();
+        let restored = load_latest(folder.path(), &model, &settings, loader, SPEC).unwrap();
         let mut resumed = restored.expect("a checkpoint").agent;
         let is_same = run.agent.weights().unwrap() == resumed.weights().unwrap();
         assert!(is_same, "the weights are the same bits");
@@ -213,104 +196,101 @@ fn a_checkpoint_continues_with_other_operations_than_it_was_saved_by() {
 
 #[test]
 fn the_newest_are_kept_and_an_unfinished_save_is_no_checkpoint() {
-    let folder = Folder::new("keep");
-    assert!(
-        load(&folder.0).unwrap().is_none(),
-        "no folder, no checkpoint"
-    );
+    let parent = tempdir().unwrap();
+    let folder = parent.path().join("checkpoints");
+    assert!(load(&folder).unwrap().is_none(), "no folder, no checkpoint");
     let mut run = start();
     for _ in 0..3 {
         learn(&mut run, 1);
-        save(&run, &folder.0, 2);
+        save(&run, &folder, 2);
     }
-    save(&run, &folder.0, 2);
-    fs::create_dir(folder.0.join("checkpoint-000000000009.tmp")).unwrap();
+    save(&run, &folder, 2);
+    fs::create_dir(folder.join("checkpoint-000000000009.tmp")).unwrap();
     assert_eq!(listed(&folder), [2, 3]);
-    assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 3);
+    assert_eq!(load(&folder).unwrap().unwrap().agent.updates(), 3);
 }
 
 /// The new one is there: whether an old one can be removed says nothing of it.
 #[test]
 fn a_checkpoint_is_saved_though_an_old_one_cannot_be_removed() {
-    let folder = Folder::new("stuck");
-    fs::create_dir_all(&folder.0).unwrap();
+    let folder = tempdir().unwrap();
     // What removes a folder does not remove this.
-    let stuck = folder.0.join("checkpoint-000000000000");
+    let stuck = folder.path().join("checkpoint-000000000000");
     fs::write(&stuck, "").unwrap();
     let mut run = start();
     for updates in 1..=3 {
         learn(&mut run, 1);
-        save(&run, &folder.0, 1);
-        let left = listed(&folder);
+        save(&run, folder.path(), 1);
+        let left = listed(folder.path());
         assert_eq!(left, [0, updates], "the others are removed all the same");
     }
 }
 
 #[test]
 fn what_a_cut_off_save_left_is_gone_after_the_next() {
-    let folder = Folder::new("cut-off");
+    let folder = tempdir().unwrap();
     let mut run = start();
     learn(&mut run, 1);
-    save(&run, &folder.0, 3);
+    save(&run, folder.path(), 3);
     for name in ["checkpoint-000000000009.tmp", "checkpoint-000000000001.tmp"] {
-        fs::create_dir(folder.0.join(name)).unwrap();
-        fs::write(folder.0.join(name).join("online.safetensors"), "half").unwrap();
+        fs::create_dir(folder.path().join(name)).unwrap();
+        fs::write(folder.path().join(name).join("online.safetensors"), "half").unwrap();
     }
     learn(&mut run, 1);
-    save(&run, &folder.0, 3);
-    assert_eq!(listed(&folder), [1, 2]);
-    assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 2);
+    save(&run, folder.path(), 3);
+    assert_eq!(listed(folder.path()), [1, 2]);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
 }
 
 #[test]
 fn a_checkpoint_is_there_while_it_is_replaced() {
-    let folder = Folder::new("replaced");
+    let folder = tempdir().unwrap();
     let mut run = start();
     learn(&mut run, 1);
-    let path = save(&run, &folder.0, 3);
+    let path = save(&run, folder.path(), 3);
     // A crash between the two renames.
-    let replaced = folder.0.join("checkpoint-000000000001.replaced.tmp");
+    let replaced = folder.path().join("checkpoint-000000000001.replaced.tmp");
     fs::rename(&path, &replaced).unwrap();
-    assert_eq!(listed(&folder), [1]);
-    assert_eq!(bytes(&resume(&folder.0)), bytes(&run));
+    assert_eq!(listed(folder.path()), [1]);
+    assert_eq!(bytes(&resume(folder.path())), bytes(&run));
     // The next save gives it its name back.
     learn(&mut run, 1);
-    save(&run, &folder.0, 3);
-    assert_eq!(listed(&folder), [1, 2]);
+    save(&run, folder.path(), 3);
+    assert_eq!(listed(folder.path()), [1, 2]);
     assert!(path.exists() && !replaced.exists());
     // And a crash after them.
     fs::create_dir(&replaced).unwrap();
-    assert_eq!(listed(&folder), [1, 2]);
-    save(&run, &folder.0, 3);
+    assert_eq!(listed(folder.path()), [1, 2]);
+    save(&run, folder.path(), 3);
     assert!(!replaced.exists());
 }
 
 #[test]
 fn another_run_s_checkpoint_is_refused() {
-    let folder = Folder::new("other");
-    save(&start(), &folder.0, 1);
+    let folder = tempdir().unwrap();
+    save(&start(), folder.path(), 1);
     let (model, settings) = (model(ALL_DIM), settings(ALL_DIM));
-    let error = load_latest(&folder.0, &model, &settings, &Compute::CPU, SPEC + 1).unwrap_err();
+    let error = load_latest(folder.path(), &model, &settings, &Compute::CPU, SPEC + 1).unwrap_err();
     assert!(matches!(error, CheckpointError::OtherRun { .. }), "{error}");
 }
 
 #[test]
 fn one_learner_saves_in_a_folder() {
-    let folder = Folder::new("lock");
-    let held = lock(&folder.0).unwrap();
-    let said = lock(&folder.0).unwrap_err().to_string();
+    let folder = tempdir().unwrap();
+    let held = lock(folder.path()).unwrap();
+    let said = lock(folder.path()).unwrap_err().to_string();
     assert!(said.contains("another learner saves in"), "{said}");
-    assert_eq!(list(&folder.0).unwrap(), []);
+    assert_eq!(list(folder.path()).unwrap(), []);
     drop(held);
-    lock(&folder.0).unwrap();
+    lock(folder.path()).unwrap();
 }
 
 /// Checkpoints of earlier versions say nothing of themselves, and load all the same.
 #[test]
 fn the_networks_say_what_they_are_and_need_not() {
-    let folder = Folder::new("described");
+    let folder = tempdir().unwrap();
     let run = start();
-    let path = save(&run, &folder.0, 1);
+    let path = save(&run, folder.path(), 1);
     for name in ["online.safetensors", "target.safetensors"] {
         let file = fs::read(path.join(name)).unwrap();
         let (_, header) = safetensors::SafeTensors::read_metadata(&file).unwrap();
@@ -323,14 +303,14 @@ fn the_networks_say_what_they_are_and_need_not() {
     change_state(&path, |state| {
         state["sha256"]["online.safetensors"] = sha256(&bare).into()
     });
-    assert_eq!(bytes(&resume(&folder.0)), bytes(&run));
+    assert_eq!(bytes(&resume(folder.path())), bytes(&run));
 }
 
 /// Against float64; the average does not affect learning.
 #[test]
 fn averaged_weights_follow_and_are_saved_and_played() {
     const TAU: f64 = 0.25;
-    let folder = Folder::new("average");
+    let folder = tempdir().unwrap();
     let mut run = start();
     let mut settings = run.agent.settings().clone();
     settings.average_tau = Some(TAU);
@@ -355,9 +335,15 @@ fn averaged_weights_follow_and_are_saved_and_played() {
     assert!(worst.fold(0.0, f64::max) < 1e-6);
     assert_ne!(average, values(run.agent.online()));
 
-    save(&run, &folder.0, 1);
+    save(&run, folder.path(), 1);
     let load = |settings: &_| {
-        let restored = load_latest(&folder.0, &model(ALL_DIM), settings, &Compute::CPU, SPEC);
+        let restored = load_latest(
+            folder.path(),
+            &model(ALL_DIM),
+            settings,
+            &Compute::CPU,
+            SPEC,
+        );
         restored.unwrap().unwrap().agent
     };
     let restored = load(&settings);

@@ -8,20 +8,21 @@ use driml_learner::{
     checkpoint::{CheckpointError, LearnerState},
 };
 use driml_model::Compute;
+use tempfile::tempdir;
 
 use crate::{
-    checkpoint::{DESCRIPTION, Folder, change_state, learn, load, save, sha256, start, try_save},
+    checkpoint::{DESCRIPTION, change_state, learn, load, save, sha256, start, try_save},
     errors::diverged,
     synthetic::{ACTIONS, ALL_DIM, CANDLE, model},
 };
 
 #[test]
 fn every_kind_of_damage_is_reported_with_its_file() {
-    let folder = Folder::new("damage");
+    let folder = tempdir().unwrap();
     let mut run = start();
     learn(&mut run, 1);
     let description = serde_json::json!({ "model": model(ALL_DIM) }).to_string();
-    let path = try_save(&run, &folder.0, 1, &description).unwrap();
+    let path = try_save(&run, folder.path(), 1, &description).unwrap();
     for name in [
         "online.safetensors",
         "target.safetensors",
@@ -32,7 +33,7 @@ fn every_kind_of_damage_is_reported_with_its_file() {
         let file = path.join(name);
         let whole = fs::read(&file).unwrap();
         let reported = || {
-            let error = load(&folder.0).expect_err(name);
+            let error = load(folder.path()).expect_err(name);
             assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
             let text = error.to_string();
             assert!(text.contains(name) && text.contains("remove"), "{text}");
@@ -63,16 +64,16 @@ fn every_kind_of_damage_is_reported_with_its_file() {
         reported();
         fs::write(&file, &whole).unwrap();
     }
-    assert!(load(&folder.0).unwrap().is_some());
+    assert!(load(folder.path()).unwrap().is_some());
 }
 
 #[test]
 fn a_checkpoint_of_another_format_is_rejected() {
-    let folder = Folder::new("format");
-    let path = save(&start(), &folder.0, 1);
+    let folder = tempdir().unwrap();
+    let path = save(&start(), folder.path(), 1);
     for unknown in [0, 3, 5] {
         change_state(&path, |state| state["format"] = unknown.into());
-        let said = load(&folder.0).unwrap_err().to_string();
+        let said = load(folder.path()).unwrap_err().to_string();
         assert!(
             said.contains(&format!("its format is {unknown}, not 4")),
             "{said}"
@@ -84,20 +85,20 @@ fn a_checkpoint_of_another_format_is_rejected() {
 #[test]
 fn a_state_that_is_not_finite_is_not_saved() {
     for compute in [&Compute::CPU, &CANDLE] {
-        let folder = Folder::new("not-finite");
+        let folder = tempdir().unwrap();
         let mut run = start();
-        save(&run, &folder.0, 1);
+        save(&run, folder.path(), 1);
         for name in ["head.bias", "dim.psi4.out.weight"] {
             run.agent = diverged(compute, name).0;
-            let said = try_save(&run, &folder.0, 1, DESCRIPTION);
+            let said = try_save(&run, folder.path(), 1, DESCRIPTION);
             let said = said.unwrap_err().to_string();
             assert!(
                 said.starts_with("nothing is saved") && said.contains(name),
                 "{said}"
             );
-            let left: Vec<_> = fs::read_dir(&folder.0).unwrap().collect();
+            let left: Vec<_> = fs::read_dir(folder.path()).unwrap().collect();
             assert_eq!(left.len(), 1, "{left:?}");
-            assert_eq!(load(&folder.0).unwrap().unwrap().agent.updates(), 0);
+            assert_eq!(load(folder.path()).unwrap().unwrap().agent.updates(), 0);
         }
     }
 }
@@ -113,11 +114,11 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
     let mut run = start();
     let learned = run.affinity.clone().unwrap();
     let refused = |run: &LearnerState, change: &dyn Fn(&mut serde_json::Value), said: &str| {
-        let folder = Folder::new("arrays");
-        let path = save(run, &folder.0, 1);
-        load(&folder.0).unwrap().unwrap();
+        let folder = tempdir().unwrap();
+        let path = save(run, folder.path(), 1);
+        load(folder.path()).unwrap().unwrap();
         change_state(&path, change);
-        let error = load(&folder.0).map(|_| ()).unwrap_err();
+        let error = load(folder.path()).map(|_| ()).unwrap_err();
         assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
         let text = error.to_string();
         assert!(
@@ -183,10 +184,10 @@ fn arrays_and_counts_that_no_learner_wrote_are_damage() {
 
 #[test]
 fn moments_that_no_optimiser_has_are_damage() {
-    let folder = Folder::new("moments");
+    let folder = tempdir().unwrap();
     let mut run = start();
     learn(&mut run, 1);
-    let path = save(&run, &folder.0, 1);
+    let path = save(&run, folder.path(), 1);
     let file = path.join("optimizer.safetensors");
     let whole = fs::read(&file).unwrap();
     for (name, number) in [
@@ -204,7 +205,7 @@ fn moments_that_no_optimiser_has_are_damage() {
         change_state(&path, |state| {
             state["sha256"]["optimizer.safetensors"] = sha256(&bytes).into();
         });
-        let said = load(&folder.0).map(|_| ()).unwrap_err().to_string();
+        let said = load(folder.path()).map(|_| ()).unwrap_err().to_string();
         let wanted = format!("the moment {name} is {number} at index 0");
         assert!(
             said.contains("optimizer.safetensors") && said.contains(&wanted),

@@ -14,11 +14,11 @@ use driml_protocol::{
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use tempfile::tempdir;
 
 use crate::{
     agents,
     augment::{NOTHING, PAPER},
-    checkpoint::Folder,
     synthetic::{CPC, CURL, DIM, LEARNED},
 };
 
@@ -144,7 +144,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
 #[test]
 fn an_augmenting_run_resumes_bit_for_bit() {
     for auxiliary_loss in [CURL, DIM] {
-        let folder = Folder::new(&format!("augmenting-{}", auxiliary_loss.name()));
+        let folder = tempdir().unwrap();
         let mut config = config(auxiliary_loss, Some(PAPER));
         // A number that f32 does not hold exactly.
         config.model.v_max = 12.6;
@@ -167,11 +167,11 @@ fn an_augmenting_run_resumes_bit_for_bit() {
         learn(&mut straight, 0..8);
         let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
         learn(&mut half, 0..4);
-        half.save(&folder.0).unwrap();
-        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, &folder.0).unwrap();
+        half.save(folder.path()).unwrap();
+        let mut resumed = Learner::resume(config.clone(), &Compute::CPU, folder.path()).unwrap();
         assert_eq!(resumed.updates(), 4);
         learn(&mut resumed, 4..8);
-        let [a, b] = ["a", "b"].map(|name| folder.0.join(name));
+        let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
         straight.save(&a).unwrap();
         resumed.save(&b).unwrap();
         let mut files = vec![
@@ -195,12 +195,12 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 /// A checkpoint that lost its key encoder is damaged.
 #[test]
 fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
-    let folder = Folder::new("curl");
+    let folder = tempdir().unwrap();
     let config = config(CURL, Some(PAPER));
     let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
-    learner.save(&folder.0).unwrap();
-    let path = folder.0.join("checkpoint-000000000000");
-    let resume = || Learner::resume(config.clone(), &Compute::CPU, &folder.0).map(|_| ());
+    learner.save(folder.path()).unwrap();
+    let path = folder.path().join("checkpoint-000000000000");
+    let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
     resume().unwrap();
     fs::remove_file(path.join("key.safetensors")).unwrap();
     let said = resume().unwrap_err().to_string();
