@@ -7,7 +7,8 @@ use driml_learner::{
 use driml_model::{Compute, ModelConfig};
 
 use crate::synthetic::{
-    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, made, model, random_batch, settings, values,
+    ALL_DIM, CPC, CURL, DIM, NO_DIM, Values, check_says, made, model, random_batch, settings,
+    values,
 };
 
 pub(crate) const GLOBAL: Lambda = Lambda {
@@ -127,8 +128,7 @@ fn states_that_rows_do_not_have_may_be_left_out() {
                 states_n,
                 ..whole
             };
-            let error = agent(kind, lambda).evaluate(&batch).unwrap_err();
-            assert!(error.to_string().contains(what), "{error}");
+            check_says(agent(kind, lambda).evaluate(&batch).unwrap_err(), &[what]);
         }
     }
 }
@@ -273,25 +273,21 @@ fn c51_s_target_network_is_the_same_for_every_agent() {
 fn batches_that_an_agent_cannot_use_are_refused() {
     let rows = random_batch(5, 9);
     let (states_k, valid) = (later(&rows), [1; 5 * POSITIVES]);
-    let said = |kind, batch: &Batch<'_>| {
-        let error = agent(kind, GLOBAL).evaluate(batch).unwrap_err();
+    let refuses = |kind, batch: Batch<'_>, words: &str| {
+        let error = agent(kind, GLOBAL).evaluate(&batch).unwrap_err();
         assert!(matches!(error, UpdateError::Batch(_)));
-        error.to_string()
+        check_says(error, &[words]);
     };
     let several = cpc(&rows, &states_k, &valid);
-    assert!(said(DIM, &several).contains("3 positives a row; this agent needs one"));
-    let plain = rows.batch();
-    assert!(said(CURL, &plain).contains("needs two views of each state"));
-    let short = Batch {
-        positive_valid: &valid[1..],
-        ..several
-    };
-    assert!(said(CPC, &short).contains("positive_valid"));
+    refuses(DIM, several, "3 positives a row; this agent needs one");
+    refuses(CURL, rows.batch(), "needs two views of each state");
+    let short = cpc(&rows, &states_k, &valid[1..]);
+    refuses(CPC, short, "positive_valid");
     let short = Batch {
         anchors: Some(&states_k[..8]),
         ..curl(&rows)
     };
-    assert!(said(CURL, &short).contains("anchors"));
+    refuses(CURL, short, "anchors");
 }
 
 #[test]
@@ -302,9 +298,9 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
         own: own.parse().unwrap(),
         ..settings(lambda)
     };
-    let said = |kind, lambda, condition_on_action, own: &str| {
+    let check = |kind, lambda, condition_on_action, own: &str, words: &str| {
         let settings = with(kind, lambda, condition_on_action, own);
-        settings.validate().unwrap_err().to_string()
+        check_says(settings.validate().unwrap_err(), &[words]);
     };
     for (kind, lambda, condition_on_action, wanted) in [
         (
@@ -326,21 +322,21 @@ fn auxiliary_losses_at_odds_with_their_settings_are_refused() {
             "has no use for the table curl",
         ),
     ] {
-        let said = said(kind, lambda, condition_on_action, "curl.key_tau = 0.1");
-        assert!(said.contains(wanted), "{said}");
+        let own = "curl.key_tau = 0.1";
+        check(kind, lambda, condition_on_action, own, wanted);
     }
     for (kind, lambda) in [(AuxiliaryKind::NONE, NO_DIM), (DIM, GLOBAL), (CPC, GLOBAL)] {
         let wanted = format!("take {} out of learner.update", kind.name());
         for own in ["= 0.01", "= { tanh_clip = 5.0 }", "= {}"] {
-            let said = said(kind, lambda, false, &format!("{} {own}", kind.name()));
-            assert!(said.contains(&wanted), "{said}");
+            let own = format!("{} {own}", kind.name());
+            check(kind, lambda, false, &own, &wanted);
         }
     }
-    let missing = said(CURL, GLOBAL, false, "");
-    let wanted = "--set learner.update.curl.key_tau=";
-    assert!(missing.contains(wanted), "{missing}");
+    let missing = "--set learner.update.curl.key_tau=";
+    check(CURL, GLOBAL, false, "", missing);
     for out in ["0.0", "-0.1", "1.1", "nan"] {
-        let said = said(CURL, GLOBAL, false, &format!("curl.key_tau = {out}"));
+        let settings = with(CURL, GLOBAL, false, &format!("curl.key_tau = {out}"));
+        let said = settings.validate().unwrap_err().to_string();
         let wanted = format!("curl.key_tau = {}", out.parse::<f64>().unwrap());
         assert!(said.starts_with(&wanted), "{said}");
     }

@@ -19,7 +19,7 @@ use tempfile::tempdir;
 use crate::{
     agents,
     augment::{NOTHING, PAPER},
-    synthetic::{CPC, CURL, DIM, LEARNED},
+    synthetic::{CPC, CURL, DIM, LEARNED, check_says},
 };
 
 const STATE: usize = 20 * 24 * 2;
@@ -203,11 +203,8 @@ fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
     resume().unwrap();
     fs::remove_file(path.join("key.safetensors")).unwrap();
-    let said = resume().unwrap_err().to_string();
-    assert!(
-        said.contains("key.safetensors is damaged: it is missing"),
-        "{said}"
-    );
+    let missing = "key.safetensors is damaged: it is missing";
+    check_says(resume().unwrap_err(), &[missing]);
 }
 
 /// A refused batch leaves the generator where it was.
@@ -230,26 +227,15 @@ fn a_refused_batch_draws_nothing() {
 
 #[test]
 fn augmentation_and_auxiliary_loss_belong_together() {
-    let said = |auxiliary_loss, augment| {
-        config(auxiliary_loss, augment)
-            .learner
-            .validate()
-            .unwrap_err()
-            .to_string()
-    };
-    assert!(said(CURL, None).contains("take the agent curl"));
+    let plain = config(CURL, None).learner;
+    check_says(plain.validate().unwrap_err(), &["take the agent curl"]);
     let mut c51 = config(DIM, Some(PAPER)).learner;
     c51.update.auxiliary_loss = AuxiliaryKind::NONE;
-    assert!(
-        c51.validate()
-            .unwrap_err()
-            .to_string()
-            .contains("this agent has none")
-    );
-    let wild = AugmentSettings { hue: 0.7, ..PAPER };
+    check_says(c51.validate().unwrap_err(), &["this agent has none"]);
+    let wild = config(DIM, Some(AugmentSettings { hue: 0.7, ..PAPER })).learner;
     let range = "it must lie between 0 and 0.5, half a turn either way";
     let wanted = format!("learner.augment.hue = 0.7 cannot work: {range}");
-    assert_eq!(said(DIM, Some(wild)), wanted);
+    assert_eq!(wild.validate().unwrap_err().to_string(), wanted);
 }
 
 /// The chance of each row weights its C51 loss, at the beta of the update's number; nothing else, and the row's own loss comes back.

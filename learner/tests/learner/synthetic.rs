@@ -1,7 +1,7 @@
-//! Small networks, settings and batches for these tests.
-//! Nothing here is measured or asserted.
+//! Small networks, settings and batches for these tests, and what several of them check.
+//! Nothing here is measured.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, fmt::Display};
 
 use candle_core::{Device, Tensor};
 use driml_learner::{
@@ -124,17 +124,10 @@ pub(crate) fn random_batch(rows: usize, seed: u64) -> OwnedBatch {
 /// With states of `frame_len` bytes.
 pub(crate) fn batch_of(rows: usize, frame_len: usize, seed: u64) -> OwnedBatch {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut states = || {
-        (0..rows * frame_len)
-            .map(|_| rng.random())
-            .collect::<Vec<u8>>()
-    };
+    let mut states = || -> Vec<u8> { (0..rows * frame_len).map(|_| rng.random()).collect() };
     let [states_t, states_k, states_n] = [states(), states(), states()];
-    let mut draw = |below: u8| {
-        (0..rows)
-            .map(|_| rng.random_range(0..below))
-            .collect::<Vec<u8>>()
-    };
+    let mut draw =
+        |below: u8| -> Vec<u8> { (0..rows).map(|_| rng.random_range(0..below)).collect() };
     let action = draw(ACTIONS as u8);
     let mut next_action = draw(ACTIONS as u8);
     next_action[0] = NO_ACTION;
@@ -161,6 +154,15 @@ pub(crate) fn values(parameters: &Parameters) -> Values {
         .iter()
         .map(|(name, var)| (name.to_owned(), flat(var)))
         .collect()
+}
+
+/// Checks that an error has all of these words.
+#[track_caller]
+pub(crate) fn check_says(error: impl Display, all: &[&str]) {
+    let said = error.to_string();
+    for words in all {
+        assert!(said.contains(words), "wanted {words:?} in: {said}");
+    }
 }
 
 /// The agent with its online parameters changed in place.

@@ -7,8 +7,8 @@ use driml_model::{Compute, HeadConfig, Parameters};
 use driml_protocol::NO_ACTION;
 
 use crate::synthetic::{
-    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, made, model,
-    random_batch, settings, values,
+    ALL_DIM, CANDLE, NO_DIM, NOISY_DUELING, agent, agent_on, agent_with, changed, check_says, made,
+    model, random_batch, settings, values,
 };
 
 #[test]
@@ -187,8 +187,5 @@ fn noise_is_drawn_anew_for_each_update_and_each_network() {
     let plain = agent_with(HeadConfig::PLAIN, settings, 1);
     assert_eq!(plain.noise(), UpdateNoise::default());
     let refused = plain.evaluate_with(&rows.batch(), &first).unwrap_err();
-    assert!(
-        refused.to_string().contains("without noisy layers"),
-        "{refused}"
-    );
+    check_says(refused, &["without noisy layers"]);
 }
