@@ -112,7 +112,12 @@ impl TestSystem {
 
     /// The endpoint at which this system's processes meet: a unix socket, so that no port can be taken.
     pub fn endpoint(&self) -> String {
-        format!("unixsock-stream/{}", self.path("s").display())
+        self.socket("s")
+    }
+
+    /// The endpoint of a unix socket in the system's folder.
+    pub fn socket(&self, name: &str) -> String {
+        format!("unixsock-stream/{}", self.path(name).display())
     }
 
     /// The call of a run in the folder `run` whose processes meet at this system's endpoint.

@@ -49,29 +49,20 @@ fn processes_find_each_other_and_end_in_order() {
 fn processes_end_by_themselves_when_the_run_is_over() {
     for shards in [1, 2] {
         let system = system();
-        let listen = |shard| {
-            format!(
-                "unixsock-stream/{}",
-                system.path(&format!("{shard}.sock")).display()
-            )
-        };
-        let endpoints: Vec<_> = (0..shards).map(listen).collect();
-        let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
-        let mut processes = Vec::new();
-        for (shard, endpoint) in endpoints.iter().enumerate() {
-            processes.push(system.start_process(&format!(
-                "replay-server --listen {endpoint} --shard {shard} {flags}"
-            )));
-        }
-        let connect: Vec<_> = endpoints
-            .iter()
-            .map(|it| format!("--connect {it}"))
+        let endpoints: Vec<_> = (0..shards)
+            .map(|shard| system.socket(&format!("{shard}.sock")))
             .collect();
-        let learner = format!("learner {} --run-dir run", connect.join(" "));
-        processes.push(system.start_process(&learner));
-        for (id, connect) in connect.iter().enumerate() {
-            processes.push(system.start_process(&format!("actor {connect} --id {id}")));
+        let flags = format!("--agent driml-ada --replay-shards {shards} --actors {shards} {SHORT}");
+        let mut calls = Vec::new();
+        for (shard, endpoint) in endpoints.iter().enumerate() {
+            calls.push(format!(
+                "replay-server --listen {endpoint} --shard {shard} {flags}"
+            ));
+            calls.push(format!("actor --connect {endpoint} --id {shard}"));
         }
+        let all = endpoints.join(" --connect ");
+        calls.push(format!("learner --connect {all} --run-dir run"));
+        let processes: Vec<_> = calls.iter().map(|it| system.start_process(it)).collect();
         for process in processes {
             process.wait_ok();
         }

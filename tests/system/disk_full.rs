@@ -224,10 +224,8 @@ fn a_folder_that_cannot_be_used_is_said() {
     let server = system.start_replay_server(&flags);
     drop(system.connect());
     let other = |flags: &str| {
-        let socket = system.path("other").display().to_string();
-        system.start_process(&format!(
-            "replay-server --listen unixsock-stream/{socket} {flags}"
-        ))
+        let socket = system.socket("other");
+        system.start_process(&format!("replay-server --listen {socket} {flags}"))
     };
     other(&flags)
         .fails("another replay server keeps its replay in replay: end it first, or choose another --replay-dir");

@@ -9,11 +9,7 @@ use driml_tests::{TestSystem, check_has, updates_of, wait_until};
 use crate::{SHORT, system};
 
 /// A system with a run in `run`.
-fn with_run() -> TestSystem {
-    with_run_of("")
-}
-
-fn with_run_of(flags: &str) -> TestSystem {
+fn with_run(flags: &str) -> TestSystem {
     let system = system();
     let run = format!("{SHORT} --agent driml-fix {flags} --run-dir run");
     system.run_ok(&format!("local --lockstep {run}"));
@@ -22,7 +18,7 @@ fn with_run_of(flags: &str) -> TestSystem {
 
 #[test]
 fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
-    let system = with_run();
+    let system = with_run("");
     let flags = "evaluate run --episodes 7 --seed 2";
     let said = system.run_ok(flags).stdout;
     let lines: Vec<_> = said.lines().collect();
@@ -82,14 +78,12 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
     );
 }
 
-/// A system with a run with averaged weights in `run`.
-fn with_averages() -> TestSystem {
-    with_run_of("--set learner.update.average_tau=0.01")
-}
+/// Of a run that averages its weights.
+const AVERAGED: &str = "--set learner.update.average_tau=0.01";
 
 #[test]
 fn it_plays_averaged_weights_where_a_run_has_them() {
-    let system = with_averages();
+    let system = with_run(AVERAGED);
     system.run_ok("evaluate run --keep --episodes 2");
     for (flags, weights) in [
         ("", "averaged"),
@@ -108,7 +102,7 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
 
 #[test]
 fn an_exported_network_is_played_without_its_run() {
-    let system = with_averages();
+    let system = with_run(AVERAGED);
     system
         .run_ok("evaluate run --export net.safetensors")
         .expect_printed("averaged weights after 540 updates as f16");
@@ -229,7 +223,7 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
 /// A checkpoint is compared with the best over as many episodes as that was played for, or more.
 #[test]
 fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it() {
-    let system = with_run();
+    let system = with_run("");
     system.refuses(
         "evaluate run --checkpoint best",
         "run has no best checkpoint",
@@ -322,7 +316,7 @@ fn a_folder_that_is_no_run_s() {
 /// That every file's damage is found is the learner's own test. Films that cannot be are refused before anything is played.
 #[test]
 fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named() {
-    let system = with_run();
+    let system = with_run("");
     system.refuses_each(
         "
         evaluate run --record play.mp4 => use one that ends in .gif

@@ -86,19 +86,13 @@ impl Endpoint {
     }
 }
 
-/// What the network does to messages about chunks.
-#[derive(Clone, Copy)]
-enum Loses {
-    /// Of each five, one does not arrive, and the answer to another one does not.
-    TwoOfFive,
-    /// The first few do not arrive, the others do.
-    First(u32),
-}
+/// What the network does to a message about chunks, by its number: whether that arrives, and whether its answer does.
+type Passes = fn(u32) -> [bool; 2];
 
 /// A replay server behind a network that loses messages.
 struct Server {
     replay: Mutex<Replay>,
-    loses: Loses,
+    passes: Passes,
     messages: AtomicU32,
     /// How often each actor sent `Leave`.
     leaves: Mutex<BTreeMap<u32, u32>>,
@@ -107,7 +101,7 @@ struct Server {
 }
 
 impl Server {
-    fn new(loses: Loses) -> Arc<Self> {
+    fn new(passes: Passes) -> Arc<Self> {
         let config = Config {
             replay_ratio: SAMPLED as f64,
             ..tiny_replay::config(2 * TRANSITIONS)
@@ -118,7 +112,7 @@ impl Server {
         }
         Arc::new(Self {
             replay: Mutex::new(replay),
-            loses,
+            passes,
             messages: AtomicU32::new(0),
             leaves: Mutex::default(),
             lost: Mutex::default(),
@@ -168,10 +162,7 @@ impl Server {
 
     fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {
         let message = self.messages.fetch_add(1, Ordering::Relaxed);
-        let (arrives, is_answered) = match self.loses {
-            Loses::TwoOfFive => (message % 5 != 1, message % 5 != 3),
-            Loses::First(count) => (message >= count, true),
-        };
+        let [arrives, is_answered] = (self.passes)(message);
         let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
         is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
     }
@@ -226,7 +217,7 @@ fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
 
 #[test]
 fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
-    let server = Server::new(Loses::TwoOfFive);
+    let server = Server::new(|message| [message % 5 != 1, message % 5 != 3]);
     deliver_all(&server, Duration::from_millis(100), false);
     server.check_numbers();
     server.check_leaves();
@@ -238,7 +229,7 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
 /// The time in which an actor that leaves must deliver is not spent on one message that was lost.
 #[test]
 fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
-    let server = Server::new(Loses::First(3 * ACTORS));
+    let server = Server::new(|message| [message >= 3 * ACTORS, true]);
     deliver_all(&server, Duration::from_secs(15), true);
     server.check_numbers();
     server.check_leaves();
@@ -343,50 +334,33 @@ impl Shards {
     }
 }
 
-/// Fetches all batches of a run from `shards` shards, of which some get lost.
-fn every_batch_comes_once(shards: u32) {
-    let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
-    let mut batches = 0;
-    while let Some(Served { batch, parts }) = served.next() {
-        assert_eq!(batch.rows(), ROWS as usize);
-        assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
-        batches += 1;
-    }
-    let Shards {
-        replays,
-        drawn,
-        source,
-        ..
-    } = served;
-    assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
-    let statuses: Vec<_> = replays
-        .iter()
-        .map(|replay| {
+/// Of a replay of one shard, and of one of three, whose batches have parts.
+#[test]
+fn lost_batches_and_lost_parts_of_batches_do_not_count() {
+    for shards in [1, 3] {
+        let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
+        let mut batches = 0;
+        while let Some(Served { batch, parts }) = served.next() {
+            assert_eq!(batch.rows(), ROWS as usize);
+            assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
+            batches += 1;
+        }
+        assert_eq!(batches * u64::from(ROWS), TRANSITIONS);
+        let statuses = served.replays.iter().map(|replay| {
             let replay = replay.lock().unwrap();
             replay.check_valid();
             replay.status()
-        })
-        .collect();
-    let sampled: u64 = statuses.iter().map(|status| status.rows_sampled).sum();
-    let retried: u64 = statuses.iter().map(|status| status.batches_retried).sum();
-    assert_eq!(sampled, TRANSITIONS);
-    let lost = drawn.load(Ordering::Relaxed).div_ceil(LOSES);
-    assert!(
-        lost >= 5,
-        "of so many batches as there are, some were to get lost: {lost}"
-    );
-    assert_eq!(retried, u64::from(lost));
-    source.end();
-}
-
-#[test]
-fn lost_batches_do_not_count() {
-    every_batch_comes_once(1);
-}
-
-#[test]
-fn lost_parts_of_batches_do_not_count() {
-    every_batch_comes_once(3);
+        });
+        let status = ReplayStatus::merged(&statuses.collect::<Vec<_>>());
+        assert_eq!(status.rows_sampled, TRANSITIONS);
+        let lost = served.drawn.load(Ordering::Relaxed).div_ceil(LOSES);
+        assert!(
+            lost >= 5,
+            "of so many batches as there are, some were to get lost: {lost}"
+        );
+        assert_eq!(status.batches_retried, u64::from(lost));
+        served.source.end();
+    }
 }
 
 /// A shard that held nothing when batches began, as its actors started late, is drawn from once it holds something, although the others

@@ -1,9 +1,9 @@
 //! Custom worlds: a process that the actor starts, in a whole run; and the errors when it fails.
 //! What passes between an actor and such a process is tested beside the worlds.
 
-use std::{fs, path::Path};
+use std::{fs, path::Path, process::Command};
 
-use driml_tests::{python, skip, skipped_offline, wait_until};
+use driml_tests::{python, skipped_offline, succeeds, wait_until};
 
 use crate::{lockstep::continues_exactly, repo_rules::root, system};
 
@@ -189,13 +189,7 @@ fn gymnasium() -> Option<String> {
             "python3 -m venv {0} && {0}/bin/pip install --quiet --disable-pip-version-check -r {requirements}",
             folder.display()
         );
-        let output = std::process::Command::new("sh")
-            .args(["-c", &script])
-            .output()
-            .unwrap();
-        if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr);
-            skip(said.lines().last().unwrap_or("no pip"));
+        if !succeeds(Command::new("sh").args(["-c", &script])) {
             return None;
         }
         fs::write(&ready, "").unwrap();

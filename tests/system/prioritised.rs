@@ -24,20 +24,19 @@ const SET: &str = "rows were set";
 /// The priorities of all updates that the learner says have arrived. Where the machine is busy, some are on their way when it ends.
 #[test]
 fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
-    for (shards, flags) in [(1, ""), (2, "--actors 2 --replay-shards 2")] {
+    for flags in ["", "--actors 2 --replay-shards 2"] {
         let system = system();
         system.run_ok(&format!(
             "local --agent driml-ada {SHORT} {PRIORITISED} {flags} --run-dir run"
         ));
         let run = system.run_folder("run");
         let summary = run.check(Outcome::Finished);
-        let processes: Vec<String> = match shards {
-            1 => vec!["replay-server".into()],
-            _ => (0..shards)
-                .map(|shard| format!("replay-server-{shard}"))
-                .collect(),
-        };
-        let all = processes.iter().map(|role| said::<3>(&run.log(role), SET));
+        let mut logs = system.names("run/logs");
+        logs.retain(|name| name.starts_with("replay-server"));
+        let all = logs.iter().map(|name| {
+            let log = system.read(&format!("run/logs/{name}"));
+            said::<3>(&log, SET)
+        });
         let sums = all.fold([0; 3], |sums, counts| {
             std::array::from_fn(|at| sums[at] + counts[at])
         });

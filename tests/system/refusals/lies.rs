@@ -32,14 +32,10 @@ struct Lied {
     system: TestSystem,
 }
 
-fn lied() -> Lied {
-    Lied::of("--agent driml-ada")
-}
-
 impl Lied {
-    fn of(flags: &str) -> Self {
+    fn new(flags: &str) -> Self {
         let system = system();
-        let run = launched_with(&system, flags, 20);
+        let run = launched_with(&system, &format!("--agent driml-ada {flags}"), 20);
         Self {
             client: system.connect(),
             run,
@@ -77,7 +73,7 @@ impl Lied {
 
 #[test]
 fn of_each_kind_of_message() {
-    let lied = lied();
+    let lied = Lied::new("");
     let (client, keys) = (&lied.client, &lied.client.keys);
     let joins = [0, 1 << 60, u64::MAX].map(|rows_sampled| {
         let mut join = new_learner(LEARNER);
@@ -188,7 +184,7 @@ fn priority(transition: u64, priority: f32) -> PriorityUpdate {
 /// Without certificates every client may offer to answer in the replay server's place.
 #[test]
 fn of_who_answers() {
-    let lied = lied();
+    let lied = Lied::new("");
     let liar = lied.system.connect();
     let asked = Arc::<AtomicUsize>::default();
     let count = asked.clone();
@@ -211,7 +207,7 @@ fn of_who_answers() {
 /// More than a run may have; then one that belongs to the run.
 #[test]
 fn of_4096_strangers() {
-    let lied = lied();
+    let lied = Lied::new("");
     let client = &lied.client;
     let tokens: Vec<_> = (0..300)
         .map(|number| client.run().declare_alive(Alive::learner(number)).unwrap())
@@ -237,7 +233,7 @@ fn of_4096_strangers() {
 /// Of a run that draws by them.
 #[test]
 fn of_priorities() {
-    let lied = Lied::of(&format!("--agent driml-ada {PRIORITISED}"));
+    let lied = Lied::new(PRIORITISED);
     let client = &lied.client;
     let row = |lie: &PriorityUpdate| Row::of(client, lie, SILENCE);
     let no_numbers = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0];
@@ -257,7 +253,7 @@ fn of_priorities() {
 /// 512 MB of zeros are never held; what is too long by less is refused and counted before it is copied.
 #[test]
 fn of_half_a_gigabyte() {
-    let lied = lied();
+    let lied = Lied::new("");
     let client = &lied.client;
     let server = lied.system.find_process("replay-server");
     let peak_mib = || server.status("VmHWM") / 1024;
@@ -282,7 +278,7 @@ fn of_half_a_gigabyte() {
 /// What a liar would need is not to be seen: the numbers by which the replay server knows its learner and its actors.
 #[test]
 fn of_processes_whose_number_can_be_read() {
-    let lied = lied();
+    let lied = Lied::new("");
     let client = &lied.client;
     let tokens = client
         .session

@@ -1,7 +1,0 @@
-//! Fuzzes the decoder `config` of `driml-decoders`.
-#![no_main]
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    let decoder = driml_decoders::ALL.iter().find(|(name, _)| *name == "config");
-    decoder.expect("it is in the list").1(bytes);
-});
