@@ -58,8 +58,8 @@ impl Certificates {
         }
     }
 
-    /// Signs the certificate of `role` anew, valid at another time.
-    pub fn sign_again(&self, role: &str, [start, end]: [&str; 2]) {
+    /// These with the certificate of `role` signed anew, valid at another time.
+    pub fn sign_again(self, role: &str, [start, end]: [&str; 2]) -> Self {
         let openssl = |args: String| {
             let mut command = Command::new("openssl");
             run(command
@@ -85,5 +85,6 @@ impl Certificates {
         openssl(format!(
             "ca -batch -notext -config config -cert ca.pem -keyfile ca.key -in request -out {role}.pem -startdate {start} -enddate {end}"
         ));
+        self
     }
 }

@@ -188,8 +188,9 @@ impl Server {
     }
 }
 
-/// Delivers the chunks of `ACTORS` actors to `server`, which are about to leave or not.
-fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
+/// Delivers the chunks of `ACTORS` actors, which are about to leave or not, to a server that then holds all of them.
+fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Server> {
+    let server = Server::new(passes);
     let mut endpoint = Endpoint::open();
     server.serve(&mut endpoint);
     let limits = DeliveryLimits {
@@ -213,14 +214,15 @@ fn deliver_all(server: &Arc<Server>, ack_timeout: Duration, leaving: bool) {
             });
         }
     });
+    server.check_numbers();
+    server.check_leaves();
+    server
 }
 
 #[test]
 fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
-    let server = Server::new(|message| [message % 5 != 1, message % 5 != 3]);
-    deliver_all(&server, Duration::from_millis(100), false);
-    server.check_numbers();
-    server.check_leaves();
+    let passes = |message: u32| [message % 5 != 1, message % 5 != 3];
+    let server = deliver_all(passes, Duration::from_millis(100), false);
     let retried = server.replay.lock().unwrap().status().chunks_retried;
     // Some answers were lost; how many chunks came again for it, and were not just asked about, is the machine's.
     assert!(retried > 0, "answers were to get lost");
@@ -229,10 +231,8 @@ fn chunks_and_answers_that_get_lost_leave_each_transition_stored_once() {
 /// The time in which an actor that leaves must deliver is not spent on one message that was lost.
 #[test]
 fn an_actor_that_leaves_does_not_wait_for_long_before_it_sends_again() {
-    let server = Server::new(|message| [message >= 3 * ACTORS, true]);
-    deliver_all(&server, Duration::from_secs(15), true);
-    server.check_numbers();
-    server.check_leaves();
+    let passes = |message: u32| [message >= 3 * ACTORS, true];
+    deliver_all(passes, Duration::from_secs(15), true);
 }
 
 fn config(shards: u32) -> Config {

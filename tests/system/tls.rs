@@ -62,6 +62,11 @@ impl TlsSystem {
         self.system.start_process(&args)
     }
 
+    /// Good certificates in another folder, to be spoiled there.
+    fn spoiled(&self, name: &str) -> Certificates {
+        self.good.copy(self.system.path(name))
+    }
+
     /// A client with the certificate of `role`, as this program opens its sessions.
     pub(crate) fn client(&self, role: Role) -> Client {
         let credentials = Credentials::read(self.good.folder(), role).unwrap();
@@ -191,16 +196,16 @@ fn a_launched_run_with_an_actor_from_outside() {
 #[test]
 fn own_files_that_cannot_be_used() {
     let Some(tls) = TlsSystem::new() else { return };
-    let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
-    spoiled("role").pass_off("learner", "actor-0");
-    spoiled("number").pass_off("actor-1", "actor-0");
-    let key = spoiled("key");
-    std::fs::copy(tls.good.path("actor-1.key"), key.path("actor-0.key")).unwrap();
-    std::fs::write(spoiled("garbage").path("learner.key"), "no key").unwrap();
-    spoiled("old").sign_again("learner", EXPIRED);
-    spoiled("new").sign_again("learner", FUTURE);
+    let key = tls.spoiled("key").path("actor-0.key");
+    std::fs::copy(tls.good.path("actor-1.key"), key).unwrap();
+    std::fs::write(tls.spoiled("garbage").path("learner.key"), "no key").unwrap();
+    tls.spoiled("role").pass_off("learner", "actor-0");
+    tls.spoiled("number").pass_off("actor-1", "actor-0");
+    tls.spoiled("old").sign_again("learner", EXPIRED);
+    tls.spoiled("new").sign_again("learner", FUTURE);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
-    std::fs::copy(foreign.path("ca.pem"), spoiled("mixed").path("ca.pem")).unwrap();
+    let mixed = tls.spoiled("mixed").path("ca.pem");
+    std::fs::copy(foreign.path("ca.pem"), mixed).unwrap();
     let [actor, learner] = ["actor --id 0", "learner --run-dir run"]
         .map(|role| format!("{role} --connect {} --tls-dir", tls.endpoint));
     let other = |id: u32| actor.replace("--id 0", &format!("--id {id}"));
@@ -241,10 +246,8 @@ fn strangers_at_a_replay_server() {
     let observer = tls.client(Role::Observer);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
     std::fs::copy(tls.good.path("ca.pem"), foreign.path("ca.pem")).unwrap();
-    let old = tls.good.copy(tls.system.path("old"));
-    old.sign_again("learner", EXPIRED);
-    let new = tls.good.copy(tls.system.path("new"));
-    new.sign_again("learner", FUTURE);
+    let old = tls.spoiled("old").sign_again("learner", EXPIRED);
+    let new = tls.spoiled("new").sign_again("learner", FUTURE);
     let endpoint = &tls.endpoint;
     let attempts = [
         ("none", &tls.good, None),
@@ -281,13 +284,10 @@ fn strangers_at_a_replay_server() {
 #[test]
 fn strangers_in_the_place_of_a_replay_server() {
     let Some(tls) = TlsSystem::new() else { return };
-    let spoiled = |name: &str| tls.good.copy(tls.system.path(name));
-    let old = spoiled("old");
-    old.sign_again("replay-server", EXPIRED);
-    let new = spoiled("new");
-    new.sign_again("replay-server", FUTURE);
+    let old = tls.spoiled("old").sign_again("replay-server", EXPIRED);
+    let new = tls.spoiled("new").sign_again("replay-server", FUTURE);
     let foreign = Certificates::make(tls.system.path("foreign"), "");
-    let [named, unknowing] = ["named", "unknowing"].map(spoiled);
+    let [named, unknowing] = ["named", "unknowing"].map(|name| tls.spoiled(name));
     for ending in ["pem", "key"] {
         std::fs::remove_file(named.path(&format!("replay-server.{ending}"))).unwrap();
     }
@@ -346,8 +346,7 @@ fn the_doctor_looks_at_certificates() {
     said(&well, "note", "tls authority", "ca.key is here");
     assert!(!well.stderr.contains("--tls-dir"), "{}", well.stderr);
 
-    let bad = tls.good.copy(tls.system.path("bad"));
-    bad.sign_again("learner", EXPIRED);
+    let bad = tls.spoiled("bad").sign_again("learner", EXPIRED);
     bad.pass_off("actor-0", "observer");
     std::fs::remove_file(bad.path("actor-1.key")).unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);

@@ -157,12 +157,8 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
 
     let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
     let said = ended.json();
-    let names: BTreeSet<_> = said
-        .as_object()
-        .unwrap()
-        .keys()
-        .map(String::as_str)
-        .collect();
+    let names = said.as_object().unwrap().keys().map(String::as_str);
+    let names: BTreeSet<_> = names.collect();
     let metrics = COLUMNS.iter().map(|it| it.name);
     let fields: BTreeSet<_> = metrics.chain(FIELDS).collect();
     assert_eq!(names, fields);
@@ -203,30 +199,20 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
 /// Name, labels and value of each sample; panics at what Prometheus' text format does not allow.
 fn parse_prometheus(text: &str) -> Vec<(String, BTreeMap<String, String>, f64)> {
     assert!(text.ends_with('\n'));
-    let (mut families, mut samples) = (BTreeMap::new(), Vec::new());
-    let (mut helped, mut family) = (None, String::new());
+    let (mut families, mut samples) = (BTreeSet::new(), Vec::new());
+    let (mut helped, mut family) = ("", "");
     for line in text.lines() {
         if let Some(help) = line.strip_prefix("# HELP ") {
-            helped = help.split_once(' ').map(|(name, _)| name.to_owned());
+            helped = help.split_once(' ').unwrap().0;
         } else if let Some(of) = line.strip_prefix("# TYPE ") {
             let (name, kind) = of.split_once(' ').unwrap();
-            assert_eq!(
-                helped.take().as_deref(),
-                Some(name),
-                "HELP comes before TYPE"
-            );
+            assert_eq!(name, helped, "HELP comes before TYPE");
             assert!(["counter", "gauge"].contains(&kind), "{line}");
             assert_eq!(kind == "counter", name.ends_with("_total"), "{line}");
-            assert!(
-                name.bytes()
-                    .all(|it| it.is_ascii_lowercase() || it.is_ascii_digit() || it == b'_'),
-                "{line}"
-            );
-            assert!(
-                families.insert(name.to_owned(), kind).is_none(),
-                "{name} comes twice"
-            );
-            name.clone_into(&mut family);
+            let is_plain = |it: u8| matches!(it, b'a'..=b'z' | b'0'..=b'9' | b'_');
+            assert!(name.bytes().all(is_plain), "{line}");
+            assert!(families.insert(name), "{name} comes twice");
+            family = name;
         } else {
             let (name, rest) = line.split_once('{').unwrap();
             assert_eq!(name, family, "samples follow their family");
