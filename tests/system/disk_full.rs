@@ -48,15 +48,35 @@ pub(crate) fn fill(file: impl AsRef<Path>) {
 /// Updates between two checkpoints of a run that ends before the first.
 pub(crate) const NEVER: u32 = 100_000_000;
 
-/// A run on the disk, with a checkpoint after so many updates, that has learned something.
-fn started(system: &TestSystem, checkpoint_period: u32) -> Process {
-    let process = system.start(&format!(
+/// Tests a run on a disk that is full, which has learned something, saves a checkpoint after so many updates, and has logged `words`; the
+/// third argument is the file that fills the disk. No process is left then, and no half of a file.
+fn with_full_disk(
+    checkpoint_period: u32,
+    words: &str,
+    test: impl FnOnce(&TestSystem, Process, PathBuf),
+) {
+    let system = system();
+    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
+        return;
+    };
+    let mut process = system.start(&format!(
         "local --agent c51 {LONG} --set learner.checkpoint_period_updates={checkpoint_period} --listen {} --run-dir disk/run",
         system.endpoint()
     ));
     system.connect().wait_for_updates(100);
-    process
+    let filler = system.path("disk/filler");
+    fill(&filler);
+    process.wait_for_stderr(words);
+    test(&system, process, filler);
+    assert_eq!(system.survivors(), []);
+    for folder in ["disk/run", "disk/run/checkpoints"] {
+        let names = system.names(folder);
+        let temporary = names.iter().find(|name| name.contains("tmp"));
+        assert_eq!(temporary, None);
+    }
 }
+
+const NOT_WRITTEN: &str = "cannot be written: No space left";
 
 /// How often `words` were said.
 fn times(said: &str, words: &str) -> usize {
@@ -65,97 +85,66 @@ fn times(said: &str, words: &str) -> usize {
 
 #[test]
 fn a_run_continues_while_the_disk_is_full() {
-    let system = system();
-    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
-        return;
-    };
-    let mut process = started(&system, NEVER);
-    let filler = system.path("disk/filler");
-    fill(&filler);
-    process.wait_for_stderr("cannot be written: No space left");
-    let client = system.connect();
-    let then = client.learner().unwrap().updates;
-    client.wait_for_updates(then + 200);
-    fs::remove_file(filler).unwrap();
-    let run = system.run_folder("disk/run");
-    let now = client.learner().unwrap().updates;
-    run.wait_for_updates(now);
-    let ended = process.interrupt().expect_code(130);
-    assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
-    assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
-    run.check(Outcome::Interrupted);
-    // No second is missing.
-    let [seconds, frames] = ["seconds", "frames"].map(|name| run.numbers(name));
-    assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
-    assert!(frames.is_sorted(), "{frames:?}");
-    check_nothing_is_left(&system);
+    with_full_disk(NEVER, NOT_WRITTEN, |system, process, filler| {
+        let client = system.connect();
+        let then = client.learner().unwrap().updates;
+        client.wait_for_updates(then + 200);
+        fs::remove_file(filler).unwrap();
+        let run = system.run_folder("disk/run");
+        let now = client.learner().unwrap().updates;
+        run.wait_for_updates(now);
+        let ended = process.interrupt().expect_code(130);
+        assert_eq!(times(&ended.stderr, "No space left"), 1, "{ended:#?}");
+        assert_eq!(times(&ended.stderr, "are lost"), 0, "{ended:#?}");
+        run.check(Outcome::Interrupted);
+        // No second is missing.
+        let [seconds, frames] = ["seconds", "frames"].map(|name| run.numbers(name));
+        assert!(seconds.is_sorted_by(|a, b| a < b), "{seconds:?}");
+        assert!(frames.is_sorted(), "{frames:?}");
+    });
 }
 
 #[test]
 fn the_first_error_is_the_one_shown() {
-    let system = system();
-    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
-        return;
-    };
-    let mut process = started(&system, NEVER);
-    let filler = system.path("disk/filler");
-    fill(&filler);
-    process.wait_for_stderr("cannot be written: No space left");
-    let ended = process.interrupt().expect_code(1);
-    // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
-    let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
-    let last = &ended.stderr[errors..];
-    assert!(last.contains("learner exited with code 1"), "{ended:#?}");
-    check_has(&ended.stderr, &["summary.json: No space left"]);
-    let lost = ended.stderr.lines().filter(|it| it.contains("are lost: "));
-    let lost: Vec<_> = lost.collect();
-    assert!(
-        lost.len() == 1 && lost[0].contains(" rows of "),
-        "{ended:#?}"
-    );
-    for line in ended.stderr.lines() {
+    with_full_disk(NEVER, NOT_WRITTEN, |_, process, filler| {
+        let ended = process.interrupt().expect_code(1);
+        // The checkpoint could not be saved: that is what the run failed by, and the summary is only said before.
+        let errors = ended.stderr.rfind("\nerror: ").expect("an error is last");
+        let last = &ended.stderr[errors..];
+        assert!(last.contains("learner exited with code 1"), "{ended:#?}");
+        check_has(&ended.stderr, &["summary.json: No space left"]);
+        let lost = ended.stderr.lines().filter(|it| it.contains("are lost: "));
+        let lost: Vec<_> = lost.collect();
         assert!(
-            times(line, "No space left") <= 1,
-            "a cause is logged once: {line}"
+            lost.len() == 1 && lost[0].contains(" rows of "),
+            "{ended:#?}"
         );
-    }
-    fs::remove_file(filler).unwrap();
-    check_nothing_is_left(&system);
+        for line in ended.stderr.lines() {
+            assert!(
+                times(line, "No space left") <= 1,
+                "a cause is logged once: {line}"
+            );
+        }
+        fs::remove_file(filler).unwrap();
+    });
 }
 
 #[test]
 fn a_checkpoint_that_finds_no_room_is_tried_again() {
-    let system = system();
-    let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
-        return;
-    };
-    let mut process = started(&system, 200);
-    let filler = system.path("disk/filler");
-    fill(&filler);
-    process.wait_for_stderr("No space left");
-    let client = system.connect();
-    let then = client.learner().unwrap().updates;
-    client.wait_for_updates(then + 600);
-    fs::remove_file(filler).unwrap();
-    let now = client.learner().unwrap().updates;
-    wait_until("a checkpoint after that", || {
-        let names = system.names("disk/run/checkpoints");
-        let updates = |name: &String| name.strip_prefix("checkpoint-")?.parse::<u64>().ok();
-        names.iter().any(|name| updates(name) > Some(now))
+    with_full_disk(200, "No space left", |system, process, filler| {
+        let client = system.connect();
+        let then = client.learner().unwrap().updates;
+        client.wait_for_updates(then + 600);
+        fs::remove_file(filler).unwrap();
+        let now = client.learner().unwrap().updates;
+        wait_until("a checkpoint after that", || {
+            let names = system.names("disk/run/checkpoints");
+            let updates = |name: &String| name.strip_prefix("checkpoint-")?.parse::<u64>().ok();
+            names.iter().any(|name| updates(name) > Some(now))
+        });
+        process.interrupt().expect_code(130);
+        system.run_folder("disk/run").check(Outcome::Interrupted);
     });
-    process.interrupt().expect_code(130);
-    system.run_folder("disk/run").check(Outcome::Interrupted);
-    check_nothing_is_left(&system);
-}
-
-/// No process and no half of a file.
-fn check_nothing_is_left(system: &TestSystem) {
-    assert_eq!(system.survivors(), []);
-    for folder in ["disk/run", "disk/run/checkpoints"] {
-        let names = system.names(folder);
-        let temporary = names.iter().find(|name| name.contains("tmp"));
-        assert_eq!(temporary, None);
-    }
 }
 
 /// Batches that may have been on their way to a learner that ended.
