@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
-    ReplayStatus, RunClient, RunSpec, ShardCounts, Shutdown, codec,
+    ReplayStatus, RunClient, RunSpec, Shutdown, codec,
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
@@ -50,10 +50,7 @@ pub fn new_learner(learner: u64) -> LearnerJoin {
     LearnerJoin {
         learner,
         run: learner,
-        updates: 0,
-        counts: ShardCounts::default(),
-        other_shards: ShardCounts::default(),
-        restart: false,
+        ..LearnerJoin::default()
     }
 }
 

@@ -105,13 +105,18 @@ fn an_actor_waits_for_as_long_as_it_must() {
 }
 
 #[test]
-fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
+fn of_two_processes_with_one_role_the_second_waits_for_the_first_one_s_end() {
     let system = system();
     let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let learner = system.start_learner("run");
-    let first = system.start_actor(3);
+    let learner = system.start_learner("first");
+    let actor = system.start_actor(3);
     let client = system.connect();
-    client.wait_for_transitions(0);
+    client.wait_for_updates(10);
+    let mut second = system.start_learner("second");
+    second.wait_for_stderr("another learner takes part in this run, which has one alone");
+    second.stop_ok();
+    assert!(system.run_folder("second").checkpoints().is_empty());
+
     let mut second = system.start_actor(3);
     second.wait_for_stderr(
         "another process is actor 3 of this run: give each actor another number (--id)",
@@ -119,27 +124,10 @@ fn a_second_process_with_an_actor_s_number_waits_for_the_first_one_s_end() {
     // The first one still plays.
     let before = client.replay().unwrap();
     client.wait_for_transitions(before.transitions_inserted);
-    first.stop_ok().expect_said("leaves: ");
+    actor.stop_ok().expect_said("leaves: ");
     second.wait_for_stderr("actor 3 steps 4 environments");
     second.stop_ok();
     let status = client.replay().unwrap();
     assert_eq!((status.transitions_lost, status.messages_refused), (0, 0));
     learner.stop_ok();
-}
-
-#[test]
-fn a_second_learner_gets_nothing_while_the_first_is_there() {
-    let system = system();
-    let _server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let first = system.start_learner("first");
-    let actor = system.start_actor(0);
-    let client = system.connect();
-    client.wait_for_updates(10);
-    let mut second = system.start_learner("second");
-    second.wait_for_stderr("another learner takes part in this run, which has one alone");
-    second.stop_ok();
-    assert!(system.run_folder("second").checkpoints().is_empty());
-    actor.stop_ok();
-    first.stop_ok();
-    assert_eq!(client.replay().unwrap().messages_refused, 0);
 }

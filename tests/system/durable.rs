@@ -11,8 +11,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    chain, launched_with,
+    PRIORITISED, chain, launched_with,
     numbered::{KILLS, ROWS, SAMPLED, WARMUP, kill_after_rows},
+    prioritised::{SET, said},
     system,
 };
 
@@ -60,12 +61,13 @@ fn check_exactly_once(run: &RunFolder) {
     assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
 }
 
+/// Transitions come back with the highest priority each; losses of rows that it drew before are not mistaken for those of others.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
     let system = system();
     let longer = chain(8_000);
     system.hold_at(3_500);
-    let flags = format!("--durable --agent driml-ada {longer} --actors 2");
+    let flags = format!("--durable --agent driml-ada {longer} --actors 2 {PRIORITISED}");
     let process = system.start(&system.local(&flags));
     let run = system.run_folder("run");
     for updates in [500, 1_500, 2_500] {
@@ -80,6 +82,9 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
         .expect_printed("of disk, in the run folder");
     check_exactly_once(&run);
     assert_eq!(run.check_finished().replay_servers_restarted, 3);
+    let log = run.log("replay-server");
+    check_has(&log, &["priorities are those of the last checkpoint"]);
+    assert!(said::<3>(&log, SET)[0] > 0, "{log}");
     assert_eq!(system.survivors(), []);
 }
 

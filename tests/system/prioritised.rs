@@ -1,14 +1,13 @@
-//! Rows drawn by priority, in whole runs: of one replay server and of several, and of one that dies. Those in lockstep are in `lockstep`.
+//! Rows drawn by priority, in whole runs: of one replay server and of several. One that dies is in `durable`, a run in lockstep in `lockstep`.
 //! The law of the draws is tested beside the code.
 
-use driml_tests::{Outcome, check_has};
-use nix::sys::signal::Signal;
+use driml_tests::Outcome;
 
-use crate::{PRIORITISED, SHORT, chain, system};
+use crate::{PRIORITISED, SHORT, system};
 
 /// The numbers of the last line with `words`: of a replay server, rows whose priority was set, came too late and came twice; of the
 /// learner, updates whose priorities arrived.
-fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
+pub(crate) fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
     let line = log.lines().rfind(|line| line.contains(words));
     let line = line.unwrap_or_else(|| panic!("no word of priorities: {log}"));
     let start = line.find("priorities of ").unwrap();
@@ -19,7 +18,7 @@ fn said<const N: usize>(log: &str, words: &str) -> [u64; N] {
 
 /// Of the preset `smoke`.
 const BATCH_ROWS: u64 = 16;
-const SET: &str = "rows were set";
+pub(crate) const SET: &str = "rows were set";
 
 /// The priorities of all updates that the learner says have arrived. Where the machine is busy, some are on their way when it ends.
 #[test]
@@ -51,25 +50,4 @@ fn the_learner_s_losses_come_back_to_the_replay_that_drew_the_rows() {
         assert_eq!(repeated, 0);
         assert!(gone * 10 < rows, "{sums:?} of {rows}");
     }
-}
-
-/// Its transitions come back, with the highest priority each; losses of rows that it drew before are not mistaken for those of others.
-#[test]
-fn a_replay_server_that_dies_continues_with_equal_priorities() {
-    let system = system();
-    let longer = chain(3_200);
-    system.hold_at(1_000);
-    let flags = format!("--durable --agent c51 {longer} {PRIORITISED}");
-    let process = system.start(&system.local(&flags));
-    system.connect().wait_for_updates(500);
-    system.find_process("replay-server").signal(Signal::SIGKILL);
-    system.let_go();
-    process
-        .wait_ok()
-        .expect_said("is started again with what it has kept");
-    let run = system.run_folder("run");
-    run.check(Outcome::Finished);
-    let log = run.log("replay-server");
-    check_has(&log, &["priorities are those of the last checkpoint"]);
-    assert!(said::<3>(&log, SET)[0] > 0, "{log}");
 }

@@ -12,7 +12,7 @@ use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, SlowMachine, TestSystem, check_has, connect, new_learner, wait_for};
 use serde_json::Value;
 
-use crate::{system, tls::TlsSystem};
+use crate::{system, tiny_replay, tls::TlsSystem};
 
 /// Transitions in a log, one record each: in one that is read for longer than the limit for an absent server, and in the others.
 const LONG: u64 = 1_000_000;
@@ -57,11 +57,7 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
         mark: None,
     };
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
-    let join = ActorJoin {
-        actor: 9,
-        incarnation: 1,
-    };
-    replay.join_actor(join).unwrap();
+    tiny_replay::join(&mut replay, 9);
     let mut header = header_of(9, spec.frame_bytes());
     for sequence in 0..kept {
         (header.sequence, header.first_transition) = (sequence, sequence);

@@ -9,7 +9,7 @@ use driml_learner::{
 };
 use driml_model::{Compute, InputSize};
 use driml_protocol::{
-    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, Sampling, TimeoutRule,
+    Batch as WireBatch, BatchHeader, Buffer, Horizon, RowScalars, RunSpec, Sampling,
     config::TransportConfig,
 };
 use rand::{Rng, SeedableRng};
@@ -36,18 +36,16 @@ pub(crate) fn config(
     };
     LearnerConfig {
         spec: RunSpec {
-            world: "test".into(),
             agent: auxiliary_loss.name().into(),
             seed: 5,
             frame_height: 20,
             frame_width: 24,
             frame_channels: 2,
-            frame_stack: 1,
             num_actions: 4,
             n_step: 3,
             gamma: 0.9,
             horizon,
-            timeout: TimeoutRule::Terminal,
+            ..RunSpec::smallest()
         },
         input: InputSize {
             height: model.height as u32,

@@ -104,12 +104,9 @@ fn processes_of_another_protocol_version_do_not_join() {
     let system = system();
     let server = listen(&system.endpoint());
     let run_info = RunInfo {
-        config_toml: String::new(),
-        inserted_total: 0,
         has_learner: true,
-        after_updates: 0,
         shard: (0, 1),
-        shared_memory: false,
+        ..RunInfo::default()
     };
     let whole = codec::encode(0, &run_info, &[]).unwrap();
     let run_infos = [
