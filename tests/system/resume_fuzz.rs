@@ -27,10 +27,8 @@ enum Stop {
     KillLauncher,
     /// All processes are killed.
     KillAll,
-    /// The learner is killed, with which the run fails.
-    KillLearner,
-    /// A replay server is killed; one that is kept on disk is started again, else the run fails.
-    KillServer,
+    /// A process is killed, with which the run fails; but a replay server that is kept on disk is started again.
+    Kill(&'static str),
 }
 
 /// Settings of the second life.
@@ -97,8 +95,8 @@ fn resume_once(seed: u64) {
         Stop::Interrupt,
         Stop::KillLauncher,
         Stop::KillAll,
-        Stop::KillLearner,
-        Stop::KillServer,
+        Stop::Kill("learner"),
+        Stop::Kill("replay-server"),
     ];
     // In lockstep there is one process.
     let is_lockstep = store == "--lockstep";
@@ -109,12 +107,11 @@ fn resume_once(seed: u64) {
     } else {
         rng.random_range(1..3)
     };
+    let mut one_of = |all: &[u64]| *all.choose(&mut rng).unwrap();
     let mut change = Change {
-        frames: *[FRAMES, FRAMES, FRAMES / 2, FRAMES + 1_000]
-            .choose(&mut rng)
-            .unwrap(),
-        rows: *[ROWS, ROWS, 8, 24].choose(&mut rng).unwrap(),
-        ratio: *[RATIO, RATIO, 4].choose(&mut rng).unwrap(),
+        frames: one_of(&[FRAMES, FRAMES, FRAMES / 2, FRAMES + 1_000]),
+        rows: one_of(&[ROWS, ROWS, 8, 24]),
+        ratio: one_of(&[RATIO, RATIO, 4]),
         actors: 2,
     };
     if !is_lockstep {
@@ -126,13 +123,8 @@ fn resume_once(seed: u64) {
          --set learner.batch_size={ROWS} --set learner.checkpoint_period_updates=50 --actors 2 --replay-shards {shards} {store} --run-dir run"
     );
     let run = system.run_folder("run");
-    first_life(
-        &system,
-        &run,
-        &first,
-        stop,
-        Duration::from_millis(rng.random_range(0..1_500)),
-    );
+    let moment = Duration::from_millis(rng.random_range(0..1_500));
+    first_life(&system, &run, &first, stop, moment);
     let Some(before) = saved(&run) else {
         // Nothing was saved yet.
         system.refuses("local --resume run", "there is no checkpoint");
@@ -213,18 +205,16 @@ fn first_life(system: &TestSystem, run: &RunFolder, flags: &str, stop: Stop, mom
     let settings = run.path().join("config.toml");
     wait_until("the run's settings", || settings.exists());
     std::thread::sleep(moment);
-    // There is none before the launcher has started it, and after the run's end.
-    let kill = |role| {
-        let found = system.find_process_now(role);
-        found.iter().for_each(|it| it.signal(Signal::SIGKILL));
-    };
     match stop {
         Stop::End => {}
         Stop::Interrupt => process.signal(Signal::SIGINT),
         Stop::KillLauncher => process.signal(Signal::SIGKILL),
         Stop::KillAll => system.kill_all(),
-        Stop::KillLearner => kill("learner"),
-        Stop::KillServer => kill("replay-server"),
+        Stop::Kill(role) => {
+            // There is none before the launcher has started it, and after the run's end.
+            let found = system.find_process_now(role);
+            found.iter().for_each(|it| it.signal(Signal::SIGKILL));
+        }
     }
     let ended = process.wait();
     let in_order = matches!(ended.code, Some(0 | 130));
