@@ -3,9 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{
-    Outcome, RunFolder, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
-};
+use driml_tests::{Outcome, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -51,16 +49,6 @@ const fn planned(frames: u64) -> u64 {
     (frames - WARMUP) * 8 / ROWS as u64
 }
 
-fn check_exactly_once(run: &RunFolder) {
-    let summary = run.summary();
-    let said = format!("{summary:#?}");
-    let replay = &summary.replay;
-    check_nothing_lost(replay);
-    let updates = planned(replay.transitions_inserted);
-    assert_eq!(summary.updates, updates, "{said}");
-    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
-}
-
 /// Transitions come back with the highest priority each; losses of rows that it drew before are not mistaken for those of others.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
@@ -80,7 +68,6 @@ fn a_launched_run_starts_its_dead_replay_server_again() {
         .expect_said("replay-server was killed by signal 9 SIGKILL")
         .expect_said("replay-server is started again with what it has kept (3 of 8 times in a run)")
         .expect_printed("of disk, in the run folder");
-    check_exactly_once(&run);
     assert_eq!(run.check_finished().replay_servers_restarted, 3);
     let log = run.log("replay-server");
     check_has(&log, &["priorities are those of the last checkpoint"]);
@@ -162,7 +149,13 @@ fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
     process.wait_ok().expect_said(&format!(
         "is started again with what it has kept ({kills} of 8"
     ));
-    check_exactly_once(&run);
+    let summary = run.summary();
+    let said = format!("{summary:#?}");
+    let replay = &summary.replay;
+    check_nothing_lost(replay);
+    let updates = planned(replay.transitions_inserted);
+    assert_eq!(summary.updates, updates, "{said}");
+    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
     for log in ["replay/shard-0/log.toml", "replay/shard-1/log.toml"] {
         assert!(run.path().join(log).exists());
     }
@@ -184,7 +177,6 @@ fn a_resumed_run_continues_with_its_replay() {
     system.run_ok(&format!("local --resume run --frames {frames}"));
     let run = system.run_folder("run");
     let summary = run.check_finished();
-    check_exactly_once(&run);
     // It does not fill anew: no frame was made twice, no episode is counted twice.
     assert!(
         (frames..frames + 64).contains(&summary.frames),
@@ -224,7 +216,5 @@ fn a_run_whose_launcher_was_killed_continues() {
         .run_ok(&format!("local --resume run --frames {frames} {listen}"))
         .expect_said(": waiting");
     actor.signal(Signal::SIGKILL);
-    let run = system.run_folder("run");
-    run.check_finished();
-    check_exactly_once(&run);
+    system.run_folder("run").check_finished();
 }

@@ -7,6 +7,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use walkdir::{DirEntry, WalkDir};
+
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
     ("protocol", 8_000),
@@ -163,31 +165,20 @@ fn each_process_is_free_of_what_is_none_of_its_business() {
 
 /// Every file of the repository that is not built, fetched or left by a run, by its path from the root.
 fn files() -> Vec<String> {
-    let mut files = Vec::new();
-    let mut folders = vec![root()];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(folder).unwrap() {
-            let entry = entry.unwrap();
-            let path = entry.path();
-            let name = path
-                .strip_prefix(root())
-                .unwrap()
-                .to_str()
-                .expect("names here are plain")
-                .to_owned();
-            // `target` and `runs` are in .gitignore; a folder that cargo made has a tag.
-            if matches!(name.as_str(), ".git" | "target" | "runs")
-                || path.join("CACHEDIR.TAG").exists()
-            {
-                continue;
-            }
-            if entry.file_type().unwrap().is_dir() {
-                folders.push(path);
-            } else {
-                files.push(name);
-            }
-        }
-    }
+    let root = root();
+    let name = |entry: &DirEntry| {
+        let name = entry.path().strip_prefix(&root).unwrap();
+        name.to_str().expect("names here are plain").to_owned()
+    };
+    // `target` and `runs` are in .gitignore; a folder that cargo made has a tag.
+    let is_ours = |entry: &DirEntry| {
+        !matches!(&*name(entry), ".git" | "target" | "runs")
+            && !entry.path().join("CACHEDIR.TAG").exists()
+    };
+    let walk = WalkDir::new(&root).into_iter().filter_entry(is_ours);
+    let all = walk.map(|entry| entry.unwrap());
+    let files = all.filter(|entry| !entry.file_type().is_dir());
+    let mut files: Vec<_> = files.map(|entry| name(&entry)).collect();
     files.sort();
     assert!(files.len() > 300, "the walk found only {files:?}");
     files
