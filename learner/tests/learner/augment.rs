@@ -29,6 +29,13 @@ fn noise(bytes: usize, seed: u64) -> Vec<u8> {
     (0..bytes).map(|_| rng.random()).collect()
 }
 
+/// Chi-square of counts against the uniform law.
+fn chi_square(counts: &[u32]) -> f64 {
+    let expected = f64::from(counts.iter().sum::<u32>()) / counts.len() as f64;
+    let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
+    counts.iter().map(square).sum()
+}
+
 #[test]
 fn at_no_strength_every_byte_stays() {
     for (size, frame_channels) in [
@@ -64,26 +71,21 @@ fn crops_are_of_a_share_of_each_side() {
     }
 }
 
-/// Every place of the crop comes equally often: chi-square against the uniform law.
+/// Every place of the crop comes equally often.
 #[test]
 fn crops_are_anywhere_with_equal_chances() {
     let augment = Augment::new(PAPER, (64, 64, 3), 3);
     assert_eq!(augment.crop(), (51, 51));
     let mut rng = rng(7);
-    let (draws, places) = (28_000, 14);
+    let places = 14;
     let mut counts = [[0u32; 14]; 2];
     let mut both = vec![0u32; places * places];
-    for _ in 0..draws {
+    for _ in 0..28_000 {
         let View { top, left, .. } = augment.draw(&mut rng);
         counts[0][top] += 1;
         counts[1][left] += 1;
         both[top * places + left] += 1;
     }
-    let chi_square = |counts: &[u32]| {
-        let expected = f64::from(draws) / counts.len() as f64;
-        let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
-        counts.iter().map(square).sum::<f64>()
-    };
     // Quantiles of 99.9%: 13 and 195 degrees of freedom.
     assert!(chi_square(&counts[0]) < 34.5 && chi_square(&counts[1]) < 34.5);
     assert!(chi_square(&both) < 262.0, "{}", chi_square(&both));
@@ -122,10 +124,8 @@ fn jitter_is_uniform_within_its_strength() {
         }
     }
     for bins in bins {
-        let expected = f64::from(draws) / 10.0;
-        let square = |&count: &u32| (f64::from(count) - expected).powi(2) / expected;
-        let chi_square: f64 = bins.iter().map(square).sum();
-        assert!(chi_square < 27.9, "9 degrees of freedom, 99.9%: {bins:?}");
+        let far = chi_square(&bins);
+        assert!(far < 27.9, "9 degrees of freedom, 99.9%: {bins:?}");
     }
     for product in products {
         // Standard deviation of a product of two such shares: 1/3.

@@ -8,13 +8,6 @@ use driml_model::{ModelConfig, Parameters, Precision, StoredAs, TorsoName};
 
 use crate::support::{bits, bytes, parameters, policy, q_values, residual, rng, small, values};
 
-fn tensors(parameters: &Parameters) -> HashMap<String, Tensor> {
-    parameters
-        .iter()
-        .map(|(name, var)| (name.to_owned(), var.as_tensor().clone()))
-        .collect()
-}
-
 fn all_bits(parameters: &Parameters) -> Vec<(String, Vec<u32>)> {
     parameters
         .iter()
@@ -157,7 +150,10 @@ fn copies_share_nothing_and_clones_share_all() {
 #[test]
 fn tensors_that_do_not_fit_are_named() {
     let config = small();
-    let good = tensors(&parameters(&config, 1));
+    let drawn = parameters(&config, 1);
+    let named = drawn.iter();
+    let named = named.map(|(name, var)| (name.to_owned(), var.as_tensor().clone()));
+    let good: HashMap<String, Tensor> = named.collect();
     let nan = Tensor::new(&[f32::NAN; 19], &Device::Cpu).unwrap();
     let transposed = good["head.weight"].t().unwrap();
     let double = good["head.bias"].to_dtype(DType::F64).unwrap();
