@@ -1,5 +1,5 @@
 //! Messages that a live replay server must refuse: of other runs and versions, damaged, cut off, not ours at all.
-//! Each is counted once and stores nothing, and the server continues to store.
+//! Each is counted once and stores nothing, and the server continues to store. That every cut and every flip is found is the codec's test.
 
 use driml_protocol::{
     AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, codec,
@@ -100,6 +100,8 @@ fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
     let leave = sealed(&served.client, &leave(0, INCARNATION, 0));
     let mut huge = whole.clone();
     huge[20..28].copy_from_slice(&u64::MAX.to_le_bytes());
+    let mut damaged = whole.clone();
+    damaged[33] ^= 0x10;
     let web = b"GET / HTTP/1.1\r\nHost: replay\r\nAccept: */*\r\n\r\n";
     served.refuses_chunks([
         (foreign, "start every process with the same settings"),
@@ -110,18 +112,11 @@ fn chunks_of_other_runs_and_versions_damaged_ones_and_what_is_not_a_chunk() {
         (leave, "a message of kind 8 came where kind 1 is expected"),
         (web.to_vec(), "does not start with DRML"),
         (huge, "more than the"),
+        (damaged, "checksum is wrong"),
+        (vec![], "cut off or padded"),
+        (whole[..40].to_vec(), "cut off or padded"),
         ([&whole[..], &[0]].concat(), "cut off or padded"),
     ]);
-    let half = whole.len() / 2;
-    served.refuses_chunks(
-        [0, 1, 31, 32, 40, half, whole.len() - 1]
-            .map(|length| (whole[..length].to_vec(), "cut off or padded")),
-    );
-    served.refuses_chunks([8, 28, 33, half, whole.len() - 1].map(|at| {
-        let mut damaged = whole.clone();
-        damaged[at] ^= 0x10;
-        (damaged, "checksum is wrong")
-    }));
     served.stores(0);
 }
 
