@@ -7,7 +7,7 @@ use driml_actor::DeliveryLimits;
 use driml_protocol::{ChunkHeader, Keys, RunClient, Shutdown};
 use driml_tests::{Outcome, connect, wait_until};
 
-use crate::{LONG, chain, synthetic_actor::SyntheticActor, system};
+use crate::{LONG, chain, synthetic::SyntheticActor, system};
 
 /// The learner is so slow, by a replay ratio of 64, that every actor waits nearly all of the time.
 #[test]

@@ -13,7 +13,7 @@ use std::{
 };
 
 use driml_actor::DeliveryLimits;
-use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
+use driml_learner::remote::batch_source::Served;
 use driml_protocol::{
     Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
     Keyed, Keys, Leave, ReplayStatus, RunClient, RunSpec, Shutdown, codec, session,
@@ -25,7 +25,10 @@ use zenoh::{
     query::{Query, Queryable},
 };
 
-use crate::{synthetic_actor::SyntheticActor, tiny_replay};
+use crate::{
+    synthetic::{SyntheticActor, SyntheticLearner},
+    tiny_replay,
+};
 
 /// Actors, and chunks of each.
 const ACTORS: u32 = 3;
@@ -283,7 +286,7 @@ fn answer(query: &Query, replay: &Mutex<Replay>, drawn: &AtomicU32) {
 struct Shards {
     replays: Vec<Arc<Mutex<Replay>>>,
     drawn: Arc<AtomicU32>,
-    source: BatchSource,
+    learner: SyntheticLearner,
     _endpoints: Vec<Endpoint>,
 }
 
@@ -305,32 +308,12 @@ fn serve(shards: Vec<Replay>) -> Shards {
         replays.push(replay);
         endpoints.push(endpoint);
     }
-    let requests = Requests {
-        learner: 1,
-        rows: ROWS,
-        in_flight: 2,
-        shared_memory: false,
-        unreachable_max: Duration::from_secs(60),
-    };
-    let stop = Shutdown::default();
-    let counters = Counters::at_start(clients.len());
-    let source = BatchSource::start(&clients, requests, &counters, &stop).unwrap();
+    let learner = SyntheticLearner::start(&clients, 1, ROWS, 2);
     Shards {
         replays,
         drawn,
-        source,
+        learner,
         _endpoints: endpoints,
-    }
-}
-
-impl Shards {
-    /// The next batch; none at the end of the run.
-    fn next(&mut self) -> Option<Served> {
-        match self.source.next(Duration::from_secs(60)).unwrap() {
-            Next::Batch(served) => Some(*served),
-            Next::Finished => None,
-            Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
-        }
     }
 }
 
@@ -340,7 +323,7 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
     for shards in [1, 3] {
         let mut served = serve((0..shards).map(|shard| full(shard, shards)).collect());
         let mut batches = 0;
-        while let Some(Served { batch, parts }) = served.next() {
+        while let Some(Served { batch, parts }) = served.learner.next() {
             assert_eq!(batch.rows(), ROWS as usize);
             assert_eq!(parts.iter().map(|it| it.rows).sum::<u32>(), ROWS);
             batches += 1;
@@ -359,7 +342,7 @@ fn lost_batches_and_lost_parts_of_batches_do_not_count() {
             "of so many batches as there are, some were to get lost: {lost}"
         );
         assert_eq!(status.batches_retried, u64::from(lost));
-        served.source.end();
+        served.learner.end();
     }
 }
 
@@ -380,10 +363,10 @@ fn a_shard_that_fills_late_is_asked() {
     fill(&mut shards[0], 0..8);
     let mut served = serve(shards);
     for batches in 0..1_000 {
-        let parts = served.next().unwrap().parts;
+        let parts = served.learner.next().unwrap().parts;
         if parts.iter().any(|part| part.shard == 1) {
             assert!(batches > 3, "it held nothing");
-            served.source.end();
+            served.learner.end();
             return;
         }
         let replays: Vec<_> = served.replays.iter().map(|it| it.lock().unwrap()).collect();

@@ -39,7 +39,7 @@ mod small_shared_memory;
 mod soak;
 mod status;
 mod successors;
-mod synthetic_actor;
+mod synthetic;
 mod tensorboard;
 mod tiny_replay;
 mod tls;

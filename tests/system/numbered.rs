@@ -1,17 +1,17 @@
 //! Numbered transitions and counted batches through deaths of the replay server: each number is in the replay once, and each batch of the
-//! plan is served. Actors and learner are clients of these tests, as those of the program count nothing from outside.
+//! plan is served. Actors and learner are synthetic, as those of the program count nothing from outside.
 
 use std::{collections::BTreeSet, time::Duration};
 
 use driml_actor::DeliveryLimits;
-use driml_protocol::{
-    Batch, BatchReply, BatchRequest, BufferPool, ChunkHeader, Keys, Learned, NotReady, RequestId,
-    RunClient, RunSpec, Shutdown, config::Settings,
-};
+use driml_protocol::{ChunkHeader, Keys, RunClient, RunSpec, Shutdown, config::Settings};
 use driml_replay_server::{Config, PersistArgs, Replay};
 use driml_tests::{Process, TestSystem, check_nothing_lost, connect};
 
-use crate::{synthetic_actor::SyntheticActor, system, tiny_replay};
+use crate::{
+    synthetic::{SyntheticActor, SyntheticLearner},
+    system, tiny_replay,
+};
 
 /// Actors that number their transitions, chunks of each, and transitions of a chunk.
 const ACTORS: u32 = 3;
@@ -48,42 +48,6 @@ fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
     let mut synthetic = SyntheticActor::start(run, first, limits, &Shutdown::default());
     (0..CHUNKS).for_each(|_| synthetic.send(u64::from(actor) * OF_AN_ACTOR));
     synthetic.finish();
-}
-
-/// Asks for all batches there are, as a learner that asks again; gives their number.
-fn learn(run: &RunClient, learner: u64) -> u64 {
-    let pool = BufferPool::new(2);
-    let mut batches = 0;
-    let mut id = RequestId::first(learner);
-    let ask = |id, batches: u64| {
-        let request = BatchRequest {
-            learner,
-            id,
-            rows: ROWS,
-            learned: Learned {
-                rows_received: batches * u64::from(ROWS),
-                ..Learned::default()
-            },
-            ..BatchRequest::default()
-        };
-        let asked = run.send(run.seal(&request)?, Duration::from_secs(2))?;
-        asked.receive(&pool)
-    };
-    loop {
-        id = id.again();
-        match ask(id, batches) {
-            Ok((BatchReply::Batch(header), payload)) => {
-                Batch::from_payload(header, payload).unwrap();
-                batches += 1;
-                id = id.next();
-            }
-            Ok((BatchReply::NotReady(NotReady::Wait(_)), _)) => id = id.next(),
-            Ok((BatchReply::NotReady(NotReady::Finished), _)) => return batches,
-            Ok((BatchReply::NotReady(refused), _)) => panic!("{refused:?}"),
-            // The server is away; it is asked again, as the same request.
-            Err(_) => std::thread::sleep(Duration::from_millis(20)),
-        }
-    }
 }
 
 /// The numbers of all transitions in a replay whose server has ended, from rows that are drawn until each was seen.
@@ -135,8 +99,12 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
             let run = run();
             scope.spawn(move || deliver(run, actor, frame_bytes));
         }
-        let learner = run();
-        let learning = scope.spawn(move || learn(&learner, 7));
+        let mut learner = SyntheticLearner::start(&[run()], 7, ROWS, 1);
+        let learning = scope.spawn(move || {
+            let batches = std::iter::from_fn(|| learner.next()).count();
+            learner.end();
+            batches as u64
+        });
         for rows in moments {
             client.wait_for_replay("some more rows", |replay| replay.rows_sampled > rows);
             server.take().into_iter().for_each(Process::kill);

@@ -103,7 +103,7 @@ fn served_with(config: &LearnerConfig, seed: u64, change: impl Fn(&mut [RowScala
         state_bytes: STATE as u32,
         held: 9,
         weights_versions: (1, 1),
-        ..BatchHeader::of(&config.spec, 6)
+        ..BatchHeader::of(&config.spec, 6).sampled_by(&config.sampling)
     };
     let mut batch = WireBatch::of_rows(header, &rows, Buffer::zeroed);
     let mut places = batch.states_mut();
@@ -252,20 +252,9 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
     };
     let chances = [0.5f32, 0.25, 0.125, 0.1, 0.5, 1.0];
     let drawn = |chances: &[f32]| {
-        let plain = served(&config, 1);
-        let header = BatchHeader::of(&config.spec, 6).sampled_by(&sampling);
-        let header = BatchHeader {
-            origin: header.origin,
-            ..plain.header
-        };
-        let (_, payload) = plain.into_payload();
-        let mut more = Buffer::zeroed(header.payload_bytes());
-        more[..payload.len()].copy_from_slice(&payload);
-        for (row, chance) in chances.iter().enumerate() {
-            let at = payload.len() + 6 * 8 + row * 4;
-            more[at..at + 4].copy_from_slice(&chance.to_le_bytes());
-        }
-        WireBatch::from_payload(header, more).unwrap()
+        let mut batch = served(&config, 1);
+        batch.set_draws(chances.iter().map(|chance| (0, *chance)));
+        batch
     };
     let learner = |config: &LearnerConfig| Learner::new(config.clone(), &Compute::CPU).unwrap();
     let plain = learner(&uniform).update(&served(&uniform, 1)).unwrap();

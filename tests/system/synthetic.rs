@@ -1,8 +1,49 @@
 //! An actor without a world: numbered transitions through the real delivery, each an episode of its own whose return is its number.
-//! What becomes of them is for the tests that start one.
+//! And a learner without a network, which fetches batches as the real one does. What becomes of them is for the tests that start them.
+
+use std::time::Duration;
 
 use driml_actor::{Delivery, DeliveryLimits};
+use driml_learner::remote::batch_source::{BatchSource, Counters, Next, Requests, Served};
 use driml_protocol::{BufferPool, Chunk, ChunkHeader, End, RunClient, Shutdown};
+
+/// How long a batch and an answer are waited for.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+pub(crate) struct SyntheticLearner {
+    source: BatchSource,
+}
+
+impl SyntheticLearner {
+    /// One that asks these replay servers, each for a shard, for batches of `rows`, so many at a time.
+    pub(crate) fn start(clients: &[RunClient], learner: u64, rows: u32, in_flight: u32) -> Self {
+        let requests = Requests {
+            learner,
+            rows,
+            in_flight,
+            shared_memory: false,
+            unreachable_max: PATIENCE,
+        };
+        let (counters, never) = (Counters::at_start(clients.len()), Shutdown::default());
+        let source = BatchSource::start(clients, requests, &counters, &never);
+        Self {
+            source: source.unwrap(),
+        }
+    }
+
+    /// The next batch; none at the end of the run.
+    pub(crate) fn next(&mut self) -> Option<Served> {
+        match self.source.next(PATIENCE).unwrap() {
+            Next::Batch(served) => Some(*served),
+            Next::Finished => None,
+            Next::NotYet(waiting) => panic!("no batch in a minute: {waiting}"),
+        }
+    }
+
+    pub(crate) fn end(self) {
+        self.source.end();
+    }
+}
 
 pub(crate) struct SyntheticActor {
     delivery: Delivery,
