@@ -49,7 +49,8 @@ const fn planned(frames: u64) -> u64 {
     (frames - WARMUP) * 8 / ROWS as u64
 }
 
-/// Transitions come back with the highest priority each; losses of rows that it drew before are not mistaken for those of others.
+/// Its rows are drawn by priority: transitions come back with the highest one each, and losses of rows that were drawn before are not
+/// mistaken for those of others.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
     let system = system();

@@ -1,4 +1,4 @@
-//! Rows drawn by priority, in whole runs: of one replay server and of several. One that dies is in `durable`, a run in lockstep in `lockstep`.
+//! Rows drawn by priority, in whole runs of one replay server and of several. A server that dies is in `durable`, lockstep in `lockstep`.
 //! The law of the draws is tested beside the code.
 
 use driml_tests::Outcome;

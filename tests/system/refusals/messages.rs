@@ -1,5 +1,5 @@
 //! Messages that a live replay server must refuse: of other runs and versions, damaged, cut off, not ours at all.
-//! Each is counted once and stores nothing, and the server continues to store. That every cut and every flip is found is the codec's test.
+//! Each is counted once and stores nothing, and the server continues to store. That no cut and no flip is missed is the codec's test.
 
 use driml_protocol::{
     AffinityUpdate, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Leave, codec,
