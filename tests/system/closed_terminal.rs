@@ -6,14 +6,12 @@ use std::{
     io::{BufRead, BufReader, Read, pipe},
     os::{fd::AsFd, unix::fs::OpenOptionsExt},
     process::{Child, Stdio},
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, Mutex},
     thread::{self, JoinHandle},
     time::Duration,
 };
 
+use driml_protocol::Shutdown;
 use driml_tests::{Outcome, Process, TestSystem, wait_for, wait_until};
 use nix::{
     fcntl::OFlag,
@@ -26,7 +24,7 @@ use crate::{LONG, PROCESSES, launched, system};
 
 /// A terminal whose window a test can close. Until then what is written there is read, as a window does it.
 struct Window {
-    is_closed: Arc<AtomicBool>,
+    closed: Shutdown,
     shown: Arc<Mutex<Vec<u8>>>,
     reader: JoinHandle<()>,
 }
@@ -46,10 +44,10 @@ impl Window {
             .custom_flags(OFlag::O_NOCTTY.bits())
             .open(path)
             .unwrap();
-        let (is_closed, shown) = <(Arc<AtomicBool>, Arc<Mutex<Vec<u8>>>)>::default();
-        let (closed, sink) = (is_closed.clone(), shown.clone());
+        let (closed, shown) = <(Shutdown, Arc<Mutex<Vec<u8>>>)>::default();
+        let (is_closed, sink) = (closed.clone(), shown.clone());
         let reader = thread::spawn(move || {
-            while !closed.load(Ordering::Relaxed) {
+            while !is_closed.is_set() {
                 let mut ready = [PollFd::new(master.as_fd(), PollFlags::POLLIN)];
                 if poll(&mut ready, 20_u8).unwrap() > 0 {
                     let mut bytes = [0; 4096];
@@ -59,7 +57,7 @@ impl Window {
             }
         });
         let window = Self {
-            is_closed,
+            closed,
             shown,
             reader,
         };
@@ -72,7 +70,7 @@ impl Window {
     }
 
     fn close(self) {
-        self.is_closed.store(true, Ordering::Relaxed);
+        self.closed.set();
         self.reader.join().unwrap();
     }
 }

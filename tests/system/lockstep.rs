@@ -45,15 +45,9 @@ fn seed_and_settings_decide_the_weights() {
 }
 
 /// What a run came to.
-fn result(summary: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
-    let Summary {
-        weights_sha256,
-        mean_return,
-        replay,
-        episodes,
-        ..
-    } = summary;
-    (weights_sha256, mean_return, replay.k_histogram, episodes)
+fn result(it: Summary) -> (String, Option<f64>, Vec<u64>, u64) {
+    let k_histogram = it.replay.k_histogram;
+    (it.weights_sha256, it.mean_return, k_histogram, it.episodes)
 }
 
 /// Runs it whole; finished after half of its frames and prolonged; and resumed after each signal: Ctrl-C, which saves, and death, after
