@@ -67,18 +67,6 @@ pub(crate) fn spec(frame_bytes: u32) -> RunSpec {
     }
 }
 
-fn config(shards: u32, sampling: Sampling) -> Config {
-    Config {
-        shards,
-        sampling,
-        replay_ratio: 2.0,
-        warmup_transitions: 8,
-        slack_transitions: 16,
-        transitions_max: (shards == 1).then_some(4096),
-        ..Config::unlimited(64 * u64::from(shards))
-    }
-}
-
 /// Sends the messages that the bytes say, one after the other.
 pub(crate) fn replay(bytes: &[u8]) {
     let mut numbers = Numbers(bytes);
@@ -90,7 +78,16 @@ pub(crate) fn replay(bytes: &[u8]) {
         0 => Sampling::Uniform {},
         _ => PRIORITISED,
     };
-    let mut replay = Replay::new(&spec(2), &config(shards, sampling), 4).unwrap();
+    let config = Config {
+        shards,
+        sampling,
+        replay_ratio: 2.0,
+        warmup_transitions: 8,
+        slack_transitions: 16,
+        transitions_max: (shards == 1).then_some(4096),
+        ..Config::unlimited(64 * u64::from(shards))
+    };
+    let mut replay = Replay::new(&spec(2), &config, 4).unwrap();
     for _ in 0..MESSAGES_MAX {
         if message(&mut replay, &mut numbers).is_none() {
             break;

@@ -49,14 +49,6 @@ fn spec() -> RunSpec {
     replay::spec(FRAME_BYTES as u32)
 }
 
-fn config() -> Config {
-    Config {
-        // Without a thread.
-        fsync_ms: Some(0),
-        ..Config::unlimited(CAPACITY)
-    }
-}
-
 fn open(dir: &Path) -> Result<Replay, String> {
     let args = PersistArgs {
         dir: dir.to_owned(),
@@ -64,7 +56,12 @@ fn open(dir: &Path) -> Result<Replay, String> {
         segment_bytes: Some(SEGMENT_BYTES),
         mark: None,
     };
-    Replay::open(&args, &spec(), &config(), ROWS)
+    let config = Config {
+        // Without a thread.
+        fsync_ms: Some(0),
+        ..Config::unlimited(CAPACITY)
+    };
+    Replay::open(&args, &spec(), &config, ROWS)
         .map(|(replay, _)| replay)
         .map_err(|e| e.to_string())
 }
