@@ -61,12 +61,26 @@ impl Crate {
                 own.push(first.clone());
             }
         }
-        let mut names = Names {
-            module,
-            children: &children,
-            found: self.named.entry(file.into()).or_default(),
-        };
-        names.note_tokens(&own, &[]);
+        let named = self.named.entry(file.into()).or_default();
+        let mut written = Vec::new();
+        note_paths(&own, &[], &mut written);
+        for path in written {
+            let mut from = match path.first().map(String::as_str) {
+                Some("crate") => vec![],
+                Some("self" | "super") => module.to_vec(),
+                Some(first) if children.contains_key(first) => module.to_vec(),
+                // It does not lead into this crate.
+                _ => continue,
+            };
+            for segment in &path {
+                match segment.as_str() {
+                    "crate" | "self" => {}
+                    "super" => drop(from.pop()),
+                    name => from.push(name.into()),
+                }
+            }
+            named.insert(from);
+        }
         for (name, body) in children {
             let path = [module, std::slice::from_ref(&name)].concat();
             let inner = folder.join(&name);
@@ -125,75 +139,48 @@ fn without_tests(tokens: TokenStream) -> Vec<TokenTree> {
     kept
 }
 
-/// Collects the paths of this crate that code names.
-struct Names<'a> {
-    module: &'a [String],
-    children: &'a BTreeMap<String, TokenTree>,
-    found: &'a mut BTreeSet<ModulePath>,
-}
-
-impl Names<'_> {
-    /// Notes `path` as written in this module, if it leads into this crate.
-    fn note(&mut self, path: &[String]) {
-        let mut from = match path.first().map(String::as_str) {
-            Some("crate") => vec![],
-            Some("self" | "super") => self.module.to_vec(),
-            Some(first) if self.children.contains_key(first) => self.module.to_vec(),
-            _ => return,
-        };
-        for segment in path {
-            match segment.as_str() {
-                "crate" | "self" => {}
-                "super" => drop(from.pop()),
-                name => from.push(name.into()),
-            }
-        }
-        self.found.insert(from);
-    }
-
-    /// Notes all paths; `before` is the one that they continue, as those in the braces of a `use` do.
-    fn note_tokens(&mut self, tokens: &[TokenTree], before: &[String]) {
-        let mut rest = tokens;
-        while let [first, after @ ..] = rest {
-            rest = after;
-            let word = match first {
-                TokenTree::Ident(word) => word.to_string(),
-                TokenTree::Group(group) => {
-                    self.note_tokens(&without_tests(group.stream()), &[]);
-                    continue;
-                }
-                _ => continue,
-            };
-            if word == "as" && !before.is_empty() {
-                // Another name for what was just noted.
-                rest = rest.get(1..).unwrap_or_default();
+/// Notes all paths as code has them; `before` is the one that they continue, as those in the braces of a `use` do.
+fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePath>) {
+    let mut rest = tokens;
+    while let [first, after @ ..] = rest {
+        rest = after;
+        let word = match first {
+            TokenTree::Ident(word) => word.to_string(),
+            TokenTree::Group(group) => {
+                note_paths(&without_tests(group.stream()), &[], found);
                 continue;
             }
-            let mut path = [before, &[word]].concat();
-            let mut is_whole = path.len() > 1;
-            while let [
-                TokenTree::Punct(one),
-                TokenTree::Punct(two),
-                next,
-                after @ ..,
-            ] = rest
-                && [one, two].iter().all(|it| it.as_char() == ':')
-            {
-                match next {
-                    TokenTree::Ident(word) => path.push(word.to_string()),
-                    TokenTree::Group(group) => {
-                        self.note_tokens(&without_tests(group.stream()), &path);
-                        path.clear();
-                    }
-                    // All of it, or the types that it is given.
-                    _ => {}
+            _ => continue,
+        };
+        if word == "as" && !before.is_empty() {
+            // Another name for what was just noted.
+            rest = rest.get(1..).unwrap_or_default();
+            continue;
+        }
+        let mut path = [before, &[word]].concat();
+        let mut is_whole = path.len() > 1;
+        while let [
+            TokenTree::Punct(one),
+            TokenTree::Punct(two),
+            next,
+            after @ ..,
+        ] = rest
+            && [one, two].iter().all(|it| it.as_char() == ':')
+        {
+            match next {
+                TokenTree::Ident(word) => path.push(word.to_string()),
+                TokenTree::Group(group) => {
+                    note_paths(&without_tests(group.stream()), &path, found);
+                    path.clear();
                 }
-                is_whole = true;
-                rest = after;
+                // All of it, or the types that it is given.
+                _ => {}
             }
-            if is_whole {
-                self.note(&path);
-            }
+            is_whole = true;
+            rest = after;
+        }
+        if is_whole {
+            found.push(path);
         }
     }
 }
