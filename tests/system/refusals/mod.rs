@@ -15,7 +15,7 @@ use driml_protocol::{
     Keyed, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload,
     codec, session,
 };
-use driml_tests::Client;
+use driml_tests::{Client, check_nothing_lost};
 use zenoh::qos::Priority;
 
 /// What comes of a message to whose sender nothing is promised.
@@ -141,6 +141,19 @@ fn send_refused(client: &Client, what: &str, rows: impl IntoIterator<Item = Row>
     // The last one may still be on its way through a busy server.
     let status = client.wait_for_replay(what, |replay| replay.messages_refused >= before + refused);
     assert_eq!(status.messages_refused - before, refused, "{what}");
+}
+
+/// The run of this client continues with its own numbers.
+fn continues(client: &Client) {
+    let updates = client.learner().unwrap().updates;
+    let transitions = client.replay().unwrap().transitions_inserted;
+    client.wait_for_updates(updates + 20);
+    let status = client.wait_for_transitions(transitions + 100);
+    check_nothing_lost(&status);
+    assert_eq!((status.actors, status.finished), (1, false));
+    assert!(status.affinity_version < 1 << 20, "{status:#?}");
+    let learner = client.learner().unwrap();
+    assert!(learner.weights_version < 1 << 20, "{learner:#?}");
 }
 
 /// An answer of any kind.
