@@ -48,7 +48,7 @@ impl Network {
     }
 
     fn build(&self) -> Result<(), String> {
-        let router = self.router();
+        let router = self.namespace("router");
         let mut commands = format!(
             "netns add {router}
             -n {router} link set lo up
@@ -81,10 +81,6 @@ impl Network {
         format!("{}-{machine}", self.name)
     }
 
-    fn router(&self) -> String {
-        self.namespace("router")
-    }
-
     /// The router's end of a machine's link.
     fn device(&self, machine: &str) -> String {
         format!("{}o{}", self.name, self.number(machine))
@@ -111,7 +107,7 @@ impl Network {
     }
 
     fn set(&self, machine: &str, state: &str) {
-        let (router, device) = (self.router(), self.device(machine));
+        let (router, device) = (self.namespace("router"), self.device(machine));
         ip(&format!("-n {router} link set {device} {state}")).unwrap();
     }
 
@@ -119,7 +115,7 @@ impl Network {
     pub fn narrow(&self, machine: &str, kbit: u32) -> bool {
         let inner = format!("{}i{}", self.name, self.number(machine));
         let ends = [
-            (self.router(), self.device(machine)),
+            (self.namespace("router"), self.device(machine)),
             (self.namespace(machine), inner),
         ];
         ends.iter().all(|(namespace, device)| {
@@ -134,7 +130,7 @@ impl Network {
 impl Drop for Network {
     fn drop(&mut self) {
         let machines = self.machines.iter().map(|it| self.namespace(it));
-        for namespace in machines.chain([self.router()]) {
+        for namespace in machines.chain([self.namespace("router")]) {
             // One that was not made yet does not matter.
             let _ = ip(&format!("netns del {namespace}"));
         }

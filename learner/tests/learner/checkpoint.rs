@@ -337,13 +337,8 @@ fn averaged_weights_follow_and_are_saved_and_played() {
 
     save(&run, folder.path(), 1);
     let load = |settings: &_| {
-        let restored = load_latest(
-            folder.path(),
-            &model(ALL_DIM),
-            settings,
-            &Compute::CPU,
-            SPEC,
-        );
+        let model = model(ALL_DIM);
+        let restored = load_latest(folder.path(), &model, settings, &Compute::CPU, SPEC);
         restored.unwrap().unwrap().agent
     };
     let restored = load(&settings);
