@@ -1,6 +1,7 @@
 //! Equal states of a batch that are computed once: what an update gives with it and without.
 
-use driml_learner::{Agent, AuxiliaryKind, Compute, Evaluation, Lambda, OwnedBatch, Precision};
+use candle_core::Tensor;
+use driml_learner::{AuxiliaryKind, Batch, Compute, Lambda, OwnedBatch, Precision};
 use driml_model::Kernels;
 
 use crate::agents::{GLOBAL, curl_table};
@@ -10,12 +11,20 @@ use crate::synthetic::{
 
 const ROWS: usize = 40;
 
-fn agent(
+/// Losses, logits, next actions and targets of a batch, and the gradients.
+#[derive(PartialEq)]
+struct Found {
+    forward: (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>),
+    gradients: Vec<(String, Vec<f32>)>,
+}
+
+fn found(
     compute: &Compute,
     (auxiliary_loss, lambda): (AuxiliaryKind, Lambda),
     double_dqn: bool,
     deduplicate: bool,
-) -> Agent {
+    batch: &Batch<'_>,
+) -> Found {
     let mut settings = settings(lambda);
     (settings.auxiliary_loss, settings.double_dqn) = (auxiliary_loss, double_dqn);
     if auxiliary_loss == CURL {
@@ -24,7 +33,18 @@ fn agent(
     }
     let mut model = model(lambda);
     model.dim = settings.dim_heads(model.num_actions);
-    made(model, settings, compute, 1).with_deduplication(deduplicate)
+    let agent = made(model, settings, compute, 1).with_deduplication(deduplicate);
+    let it = agent.evaluate(batch).unwrap();
+    let values = |tensor: &Tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let names = agent.online().iter().map(|(name, _)| name);
+    let gradient = |name: &str| Some((name.to_owned(), values(it.gradients.get(name)?)));
+    let gradients = names.filter_map(gradient).collect();
+    let mut losses = vec![it.c51_kl, it.total];
+    losses.extend(it.losses.iter().map(|(_, loss)| loss));
+    losses.extend(&it.row_kls);
+    let logits = values(&it.taken_logits);
+    let forward = (losses, logits, it.next_greedy_action, it.target_projection);
+    Found { forward, gradients }
 }
 
 /// Which planes hold states that repeat others.
@@ -57,30 +77,6 @@ fn rows(repeat: Repeat) -> OwnedBatch {
     rows
 }
 
-fn gradients(evaluation: &Evaluation, agent: &Agent) -> Vec<(String, Vec<f32>)> {
-    let of = |(name, _): (&str, _)| {
-        let gradient = evaluation.gradients.get(name)?;
-        Some((
-            name.to_owned(),
-            gradient.flatten_all().unwrap().to_vec1().unwrap(),
-        ))
-    };
-    agent.online().iter().filter_map(of).collect()
-}
-
-fn forward(it: &Evaluation) -> (Vec<f32>, Vec<f32>, Vec<u8>, Vec<f32>) {
-    let mut losses = vec![it.c51_kl, it.total];
-    losses.extend(it.losses.iter().map(|(_, loss)| loss));
-    losses.extend(&it.row_kls);
-    let logits = it.taken_logits.flatten_all().unwrap().to_vec1().unwrap();
-    (
-        losses,
-        logits,
-        it.next_greedy_action.clone(),
-        it.target_projection.clone(),
-    )
-}
-
 #[test]
 fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alone() {
     for precision in [Precision::F32, Precision::Bf16] {
@@ -106,26 +102,27 @@ fn leaving_repeats_out_changes_no_result_and_sums_gradients_in_another_order_alo
                     batch.states_k = &rows.states_n;
                 }
                 let case = format!("{precision} {auxiliary_loss:?}");
-                let [each, once] = [false, true].map(|deduplicate| {
-                    let compute = Compute::cpu(precision);
-                    let agent = agent(&compute, (auxiliary_loss, lambda), double_dqn, deduplicate);
-                    let evaluation = agent.evaluate(&batch).unwrap();
-                    (forward(&evaluation), gradients(&evaluation, &agent))
-                });
-                assert!(each.0 == once.0, "{case}: the same bits forward");
+                let (compute, auxiliary) = (Compute::cpu(precision), (auxiliary_loss, lambda));
+                let [each, once] = [false, true]
+                    .map(|deduplicate| found(&compute, auxiliary, double_dqn, deduplicate, &batch));
+                assert!(
+                    each.forward == once.forward,
+                    "{case}: the same bits forward"
+                );
+                let (each, once) = (each.gradients, once.gradients);
                 // Views of states never count as equal, and a target has no gradient.
                 if repeat != Repeat::Everywhere || auxiliary_loss == CURL {
-                    assert!(each.1 == once.1, "{case}: the same bits of gradients");
+                    assert!(each == once, "{case}: the same bits of gradients");
                     continue;
                 }
-                assert!(each.1 != once.1, "{case}: nothing was left out");
-                assert_eq!(each.1.len(), once.1.len());
+                assert!(each != once, "{case}: nothing was left out");
+                assert_eq!(each.len(), once.len());
                 // A sum of gradients is rounded to bf16 once, not each of them.
                 let tolerance = match precision {
                     Precision::F32 => 1e-6,
                     Precision::Bf16 => 1e-2,
                 };
-                for ((name, each), (_, once)) in each.1.iter().zip(&once.1) {
+                for ((name, each), (_, once)) in each.iter().zip(&once) {
                     let norm = |values: &mut dyn Iterator<Item = f32>| {
                         values.map(|x| f64::from(x).powi(2)).sum::<f64>().sqrt()
                     };
@@ -147,9 +144,8 @@ fn gradients_have_the_same_bits_for_any_number_of_threads() {
     let with_threads = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         pool.build().unwrap().install(|| {
-            let agent = agent(&Compute::CPU, (DIM, ALL_DIM), false, true);
-            let evaluation = agent.evaluate(&rows.batch()).unwrap();
-            gradients(&evaluation, &agent)
+            let found = found(&Compute::CPU, (DIM, ALL_DIM), false, true, &rows.batch());
+            found.gradients
         })
     };
     let one = with_threads(1);
@@ -164,10 +160,7 @@ fn gradients_have_the_same_bits_for_any_number_of_threads() {
 fn candle_s_own_operations_compute_each_state() {
     assert_eq!(CANDLE.kernels, Kernels::Candle);
     let rows = rows(Repeat::Everywhere);
-    let [each, once] = [false, true].map(|deduplicate| {
-        let agent = agent(&CANDLE, (DIM, ALL_DIM), false, deduplicate);
-        let evaluation = agent.evaluate(&rows.batch()).unwrap();
-        (forward(&evaluation), gradients(&evaluation, &agent))
-    });
+    let [each, once] = [false, true]
+        .map(|deduplicate| found(&CANDLE, (DIM, ALL_DIM), false, deduplicate, &rows.batch()));
     assert!(each == once);
 }
