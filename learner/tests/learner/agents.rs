@@ -75,9 +75,9 @@ fn curl(rows: &OwnedBatch) -> Batch<'_> {
 }
 
 /// `states` without those that are not `there`.
-fn packed(states: &[u8], there: &[bool]) -> Vec<u8> {
+fn packed(states: &[u8], there: impl ExactSizeIterator<Item = bool>) -> Vec<u8> {
     let states = states.chunks_exact(states.len() / there.len());
-    let present = states.zip(there).filter(|(_, there)| **there);
+    let present = states.zip(there).filter(|(_, there)| *there);
     present.flat_map(|(state, _)| state.to_vec()).collect()
 }
 
@@ -98,14 +98,10 @@ fn states_that_rows_do_not_have_may_be_left_out() {
         } else {
             rows.batch()
         };
-        let there: Vec<_> = whole.positive_valid.iter().map(|it| *it != 0).collect();
-        let states_k = packed(whole.states_k, &there);
-        let there: Vec<_> = rows
-            .bootstrap_discount
-            .iter()
-            .map(|it| *it != 0.0)
-            .collect();
-        let states_n = packed(whole.states_n, &there);
+        let valid = whole.positive_valid.iter().map(|it| *it != 0);
+        let states_k = packed(whole.states_k, valid);
+        let bootstraps = whole.bootstrap_discount.iter().map(|it| *it != 0.0);
+        let states_n = packed(whole.states_n, bootstraps);
         let parts = Batch {
             states_k: &states_k,
             states_n: &states_n,
