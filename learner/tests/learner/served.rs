@@ -80,6 +80,10 @@ pub(crate) fn config(
     }
 }
 
+fn made(config: &LearnerConfig) -> Learner {
+    Learner::new(config.clone(), &Compute::CPU).unwrap()
+}
+
 /// A batch as the replay server of this run would send it.
 pub(crate) fn served(config: &LearnerConfig, seed: u64) -> WireBatch {
     served_with(config, seed, |_| {})
@@ -120,11 +124,7 @@ fn augmentation_of_no_strength_is_none_and_a_stronger_one_changes_dim_alone() {
     for auxiliary_loss in [DIM, CPC] {
         let report = |augment| {
             let config = config(auxiliary_loss, augment);
-            let batch = served(&config, 1);
-            Learner::new(config, &Compute::CPU)
-                .unwrap()
-                .update(&batch)
-                .unwrap()
+            made(&config).update(&served(&config, 1)).unwrap()
         };
         let (plain, identity, strong) = (report(None), report(Some(NOTHING)), report(Some(PAPER)));
         // The augmented states go through a pass of their own, so the sum of gradients may round otherwise.
@@ -161,9 +161,9 @@ fn an_augmenting_run_resumes_bit_for_bit() {
                 learner.update(&served(&config, seed)).unwrap();
             }
         };
-        let mut straight = Learner::new(config.clone(), &Compute::CPU).unwrap();
+        let mut straight = made(&config);
         learn(&mut straight, 0..8);
-        let mut half = Learner::new(config.clone(), &Compute::CPU).unwrap();
+        let mut half = made(&config);
         learn(&mut half, 0..4);
         half.save(folder.path()).unwrap();
         let mut resumed = Learner::resume(config.clone(), &Compute::CPU, folder.path()).unwrap();
@@ -195,8 +195,7 @@ fn an_augmenting_run_resumes_bit_for_bit() {
 fn a_curl_checkpoint_without_a_key_encoder_is_rejected() {
     let folder = tempdir().unwrap();
     let config = config(CURL, Some(PAPER));
-    let learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
-    learner.save(folder.path()).unwrap();
+    made(&config).save(folder.path()).unwrap();
     let path = folder.path().join("checkpoint-000000000000");
     let resume = || Learner::resume(config.clone(), &Compute::CPU, folder.path()).map(|_| ());
     resume().unwrap();
@@ -211,16 +210,10 @@ fn a_refused_batch_draws_nothing() {
     let config = config(CURL, Some(PAPER));
     let good = served(&config, 1);
     let bad = served_with(&config, 2, |rows| rows[0].action = 77);
-    let mut learner = Learner::new(config.clone(), &Compute::CPU).unwrap();
+    let mut learner = made(&config);
     assert!(learner.update(&bad).is_err());
     let after = learner.update(&good).unwrap();
-    assert_eq!(
-        after,
-        Learner::new(config, &Compute::CPU)
-            .unwrap()
-            .update(&good)
-            .unwrap()
-    );
+    assert_eq!(after, made(&config).update(&good).unwrap());
 }
 
 #[test]
@@ -256,18 +249,17 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
         batch.set_draws(chances.iter().map(|chance| (0, *chance)));
         batch
     };
-    let learner = |config: &LearnerConfig| Learner::new(config.clone(), &Compute::CPU).unwrap();
-    let plain = learner(&uniform).update(&served(&uniform, 1)).unwrap();
+    let plain = made(&uniform).update(&served(&uniform, 1)).unwrap();
     assert!(plain.row_kls.is_empty());
 
     // Equal chances are a weight of 1 each.
-    let mut equal = learner(&config);
+    let mut equal = made(&config);
     let report = equal.update(&drawn(&[0.25; 6])).unwrap();
     assert_eq!(report.losses, plain.losses);
     assert!((report.c51_kl - plain.c51_kl).abs() < 1e-6 * plain.c51_kl);
     assert!((report.grad_norm - plain.grad_norm).abs() < 1e-5 * plain.grad_norm);
 
-    let mut learner = learner(&config);
+    let mut learner = made(&config);
     for beta in [0.5, 1.0, 1.0] {
         let report = learner.update(&drawn(&chances)).unwrap();
         let weighted = chances.iter().zip(&report.row_kls).map(|(chance, kl)| {
