@@ -7,7 +7,7 @@ mod settings;
 use driml_launch::evaluate::Levels;
 
 use self::{
-    report::{Scored, games},
+    report::Scored,
     settings::{NAME, Settings},
 };
 use crate::{
@@ -38,17 +38,12 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
         let (name, game) = (&made.plan.name, &made.point.game);
         let greedy = play.greedy(&mut session, &format!("{name}-greedy"), &made.run)?;
         let random = play.random(&mut session, &format!("{game}-at-random"), &made.run)?;
-        scored.push(Scored {
-            greedy: greedy.unwrap_or_default(),
-            random,
-            made,
-        });
+        scored.push(Scored::new(made, &greedy.unwrap_or_default(), &random));
     }
     report::write_data(&session, &scored)?;
-    let games = games(&settings, &scored);
-    session.figure("curves", &report::figure(&settings, &games)?)?;
-    let over_games = report::over_games(&mut session, &settings, &games)?;
-    let values = report::values(&settings, &games, &over_games, scored.len(), &missing);
+    session.figure("curves", &report::figure(&settings, &scored)?)?;
+    let over_games = report::over_games(&mut session, &settings, &scored)?;
+    let values = report::values(&settings, &scored, &over_games, &missing);
     session.finish(include_str!("procgen.md.j2"), values)?;
     plan::check_made(&missing, report)
 }

@@ -1,6 +1,6 @@
 //! What the runs of table 1 gave: data, figure and page.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
@@ -17,7 +17,7 @@ use crate::{
         Spread, mean,
         over_games::{Scores, improvement, iqm},
     },
-    sweep::plan::Made,
+    sweep::plan::{FinishedRun, Made, PlannedRun},
     sweeps::published::{normalised, paper},
 };
 
@@ -27,86 +27,71 @@ const PAPER_FRAMES: f64 = 50e6;
 /// Seeds of each game and agent from which on scores over all games are made.
 const SEEDS_MIN: usize = 3;
 
+/// A finished run and its mean returns; a line of the data, from which the page is made.
+#[derive(Serialize)]
 pub(super) struct Scored {
-    pub(super) made: Made<Point>,
-    /// Returns of its agent, played greedily.
-    pub(super) greedy: Vec<f64>,
-    /// Returns of a random policy in its world.
-    pub(super) random: Vec<f64>,
-}
-
-impl Scored {
-    fn is_above_random(&self) -> bool {
-        let spreads = [&self.greedy, &self.random].map(|it| Spread::of(it.iter().copied()));
-        let [Some(greedy), Some(random)] = spreads else {
-            return false;
-        };
-        let error = |it: Spread| it.sd.powi(2) / it.count as f64;
-        greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
-    }
-}
-
-/// A game that has a run.
-#[derive(Serialize)]
-pub(super) struct Game<'a> {
-    name: &'a str,
-    /// Returns of the random policy.
-    random: &'a [f64],
-    /// Of each agent that is asked for, in that order.
-    agents: Vec<OfAgent<'a>>,
-}
-
-/// What the runs of an agent in a game gave; nothing where none is finished.
-#[derive(Serialize)]
-struct OfAgent<'a> {
+    #[serde(flatten)]
+    point: Point,
     #[serde(skip)]
-    runs: Vec<&'a Made<Point>>,
-    training: Vec<f64>,
-    greedy: Vec<f64>,
-    paper: Option<f64>,
-    /// Whether each of the runs plays better than at random.
+    plan: PlannedRun,
+    #[serde(skip)]
+    run: FinishedRun,
+    training: Option<f64>,
+    /// Of its agent, played greedily.
+    greedy: Option<f64>,
+    /// Of a random policy in its world.
+    random: Option<f64>,
     is_above_random: bool,
 }
 
-pub(super) fn games<'a>(settings: &'a Settings, scored: &'a [Scored]) -> Vec<Game<'a>> {
-    let mut games: BTreeMap<&str, Vec<&Scored>> = BTreeMap::new();
-    for it in scored {
-        games.entry(&it.made.point.game).or_default().push(it);
-    }
-    let of = |name: &str, runs: &[&'a Scored], agent: &String| {
-        let own = || runs.iter().filter(|it| it.made.point.agent == *agent);
-        let training = own().filter_map(|it| it.made.run.summary.mean_return);
-        OfAgent {
-            runs: own().map(|it| &it.made).collect(),
-            training: training.collect(),
-            greedy: own().filter_map(|it| mean(&it.greedy)).collect(),
-            paper: paper(name, agent),
-            is_above_random: own().all(|it| it.is_above_random()),
+impl Scored {
+    /// A run, and the returns of its agent and of a random policy.
+    pub(super) fn new(made: Made<Point>, greedy: &[f64], random: &[f64]) -> Self {
+        let Made { point, plan, run } = made;
+        Self {
+            point,
+            plan,
+            training: run.summary.mean_return,
+            run,
+            greedy: mean(greedy),
+            random: mean(random),
+            is_above_random: is_above(greedy, random),
         }
+    }
+}
+
+fn is_above(greedy: &[f64], random: &[f64]) -> bool {
+    let spreads = [greedy, random].map(|it| Spread::of(it.iter().copied()));
+    let [Some(greedy), Some(random)] = spreads else {
+        return false;
     };
-    let agents = settings.agents.iter();
-    let game = |(name, runs): (&'a str, Vec<&'a Scored>)| Game {
-        name,
-        random: &runs[0].random,
-        agents: agents.clone().map(|it| of(name, &runs, it)).collect(),
-    };
-    games.into_iter().map(game).collect()
+    let error = |it: Spread| it.sd.powi(2) / it.count as f64;
+    greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
+}
+
+/// The games that have a run, in the order of their names.
+fn games(all: &[Scored]) -> BTreeSet<&str> {
+    all.iter().map(|it| it.point.game.as_str()).collect()
+}
+
+/// The runs of an agent in a game.
+fn of<'a>(all: &'a [Scored], game: &str, agent: &str) -> impl Iterator<Item = &'a Scored> {
+    let all = all.iter();
+    all.filter(move |it| it.point.game == game && it.point.agent == agent)
 }
 
 pub(super) fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
     let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
     let mut rows = Vec::new();
     for it in scored {
-        let Made { point, plan, run } = &it.made;
-        let summary = &run.summary;
+        let (point, summary) = (&it.point, &it.run.summary);
         let paper = paper(&point.game, &point.agent);
-        let [greedy, random] = [&it.greedy, &it.random].map(|of| mean(of));
-        let returns = [summary.mean_return, greedy, random, paper];
+        let returns = [it.training, it.greedy, it.random, paper];
         rows.push((
-            (&point.game, &point.agent, torso(&run.folder)?),
-            (plan.call.seed, summary.frames),
+            (&point.game, &point.agent, torso(&it.run.folder)?),
+            (it.plan.call.seed, summary.frames),
             returns.map(|it| it.map(rounded)),
-            (summary.wall_seconds.round() as u64, &run.commit),
+            (summary.wall_seconds.round() as u64, &it.run.commit),
         ));
     }
     session.csv("table", columns, rows)
@@ -124,30 +109,30 @@ fn torso(folder: &RunFolder) -> anyhow::Result<String> {
 }
 
 /// Training return over frames, a chart a game.
-pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<Figure> {
+pub(super) fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
     let mut panels = Vec::new();
-    for game in games {
+    for game in games(scored) {
         let level = |value: f64| vec![(0.0, value), (settings.frames as f64, value)];
         let mut series = Vec::new();
-        if let Some(random) = mean(game.random) {
+        let first = scored.iter().find(|it| it.point.game == game);
+        if let Some(random) = first.and_then(|it| it.random) {
             series.push(Series::line("random", 0, level(random)).coloured(GREY));
         }
-        for (index, (agent, of)) in settings.agents.iter().zip(&game.agents).enumerate() {
-            let read =
-                |it: &&Made<Point>| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?);
-            let each = of.runs.iter().map(read);
+        for (index, agent) in settings.agents.iter().enumerate() {
+            let each = of(scored, game, agent)
+                .map(|it| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?));
             let each = each.collect::<anyhow::Result<Vec<_>>>()?;
             let curve = over_seeds(&each, Band::Range);
             if curve.points.is_empty() {
                 continue;
             }
             series.push(curve.series(agent, index));
-            if let Some(paper) = of.paper {
+            if let Some(paper) = paper(game, agent) {
                 series.push(Series::line("", index, level(paper)).marked(Mark::Dashed));
             }
         }
         let (x, y) = (Axis::linear("frames"), Axis::linear("mean return"));
-        panels.push(Panel::Chart(Chart::new(game.name, x, y, series)));
+        panels.push(Panel::Chart(Chart::new(game, x, y, series)));
     }
     Ok(Figure {
         title: "Training return by game".into(),
@@ -165,24 +150,28 @@ pub(super) fn figure(settings: &Settings, games: &[Game<'_>]) -> anyhow::Result<
 pub(super) fn over_games(
     session: &mut Session,
     settings: &Settings,
-    games: &[Game<'_>],
+    scored: &[Scored],
 ) -> anyhow::Result<Vec<String>> {
-    let mut all = games.iter().flat_map(|it| &it.agents);
-    if !all.all(|of| of.runs.len() >= SEEDS_MIN) {
+    let games = games(scored);
+    let has_seeds = |game: &&str| {
+        let mut agents = settings.agents.iter();
+        agents.all(|agent| of(scored, game, agent).count() >= SEEDS_MIN)
+    };
+    if !games.iter().all(has_seeds) {
         return Ok(Vec::new());
     }
     let mut lines = Vec::new();
     let play = settings.play(Levels::TrainSingle);
-    for (at, agent) in settings.agents.iter().enumerate() {
+    for agent in &settings.agents {
         let mut scores = Scores::new();
-        for game in games {
+        for &game in &games {
             let mut of_game = Vec::new();
-            for it in &game.agents[at].runs {
+            for it in of(scored, game, agent) {
                 session.progress().again(play.units);
                 let key = format!("{}-single", it.plan.name);
                 let returns = play.greedy(session, &key, &it.run)?;
                 let returns = returns.and_then(|it| mean(&it));
-                of_game.extend(returns.and_then(|it| normalised(game.name, it)));
+                of_game.extend(returns.and_then(|it| normalised(game, it)));
             }
             if of_game.len() >= SEEDS_MIN {
                 scores.push(of_game);
@@ -195,43 +184,48 @@ pub(super) fn over_games(
             )
         }));
     }
-    let scores = |at: usize| -> Scores {
-        let trained = games.iter().map(|game| game.agents[at].training.clone());
-        trained.collect()
+    let scores = |agent: &str| -> Scores {
+        let trained = |&game: &&str| {
+            of(scored, game, agent)
+                .filter_map(|it| it.training)
+                .collect()
+        };
+        games.iter().map(trained).collect()
     };
-    for (at, agent) in settings.agents.iter().enumerate().skip(1) {
-        let first = &settings.agents[0];
-        lines.extend(improvement(&scores(at), &scores(0)).map(|it| {
-            format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
-        }));
+    if let [first, others @ ..] = &settings.agents[..] {
+        for agent in others {
+            lines.extend(improvement(&scores(agent), &scores(first)).map(|it| {
+                format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
+            }));
+        }
     }
     Ok(lines)
 }
 
-/// What the page says. `count` runs are finished.
+/// What the page says.
 pub(super) fn values(
     settings: &Settings,
-    games: &[Game<'_>],
+    scored: &[Scored],
     over_games: &[String],
-    count: usize,
     missing: &[String],
 ) -> Value {
-    let agents = games.iter().flat_map(|it| &it.agents);
-    let mut runs = agents.flat_map(|it| &it.runs);
+    let games = games(scored).into_iter().map(|name| {
+        let agents = settings.agents.iter();
+        context! { name, paper => agents.map(|agent| paper(name, agent)).collect::<Vec<_>>() }
+    });
     context! {
         settings,
         agents => settings.agents,
         seeds => settings.seeds,
-        games,
+        runs => scored,
+        games => games.collect::<Vec<_>>(),
         percent => percent(settings.frames as f64 / PAPER_FRAMES),
-        above_random => above_random(settings, games),
+        errors => ERRORS,
         over_games,
-        count,
-        planned => count + missing.len(),
         missing,
         returns_of => RETURNS_OF,
         episodes => CHECKPOINTS * settings.episodes,
-        some_seeds => runs.any(|it| it.plan.call.seed > 1),
+        some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
     }
 }
 
@@ -239,23 +233,6 @@ fn percent(share: f64) -> String {
     let percent = 100.0 * share;
     let decimals = (1.0 - percent.log10().floor()).clamp(0.0, 6.0) as usize;
     format!("{percent:.decimals$}")
-}
-
-/// On how many of its games each agent plays better than at random.
-fn above_random(settings: &Settings, games: &[Game<'_>]) -> Vec<String> {
-    let agents = settings.agents.iter().enumerate();
-    let lines = agents.filter_map(|(at, agent)| {
-        let of_game = games.iter().map(|game| &game.agents[at]);
-        let played: Vec<_> = of_game.filter(|of| !of.runs.is_empty()).collect();
-        let above = played.iter().filter(|of| of.is_above_random);
-        let text = format!(
-            "`{agent}` is better than random, in every seed by {ERRORS} standard errors, on {} of {} games.",
-            above.count(),
-            played.len()
-        );
-        (!played.is_empty()).then_some(text)
-    });
-    lines.collect()
 }
 
 #[cfg(test)]

@@ -46,7 +46,7 @@ pub(super) struct Settings {
     pub(super) episodes: u32,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Serialize)]
 pub(super) struct Point {
     /// The world's name as files have it.
     pub(super) game: String,
