@@ -19,7 +19,6 @@ use crate::{
     sweep::{plan, queue},
 };
 
-const GHOSTS: [&str; 4] = ["red", "cyan", "orange", "green"];
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
 pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
@@ -59,41 +58,6 @@ fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Of each epsilon its episodes, and the final losses of its runs.
-fn losses(results: &Results) -> Vec<Value> {
-    let epsilons = results.settings.predictability.epsilons.iter();
-    let row = |&epsilon: &f64| {
-        let of = |(column, _)| results.losses(column, epsilon).collect::<Vec<_>>();
-        let losses = LOSSES.map(of);
-        context! {
-            epsilon => epsilon.to_string(),
-            episodes => losses[0].iter().map(|it| it.episodes).collect::<Vec<_>>(),
-            losses,
-        }
-    };
-    epsilons.map(row).collect()
-}
-
-/// Of each task its lethal ghost, and of each agent the returns at its end and over it.
-fn tasks(part: usize, results: &Results) -> Vec<Value> {
-    let continual = results.settings.tasks(part);
-    let row = |task: usize| {
-        let ghost = continual.order[task % continual.order.len()];
-        let of_agent = |agent: &String| {
-            let both = results.traces(part, agent).filter_map(|it| it.tasks[task]);
-            let (end, over): (Vec<f64>, Vec<f64>) = both.unzip();
-            context! { end, over }
-        };
-        let agents = results.settings.agents.iter().map(of_agent);
-        context! {
-            number => task + 1,
-            ghost => GHOSTS.get(usize::from(ghost)).unwrap_or(&"?"),
-            agents => agents.collect::<Vec<_>>(),
-        }
-    };
-    (0..continual.tasks as usize).map(row).collect()
-}
-
 /// By seed, of each agent how much more it earns at the end of its last task than of its first, and how much more than the first agent
 /// over all tasks; where a run has both.
 fn differences(part: usize, results: &Results) -> Vec<Value> {
@@ -120,15 +84,12 @@ fn differences(part: usize, results: &Results) -> Vec<Value> {
 
 fn values(results: &Results) -> Value {
     let settings = &results.settings;
-    let (ghosts, noise) = (&settings.continual, &settings.noise);
     let ranks = LOSSES.iter().filter_map(|(column, what)| {
         let (rank, runs) = results.order_of_epsilon(column)?;
         Some(context! { what, rank, runs })
     });
     let differences = (0..PARTS).flat_map(|part| differences(part, results));
-    let task_min = ghosts.episodes_per_task.min(noise.episodes_per_task);
-    let mut sets = ghosts.sets.iter();
-    let capacity = sets.find_map(|set| set.strip_prefix("replay.capacity_transitions="));
+    let epsilons = settings.predictability.epsilons.iter();
     let order = results.order_of_epsilon(LOSSES[1].0);
     context! {
         settings,
@@ -136,13 +97,12 @@ fn values(results: &Results) -> Value {
         seeds => settings.seeds,
         ranks => ranks.collect::<Vec<_>>(),
         differences => differences.collect::<Vec<_>>(),
-        losses => losses(results),
-        ghosts => tasks(0, results),
-        noise => tasks(1, results),
+        epsilons => epsilons.map(f64::to_string).collect::<Vec<_>>(),
+        columns => LOSSES.map(|(column, _)| column),
+        losses => results.losses,
+        traces => results.traces,
         missing => results.missing,
         out_of_order => order.is_some_and(|(rank, _)| rank <= 0.0),
-        capacity,
-        short_tasks => task_min < 2 * RETURNS_OF as u64,
         returns_of => RETURNS_OF,
         episode_frames_max => EPISODE_FRAMES_MAX,
     }

@@ -41,9 +41,11 @@ pub(super) struct Loss {
 }
 
 /// Training return over episodes.
+#[derive(Serialize)]
 pub(super) struct Trace {
     pub(super) agent: String,
     pub(super) seed: u32,
+    #[serde(skip)]
     pub(super) points: Points,
     /// Of each task the mean return at its end, and its mean over the task; none if the run has no row there.
     pub(super) tasks: Vec<Option<(f64, f64)>>,
