@@ -157,23 +157,10 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
         let all: Vec<_> = rows.iter().map(page_row).collect();
         context! { dial => rows[0].dial, base => all[0], levels => all[1..] }
     });
-    // Dials may share a base.
-    let bases = results.by_dial().map(|mut rows| rows.swap_remove(0));
-    let bases: BTreeMap<_, _> = bases.map(|base| (base.agent, base)).collect();
-    let bases = bases.values().map(|base| {
-        let above = difference(&results.random, &base.result.values(TRAINING));
-        let unsure = above.is_some_and(|it| {
-            it.interval.ends.is_some() && !(it.is_apart && it.interval.mean > 0.0)
-        });
-        let mut row = page_row(base);
-        row.insert("may_have_learned_nothing", unsure.into());
-        row
-    });
     let (judged, by_chance) = by_chance(results);
     Ok(context! {
         settings => common,
         dials => dials.collect::<Vec<_>>(),
-        bases => bases.collect::<Vec<_>>(),
         equal,
         random => results.random,
         seeds => seeds(results),
