@@ -4,9 +4,10 @@
 //! From i to i + 1 with probability alpha, else to i - 1; at an end the step that would leave it stays.
 
 use rand::Rng;
+use serde::Serialize;
 
 /// A biased random walk on a line of states, whose transition ratio is known in closed form.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize)]
 pub(super) struct Chain {
     /// States K, at least 2.
     pub(super) states: usize,

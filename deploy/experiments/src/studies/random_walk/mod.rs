@@ -122,6 +122,15 @@ fn values(results: &Results) -> Value {
         let found = results.gap_correlations(Sampling::Stationary, measure);
         mean(&found).is_some_and(|mean| mean > 0.5)
     };
+    let samplings = Sampling::ALL.map(|sampling| {
+        let trained = results.trained.iter().filter(|it| it.sampling == sampling);
+        let [tv, share] = [TV, SHARE].map(|measure| results.gap_correlations(sampling, measure));
+        context! {
+            name => sampling.name(),
+            trained => trained.collect::<Vec<_>>(),
+            correlations => context! { tv, share },
+        }
+    });
     // What follows from the closed forms alone, at any length of the experiment.
     let closed_forms = [0.5, 0.9, 0.3].map(|alpha| {
         let chain = results.chain(alpha);
@@ -138,7 +147,7 @@ fn values(results: &Results) -> Value {
         largest_errors => of_errors(|it| it.max),
         largest_ratio => truth.iter().copied().fold(0.0, f64::max),
         final_tv => at_figure().map(Trained::final_tv).collect::<Vec<_>>(),
-        convergence => convergence(results),
+        samplings,
         missed => 1.0 - settings.share_reached,
         tv_reached => settings.tv_reached,
         absolute => holds(TV),
@@ -146,32 +155,6 @@ fn values(results: &Results) -> Value {
         closed_forms,
         most => (settings.states as f64).ln(),
     }
-}
-
-/// How long each sampling takes, by either measure: the updates at the first, the figure's and the last alpha.
-fn convergence(results: &Results) -> Vec<Value> {
-    let settings = &results.settings;
-    let ends = [settings.alphas.first(), settings.alphas.last()];
-    let [first, last] = ends.map(|end| end.unwrap_or(&settings.figure_alpha));
-    let mut rows = Vec::new();
-    for (name, measure) in [("tv", TV), ("share", SHARE)] {
-        for sampling in Sampling::ALL {
-            let times = [first, &settings.figure_alpha, last].map(|&alpha| {
-                let times = results.of(sampling, alpha).filter_map(measure);
-                context! { alpha, updates => times.collect::<Vec<_>>() }
-            });
-            let trained = results.trained.iter();
-            let late = trained.filter(|it| it.sampling == sampling && measure(it).is_none());
-            rows.push(context! {
-                measure => name,
-                sampling => sampling.name(),
-                times,
-                late => late.count(),
-                correlations => results.gap_correlations(sampling, measure),
-            });
-        }
-    }
-    rows
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! All trainings of the grid, and what follows from them together.
 
+use serde::Serialize;
+
 use super::{
     chain::Chain,
     training::{Learnt, Sampling, Settings},
@@ -9,10 +11,14 @@ use crate::{
     stats::{Spread, rank_correlation},
 };
 
+#[derive(Serialize)]
 pub(super) struct Trained {
+    #[serde(flatten)]
     pub(super) chain: Chain,
+    #[serde(skip)]
     pub(super) sampling: Sampling,
     pub(super) seed: u32,
+    #[serde(skip)]
     pub(super) learnt: Learnt,
     /// Updates until the law of the next state is near the true one, however near a blind guess is; none if it never was.
     pub(super) updates_to_tv: Option<u64>,
