@@ -46,11 +46,11 @@ pub(crate) fn summary(page: &str) -> String {
     list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
 }
 
-/// The Markdown that `template` becomes. Blocks of which nothing is left are left out.
+/// The text that `template` becomes. Blocks of which nothing is left are left out.
 ///
 /// # Errors
 /// The template is not one, or names a value that its experiment does not give.
-fn fill(template: &str, values: &Value) -> Result<String, Error> {
+pub(crate) fn fill(template: &str, values: &Value) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.set_trim_blocks(true);

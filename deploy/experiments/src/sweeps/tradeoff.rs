@@ -19,8 +19,9 @@ use driml_launch::{
     console::{self, print},
     evaluate::Levels,
 };
-use driml_machine::{error::usage, units::rough_duration};
+use driml_machine::error::usage;
 use driml_settings::{config::RunConfig, presets};
+use minijinja::context;
 
 use self::{
     dials::Point,
@@ -31,6 +32,7 @@ use self::{
 use crate::{
     cache::{self, Session},
     flags::{TradeoffArgs, this_command},
+    page::fill,
     stats::Spread,
     sweep::{
         plan::{FinishedRun, Made, Planned, Swept, check_made},
@@ -87,7 +89,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let costs = it.costs()?;
     let fit = plan::fit(&costs, left);
     if !report_only {
-        print(&it.describe(&costs, &fit, left))?;
+        print(&it.describe(&costs, &fit, left)?)?;
     }
     if args.plan {
         return Ok(());
@@ -209,33 +211,25 @@ impl Tradeoff<'_> {
     }
 
     /// What is printed of the plan before anything is run.
-    fn describe(&self, costs: &[Option<[Cost; 2]>], fit: &Fit, left: f64) -> String {
-        let common = &self.settings.common;
-        let mut text = format!(
-            "world       {}, {} frames a run, seeds 1 to {}\nsettings    preset {} with {}\n",
-            common.env,
-            common.frames,
-            self.settings.seeds,
-            common.preset,
-            common.sets.join(", ")
-        );
-        for ((of, costs), chosen) in self.settings.levels.iter().zip(costs).zip(&fit.chosen) {
-            let Some([_, Cost { seconds, .. }]) = costs else {
-                continue;
-            };
-            let about = rough_duration(*seconds);
-            let what = match (chosen, *seconds) {
-                (true, 0.0) => "finished".to_owned(),
-                (true, _) => format!("about {about}"),
-                (false, _) => format!("does not fit, about {about}"),
-            };
-            text += &format!("level       {}: {what}\n", of.name());
-        }
-        text + &format!(
-            "time        about {} of runs, with their bases, of {} that are left of the budget\n",
-            rough_duration(fit.seconds),
-            rough_duration(left)
-        )
+    fn describe(
+        &self,
+        costs: &[Option<[Cost; 2]>],
+        fit: &Fit,
+        left: f64,
+    ) -> Result<String, minijinja::Error> {
+        let levels = self.settings.levels.iter().zip(costs).zip(&fit.chosen);
+        let levels = levels.filter_map(|((of, costs), fits)| {
+            let [_, Cost { seconds, .. }] = costs.as_ref()?;
+            Some(context! { name => of.name(), seconds, fits })
+        });
+        let values = context! {
+            settings => self.settings.common,
+            seeds => self.settings.seeds,
+            levels => levels.collect::<Vec<_>>(),
+            seconds => fit.seconds,
+            left,
+        };
+        fill(include_str!("tradeoff_plan.j2"), &values)
     }
 
     /// The runs of the chosen levels and their bases, and those that are there already.

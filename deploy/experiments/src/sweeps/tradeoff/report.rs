@@ -163,7 +163,8 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
         dials => dials.collect::<Vec<_>>(),
         equal,
         random => results.random,
-        seeds => seeds(results),
+        seeds => seeds(results, false),
+        base_seeds => seeds(results, true),
         judged,
         by_chance,
         rows,
@@ -190,21 +191,12 @@ fn page_row(row: &Row<'_>) -> BTreeMap<&'static str, Value> {
     values
 }
 
-/// How many seeds the intervals are over, in words.
-fn seeds(results: &Results) -> String {
+/// How many seeds the intervals of bases are over, or of the other points, the fewest first.
+fn seeds(results: &Results, of_bases: bool) -> BTreeSet<usize> {
     let bases: BTreeSet<&str> = results.levels.iter().map(|of| &*of.base.key).collect();
-    let [bases, levels] = [true, false].map(|is_base| {
-        let all = results.points.iter();
-        let counts = all.filter(|(key, _)| bases.contains(key.as_str()) == is_base);
-        let counts: BTreeSet<usize> = counts.map(|(_, point)| point.seeds.len()).collect();
-        match (counts.first(), counts.last()) {
-            (Some(low), Some(high)) if low == high => low.to_string(),
-            (Some(low), Some(high)) => format!("{low} to {high}"),
-            _ => "no".to_owned(),
-        }
-    });
-    let seeds = if levels == "1" { "seed" } else { "seeds" };
-    format!("{levels} {seeds} of a level and {bases} of a base")
+    let all = results.points.iter();
+    let some = all.filter(|(key, _)| bases.contains(key.as_str()) == of_bases);
+    some.map(|(_, point)| point.seeds.len()).collect()
 }
 
 /// How many differences of the page's returns are judged, and how many of them would be called better or worse if no level changed
