@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::{
-    dials::{Dial, LevelOf},
+    dials::{Dial, LevelOf, Point},
     settings::Common,
 };
 use crate::{
@@ -129,31 +129,25 @@ impl Row<'_> {
 
 impl Results {
     /// Of each dial that has runs its base, and then its levels.
-    pub(super) fn by_dial(&self) -> impl Iterator<Item = Vec<Row<'_>>> {
+    pub(super) fn by_dial<'a>(&'a self) -> impl Iterator<Item = Vec<Row<'a>>> {
         let dials = self.levels.chunk_by(|a, b| a.dial.name == b.dial.name);
-        dials.map(|levels| {
-            let base = std::iter::once(self.row(&levels[0], true));
-            base.chain(levels.iter().map(|of| self.row(of, false)))
-                .collect()
+        dials.map(move |levels| {
+            let LevelOf { dial, base, .. } = &levels[0];
+            let row = |name: &'a str, point: &'a Point, is_base| Row {
+                dial,
+                name,
+                agent: &point.agent,
+                is_base,
+                result: &self.points[&point.key],
+                base: &self.points[&base.key],
+            };
+            let base = row(&dial.base, base, true);
+            let levels = levels.iter().map(|of| row(&of.level, &of.point, false));
+            std::iter::once(base).chain(levels).collect()
         })
     }
 
     pub(super) fn level_rows(&self) -> impl Iterator<Item = Row<'_>> {
-        self.levels.iter().map(|of| self.row(of, false))
-    }
-
-    fn row<'a>(&'a self, of: &'a LevelOf, is_base: bool) -> Row<'a> {
-        let (name, point) = match is_base {
-            true => (&of.dial.base, &of.base),
-            false => (&of.level, &of.point),
-        };
-        Row {
-            dial: &of.dial,
-            name,
-            agent: &point.agent,
-            is_base,
-            result: &self.points[&point.key],
-            base: &self.points[&of.base.key],
-        }
+        self.by_dial().flatten().filter(|row| !row.is_base)
     }
 }
