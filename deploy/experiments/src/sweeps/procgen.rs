@@ -1,23 +1,38 @@
 //! Table 1: agents on Procgen's games beside a random policy and the paper's numbers.
-//! Runs are made by the engine in `sweep`; data, figure and page are in `report`.
+//! Runs are made by the engine in `sweep`; what they are is in `settings`.
 
-mod report;
 mod settings;
 
-use driml_launch::evaluate::Levels;
+use std::collections::BTreeSet;
 
-use self::{
-    report::Scored,
-    settings::{NAME, Settings},
-};
+use anyhow::Context;
+use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
+use driml_launch::{evaluate::Levels, metrics::rounded, run_folder::RunFolder};
+use driml_protocol::RETURNS_OF;
+use minijinja::{Value, context};
+use serde::Serialize;
+
+use self::settings::{CHECKPOINTS, NAME, Point, Settings};
 use crate::{
     cache::Session,
     flags::ProcgenArgs,
+    plot::{Band, Run, over_seeds},
+    stats::{
+        Spread, mean,
+        over_games::{Scores, improvement, iqm},
+    },
     sweep::{
-        plan::{self, Swept},
+        plan::{self, FinishedRun, Made, PlannedRun, Swept},
         queue,
     },
+    sweeps::published::{normalised, paper},
 };
+
+/// Standard errors from which on a mean return counts as different from the random policy's.
+const ERRORS: f64 = 2.0;
+const PAPER_FRAMES: f64 = 50e6;
+/// Seeds of each game and agent from which on scores over all games are made.
+const SEEDS_MIN: usize = 3;
 
 /// Makes the runs, plays with them, and writes the table, the figure and the page.
 pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
@@ -34,16 +49,227 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     swept.check_any(report)?;
     let Swept { made, missing } = swept;
     let mut scored = Vec::new();
-    for made in made {
-        let (name, game) = (&made.plan.name, &made.point.game);
-        let greedy = play.greedy(&mut session, &format!("{name}-greedy"), &made.run)?;
-        let random = play.random(&mut session, &format!("{game}-at-random"), &made.run)?;
-        scored.push(Scored::new(made, &greedy.unwrap_or_default(), &random));
+    for Made { point, plan, run } in made {
+        let greedy = play.greedy(&mut session, &format!("{}-greedy", plan.name), &run)?;
+        let greedy = greedy.unwrap_or_default();
+        let random = play.random(&mut session, &format!("{}-at-random", point.game), &run)?;
+        scored.push(Scored {
+            training: run.summary.mean_return,
+            greedy: mean(&greedy),
+            random: mean(&random),
+            is_above_random: is_above(&greedy, &random),
+            point,
+            plan,
+            run,
+        });
     }
-    report::write_data(&session, &scored)?;
-    session.figure("curves", &report::figure(&settings, &scored)?)?;
-    let over_games = report::over_games(&mut session, &settings, &scored)?;
-    let values = report::values(&settings, &scored, &over_games, &missing);
+    write_data(&session, &scored)?;
+    session.figure("curves", &figure(&settings, &scored)?)?;
+    let over_games = over_games(&mut session, &settings, &scored)?;
+    let values = values(&settings, &scored, &over_games, &missing);
     session.finish(include_str!("procgen.md.j2"), values)?;
     plan::check_made(&missing, report)
+}
+
+/// A finished run and its mean returns; a line of the data, from which the page is made.
+#[derive(Serialize)]
+struct Scored {
+    #[serde(flatten)]
+    point: Point,
+    #[serde(skip)]
+    plan: PlannedRun,
+    #[serde(skip)]
+    run: FinishedRun,
+    training: Option<f64>,
+    /// Of its agent, played greedily.
+    greedy: Option<f64>,
+    /// Of a random policy in its world.
+    random: Option<f64>,
+    is_above_random: bool,
+}
+
+fn is_above(greedy: &[f64], random: &[f64]) -> bool {
+    let spreads = [greedy, random].map(|it| Spread::of(it.iter().copied()));
+    let [Some(greedy), Some(random)] = spreads else {
+        return false;
+    };
+    let error = |it: Spread| it.sd.powi(2) / it.count as f64;
+    greedy.mean - random.mean > ERRORS * (error(greedy) + error(random)).sqrt()
+}
+
+/// The games that have a run, in the order of their names.
+fn games(all: &[Scored]) -> BTreeSet<&str> {
+    all.iter().map(|it| it.point.game.as_str()).collect()
+}
+
+/// The runs of an agent in a game.
+fn of<'a>(all: &'a [Scored], game: &str, agent: &str) -> impl Iterator<Item = &'a Scored> {
+    let all = all.iter();
+    all.filter(move |it| it.point.game == game && it.point.agent == agent)
+}
+
+fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
+    let columns = "game,agent,torso,seed,frames,training,greedy,random,paper,wall_seconds,commit";
+    let mut rows = Vec::new();
+    for it in scored {
+        let (point, summary) = (&it.point, &it.run.summary);
+        let paper = paper(&point.game, &point.agent);
+        let returns = [it.training, it.greedy, it.random, paper];
+        rows.push((
+            (&point.game, &point.agent, torso(&it.run.folder)?),
+            (it.plan.call.seed, summary.frames),
+            returns.map(|it| it.map(rounded)),
+            (summary.wall_seconds.round() as u64, &it.run.commit),
+        ));
+    }
+    session.csv("table", columns, rows)
+}
+
+/// The torso of a run's network, from its settings; those without a choice have the one of Nature's DQN.
+fn torso(folder: &RunFolder) -> anyhow::Result<String> {
+    let path = folder.config();
+    let text = std::fs::read_to_string(&path);
+    let text = text.with_context(|| format!("reading {}", path.display()))?;
+    let config: toml::Table = text.parse()?;
+    let torso = config.get("model").and_then(|model| model.get("torso"));
+    let torso = torso.and_then(toml::Value::as_str);
+    Ok(torso.unwrap_or("nature").to_owned())
+}
+
+/// Training return over frames, a chart a game.
+fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
+    let mut panels = Vec::new();
+    for game in games(scored) {
+        let level = |value: f64| vec![(0.0, value), (settings.frames as f64, value)];
+        let mut series = Vec::new();
+        let first = scored.iter().find(|it| it.point.game == game);
+        if let Some(random) = first.and_then(|it| it.random) {
+            series.push(Series::line("random", 0, level(random)).coloured(GREY));
+        }
+        for (index, agent) in settings.agents.iter().enumerate() {
+            let each = of(scored, game, agent)
+                .map(|it| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?));
+            let each = each.collect::<anyhow::Result<Vec<_>>>()?;
+            let curve = over_seeds(&each, Band::Range);
+            if curve.points.is_empty() {
+                continue;
+            }
+            series.push(curve.series(agent, index));
+            if let Some(paper) = paper(game, agent) {
+                series.push(Series::line("", index, level(paper)).marked(Mark::Dashed));
+            }
+        }
+        let (x, y) = (Axis::linear("frames"), Axis::linear("mean return"));
+        panels.push(Panel::Chart(Chart::new(game, x, y, series)));
+    }
+    Ok(Figure {
+        title: "Training return by game".into(),
+        notes: vec![format!(
+            "Mean of the last {RETURNS_OF} training episodes, with exploration; over several seeds mean and range. Dashed: the paper's \
+             after 50 million frames. Grey: a random policy."
+        )],
+        columns: panels.len().min(4),
+        panel_size: (300.0, 230.0),
+        panels,
+    })
+}
+
+/// Scores over all games, where each game and agent has enough seeds for an interval.
+fn over_games(
+    session: &mut Session,
+    settings: &Settings,
+    scored: &[Scored],
+) -> anyhow::Result<Vec<String>> {
+    let games = games(scored);
+    let has_seeds = |game: &&str| {
+        let mut agents = settings.agents.iter();
+        agents.all(|agent| of(scored, game, agent).count() >= SEEDS_MIN)
+    };
+    if !games.iter().all(has_seeds) {
+        return Ok(Vec::new());
+    }
+    let mut lines = Vec::new();
+    let play = settings.play(Levels::TrainSingle);
+    for agent in &settings.agents {
+        let mut scores = Scores::new();
+        for &game in &games {
+            let mut of_game = Vec::new();
+            for it in of(scored, game, agent) {
+                session.progress().again(play.units);
+                let key = format!("{}-single", it.plan.name);
+                let returns = play.greedy(session, &key, &it.run)?;
+                let returns = returns.and_then(|it| mean(&it));
+                of_game.extend(returns.and_then(|it| normalised(game, it)));
+            }
+            if of_game.len() >= SEEDS_MIN {
+                scores.push(of_game);
+            }
+        }
+        lines.extend(iqm(&scores).map(|it| {
+            format!(
+                "Interquartile mean of `{agent}` over {} games: {it:.3} (greedy, an episode a level, normalised as by Cobbe et al. 2020).",
+                scores.len()
+            )
+        }));
+    }
+    let scores = |agent: &str| -> Scores {
+        let trained = |&game: &&str| {
+            of(scored, game, agent)
+                .filter_map(|it| it.training)
+                .collect()
+        };
+        games.iter().map(trained).collect()
+    };
+    if let [first, others @ ..] = &settings.agents[..] {
+        for agent in others {
+            lines.extend(improvement(&scores(agent), &scores(first)).map(|it| {
+                format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
+            }));
+        }
+    }
+    Ok(lines)
+}
+
+/// What the page says.
+fn values(
+    settings: &Settings,
+    scored: &[Scored],
+    over_games: &[String],
+    missing: &[String],
+) -> Value {
+    let games = games(scored).into_iter().map(|name| {
+        let agents = settings.agents.iter();
+        context! { name, paper => agents.map(|agent| paper(name, agent)).collect::<Vec<_>>() }
+    });
+    context! {
+        settings,
+        agents => settings.agents,
+        seeds => settings.seeds,
+        runs => scored,
+        games => games.collect::<Vec<_>>(),
+        percent => percent(settings.frames as f64 / PAPER_FRAMES),
+        errors => ERRORS,
+        over_games,
+        missing,
+        returns_of => RETURNS_OF,
+        episodes => CHECKPOINTS * settings.episodes,
+        some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
+    }
+}
+
+fn percent(share: f64) -> String {
+    let percent = 100.0 * share;
+    let decimals = (1.0 - percent.log10().floor()).clamp(0.0, 6.0) as usize;
+    format!("{percent:.decimals$}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_shares_keep_two_digits() {
+        let texts = [0.002, 0.000012, 0.5, 1.0].map(percent);
+        assert_eq!(texts, ["0.20", "0.0012", "50", "100"]);
+    }
 }
