@@ -3,14 +3,13 @@
 //! The menu of dials is in `dials`, what fits a budget in `plan`, data, figures and page in `report`.
 
 mod dials;
-mod exactness;
 mod figures;
 mod fixed_batch;
+mod measured;
 mod plan;
 mod report;
 mod results;
 mod settings;
-mod speed;
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -118,7 +117,7 @@ fn shorten(settings: &mut Settings, smoke: bool, budget_seconds: f64) -> anyhow:
     let mut seconds = 0.0;
     for (point, is_base) in [(&level.base, true), (&level.point, false)] {
         let config = settings.common.config(point)?;
-        let speed = speed::measure(&base, &config, smoke)?;
+        let speed = measured::speeds(&base, &config, smoke)?;
         seconds += f64::from(settings.seeds_of(is_base)) * estimate(&config, &speed);
     }
     settings.common.frames = plan::frames(settings.common.frames, seconds, budget_seconds);
@@ -153,7 +152,7 @@ impl Tradeoff<'_> {
                     let common = &self.settings.common;
                     let (base, config) = (common.config(&of.base)?, common.config(point)?);
                     self.session.progress().again(units);
-                    let measure = |_: &mut _| speed::measure(&base, &config, smoke);
+                    let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
                     Some(self.session.piece_of(&program, &key, units, measure)?)
                 };
                 self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
@@ -324,10 +323,10 @@ impl Tradeoff<'_> {
         let (units, config) = (self.piece_units(), config_of(&run.folder)?);
         self.session.progress().again(units);
         let key = format!("exactness-{}", point.key);
-        let (rows, states) = exactness::sizes(&config);
+        let (rows, states) = measured::sizes(&config);
         let weights = &run.summary.weights_sha256;
         let what = format!("{weights}, {rows} rows, {states} states");
-        let measure = |_: &mut _| exactness::measure(&config, &run.folder);
+        let measure = |_: &mut _| measured::errors(&config, &run.folder);
         self.session.computed(&what, &key, units, measure)
     }
 

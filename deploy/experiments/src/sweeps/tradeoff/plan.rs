@@ -1,5 +1,5 @@
 //! Which levels fit into a budget.
-//! It knows seconds and names; what they cost is measured in `speed` or by runs that are finished.
+//! It knows seconds and names; what they cost is measured in `measured` or by runs that are finished.
 
 use std::collections::BTreeSet;
 

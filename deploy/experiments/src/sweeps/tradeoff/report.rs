@@ -7,7 +7,7 @@ use minijinja::{Value, context};
 use serde::Serialize;
 
 use super::{
-    exactness, figures,
+    figures, measured,
     results::{GREEDY, MEASURES, Results, Row, TRAINING},
 };
 use crate::{
@@ -152,7 +152,7 @@ fn at(curve: &[(f64, f64)], seconds: f64) -> Option<f64> {
 
 fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
     let common = &results.common;
-    let (rows, states) = exactness::sizes(&common.config(&results.levels[0].base)?);
+    let (rows, states) = measured::sizes(&common.config(&results.levels[0].base)?);
     let dials = results.by_dial().map(|rows| {
         let all: Vec<_> = rows.iter().map(page_row).collect();
         context! { dial => rows[0].dial, base => all[0], levels => all[1..] }
