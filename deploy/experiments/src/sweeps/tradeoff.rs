@@ -233,26 +233,20 @@ impl Tradeoff<'_> {
 
     /// The runs of the chosen levels and their bases, and those that are there already.
     fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<Planned<Point>>> {
-        // How many seeds of each point are to be there: none of what was not chosen.
-        let mut points: Vec<(Point, u32)> = Vec::new();
-        for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
-            for (point, is_base) in [(&of.base, true), (&of.point, false)] {
-                let seeds = u32::from(is_chosen) * self.settings.seeds_of(is_base);
-                match points.iter_mut().find(|(known, _)| known == point) {
-                    Some((_, known)) => *known = seeds.max(*known),
-                    None => points.push((point.clone(), seeds)),
-                }
-            }
-        }
         let runs = Runs::open(self.session.folder())?;
-        let mut wanted = Vec::new();
+        let mut wanted: Vec<Planned<Point>> = Vec::new();
         // Seed by seed, so that what was stopped has one seed of everything before it has two of anything. Further seeds that another
         // call made are on the page too.
         for seed in 1..=self.settings.seeds_of(true).max(SEEDS_FOUND_MAX) {
-            for (point, seeds) in &points {
-                let run = self.settings.common.run(point, seed);
-                if seed <= *seeds || runs.finished(&run).is_some() {
-                    wanted.push((point.clone(), run));
+            for (of, &is_chosen) in self.settings.levels.iter().zip(chosen) {
+                for (point, is_base) in [(&of.base, true), (&of.point, false)] {
+                    let run = self.settings.common.run(point, seed);
+                    let is_asked = is_chosen && seed <= self.settings.seeds_of(is_base);
+                    // Levels share bases, and a level may be another's base.
+                    let is_new = wanted.iter().all(|(_, known)| known.name != run.name);
+                    if is_new && (is_asked || runs.finished(&run).is_some()) {
+                        wanted.push((point.clone(), run));
+                    }
                 }
             }
         }
