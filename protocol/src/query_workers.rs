@@ -59,7 +59,7 @@ impl<R: Request> Incoming<R> {
     pub fn receive(&self, pool: &BufferPool) -> Result<(R, Buffer), CodecError> {
         let nothing = ZBytes::new();
         let bytes = self.query.payload().unwrap_or(&nothing);
-        let (request, payload) =
+        let (request, payload): (R, _) =
             codec::receive(bytes.reader(), bytes.len(), pool, Some(self.spec_hash))?;
         // One that speaks for an actor, or for the learner beside them, comes at its own key, which others may have no access to.
         let (key, actor) = (self.query.key_expr().as_str(), request.actor());

@@ -246,7 +246,8 @@ fn rows_drawn_by_priority_are_weighted_and_answered() {
     let chances = [0.5f32, 0.25, 0.125, 0.1, 0.5, 1.0];
     let drawn = |chances: &[f32]| {
         let mut batch = served(&config, 1);
-        batch.set_draws(chances.iter().map(|chance| (0, *chance)));
+        let draws: Vec<_> = chances.iter().map(|chance| (0, *chance)).collect();
+        batch.set_draws(&draws);
         batch
     };
     let plain = made(&uniform).update(&served(&uniform, 1)).unwrap();

@@ -196,7 +196,9 @@ fn damage_costs_what_it_hits_and_is_said() {
     let begin_one: Spoil = |it| copy_to(it, 999, 20);
     let misplace: Spoil = |it| copy_to(it, 600, 1 << 20);
     let forget_id: Spoil = |it| remove(&it.with_file_name("log.toml"));
-    let back_up: Spoil = |it| drop(fs::copy(it, it.with_file_name("segment-3.log")).unwrap());
+    let back_up: Spoil = |it| {
+        fs::copy(it, it.with_file_name("segment-3.log")).unwrap();
+    };
     let early = &["its beginning is damaged", "is now", gone];
     let cases: &[(usize, Spoil, &[&str], Left)] = &[
         (5, flip_late, &["damaged at byte", gone], Counts),
