@@ -16,8 +16,8 @@ fn points(rows: &[Row], names: &[String], is_drawn: bool, aside: f64) -> Vec<(f6
     let some = rows.iter().filter(|it| it.is_drawn == is_drawn);
     let points = some.filter_map(|row| {
         let at = names.iter().position(|name| *name == row.routine)? as f64;
-        let share = match row.worst {
-            _ if row.cases == 0 => MOST,
+        let share = match row.seen.worst {
+            _ if row.seen.cases == 0 => MOST,
             0.0 => 0.0,
             worst => worst / row.bound,
         };
@@ -45,7 +45,7 @@ fn chart(rows: &[Row], names: &[String]) -> Chart {
 
 /// All rows, over several charts.
 pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
-    let mut names: Vec<String> = rows.iter().map(|row| row.routine.clone()).collect();
+    let mut names: Vec<String> = rows.iter().map(|row| row.routine.into()).collect();
     names.dedup();
     let charts = names.chunks(ROUTINES_A_CHART);
     let charts = charts.map(|some| Panel::Chart(chart(rows, some)));
@@ -64,29 +64,23 @@ pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stability::property::Seen;
 
     #[test]
     fn inputs_have_their_side_and_a_promise_that_was_not_tried_is_not_kept() {
-        let row = Row {
-            routine: "halving".into(),
-            extreme: "0, 1, and drawn".into(),
+        let row = |is_drawn, cases, worst| Row {
+            routine: "halving",
+            is_drawn,
             bound: 0.5,
-            cases: 1,
-            worst: 0.25,
+            seen: Seen {
+                cases,
+                worst,
+                ..Seen::default()
+            },
             ..Row::default()
         };
-        let drawn = Row {
-            extreme: "one is infinite".into(),
-            is_drawn: true,
-            worst: 0.0,
-            ..row.clone()
-        };
-        let untried = Row {
-            cases: 0,
-            worst: 0.0,
-            ..row.clone()
-        };
-        let (rows, names) = ([row, drawn, untried], ["halving".to_owned()]);
+        let rows = [row(false, 1, 0.25), row(true, 1, 0.0), row(false, 0, 0.0)];
+        let names = ["halving".to_owned()];
         assert_eq!(points(&rows, &names, false, 0.0), [(0.0, 0.5), (0.0, MOST)]);
         assert_eq!(points(&rows, &names, true, 0.0), [(0.0, NONE)]);
     }

@@ -16,10 +16,7 @@ use minijinja::{Value, context};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use self::{
-    checks::TABLE,
-    property::{Row, Settings},
-};
+use self::property::{Row, Settings};
 use crate::{
     cache::{self, Session},
     flags::{self, ExperimentFlags},
@@ -33,33 +30,31 @@ const COLUMNS: &str = "routine,range,extreme,cases,worst,promised,kept,promise,i
 pub(super) fn run(args: &ExperimentFlags) -> anyhow::Result<()> {
     let mut settings: Settings = flags::settings(NAME, SETTINGS, args.smoke);
     settings.seeds = args.seeds.unwrap_or(settings.seeds);
-    let table = || TABLE.into_iter().flatten();
-    let units = table().count() as u64 * u64::from(settings.seeds);
+    let table = checks::table(&settings);
+    let units = table.len() as u64 * u64::from(settings.seeds);
     let mut session = Session::open(NAME, args, &settings, units, false)?;
     // What another build of the routines kept says nothing of these.
     let program = cache::program()?;
     let mut rows: Vec<Row> = Vec::new();
-    for (at, property) in table().enumerate() {
-        let mut of_property = Vec::new();
+    for (at, mut property) in table.into_iter().enumerate() {
+        let routine = property.routine;
+        let name = routine.replace(|c: char| !c.is_alphanumeric(), "-");
         for seed in 1..=settings.seeds {
-            let name = property
-                .routine
-                .replace(|c: char| !c.is_alphanumeric(), "-");
             let key = format!("{at:02}-{name}-seed{seed}");
-            let found = session.piece_of(&program, &key, 1, |progress| {
+            let seen = session.piece_of(&program, &key, 1, |progress| {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed.into());
                 rng.set_stream(at as u64);
-                property.rows(&settings, rng, progress)
+                property.run(&settings, rng, progress)
             })?;
-            property::merge(&mut of_property, found);
+            property.add(seen);
         }
-        rows.extend(property::tried(of_property));
+        rows.extend(property.tried());
     }
     let promises = rows.iter().map(|row| {
-        let of = (&row.routine, &row.range, &row.extreme, row.cases);
+        let of = (row.routine, row.range, &row.extreme, row.seen.cases);
         let kept = if row.is_kept() { "yes" } else { "no" };
-        let found = [number(row.worst), number(row.bound)];
-        (of, found, kept, &row.promise, &row.input)
+        let found = [number(row.seen.worst), number(row.bound)];
+        (of, found, kept, row.promise, &row.seen.input)
     });
     session.csv("promises", COLUMNS, promises)?;
     session.figure("worst", &figure::figure(&rows, &cases(&rows)))?;
@@ -81,7 +76,7 @@ fn number(value: f64) -> String {
 }
 
 fn cases(rows: &[Row]) -> String {
-    HumanCount(rows.iter().map(|row| row.cases).sum()).to_string()
+    HumanCount(rows.iter().map(|row| row.seen.cases).sum()).to_string()
 }
 
 /// What came out, in a sentence.
@@ -93,26 +88,25 @@ fn verdict(rows: &[Row]) -> String {
 
 fn values(rows: &[Row], settings: &Settings) -> Value {
     let broken = rows.iter().filter(|row| !row.is_kept()).map(|row| {
-        let (worst, bound) = (number(row.worst), number(row.bound));
+        let (worst, bound) = (number(row.seen.worst), number(row.bound));
+        let (routine, extreme, promise) = (row.routine, &row.extreme, row.promise);
+        let input = &row.seen.input;
         format!(
-            "**Not kept**: {}, {}: {}: {worst}, promised {bound}; at {}.",
-            row.routine, row.extreme, row.promise, row.input
+            "**Not kept**: {routine}, {extreme}: {promise}: {worst}, promised {bound}; at {input}."
         )
     });
     // Rows that allow an error, by how much of it is used.
-    let share = |row: &Row| 100.0 * row.worst / row.bound;
+    let share = |row: &Row| 100.0 * row.seen.worst / row.bound;
     let mut close: Vec<&Row> = rows.iter().filter(|row| row.bound > 0.0).collect();
     close.sort_by(|a, b| share(b).total_cmp(&share(a)));
     let mut named = HashSet::new();
-    close.retain(|row| named.insert(&row.routine));
+    close.retain(|row| named.insert(row.routine));
     let nearest = close.iter().take(5);
-    let nearest: Vec<_> = nearest
-        .map(|row| format!("{} ({:.0}%)", row.routine, share(row)))
-        .collect();
+    let nearest = nearest.map(|row| format!("{} ({:.0}%)", row.routine, share(row)));
     context! {
         verdict => verdict(rows),
         broken => broken.collect::<Vec<_>>(),
-        nearest => nearest.join(", "),
+        nearest => nearest.collect::<Vec<_>>().join(", "),
         processor => resources::processor(),
         kernels => Precision::ALL.map(describe_kernels).join("; "),
         draws => HumanCount(settings.draws).to_string(),
@@ -122,7 +116,39 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{property::Seen, *};
+
+    #[test]
+    fn the_page_and_the_verdict_name_what_is_broken() {
+        let mut row = Row {
+            routine: "halving",
+            extreme: "big".into(),
+            promise: "error of |x|",
+            bound: 0.5,
+            ..Row::default()
+        };
+        let mut reported = |worst: f64, input: &str| {
+            row.seen = Seen {
+                cases: 1,
+                worst,
+                input: input.into(),
+            };
+            let rows = [row.clone()];
+            let settings = flags::settings(NAME, SETTINGS, true);
+            let values = values(&rows, &settings);
+            let page = crate::page::page(include_str!("page.md.j2"), values, true, "1 s.");
+            (verdict(&rows), page)
+        };
+        let (verdict, page) = reported(0.25, "");
+        assert_eq!(verdict, "1 of 1 promises are kept, in 1 cases.");
+        assert!(!page.contains("Not kept"), "{page}");
+        let nearest = "Nearest to their promises: halving (50%).";
+        assert!(page.contains(nearest), "{page}");
+        let (verdict, page) = reported(f64::MAX, "7e38");
+        assert!(verdict.starts_with("0 of 1 promises are kept"));
+        let broken = "halving, big: error of |x|: not finite, promised 0.50; at 7e38.";
+        assert!(page.contains(broken), "{page}");
+    }
 
     #[test]
     fn both_lengths_read() {
@@ -130,40 +156,6 @@ mod tests {
             let settings: Settings = flags::settings(NAME, SETTINGS, smoke);
             assert!(settings.seeds > 0 && settings.draws > 0);
         }
-    }
-
-    #[test]
-    fn the_page_and_the_verdict_name_what_is_broken() {
-        let settings = flags::settings(NAME, SETTINGS, true);
-        let page = |rows: &[Row]| {
-            let values = values(rows, &settings);
-            crate::page::page(include_str!("page.md.j2"), values, true, "1 s.")
-        };
-        let mut row = Row {
-            routine: "halving".into(),
-            extreme: "big".into(),
-            promise: "error of |x|".into(),
-            bound: 0.5,
-            cases: 1,
-            worst: 0.25,
-            ..Row::default()
-        };
-        assert_eq!(
-            verdict(&[row.clone()]),
-            "1 of 1 promises are kept, in 1 cases."
-        );
-        let text = page(&[row.clone()]);
-        assert!(!text.contains("Not kept"), "{text}");
-        assert!(
-            text.contains("Nearest to their promises: halving (50%)."),
-            "{text}"
-        );
-
-        (row.worst, row.input) = (f64::MAX, "7e38".into());
-        assert!(verdict(&[row.clone()]).starts_with("0 of 1 promises are kept"));
-        let text = page(&[row]);
-        let broken = "halving, big: error of |x|: not finite, promised 0.50; at 7e38.";
-        assert!(text.contains(broken), "{text}");
     }
 
     #[test]

@@ -40,11 +40,12 @@ pub(super) struct Settings {
 pub(super) struct Property {
     pub(super) routine: &'static str,
     /// The inputs, as the routine's own documentation has them.
-    pub(super) range: &'static str,
+    range: &'static str,
     /// Each in words, with what an error is a share of, and the largest error that it allows; 0 where it allows none.
-    pub(super) promises: &'static [(&'static str, f64)],
-    /// Kinds of extremes in words, how many cases of each, and what runs the routine beside its reference in one case.
-    pub(super) extremes: &'static [(&'static str, Inputs, Check)],
+    promises: Vec<(&'static str, f64)>,
+    checks: Vec<(Inputs, Box<Check>)>,
+    /// Each promise at each kind of extreme.
+    pub(super) rows: Vec<Row>,
 }
 
 /// Where the inputs of a check come from.
@@ -56,106 +57,142 @@ pub(super) enum Inputs {
     Drawn(f64),
 }
 
-pub(super) type Check = fn(&mut Cases<'_>) -> anyhow::Result<()>;
+/// Runs the routine beside its reference in one case.
+type Check = dyn Fn(&mut Cases<'_>) -> anyhow::Result<()>;
 
 impl Property {
-    /// Runs all checks; what they saw of each promise at each kind of extreme.
-    pub(super) fn rows(
+    pub(super) const fn new(routine: &'static str, range: &'static str) -> Self {
+        Self {
+            routine,
+            range,
+            promises: Vec::new(),
+            checks: Vec::new(),
+            rows: Vec::new(),
+        }
+    }
+
+    pub(super) fn promise(mut self, promise: &'static str, bound: f64) -> Self {
+        self.promises.push((promise, bound));
+        self
+    }
+
+    /// Has all promises tried on these inputs, a kind of extremes in words.
+    pub(super) fn on(
+        mut self,
+        extreme: &str,
+        inputs: Inputs,
+        check: impl Fn(&mut Cases<'_>) -> anyhow::Result<()> + 'static,
+    ) -> Self {
+        self.checks.push((inputs, Box::new(check)));
+        for &(promise, bound) in &self.promises {
+            self.rows.push(Row {
+                routine: self.routine,
+                range: self.range,
+                extreme: extreme.to_owned(),
+                is_drawn: matches!(inputs, Drawn(_)),
+                promise,
+                bound,
+                seen: Seen::default(),
+            });
+        }
+        self
+    }
+
+    /// Runs all checks; what they saw, in the order of the rows.
+    pub(super) fn run(
         &self,
         settings: &Settings,
         rng: ChaCha8Rng,
         progress: &mut Progress,
-    ) -> anyhow::Result<Vec<Row>> {
+    ) -> anyhow::Result<Vec<Seen>> {
         let mut cases = Cases {
             settings,
             rng,
             progress,
             taken: None,
             lists: 0,
-            rows: Vec::new(),
+            seen: Vec::new(),
         };
         let mut all = Vec::new();
-        for &(extreme, inputs, check) in self.extremes {
-            let steps = settings.adam_steps.to_string();
-            let updates = settings.affinity_updates.to_string();
-            let extreme = extreme
-                .replace("{adam_steps}", &steps)
-                .replace("{affinity_updates}", &updates);
-            let rows = self.promises.iter().map(|&(promise, bound)| Row {
-                routine: self.routine.to_owned(),
-                range: self.range.to_owned(),
-                extreme: extreme.clone(),
-                is_drawn: matches!(inputs, Drawn(_)),
-                promise: promise.to_owned(),
-                bound,
-                ..Row::default()
-            });
-            cases.rows = rows.collect();
-            cases.run(inputs, check)?;
-            all.append(&mut cases.rows);
+        for (inputs, check) in &self.checks {
+            cases.seen = vec![Seen::default(); self.promises.len()];
+            match *inputs {
+                Listed => {
+                    cases.taken = Some(Vec::new());
+                    while cases.taken.is_some() {
+                        cases.attempt(check)?;
+                        cases.combine_anew();
+                    }
+                }
+                Drawn(share) => {
+                    for _ in 0..cases.draws(share) {
+                        cases.attempt(check)?;
+                    }
+                }
+            }
+            all.append(&mut cases.seen);
         }
-        cases.progress.advance(1)?;
         Ok(all)
+    }
+
+    /// Adds what one seed saw.
+    pub(super) fn add(&mut self, seen: Vec<Seen>) {
+        assert_eq!(self.rows.len(), seen.len(), "each seed has all rows");
+        for (row, seen) in self.rows.iter_mut().zip(seen) {
+            row.seen.add(seen.cases, seen.worst, || seen.input);
+        }
+    }
+
+    /// The rows with a case, and one, which is not kept, of each promise that has none at any extreme.
+    pub(super) fn tried(self) -> Vec<Row> {
+        let rows = self.rows.into_iter();
+        let (mut tried, untried): (Vec<_>, Vec<_>) = rows.partition(|row| row.seen.cases > 0);
+        for mut row in untried {
+            if tried.iter().all(|it| it.promise != row.promise) {
+                (row.extreme, row.is_drawn) = ("none was tried".into(), false);
+                tried.push(row);
+            }
+        }
+        tried
     }
 }
 
 /// One promise at one kind of extreme.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Row {
-    pub(super) routine: String,
-    pub(super) range: String,
+    pub(super) routine: &'static str,
+    pub(super) range: &'static str,
     pub(super) extreme: String,
     /// Whether its inputs are of the generator, and not listed.
     pub(super) is_drawn: bool,
-    pub(super) promise: String,
+    pub(super) promise: &'static str,
     pub(super) bound: f64,
+    pub(super) seen: Seen,
+}
+
+impl Row {
+    pub(super) fn is_kept(&self) -> bool {
+        self.seen.cases > 0 && self.seen.worst <= self.bound
+    }
+}
+
+/// What was seen of a row.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Seen {
     pub(super) cases: u64,
-    /// The largest error seen, in units of the bound's; the largest float where a result was not a number.
+    /// The largest error, in units of the bound's; the largest float where a result was not a number.
     pub(super) worst: f64,
     /// What gave it.
     pub(super) input: String,
 }
 
-impl Row {
-    pub(super) fn is_kept(&self) -> bool {
-        self.cases > 0 && self.worst <= self.bound
-    }
-
-    fn see(&mut self, input: Arguments<'_>, error: f64) {
-        self.cases += 1;
-        // The least of a number and NaN is the number.
-        let error = error.abs().min(f64::MAX);
+impl Seen {
+    fn add(&mut self, cases: u64, error: f64, input: impl FnOnce() -> String) {
+        self.cases += cases;
         if error > self.worst {
-            (self.worst, self.input) = (error, input.to_string());
+            (self.worst, self.input) = (error, input());
         }
     }
-}
-
-/// Adds what another seed saw of the same property.
-pub(super) fn merge(rows: &mut Vec<Row>, others: Vec<Row>) {
-    if rows.is_empty() {
-        *rows = others;
-        return;
-    }
-    assert_eq!(rows.len(), others.len(), "each seed has all rows");
-    for (row, other) in rows.iter_mut().zip(others) {
-        row.cases += other.cases;
-        if other.worst > row.worst {
-            (row.worst, row.input) = (other.worst, other.input);
-        }
-    }
-}
-
-/// Of a property's rows those with a case, and one, which is not kept, of each promise that has none at any extreme.
-pub(super) fn tried(rows: Vec<Row>) -> Vec<Row> {
-    let (mut tried, untried): (Vec<_>, Vec<_>) = rows.into_iter().partition(|row| row.cases > 0);
-    for mut row in untried {
-        if tried.iter().all(|it| it.promise != row.promise) {
-            (row.extreme, row.is_drawn) = ("none was tried".into(), false);
-            tried.push(row);
-        }
-    }
-    tried
 }
 
 /// What a check takes the inputs of a case from, and reports its errors to.
@@ -168,8 +205,8 @@ pub(super) struct Cases<'a> {
     taken: Option<Vec<(usize, usize)>>,
     /// The lists that the case has taken an item of.
     lists: usize,
-    /// One for each promise, at the extreme that is tried.
-    rows: Vec<Row>,
+    /// Of each promise, at the extreme that is tried.
+    seen: Vec<Seen>,
 }
 
 impl Cases<'_> {
@@ -178,26 +215,8 @@ impl Cases<'_> {
         (self.settings.draws as f64 * share).ceil().max(8.0) as u64
     }
 
-    fn run(&mut self, inputs: Inputs, check: Check) -> anyhow::Result<()> {
-        match inputs {
-            Listed => {
-                self.taken = Some(Vec::new());
-                while self.taken.is_some() {
-                    self.attempt(check)?;
-                    self.combine_anew();
-                }
-            }
-            Drawn(share) => {
-                for _ in 0..self.draws(share) {
-                    self.attempt(check)?;
-                }
-            }
-        }
-        Ok(())
-    }
-
     /// Runs a case; one that fails breaks the first promise, and the error stands for its input.
-    fn attempt(&mut self, check: Check) -> anyhow::Result<()> {
+    fn attempt(&mut self, check: &Check) -> anyhow::Result<()> {
         match check(self) {
             Err(e) if !e.is::<Interrupted>() => self.see(format_args!("{e:#}"), [f64::NAN]),
             done => done,
@@ -246,7 +265,9 @@ impl Cases<'_> {
     ) -> anyhow::Result<()> {
         for (promise, error) in errors.into_iter().enumerate() {
             if let Some(error) = error.into() {
-                self.rows[promise].see(input, error);
+                // The least of a number and NaN is the number.
+                let error = error.abs().min(f64::MAX);
+                self.seen[promise].add(1, error, || input.to_string());
             }
         }
         self.pause()
@@ -259,7 +280,7 @@ impl Cases<'_> {
         input: Arguments<'_>,
         is_kept: bool,
     ) -> anyhow::Result<()> {
-        self.rows[promise].see(input, if is_kept { 0.0 } else { 1.0 });
+        self.seen[promise].add(1, f64::from(!is_kept), || input.to_string());
         self.pause()
     }
 
@@ -280,53 +301,52 @@ mod tests {
         stability::{NAME, SETTINGS},
     };
 
-    static HALVING: Property = Property {
-        routine: "halving",
-        range: "any",
-        promises: &[("error", 320.0), ("other bits", 0.0), ("untried", 0.0)],
-        extremes: &[
-            ("listed", Listed, |cases| {
+    #[test]
+    fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
+        let mut halving = Property::new("halving", "any")
+            .promise("error", 320.0)
+            .promise("other bits", 0.0)
+            .promise("untried", 0.0)
+            .on("listed", Listed, |cases| {
                 // Which items there are may depend on what was taken before.
                 let first = cases.each(&[1, 2, 3]);
                 let second = cases.of(&[0, 1, 2][..first], |_| 9);
                 let number = 100 * first + 10 * second;
                 cases.see(format_args!("{number}"), [-(number as f64), 0.0])
-            }),
-            ("drawn", Drawn(0.1), |cases| {
+            })
+            .on("drawn", Drawn(0.1), |cases| {
                 let number = cases.of(&[1000], |rng| rng.random_range(0..10));
                 cases.see(format_args!("{number}"), [f64::from(number)])
-            }),
-            ("large", Listed, |cases| {
+            })
+            .on("large", Listed, |cases| {
                 cases.see(format_args!("4"), [Some(f64::NAN), None])
-            }),
-            ("failing", Listed, |_| anyhow::bail!("no memory")),
-        ],
-    };
-
-    #[test]
-    fn a_row_keeps_the_worst_of_all_combinations_and_no_number_is_worst_of_all() {
+            })
+            .on("failing", Listed, |_| anyhow::bail!("no memory"));
         let settings = flags::settings(NAME, SETTINGS, true);
         let progress = &mut Progress::new(1, GracefulShutdown::default());
         let rng = ChaCha8Rng::seed_from_u64(1);
-        let rows = tried(HALVING.rows(&settings, rng, progress).unwrap());
-        let seen = |row: &Row| (row.cases, row.worst, row.input.clone(), row.is_kept());
-        assert_eq!(
-            rows.iter().filter(|it| it.is_drawn).count(),
-            1,
-            "the third row"
-        );
+        let seen = halving.run(&settings, rng, progress).unwrap();
+        halving.add(seen.clone());
+        halving.add(seen);
+        let rows = halving.tried();
         let expected = [
-            (6, 320.0, "320".to_owned(), true),
-            (6, 0.0, String::new(), true),
-            (40, 9.0, "9".to_owned(), true),
-            (1, f64::MAX, "4".to_owned(), false),
-            (1, f64::MAX, "no memory".to_owned(), false),
-            (0, 0.0, String::new(), false),
+            ("listed", 12, 320.0, "320", true),
+            ("listed", 12, 0.0, "", true),
+            ("drawn", 80, 9.0, "9", true),
+            ("large", 2, f64::MAX, "4", false),
+            ("failing", 2, f64::MAX, "no memory", false),
+            ("none was tried", 0, 0.0, "", false),
         ];
-        assert_eq!(rows.iter().map(seen).collect::<Vec<_>>(), expected);
-        let mut both = rows.clone();
-        both[0].worst = 160.0;
-        merge(&mut both, rows);
-        assert_eq!((both.len(), both[0].cases, both[0].worst), (6, 12, 320.0));
+        for (row, expected) in rows.iter().zip(expected) {
+            let Seen {
+                cases,
+                worst,
+                input,
+            } = &row.seen;
+            let found = (&*row.extreme, *cases, *worst, &**input, row.is_kept());
+            assert_eq!(found, expected);
+            assert_eq!(row.is_drawn, row.extreme == "drawn");
+        }
+        assert_eq!(rows.len(), expected.len());
     }
 }

@@ -23,43 +23,31 @@ const RANGE: &str = "gradients within 1e15; lr 1e-30 to 1e38, beta 0 to 0.99999,
 const OF_WAY: &str = "a parameter, as a share of its way";
 
 const EQUAL: &str = "up to 120 equal gradients of 0, 1e-45, 1e-38, 1e-19, 1, 1e15; eps 1e-15, 1e-8, 1, 1e30; beta 0, 0.9, 0.99999";
-const LONG: &str = "{adam_steps} steps of eight patterns of gradients, 1e-40 to 1e15";
 const NUMBERS: &str = "step number 1, 2, 1000, 2^24, 2^31, 2^32, 2^33, 2^53, 2^64, and each less 1";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "Adam",
-        range: RANGE,
-        promises: &[
+pub(super) fn properties(settings: &Settings) -> Vec<Property> {
+    let steps = settings.adam_steps;
+    let long = format!("{steps} steps of eight patterns of gradients, 1e-40 to 1e15");
+    vec![
+        Property::new("Adam", RANGE)
             // Where f32 holds second moments, and where they are near the least that it holds.
-            (OF_WAY, STEP_ERROR / 10.0),
-            ("the same at the least second moments", STEP_ERROR),
-        ],
-        extremes: &[
-            (EQUAL, Listed, equal_gradients),
-            ("drawn, up to 120 gradients", Drawn(0.5), any_gradients),
-        ],
-    },
-    Property {
-        routine: "Adam",
-        range: RANGE,
-        promises: &[
-            (OF_WAY, MOMENTS_ERROR),
+            .promise(OF_WAY, STEP_ERROR / 10.0)
+            .promise("the same at the least second moments", STEP_ERROR)
+            .on(EQUAL, Listed, equal_gradients)
+            .on("drawn, up to 120 gradients", Drawn(0.5), any_gradients),
+        Property::new("Adam", RANGE)
+            .promise(OF_WAY, MOMENTS_ERROR)
             // Where half of its last place is below 0.4% of a step.
-            ("a parameter, all in", 2.0 * STEP_ERROR),
+            .promise("a parameter, all in", 2.0 * STEP_ERROR)
             // Of the decayed mean of sizes, while gradients last.
-            ("the first moment", moment_error(PRESET.beta1)),
-            ("the second moment", moment_error(PRESET.beta2)),
-        ],
-        extremes: &[(LONG, Listed, long_run)],
-    },
-    Property {
-        routine: "Adam",
-        range: RANGE,
-        promises: &[(OF_WAY, F32_STEP)],
-        extremes: &[(NUMBERS, Listed, step_number)],
-    },
-];
+            .promise("the first moment", moment_error(PRESET.beta1))
+            .promise("the second moment", moment_error(PRESET.beta2))
+            .on(&long, Listed, long_run),
+        Property::new("Adam", RANGE)
+            .promise(OF_WAY, F32_STEP)
+            .on(NUMBERS, Listed, step_number),
+    ]
+}
 
 /// A parameter that starts at 0 and its moments, as the rule steps them in f32, and in float64.
 #[derive(Clone, Copy, Default)]
@@ -90,17 +78,10 @@ impl Stepped {
 /// Takes step number `t` of each with its gradient.
 fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) {
     let rule = Rule::new(settings, t, 1.0);
-    let AdamSettings {
-        lr,
-        beta1,
-        beta2,
-        eps,
-    } = settings;
+    let (lr, eps) = (settings.lr, settings.eps);
+    let (beta1, beta2) = (settings.beta1, settings.beta2);
     // 1 - beta^t, which keeps its digits near beta = 1 and near t = 0.
-    let [first, second] = [beta1, beta2].map(|beta| match beta {
-        0.0 => 1.0,
-        _ => -(t as f64 * beta.ln()).exp_m1(),
-    });
+    let [first, second] = [beta1, beta2].map(|beta| -(t as f64 * beta.ln()).exp_m1());
     // Together, as the parameters of a tensor.
     let [mut p, mut m, mut v] =
         [0, 1, 2].map(|i| all.iter().map(|it| it.found[i]).collect::<Vec<_>>());
@@ -122,9 +103,9 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
 /// The error of one parameter after these gradients.
 fn error_after(settings: AdamSettings, gradients: &[f32]) -> f64 {
     let mut one = [Stepped::default()];
-    (1..)
-        .zip(gradients)
-        .for_each(|(t, &g)| step(settings, t, &mut one, &[g]));
+    for (t, &g) in (1..).zip(gradients) {
+        step(settings, t, &mut one, &[g]);
+    }
     one[0].error()
 }
 

@@ -14,32 +14,28 @@ const ROW_SUM_ERROR: f64 = 2.5e-7;
 const UNIFORM_ERROR: f64 = 3e-8;
 
 const COUNTS: &str = "2, 15, 60 actions, five uses of them; counts from 0, 2^24, 2^53, 1e299; decay 1, 0.999, 0.5, 1e-300; smoothing 1e-100, 1, 1e100";
-const UPDATES: &str = "2, 15 actions, five uses of them, {affinity_updates} updates; 255 actions, a hundredth as many";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "affinity, exact",
-        range: "counts below 1e300; decay above 0 and at most 1; smoothing 1e-100 to 1e100",
-        promises: &[
-            ("an entry, as a share of it", ENTRY_ERROR),
-            ("a row's sum, beside 1", ROW_SUM_ERROR),
-        ],
-        extremes: &[(COUNTS, Listed, exact)],
-    },
-    Property {
-        routine: "affinity, learned",
-        range: "any pairs of 1 to 255 actions",
-        promises: &[
-            ("a row's sum, beside 1, at any update", ROW_SUM_ERROR),
+pub(super) fn properties(settings: &Settings) -> Vec<Property> {
+    let counts = "counts below 1e300; decay above 0 and at most 1; smoothing 1e-100 to 1e100";
+    let updates = settings.affinity_updates;
+    let updates = format!(
+        "2, 15 actions, five uses of them, {updates} updates; 255 actions, a hundredth as many"
+    );
+    vec![
+        Property::new("affinity, exact", counts)
+            .promise("an entry, as a share of it", ENTRY_ERROR)
+            .promise("a row's sum, beside 1", ROW_SUM_ERROR)
+            .on(COUNTS, Listed, exact),
+        Property::new("affinity, learned", "any pairs of 1 to 255 actions")
+            .promise("a row's sum, beside 1, at any update", ROW_SUM_ERROR)
             // One pair says nothing of how actions follow each other.
-            ("an entry, beside 1 / actions", UNIFORM_ERROR),
-        ],
-        extremes: &[
-            (UPDATES, Listed, learned),
-            ("always the same action", Listed, learned_of_one_action),
-        ],
-    },
-];
+            .promise(
+                "always the same action: an entry, beside 1 / actions",
+                UNIFORM_ERROR,
+            )
+            .on(&updates, Listed, learned),
+    ]
+}
 
 /// As the preset has them.
 const LEARNED: LearnedSettings = LearnedSettings {
@@ -133,38 +129,24 @@ fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     cases.see(input, errors)
 }
 
-/// How many actions there are, an estimate of them, and the updates to make of it.
-fn untrained(cases: &mut Cases<'_>) -> anyhow::Result<(u8, AffinityEstimator, u64)> {
+fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let updates = cases.settings.affinity_updates;
     let (actions, updates) = cases.each(&[(2u8, updates), (15, updates), (255, updates / 100)]);
     let alphabet = Alphabet::raw(actions.into())?;
     let learned = LearnedAffinity::new(alphabet, LEARNED, &mut cases.rng)?;
-    Ok((actions, AffinityEstimator::Learned(learned), updates))
-}
-
-fn learned(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let (actions, mut estimate, updates) = untrained(cases)?;
+    let mut estimate = AffinityEstimator::Learned(learned);
     let (used, count, pair) = cases.each(&USES);
     for update in 1..=updates {
         let pairs = (0..count).map(|_| pair(actions, &mut cases.rng));
         let pairs: Vec<_> = pairs.collect();
         estimate.observe(&pairs, &mut cases.rng)?;
-        let error = row_sum_error(&estimate.matrix(), actions.into());
+        let matrix = estimate.matrix();
+        let row_sum = row_sum_error(&matrix, actions.into());
+        let is_last_of_one_pair = update == updates && used == "always the same";
+        let off = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
+        let uniform = is_last_of_one_pair.then(|| worst(matrix.iter().map(off)));
         let input = format_args!("{actions} actions, {used}, update {update}");
-        cases.see(input, [error])?;
+        cases.see(input, [Some(row_sum), uniform])?;
     }
     Ok(())
-}
-
-fn learned_of_one_action(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let (actions, mut estimate, updates) = untrained(cases)?;
-    let (_, count, pair) = USES[2];
-    let pairs = vec![pair(actions, &mut cases.rng); count];
-    for _ in 0..updates {
-        estimate.observe(&pairs, &mut cases.rng)?;
-        cases.pause()?;
-    }
-    let off = |&a: &f32| (f64::from(a) - 1.0 / f64::from(actions)).abs();
-    let error = worst(estimate.matrix().iter().map(off));
-    cases.see(format_args!("{actions} actions"), [None, Some(error)])
 }

@@ -4,20 +4,19 @@ use driml_learner::augment::{Augment, AugmentSettings, COLOUR_ERROR, CROP_ERROR,
 
 use crate::stability::property::*;
 
+const RANGE: &str =
+    "crops of a pixel and more; brightness, contrast and saturation 0 to 2, hue -0.5 to 0.5 turns";
 const STATES: &str = "states of 1 to 13 pixels a side, 1 to 4 frames in colour or grey; crops resized to the whole; the same states recoloured, factors and turns at the ends of their ranges and between, drawn";
 
-pub(super) const PROPERTIES: &[Property] = &[Property {
-    routine: "augmentation",
-    range: "crops of a pixel and more; brightness, contrast and saturation 0 to 2, hue -0.5 to 0.5 turns",
-    promises: &[
-        ("a byte of a crop", CROP_ERROR),
-        ("a recoloured byte", COLOUR_ERROR),
-    ],
-    extremes: &[
-        ("states and crops of the sizes of worlds", Listed, check),
-        (STATES, Drawn(0.5), check),
-    ],
-}];
+pub(super) fn properties() -> Vec<Property> {
+    vec![
+        Property::new("augmentation", RANGE)
+            .promise("a byte of a crop", CROP_ERROR)
+            .promise("a recoloured byte", COLOUR_ERROR)
+            .on("states and crops of the sizes of worlds", Listed, check)
+            .on(STATES, Drawn(0.5), check),
+    ]
+}
 
 /// States [height, width, stack * frame channels].
 struct Picture {

@@ -15,55 +15,41 @@ const LOGITS: &str =
 const GAPS: &str = "drawn; logits of -inf under targets of 0; targets sum to 0.5 to 1.5";
 const SPOILT: &str = "a logit infinite or not a number; the same under a target of 0, but for -inf; a target not a number";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "C51 projection",
-        range: "rewards any, infinite ones included; discounts 0 to 1; a support within 1e30",
-        promises: &[
+pub(super) fn properties() -> Vec<Property> {
+    let steps = "rewards any, infinite ones included; discounts 0 to 1; a support within 1e30";
+    vec![
+        Property::new("C51 projection", steps)
             // Of 1e-7 + 1e-15 N max|v| / width; none is negative.
-            ("a probability, as a share of `entry_error`", 1.0),
-            ("what a row sums to, before and after", MASS_ERROR),
-            ("rows that hide it, or change others' bits", 0.0),
-        ],
-        extremes: &[
-            (STEPS, Listed, projection),
-            ("drawn", Drawn(1.0), projection),
-            ("not a number in one row", Drawn(0.1), projection_of_nan),
-        ],
-    },
-    Property {
-        routine: "softmax",
-        range: "logits finite",
-        promises: &[("a probability, as a share of it", ENTRY_ERROR)],
-        extremes: &[(LOGITS, Listed, softmax), ("drawn", Drawn(1.0), softmax)],
-    },
-    Property {
-        routine: "C51 loss (KL)",
-        range: "logits finite; targets sum to 1",
-        promises: &[
+            .promise("a probability, as a share of `entry_error`", 1.0)
+            .promise("what a row sums to, before and after", MASS_ERROR)
+            .promise("rows that hide it, or change others' bits", 0.0)
+            .on(STEPS, Listed, projection)
+            .on("drawn", Drawn(1.0), projection)
+            .on("not a number in one row", Drawn(0.1), projection_of_nan),
+        Property::new("softmax", "logits finite")
+            .promise("a probability, as a share of it", ENTRY_ERROR)
+            .on(LOGITS, Listed, softmax)
+            .on("drawn", Drawn(1.0), softmax),
+        Property::new("C51 loss (KL)", "logits finite; targets sum to 1")
             // Of 10 + sum of target (max logit - logit).
-            ("the loss, as a share of its terms", KL_ERROR),
-            ("a slope, as a share of 6.1e-8 of it + 1e-15", 1.0),
-            ("cases in which the loss is finite all the same", 0.0),
-        ],
-        extremes: &[
-            (LOGITS, Listed, kl),
-            ("drawn", Drawn(1.0), kl),
-            (GAPS, Drawn(1.0), |cases| with_gaps(cases).see(cases)),
-            (SPOILT, Drawn(2.0), kl_of_a_spoilt_atom),
-        ],
-    },
-];
+            .promise("the loss, as a share of its terms", KL_ERROR)
+            .promise("a slope, as a share of 6.1e-8 of it + 1e-15", 1.0)
+            .promise("cases in which the loss is finite all the same", 0.0)
+            .on(LOGITS, Listed, kl)
+            .on("drawn", Drawn(1.0), |cases| {
+                Batch::drawn(&mut cases.rng).see(cases)
+            })
+            .on(GAPS, Drawn(1.0), |cases| {
+                with_gaps(&mut cases.rng).see(cases)
+            })
+            .on(SPOILT, Drawn(2.0), kl_of_a_spoilt_atom),
+    ]
+}
 
 /// Rows `probs` [B, N] with these rewards and discounts [B] on one support.
-fn projected(
-    probs: &[f32],
-    rewards: &[f32],
-    discounts: &[f32],
-    (low, high): (f32, f32),
-) -> Vec<f32> {
+fn projected(probs: &[f32], reward: &[f32], discount: &[f32], support: (f32, f32)) -> Vec<f32> {
     let mut out = vec![f32::NAN; probs.len()];
-    project(probs, rewards, discounts, low, high, &mut out);
+    project(probs, reward, discount, support.0, support.1, &mut out);
     out
 }
 
@@ -126,12 +112,11 @@ fn projection_of_nan(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         "discount" => discounts[1] = f32::NAN,
         _ => probs[atoms + rng.random_range(0..atoms)] = f32::NAN,
     }
-    let bad = projected(&probs, &rewards, &discounts, support);
+    let mut bad = projected(&probs, &rewards, &discounts, support);
     let shows = bad[atoms..2 * atoms].iter().any(|p| p.is_nan());
-    let mut others = (0..3 * atoms).filter(|at| at / atoms != 1);
-    let kept = shows && others.all(|at| good[at].to_bits() == bad[at].to_bits());
+    bad[atoms..2 * atoms].copy_from_slice(&good[atoms..2 * atoms]);
     let input = format_args!("{name}, {atoms} atoms on {support:?}");
-    cases.keeps(2, input, kept)
+    cases.keeps(2, input, shows && bits(&good) == bits(&bad))
 }
 
 fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
@@ -175,8 +160,8 @@ struct Batch {
 }
 
 impl Batch {
-    fn drawn(rows: usize, rng: &mut ChaCha8Rng) -> Self {
-        let atoms = rng.random_range(2..60);
+    fn drawn(rng: &mut ChaCha8Rng) -> Self {
+        let (rows, atoms) = (rng.random_range(1..4), rng.random_range(2..60));
         Self {
             atoms,
             logits: finites(rows * atoms, rng),
@@ -187,16 +172,16 @@ impl Batch {
         }
     }
 
-    fn kl(&self, slopes: &mut [f32]) -> f64 {
-        let weights = self.weights.as_deref();
-        c51::kl(&self.logits, &self.target, weights, self.atoms, slopes)
+    fn kl(&self) -> (f64, Vec<f32>) {
+        let (weights, mut slopes) = (self.weights.as_deref(), vec![f32::NAN; self.logits.len()]);
+        let loss = c51::kl(&self.logits, &self.target, weights, self.atoms, &mut slopes);
+        (loss, slopes)
     }
 
     /// Sees the errors of the loss and of its slopes.
     fn see(&self, cases: &mut Cases<'_>) -> anyhow::Result<()> {
         let rows = self.logits.len() / self.atoms;
-        let mut gradient = vec![f32::NAN; self.logits.len()];
-        let loss = self.kl(&mut gradient);
+        let (loss, gradient) = self.kl();
         let (mut terms, mut scale, mut slopes) = (Vec::new(), 0.0, Vec::new());
         for row in 0..rows {
             let weight = self.weights.as_ref().map_or(1.0, |it| f64::from(it[row]));
@@ -224,30 +209,28 @@ impl Batch {
 }
 
 fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let logits = cases.of(&LISTED_LOGITS, |_| Vec::new());
+    let logits = cases.each(&LISTED_LOGITS);
     let atoms = logits.len();
-    let batch = match cases.of(&["one-hot", "any"], |_| "drawn") {
-        "drawn" => Batch::drawn(cases.rng.random_range(1..4), &mut cases.rng),
-        kind => Batch {
-            atoms,
-            logits,
-            target: match kind {
-                "any" => law(atoms, &mut cases.rng),
-                _ => one_hot(atoms, atoms / 2),
-            },
-            weights: None,
-        },
+    let target = match cases.each(&["one-hot", "any"]) {
+        "any" => law(atoms, &mut cases.rng),
+        _ => one_hot(atoms, atoms / 2),
+    };
+    let batch = Batch {
+        atoms,
+        logits,
+        target,
+        weights: None,
     };
     batch.see(cases)
 }
 
 /// In the first row some atoms have no probability on either side, and the first always has one.
-fn with_gaps(cases: &mut Cases<'_>) -> Batch {
-    let mut batch = Batch::drawn(cases.rng.random_range(1..4), &mut cases.rng);
+fn with_gaps(rng: &mut ChaCha8Rng) -> Batch {
+    let mut batch = Batch::drawn(rng);
     batch.target[0] = 0.5;
-    let gap = cases.rng.random_range(1..batch.atoms);
+    let gap = rng.random_range(1..batch.atoms);
     for i in 1..batch.atoms {
-        if i == gap || cases.rng.random_bool(0.3) {
+        if i == gap || rng.random_bool(0.3) {
             (batch.logits[i], batch.target[i]) = (f32::NEG_INFINITY, 0.0);
         }
     }
@@ -256,8 +239,8 @@ fn with_gaps(cases: &mut Cases<'_>) -> Batch {
 
 /// What is not a number at one atom, be its target 0 or not, shows in the loss.
 fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let mut batch = with_gaps(cases);
     let rng = &mut cases.rng;
+    let mut batch = with_gaps(rng);
     let kind = rng.random_range(0..6);
     // The first atom's probability stays: without it nothing might be left.
     let at = rng.random_range(usize::from(kind >= 3)..batch.atoms);
@@ -267,9 +250,7 @@ fn kl_of_a_spoilt_atom(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         4 => (f32::NAN, 0.0),
         _ => (batch.logits[at], f32::NAN),
     };
-    let slopes = &mut vec![0.0; batch.logits.len()];
-    let loss = batch.kl(slopes);
     let (logit, target) = (batch.logits[at], batch.target[at]);
     let input = format_args!("logit {logit} under {target} at {at} of {}", batch.atoms);
-    cases.keeps(2, input, !loss.is_finite())
+    cases.keeps(2, input, !batch.kl().0.is_finite())
 }

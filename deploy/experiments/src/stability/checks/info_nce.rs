@@ -7,38 +7,29 @@ use driml_learner::losses::{
 
 use crate::stability::property::*;
 
-const RANGE: &str = "dot products finite; bounds 1e-30 to 1e30";
 const DOTS: &str =
     "dot products 0 to 3.4e38, bounds 1e-30, 1e-3, 1, 20, 1e9, 1e12, 1e15, 1e17, 1e30";
 const BATCHES: &str = "2, 3, 17, 256 rows; bounds 1e-30 to 1e30; dot products all 0, all 3.4e38, 1 to 1e4, 1e30; none, one, all rows valid";
 const NOT_FINITE: &str = "infinite or not a number in rows and columns that are not valid; of two valid rows infinite, beside 3.4e38, or not a number";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "soft clip",
-        range: RANGE,
-        promises: &[
-            ("a score, as a share of it", CLIP_ERROR),
-            ("its slope, as a share of `slope_error` times it", 1.0),
-        ],
-        extremes: &[(DOTS, Listed, clip), ("drawn", Drawn(5.0), clip)],
-    },
-    Property {
-        routine: "InfoNCE",
-        range: "dot products finite; bounds 1e-30 to 1e30; any rows valid",
-        promises: &[
-            ("the loss, as a share of 10 + the largest score", LOSS_ERROR),
+pub(super) fn properties() -> Vec<Property> {
+    let any_rows = "dot products finite; bounds 1e-30 to 1e30; any rows valid";
+    vec![
+        Property::new("soft clip", "dot products finite; bounds 1e-30 to 1e30")
+            .promise("a score, as a share of it", CLIP_ERROR)
+            .promise("its slope, as a share of `slope_error` times it", 1.0)
+            .on(DOTS, Listed, clip)
+            .on("drawn", Drawn(5.0), clip),
+        Property::new("InfoNCE", any_rows)
+            .promise("the loss, as a share of 10 + the largest score", LOSS_ERROR)
             // Of 1e-7 of it + 1e-15 + what the rounding of the largest score leaves open.
-            ("a slope, as a share of `slope_error`", 1.0),
-            ("cases with other bits, or that hide it", 0.0),
-        ],
-        extremes: &[
-            (BATCHES, Listed, loss),
-            ("drawn", Drawn(0.5), loss),
-            (NOT_FINITE, Drawn(0.1), loss_of_not_finite),
-        ],
-    },
-];
+            .promise("a slope, as a share of `slope_error`", 1.0)
+            .promise("cases with other bits, or that hide it", 0.0)
+            .on(BATCHES, Listed, loss)
+            .on("drawn", Drawn(0.5), loss)
+            .on(NOT_FINITE, Drawn(0.1), loss_of_not_finite),
+    ]
+}
 
 fn clip(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let bounds = [1e-30, 1e-3, 1.0, 20.0, 1e9, 1e12, 1e15, 1e17, 1e30];
@@ -79,8 +70,7 @@ impl Batch {
 
     fn bits(&self) -> (u64, Vec<u32>) {
         let (loss, slopes) = self.loss();
-        let slopes = slopes.iter().map(|slope| slope.to_bits());
-        (loss.to_bits(), slopes.collect())
+        (loss.to_bits(), bits(&slopes))
     }
 
     /// The rows that count.
@@ -127,19 +117,14 @@ fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let rows = cases.of(&[2usize, 3, 17, 256], |rng| rng.random_range(1..12));
     let bounds = [1e-30, 1e-3, 1.0, 20.0, 1e6, 1e15, 1e17, 1e30];
     let bound = cases.each(&bounds);
-    let dots = match cases.of(&["0", "3.4e38", "1", "1e4", "1e30"], |_| "drawn") {
-        "drawn" => {
-            let locations = cases.rng.random_range(1..3);
-            finites(locations * rows * rows, &mut cases.rng)
-        }
-        "0" => vec![0.0; rows * rows],
-        "3.4e38" => vec![f32::MAX; rows * rows],
-        scale => {
-            let scale: f32 = scale.parse()?;
-            let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;
-            (0..rows * rows).map(dot).collect()
-        }
-    };
+    let equal = [0.0, f32::MAX].map(|x| vec![x; rows * rows]);
+    let spread = [1.0, 1e4, 1e30].map(|scale| {
+        let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;
+        (0..rows * rows).map(dot).collect()
+    });
+    let dots = cases.of(&[&equal[..], &spread].concat(), |rng| {
+        finites(rng.random_range(1..3) * rows * rows, rng)
+    });
     let some = |count: usize| (0..rows).map(|row| u8::from(row < count)).collect();
     let valid = cases.of(&[some(0), some(1), some(rows)], |rng| -> Vec<u8> {
         (0..rows).map(|_| rng.random_bool(0.8).into()).collect()

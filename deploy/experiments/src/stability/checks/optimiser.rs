@@ -16,49 +16,30 @@ const NORMS: &str =
     "all 0, 1e-45, 1e-38, 1e20, 3.4e38; one of 3.4e38 among 1e-45; 10 and 131,000 of them";
 const MOVES: &str =
     "3 / tau moves towards a network that stands still; tau 0.95, 0.5, 0.005, 1e-3, 1e-4, 1e-5";
+const A_FEW_MOVES: &str = "drawn, up to 30 moves towards a network that moves";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "gradient norm",
-        range: "gradients finite",
-        promises: &[
-            ("the norm, as a share of it", NORM_ERROR),
-            ("cases not refused by the parameter's name", 0.0),
-        ],
-        extremes: &[
-            (NORMS, Listed, norm),
-            ("drawn", Drawn(0.05), norm),
-            ("one is infinite or not a number", Drawn(0.05), norm_of_none),
-        ],
-    },
-    Property {
-        routine: "clipping",
-        range: "max_grad_norm 1e-6 to 1e15; norms up to 8e37 times it",
-        promises: &[("share by which a norm is above the limit", 6.1e-8)],
-        extremes: &[
-            ("norms 0 to 3.4e38, limits 1e-6 to 1e15", Listed, clipping),
-            ("drawn, half of them near the limit", Drawn(10.0), clipping),
-        ],
-    },
-    Property {
-        routine: "target network",
-        range: "tau 1e-5 to 1; parameters within 1.7e38",
-        promises: &[
+pub(super) fn properties() -> Vec<Property> {
+    let limits = "max_grad_norm 1e-6 to 1e15; norms up to 8e37 times it";
+    vec![
+        Property::new("gradient norm", "gradients finite")
+            .promise("the norm, as a share of it", NORM_ERROR)
+            .promise("cases not refused by the parameter's name", 0.0)
+            .on(NORMS, Listed, norm)
+            .on("drawn", Drawn(0.05), norm)
+            .on("one is infinite or not a number", Drawn(0.05), norm_of_none),
+        Property::new("clipping", limits)
+            .promise("share by which a norm is above the limit", 6.1e-8)
+            .on("norms 0 to 3.4e38, limits 1e-6 to 1e15", Listed, clipping)
+            .on("drawn, half of them near the limit", Drawn(10.0), clipping),
+        Property::new("target network", "tau 1e-5 to 1; parameters within 1.7e38")
             // Of the largest that either ever was.
-            ("a parameter, as a share of `follow_error`", 1.0),
-            ("copies of other bits", 0.0),
-        ],
-        extremes: &[
-            (MOVES, Listed, followed_to_the_end),
-            (
-                "drawn, up to 30 moves towards a network that moves",
-                Drawn(0.02),
-                followed,
-            ),
-            ("tau 1, drawn", Drawn(0.02), copied),
-        ],
-    },
-];
+            .promise("a parameter, as a share of `follow_error`", 1.0)
+            .promise("copies of other bits", 0.0)
+            .on(MOVES, Listed, followed_to_the_end)
+            .on(A_FEW_MOVES, Drawn(0.02), followed)
+            .on("tau 1, drawn", Drawn(0.02), copied),
+    ]
+}
 
 /// Gradients with these values, one parameter after the other: those of the sum of each parameter times its value.
 fn gradients(config: &ModelConfig, values: &[f32]) -> anyhow::Result<Gradients> {
@@ -79,20 +60,16 @@ fn norm(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let len = small::len(&config);
     let mut one_large = vec![1e-45; len];
     one_large[len / 2] = f32::MAX;
-    let mut listed = [0.0, 1e-45, 1e-38, 0.1, 1e20, f32::MAX]
-        .map(|x| vec![x; len])
-        .to_vec();
-    listed.push(one_large);
+    let equal = [0.0, 1e-45, 1e-38, 0.1, 1e20, f32::MAX].map(|x| vec![x; len]);
+    let listed = [&equal[..], &[one_large]].concat();
     let values = cases.of(&listed, |rng| finites(len, rng));
     let norm = gradients(&config, &values)?.norm(Kernels::FUSED)?;
     // The largest value's size times the norm of the shares of it.
     let largest = f64::from(values.iter().fold(0.0f32, |most, x| most.max(x.abs())));
+    let squares = values.iter().map(|x| (f64::from(*x) / largest).powi(2));
     let error = match largest {
         0.0 => norm,
-        _ => {
-            let squares = values.iter().map(|x| (f64::from(*x) / largest).powi(2));
-            norm / (largest * exact_sum(squares).sqrt()) - 1.0
-        }
+        _ => norm / (largest * exact_sum(squares).sqrt()) - 1.0,
     };
     cases.see(format_args!("{}", Shown(&values)), [error])
 }
@@ -128,35 +105,30 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A target network; in f64 its parameters, and how large they or the online network's ever were.
+/// A target network of the smallest kind; in f64 its parameters, and how large they or the online network's ever were.
 struct Followed {
-    config: ModelConfig,
     target: Parameters,
     exact: Vec<(f64, f64)>,
 }
 
 impl Followed {
-    /// The smallest network, which takes eight of these parameters.
+    /// A network of eight of these parameters.
     fn new(target: &[f32]) -> anyhow::Result<Self> {
-        let config = small::least();
+        let exact = target.iter().map(|&x| (x.into(), x.abs().into()));
         Ok(Self {
-            target: small::parameters(&config, target)?,
-            exact: target.iter().map(|&x| (x.into(), x.abs().into())).collect(),
-            config,
+            target: small::parameters(&small::least(), target)?,
+            exact: exact.collect(),
         })
     }
 
     /// Moves so often towards these parameters.
     fn follow(&mut self, online: &[f32], tau: f64, moves: u64) -> anyhow::Result<()> {
-        let source = small::parameters(&self.config, online)?;
+        let source = small::parameters(&small::least(), online)?;
         for _ in 0..moves {
             follow(&self.target, &source, tau, Kernels::FUSED)?;
         }
         // All moves at once: what is left of the distance is (1 - tau)^moves.
-        let left = match tau {
-            1.0 => 0.0,
-            _ => (moves as f64 * (-tau).ln_1p()).exp(),
-        };
+        let left = (moves as f64 * (-tau).ln_1p()).exp();
         for ((exact, largest), online) in self.exact.iter_mut().zip(widened(online)) {
             *exact = online + left * (*exact - online);
             *largest = largest.max(online.abs());
@@ -166,11 +138,14 @@ impl Followed {
 
     /// The largest error, as a share of what is promised.
     fn error(&self, tau: f64) -> anyhow::Result<f64> {
-        let found = small::values(&self.config, &self.target)?;
-        let each = found.iter().zip(&self.exact);
-        Ok(worst(each.map(|(&found, (exact, largest))| {
-            (f64::from(found) - exact).abs() / largest.max(LEAST) / follow_error(tau)
-        })))
+        let found = small::values(&small::least(), &self.target)?;
+        let errors = found
+            .iter()
+            .zip(&self.exact)
+            .map(|(&found, (exact, largest))| {
+                (f64::from(found) - exact).abs() / largest.max(LEAST) / follow_error(tau)
+            });
+        Ok(worst(errors))
     }
 }
 
@@ -205,7 +180,7 @@ fn copied(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let mut network = Followed::new(&finites(10, &mut cases.rng))?;
     let online = finites(8, &mut cases.rng);
     network.follow(&online, 1.0, 1)?;
-    let found = small::values(&network.config, &network.target)?;
+    let found = small::values(&small::least(), &network.target)?;
     for (found, online) in found.iter().zip(&online) {
         let is_copied = found.to_bits() == online.to_bits();
         cases.keeps(1, format_args!("{online:e}"), is_copied)?;

@@ -7,56 +7,40 @@ use driml_model::{Precision, conv2d_relu, linear, relu};
 use crate::stability::property::*;
 
 const PRODUCT: &str = "a sum of products, as a share of the precision's `product_error` and floor";
-const PROMISES: &[(&str, f64)] = &[
-    (PRODUCT, 1.0),
-    (
-        "cases that hide it, or change other rows or later calls",
-        0.0,
-    ),
-];
-
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "products, f32",
-        range: "operands finite, the sum of their products' sizes below 3.4e38",
-        promises: PROMISES,
-        extremes: &extremes::<false>(),
-    },
-    Property {
-        routine: "products, bf16",
-        range: "operands within 3.38e38, the sum of their products' sizes below 3.3e38",
-        promises: PROMISES,
-        extremes: &extremes::<true>(),
-    },
-];
-
+const HIDDEN: &str = "cases that hide it, or change other rows or later calls";
 const SIZES: &str = "fully connected, results and gradients: operands of 0, 1e-45, 1e-40, 1e-38, 1e-20, 1, 1e17, one among others";
 const DRAWN: &str = "fully connected, results and gradients, drawn";
 const MAPS: &str = "convolution with ReLU, results and gradients, on floats and bytes, drawn";
 const PROCGEN: &str = "both at the sizes of Procgen's network, 32 images, and of DIM's heads";
 const SPOILT: &str = "one operand infinite or not a number, before and after ReLU";
 
-const fn extremes<const BF16: bool>() -> [(&'static str, Inputs, Check); 6] {
-    [
-        (SIZES, Listed, dense_of_sizes::<BF16>),
-        (DRAWN, Drawn(0.02), dense::<BF16>),
-        (MAPS, Drawn(0.02), convolution::<BF16>),
-        (PROCGEN, Listed, layers_of_procgen::<BF16>),
-        (SPOILT, Drawn(0.02), spoilt::<BF16>),
-        (
-            "products beyond 3.4e38, all of one sign",
-            Drawn(0.01),
-            infinite::<BF16>,
-        ),
-    ]
-}
+const BEYOND: &str = "products beyond 3.4e38, all of one sign";
 
-const fn precision<const BF16: bool>() -> Precision {
-    if BF16 {
-        Precision::Bf16
-    } else {
-        Precision::F32
-    }
+const EXTREMES: [(&str, Inputs, Check); 6] = [
+    (SIZES, Listed, dense_of_sizes),
+    (DRAWN, Drawn(0.02), dense),
+    (MAPS, Drawn(0.02), convolution),
+    (PROCGEN, Listed, layers_of_procgen),
+    (SPOILT, Drawn(0.02), spoilt),
+    (BEYOND, Drawn(0.01), infinite),
+];
+type Check = fn(&mut Cases<'_>, Precision) -> anyhow::Result<()>;
+
+pub(super) fn properties() -> Vec<Property> {
+    let finite = "operands finite, the sum of their products' sizes below 3.4e38";
+    let in_bf16 = "operands within 3.38e38, the sum of their products' sizes below 3.3e38";
+    let properties = [
+        (Precision::F32, Property::new("products, f32", finite)),
+        (Precision::Bf16, Property::new("products, bf16", in_bf16)),
+    ];
+    let properties = properties.into_iter().map(|(precision, mut property)| {
+        property = property.promise(PRODUCT, 1.0).promise(HIDDEN, 0.0);
+        for (extreme, inputs, check) in EXTREMES {
+            property = property.on(extreme, inputs, move |cases| check(cases, precision));
+        }
+        property
+    });
+    properties.collect()
 }
 
 /// Of Procgen's network and DIM's heads.
@@ -70,8 +54,6 @@ const LAYERS: [Layer; 6] = [
     Layer::of([32, 32, 64], [14, 4, 2]),
     Layer::of([32, 64, 64], [6, 3, 1]),
 ];
-/// No operand in bf16 is larger; beyond this it would be infinite.
-const BF16_MAX: f32 = 3.38e38;
 
 /// A fully connected layer, of one kernel without a side; or a convolution with ReLU of images [B, side, side, inputs].
 #[derive(Clone, Copy, Debug)]
@@ -105,13 +87,6 @@ impl Layer {
     fn drawn_dense(rng: &mut ChaCha8Rng) -> Self {
         let sizes = [40, 200, 40].map(|most| rng.random_range(1..most));
         Self::of(sizes, [0; 3])
-    }
-
-    fn drawn_convolution(rng: &mut ChaCha8Rng) -> Self {
-        let kernel = rng.random_range(1..5);
-        let sizes = [3, rng.random_range(1..6), rng.random_range(1..20)];
-        let side = kernel + rng.random_range(0..6);
-        Self::of(sizes, [side, kernel, rng.random_range(1..4)])
     }
 
     const fn is_convolution(&self) -> bool {
@@ -208,10 +183,15 @@ impl Layer {
     }
 
     /// Sees the errors on operands that are drawn; those of a convolution on bytes too.
-    fn see<const BF16: bool>(&self, cases: &mut Cases<'_>, draw: Draw<'_>) -> anyhow::Result<()> {
+    fn see(
+        &self,
+        cases: &mut Cases<'_>,
+        precision: Precision,
+        draw: Draw<'_>,
+    ) -> anyhow::Result<()> {
         let mut operands = self.operands(draw, &mut cases.rng)?;
         loop {
-            let error = self.error(&operands, precision::<BF16>())?;
+            let error = self.error(&operands, precision)?;
             let [x, w, ..] = &operands;
             let w = w.flatten_all()?.to_vec1()?;
             let input = format_args!("{self:?}, {:?}, w {}", x.dtype(), Shown(&w));
@@ -251,84 +231,91 @@ fn usual(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 }
 
 /// So large that no product of two leaves the finite numbers.
+const MODERATE: f32 = 1e17;
+
 fn moderate(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
-    clamped(count, 1e17, rng)
+    clamped(count, MODERATE, rng)
 }
 
-fn dense_of_sizes<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn dense_of_sizes(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let size = cases.each(&[0.0, 1e-45, 1e-40, 1e-38, 1e-20, 1.0, 1e17]);
     let other = cases.each(&[1e-40f32, 1e-20, 1.0, 1e17]);
     let layer = Layer::drawn_dense(&mut cases.rng);
     let mut sizes = [other, size].into_iter().cycle();
-    let mut draw = |count: usize, rng: &mut ChaCha8Rng| {
+    layer.see(cases, precision, &mut |count, rng| {
         let size = sizes.next().unwrap_or(size);
         usual(count, rng).into_iter().map(|x| x * size).collect()
-    };
-    layer.see::<BF16>(cases, &mut draw)
+    })
 }
 
-fn dense<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let most = if BF16 { BF16_MAX } else { f32::MAX };
+fn dense(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+    let most = match precision {
+        Precision::F32 => f32::MAX,
+        // A larger one would be infinite.
+        Precision::Bf16 => 3.38e38,
+    };
     let layer = Layer::drawn_dense(&mut cases.rng);
-    let mut draw = |count: usize, rng: &mut ChaCha8Rng| match rng.random_bool(0.7) {
-        true => moderate(count, rng),
-        false => clamped(count, most, rng),
-    };
-    layer.see::<BF16>(cases, &mut draw)
+    layer.see(cases, precision, &mut |count, rng| {
+        let is_moderate = rng.random_bool(0.7);
+        clamped(count, if is_moderate { MODERATE } else { most }, rng)
+    })
 }
 
-fn convolution<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let layer = Layer::drawn_convolution(&mut cases.rng);
-    layer.see::<BF16>(cases, &mut { moderate })
+fn convolution(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
+    let rng = &mut cases.rng;
+    let kernel = rng.random_range(1..5);
+    let sizes = [3, rng.random_range(1..6), rng.random_range(1..20)];
+    let side = kernel + rng.random_range(0..6);
+    let layer = Layer::of(sizes, [side, kernel, rng.random_range(1..4)]);
+    layer.see(cases, precision, &mut { moderate })
 }
 
-fn layers_of_procgen<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn layers_of_procgen(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let layer = cases.each(&LAYERS);
     let mut draw = cases.each(&[usual as fn(_, &mut _) -> _, moderate]);
-    layer.see::<BF16>(cases, &mut draw)
+    layer.see(cases, precision, &mut draw)
 }
 
-fn infinite<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn infinite(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let inputs = cases.rng.random_range(1..200);
     let large = finite(&mut cases.rng).abs().clamp(1e20, 1e38);
     let line = |x: f32| Tensor::full(x, (1, inputs), &Device::Cpu);
     let bias = Tensor::zeros(1, DType::F32, &Device::Cpu)?;
-    let y = linear(&line(large)?, &line(1e20)?, &bias, precision::<BF16>())?;
+    let y = linear(&line(large)?, &line(1e20)?, &bias, precision)?;
     let y = y.flatten_all()?.to_vec1::<f32>()?[0];
     let input = format_args!("{inputs} times {large:e} times 1e20: {y:e}");
     cases.keeps(1, input, !y.is_finite())
 }
 
 /// A row with a number that is none spoils itself, visibly, and nothing else.
-fn spoilt<const BF16: bool>(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+fn spoilt(cases: &mut Cases<'_>, precision: Precision) -> anyhow::Result<()> {
     let rng = &mut cases.rng;
     let mut layer = Layer::drawn_dense(rng);
     layer.rows += 1;
-    let mut positive = |count: usize, rng: &mut ChaCha8Rng| -> Vec<f32> {
-        (0..count).map(|_| rng.random_range(0.1f32..1.0)).collect()
-    };
-    let [clean, w, b, _] = layer.operands(&mut positive, rng)?;
+    let [clean, w, b, _] = layer.operands(
+        &mut |count, rng| (0..count).map(|_| rng.random_range(0.1..1.0)).collect(),
+        rng,
+    )?;
     let (bad, at) = (not_finite(rng), rng.random_range(0..clean.elem_count()));
     let mut x = clean.flatten_all()?.to_vec1::<f32>()?;
     x[at] = bad;
     let spoilt = Tensor::from_vec(x, clean.shape(), &Device::Cpu)?;
+    let first = at / layer.inputs * layer.outputs;
+    let own = first..first + layer.outputs;
     for with_relu in [false, true] {
-        let bits = |x: &Tensor| -> anyhow::Result<Vec<u32>> {
-            let y = linear(x, &w, &b, precision::<BF16>())?.flatten_all()?;
+        let results = |x: &Tensor| -> anyhow::Result<Vec<f32>> {
+            let y = linear(x, &w, &b, precision)?.flatten_all()?;
             let y = if with_relu { relu(&y)? } else { y };
-            Ok(y.to_vec1::<f32>()?.iter().map(|y| y.to_bits()).collect())
+            Ok(y.to_vec1()?)
         };
-        let (before, spoilt, after) = (bits(&clean)?, bits(&spoilt)?, bits(&clean)?);
-        let row = at / layer.inputs;
-        let own = row * layer.outputs..(row + 1) * layer.outputs;
+        let (before, mut spoilt, after) = (results(&clean)?, results(&spoilt)?, results(&clean)?);
         // The largest of 0 and -inf is 0.
         let may_hide = with_relu && bad == f32::NEG_INFINITY;
-        let is_finite = |y: &u32| f32::from_bits(*y).is_finite();
-        let shows = may_hide || !spoilt[own.clone()].iter().any(is_finite);
-        let mut others = (0..before.len()).filter(|at| !own.contains(at));
-        let kept = shows && before == after && others.all(|at| before[at] == spoilt[at]);
+        let shows = may_hide || !spoilt[own.clone()].iter().any(|y| y.is_finite());
+        spoilt[own.clone()].copy_from_slice(&before[own.clone()]);
+        let kept = [spoilt, after].iter().all(|it| bits(it) == bits(&before));
         let input = format_args!("{bad} at {at} of {layer:?}");
-        cases.keeps(1, input, kept)?;
+        cases.keeps(1, input, shows && kept)?;
     }
     Ok(())
 }

@@ -6,35 +6,36 @@ use driml_model::{Parameters, StoredAs};
 use crate::{small, stability::property::*};
 
 const NEAREST: &str = "weights not read as the nearest, ties to even, with their sign";
-const OF_WEIGHT: &str = "a weight, as a share of it";
 const ALL: &str = "every number of the type, the middles between them and the floats beside those";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "f32 weights",
-        range: "as published (learner.publish_dtype); finite",
-        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F32.error())],
-        extremes: &[("drawn", Drawn(0.005), |cases| any(cases, StoredAs::F32))],
-    },
-    Property {
-        routine: "f16 weights",
-        range: "as published (learner.publish_dtype); within 65,504",
-        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::F16.error())],
-        extremes: &[
-            (ALL, Listed, |cases| all(cases, StoredAs::F16)),
-            ("drawn", Drawn(0.005), |cases| any(cases, StoredAs::F16)),
-        ],
-    },
-    Property {
-        routine: "bf16 weights",
-        range: "as published (learner.publish_dtype); within 3.3895e38",
-        promises: &[(NEAREST, 0.0), (OF_WEIGHT, StoredAs::Bf16.error())],
-        extremes: &[
-            (ALL, Listed, |cases| all(cases, StoredAs::Bf16)),
-            ("drawn", Drawn(0.005), |cases| any(cases, StoredAs::Bf16)),
-        ],
-    },
-];
+pub(super) fn properties() -> Vec<Property> {
+    let of = |routine, range, stored: StoredAs| {
+        let property = Property::new(routine, range)
+            .promise(NEAREST, 0.0)
+            .promise("a weight, as a share of it", stored.error());
+        let property = match stored {
+            StoredAs::F32 => property,
+            _ => property.on(ALL, Listed, move |cases| {
+                see(cases, stored, &turning_points(stored))
+            }),
+        };
+        property.on("drawn", Drawn(0.005), move |cases| {
+            let count = cases.rng.random_range(1..4096);
+            let values = clamped(count, stored.largest(), &mut cases.rng);
+            see(cases, stored, &values)
+        })
+    };
+    let [f32, f16, bf16] = [
+        "as published (learner.publish_dtype); finite",
+        "as published (learner.publish_dtype); within 65,504",
+        "as published (learner.publish_dtype); within 3.3895e38",
+    ];
+    vec![
+        of("f32 weights", f32, StoredAs::F32),
+        of("f16 weights", f16, StoredAs::F16),
+        of("bf16 weights", bf16, StoredAs::Bf16),
+    ]
+}
 
 /// Scalars a row of the head's weight that carries the values.
 const HIDDEN: usize = 256;
@@ -47,11 +48,8 @@ fn step_at(stored: StoredAs, x: f32) -> f64 {
         StoredAs::F16 => (11, -14),
         StoredAs::Bf16 => (8, -126),
     };
-    let mut exponent = least;
-    while f64::from(x.abs()) >= 2f64.powi(exponent + 1) {
-        exponent += 1;
-    }
-    2f64.powi(exponent - bits + 1)
+    let exponent = (x.abs().to_bits() >> 23) as i32 - 127;
+    2f64.powi(exponent.max(least) - bits + 1)
 }
 
 /// The nearest number of the type, ties to even.
@@ -89,36 +87,7 @@ fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Resul
         let scale = f64::from(x.abs().max(stored.least_normal()));
         let error = (f64::from(found) - f64::from(x)) / scale;
         let input = format_args!("{x:e} became {found:e}");
-        cases.keeps(0, input, is_nearest)?;
-        cases.see(input, [None, Some(error)])?;
+        cases.see(input, [f64::from(!is_nearest), error])?;
     }
     Ok(())
-}
-
-fn all(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
-    see(cases, stored, &turning_points(stored))
-}
-
-fn any(cases: &mut Cases<'_>, stored: StoredAs) -> anyhow::Result<()> {
-    let count = cases.rng.random_range(1..4096);
-    let values = clamped(count, stored.largest(), &mut cases.rng);
-    see(cases, stored, &values)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_reference_rounds_as_the_types_do() {
-        let ulp = |at: i32| 2f32.powi(at);
-        assert_eq!(nearest(StoredAs::F16, 1.0 + ulp(-11)), 1.0, "a tie");
-        assert_eq!(
-            nearest(StoredAs::F16, 1.0 + 3.0 * ulp(-11)),
-            1.0 + 2f64.powi(-9)
-        );
-        assert_eq!(nearest(StoredAs::Bf16, 1.0 + ulp(-8)), 1.0);
-        assert_eq!(nearest(StoredAs::F16, 4e-8), 2f64.powi(-24));
-        assert_eq!(turning_points(StoredAs::F16).len(), 2 * (4 * 0x7bff + 1));
-    }
 }

@@ -17,15 +17,15 @@ const UPDATES_APART: f64 = 2e-4;
 
 const UPDATES: &str = "our kernels beside candle's operations: initial weights times 1e-6 to 100; returns 0 to 3e38; supports 1e-3 to 2e30 wide; tanh_clip 1e-30 to 1e30; one state, four or all that differ, equal ones computed each and once";
 
-pub(super) const PROPERTIES: &[Property] = &[Property {
-    routine: "whole update",
-    range: "f32; weights, returns and supports of any size whose losses are finite",
-    promises: &[
-        ("the loss, as a share of 1 + loss", UPDATES_APART),
-        ("gradients, as a share of their norm, median", UPDATES_APART),
-    ],
-    extremes: &[(UPDATES, Listed, check)],
-}];
+pub(super) fn properties() -> Vec<Property> {
+    let finite = "f32; weights, returns and supports of any size whose losses are finite";
+    vec![
+        Property::new("whole update", finite)
+            .promise("the loss, as a share of 1 + loss", UPDATES_APART)
+            .promise("gradients, as a share of their norm, median", UPDATES_APART)
+            .on(UPDATES, Listed, check),
+    ]
+}
 
 const ACTIONS: usize = 4;
 
@@ -94,12 +94,59 @@ impl Setting {
         }
     }
 
-    /// Initial weights times the scale.
-    fn weights(&self, model: &ModelConfig, rng: &mut ChaCha8Rng) -> anyhow::Result<Parameters> {
-        let drawn = Parameters::init(model, rng, &Device::Cpu)?;
-        let mut values = small::values(model, &drawn)?;
-        values.iter_mut().for_each(|value| *value *= self.scale);
-        Ok(small::parameters(model, &values)?)
+    /// Two agents of one network, which has initial weights times the scale: with our kernels, and with candle's.
+    fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
+        let settings = self.learner()?;
+        let model = self.model(&settings);
+        let mut weights = || -> anyhow::Result<Parameters> {
+            let drawn = Parameters::init(&model, rng, &Device::Cpu)?;
+            let mut values = small::values(&model, &drawn)?;
+            values.iter_mut().for_each(|value| *value *= self.scale);
+            Ok(small::parameters(&model, &values)?)
+        };
+        let (online, target) = (weights()?, weights()?.without_dim()?);
+        let agent = |compute: &Compute| -> anyhow::Result<Agent> {
+            let parameters = NetworkParameters {
+                online: online.copy()?,
+                target: target.copy()?,
+                key: None,
+            };
+            let (model, settings) = (model.clone(), settings.clone());
+            let agent = Agent::from_parameters(model, settings, compute, parameters);
+            Ok(agent?)
+        };
+        Ok([agent(&Compute::CPU)?, agent(&REFERENCE)?])
+    }
+
+    fn batch(&self, state_len: usize, rng: &mut ChaCha8Rng) -> OwnedBatch {
+        let rows = rng.random_range(2..24);
+        let distinct = self.distinct.min(3 * rows);
+        let state = |_| (0..state_len).map(|_| rng.random()).collect();
+        let states: Vec<Vec<u8>> = (0..distinct).map(state).collect();
+        let any_states = |rng: &mut ChaCha8Rng| {
+            let each = (0..rows).map(|_| &states[rng.random_range(0..distinct)][..]);
+            each.collect::<Vec<_>>().concat()
+        };
+        let actions = |none: f64, rng: &mut ChaCha8Rng| {
+            let action = |_| match rng.random_bool(none) {
+                true => NO_ACTION,
+                false => rng.random_range(0..ACTIONS as u8),
+            };
+            (0..rows).map(action).collect()
+        };
+        OwnedBatch {
+            states_t: any_states(rng),
+            states_k: any_states(rng),
+            states_n: any_states(rng),
+            action: actions(0.0, rng),
+            next_action: actions(0.1, rng),
+            n_step_return: (0..rows)
+                .map(|_| self.returns * rng.random_range(-1.0..1.0))
+                .collect(),
+            bootstrap_discount: (0..rows).map(|_| one_of(&[0.0, 0.93, 1.0], rng)).collect(),
+            positive_valid: (0..rows).map(|_| rng.random_bool(0.8).into()).collect(),
+            ..OwnedBatch::default()
+        }
     }
 }
 
@@ -107,50 +154,8 @@ impl Setting {
 /// gradients together, as a share of their norm; none of the gradient where of two values that are nearly the same another is the
 /// larger, after which the target is another too.
 fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Option<f64>)> {
-    let settings = setting.learner()?;
-    let model = setting.model(&settings);
-    let online = setting.weights(&model, rng)?;
-    let target = setting.weights(&model, rng)?.without_dim()?;
-    let agent = |compute: &Compute| -> anyhow::Result<Agent> {
-        let parameters = NetworkParameters {
-            online: online.copy()?,
-            target: target.copy()?,
-            key: None,
-        };
-        let (model, settings) = (model.clone(), settings.clone());
-        Ok(Agent::from_parameters(
-            model, settings, compute, parameters,
-        )?)
-    };
-    let (mut agent, reference) = (agent(&Compute::CPU)?, agent(&REFERENCE)?);
-    let rows = rng.random_range(2..24);
-    let distinct = setting.distinct.min(3 * rows);
-    let state = |_| (0..model.frame_len()).map(|_| rng.random()).collect();
-    let states: Vec<Vec<u8>> = (0..distinct).map(state).collect();
-    let any_states = |rng: &mut ChaCha8Rng| {
-        let each = (0..rows).map(|_| &states[rng.random_range(0..distinct)][..]);
-        each.collect::<Vec<_>>().concat()
-    };
-    let actions = |none: f64, rng: &mut ChaCha8Rng| {
-        let action = |_| match rng.random_bool(none) {
-            true => NO_ACTION,
-            false => rng.random_range(0..ACTIONS as u8),
-        };
-        (0..rows).map(action).collect()
-    };
-    let batch = OwnedBatch {
-        states_t: any_states(rng),
-        states_k: any_states(rng),
-        states_n: any_states(rng),
-        action: actions(0.0, rng),
-        next_action: actions(0.1, rng),
-        n_step_return: (0..rows)
-            .map(|_| setting.returns * rng.random_range(-1.0..1.0))
-            .collect(),
-        bootstrap_discount: (0..rows).map(|_| one_of(&[0.0, 0.93, 1.0], rng)).collect(),
-        positive_valid: (0..rows).map(|_| rng.random_bool(0.8).into()).collect(),
-        ..OwnedBatch::default()
-    };
+    let [mut agent, reference] = setting.agents(rng)?;
+    let batch = setting.batch(agent.model().frame_len(), rng);
     let (mut losses, mut gradients) = (Vec::new(), Vec::new());
     for deduplicate in [false, true] {
         agent = agent.with_deduplication(deduplicate);

@@ -13,35 +13,24 @@ use crate::{small, stability::property::*};
 const LOGITS: &str = "2, 51, 1,001 atoms; supports from 0, far from 0 ([1e6, 1e6 + 1], [1000, 1001]), 1 ulp and 2e30 wide; logits equal, +-1e38, one -inf";
 const TOO_LARGE: &str = "weights that take a value beyond 3.4e38 in some rows of a batch";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "Q-value",
-        range: "the expected return; logits finite, or some of them -inf; a support within 1e30",
-        promises: &[
+pub(super) fn properties() -> Vec<Property> {
+    let values = "the expected return; logits finite, or some of them -inf; a support within 1e30";
+    vec![
+        Property::new("Q-value", values)
             // Beside the value's own last place; never beyond the support.
-            ("a value, as a share of the width", EXPECTED_RETURN_ERROR),
-        ],
-        extremes: &[
-            (LOGITS, Listed, expected),
-            ("drawn, some logits -inf", Drawn(0.05), expected),
-        ],
-    },
-    Property {
-        routine: "greedy action",
-        range: "weights finite; 1 to 255 actions",
-        promises: &[
+            .promise("a value, as a share of the width", EXPECTED_RETURN_ERROR)
+            .on(LOGITS, Listed, expected)
+            .on("drawn, some logits -inf", Drawn(0.05), expected),
+        Property::new("greedy action", "weights finite; 1 to 255 actions")
             // Whose f32 may be the same.
-            ("how far its value is below the largest", F32_STEP),
-            ("actions of which a lower one has the same logits", 0.0),
-            ("rows beyond the finite numbers not refused by number", 0.0),
-        ],
-        extremes: &[
-            ("logits all 1e38, all -1e38, all 0", Listed, greedy),
-            ("drawn logits, some of them equal", Drawn(0.05), greedy),
-            (TOO_LARGE, Drawn(0.05), too_large),
-        ],
-    },
-];
+            .promise("how far its value is below the largest", F32_STEP)
+            .promise("actions of which a lower one has the same logits", 0.0)
+            .promise("rows beyond the finite numbers not refused by number", 0.0)
+            .on("logits all 1e38, all -1e38, all 0", Listed, greedy)
+            .on("drawn logits, some of them equal", Drawn(0.05), greedy)
+            .on(TOO_LARGE, Drawn(0.05), too_large),
+    ]
+}
 
 /// Rows of logits at which an expectation may go wrong.
 fn listed_logits(atoms: usize) -> Vec<Vec<f32>> {
@@ -58,18 +47,18 @@ fn listed_logits(atoms: usize) -> Vec<Vec<f32>> {
 fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let atoms = cases.of(&[2usize, 51, 1001], |rng| rng.random_range(2..120));
     let support = cases.of(&SUPPORTS, support);
-    let rows = cases.of(&[listed_logits(atoms)], |rng| {
-        let rows = (0..20).map(|row| {
-            let mut logits = finites(atoms, rng);
-            let kept = rng.random_range(0..atoms);
-            for (atom, logit) in logits.iter_mut().enumerate() {
-                if row % 2 == 1 && atom != kept && rng.random_bool(0.2) {
-                    *logit = f32::NEG_INFINITY;
-                }
+    let drawn = |rng: &mut ChaCha8Rng, row: usize| {
+        let mut logits = finites(atoms, rng);
+        let kept = rng.random_range(0..atoms);
+        for (atom, logit) in logits.iter_mut().enumerate() {
+            if row % 2 == 1 && atom != kept && rng.random_bool(0.2) {
+                *logit = f32::NEG_INFINITY;
             }
-            logits
-        });
-        rows.collect()
+        }
+        logits
+    };
+    let rows = cases.of(&[listed_logits(atoms)], |rng| {
+        (0..20).map(|row| drawn(rng, row)).collect()
     });
     let config = small::config(atoms, 1, support);
     let rng = &mut ChaCha8Rng::seed_from_u64(0);
