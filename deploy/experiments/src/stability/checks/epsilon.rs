@@ -6,12 +6,14 @@ use crate::stability::property::*;
 
 const FRAMES: &str = "decay over 0, 1, 1e5, 1e10, 2^32, 2^53, 2^64 - 1 frames, from before the first to after the last";
 
-pub(super) const PROPERTIES: &[Property] = &[Property {
-    routine: "epsilon",
-    range: "any counts of frames; start and end 0 to 1",
-    promises: &[("epsilon; never back or beyond its ends", Schedule::ERROR)],
-    extremes: &[(FRAMES, Listed, epsilon), ("drawn", Drawn(1.0), epsilon)],
-}];
+pub(super) fn properties() -> Vec<Property> {
+    vec![
+        Property::new("epsilon", "any counts of frames; start and end 0 to 1")
+            .promise("epsilon; never back or beyond its ends", Schedule::ERROR)
+            .on(FRAMES, Listed, epsilon)
+            .on("drawn", Drawn(1.0), epsilon),
+    ]
+}
 
 /// Of any size.
 fn count(rng: &mut ChaCha8Rng) -> u64 {

@@ -15,21 +15,26 @@ mod stored;
 mod update;
 mod values;
 
-use super::property::Property;
+use super::property::{Property, Settings};
 
 /// All properties, in the order of the page. A share of what is below 1.2e-38 is one of that.
-pub(super) const TABLE: [&[Property]; 13] = [
-    c51::PROPERTIES,
-    values::PROPERTIES,
-    info_nce::PROPERTIES,
-    optimiser::PROPERTIES,
-    adam::PROPERTIES,
-    products::PROPERTIES,
-    update::PROPERTIES,
-    augment::PROPERTIES,
-    stored::PROPERTIES,
-    affinity::PROPERTIES,
-    sampling::PROPERTIES,
-    replay::PROPERTIES,
-    epsilon::PROPERTIES,
-];
+pub(super) fn table(settings: &Settings) -> Vec<Property> {
+    [
+        c51::properties(),
+        values::properties(),
+        info_nce::properties(),
+        optimiser::properties(),
+        adam::properties(settings),
+        products::properties(),
+        update::properties(),
+        augment::properties(),
+        stored::properties(),
+        affinity::properties(settings),
+        sampling::properties(),
+        replay::properties(),
+        epsilon::properties(),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
+}

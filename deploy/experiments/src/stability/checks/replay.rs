@@ -1,7 +1,7 @@
 //! N-step returns and discounts, as a replay's batches have them.
 
 use driml_protocol::{
-    ActorJoin, Chunk, ChunkHeader, End, Horizon, InsertReply, RunSpec, Sampling, TimeoutRule,
+    ActorJoin, Chunk, ChunkHeader, End, InsertReply, RunSpec, Sampling, TimeoutRule,
 };
 use driml_replay_server::{Config, RETURN_ERROR, Replay, return_sum_error};
 
@@ -9,31 +9,22 @@ use crate::stability::property::*;
 
 const REWARDS: &str = "rewards 0, 1e-45, +-1e30 that cancel, 3.4e38 / n; n 1, 7, 1,000; gamma 0, 1e-320, 0.5, 0.99, 1 - 1e-12, 1";
 
-pub(super) const PROPERTIES: &[Property] = &[Property {
-    routine: "n-step return",
-    range: "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1",
-    promises: &[
-        // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
-        ("return or discount, as a share of its bound", 1.0),
-    ],
-    extremes: &[(REWARDS, Listed, returns), ("drawn", Drawn(0.1), returns)],
-}];
+pub(super) fn properties() -> Vec<Property> {
+    let terms = "rewards within 3.4e38 / n; n 1 to 1,000; gamma 0 to 1";
+    vec![
+        Property::new("n-step return", terms)
+            // Of 6.1e-8 of it + 2.2e-16 n of the terms' sizes; never infinite.
+            .promise("return or discount, as a share of its bound", 1.0)
+            .on(REWARDS, Listed, returns)
+            .on("drawn", Drawn(0.1), returns),
+    ]
+}
 
 /// Of a world whose frames are the number of their step.
-pub(super) fn spec(n_step: u32, gamma: f64, timeout: TimeoutRule) -> RunSpec {
+pub(super) fn spec() -> RunSpec {
     RunSpec {
-        world: "counter".into(),
-        agent: "c51".into(),
-        seed: 1,
-        frame_height: 1,
         frame_width: 4,
-        frame_channels: 1,
-        frame_stack: 1,
-        num_actions: 2,
-        n_step,
-        gamma,
-        horizon: Horizon::None {},
-        timeout,
+        ..RunSpec::smallest()
     }
 }
 
@@ -80,34 +71,25 @@ pub(super) fn number(state: &[u8]) -> usize {
     u32::from_le_bytes([state[0], state[1], state[2], state[3]]) as usize
 }
 
-/// One replay's steps.
-struct Stream {
-    n: usize,
-    gamma: f64,
-    timeout: TimeoutRule,
-    steps: Vec<(f32, End)>,
-}
-
-impl Stream {
-    /// Return of the row at step `t`, the sum of its terms' sizes, and its discount.
-    fn expected(&self, t: usize) -> (f64, f64, f64) {
-        let (mut terms, mut follows) = (Vec::new(), Some(self.n));
-        for (i, (reward, end)) in self.steps[t..].iter().take(self.n).enumerate() {
-            if *end == End::TimedOut && self.timeout == TimeoutRule::Bootstrap {
-                follows = Some(i);
-                break;
-            }
-            terms.push(self.gamma.powi(i as i32) * f64::from(*reward));
-            if end.is_episode_end() {
-                follows = None;
-                break;
-            }
+/// Return of the row at the first of these steps, the sum of its terms' sizes, and its discount.
+fn expected(spec: &RunSpec, steps: &[(f32, End)]) -> (f64, f64, f64) {
+    let n = spec.n_step as usize;
+    let (mut terms, mut follows) = (Vec::new(), Some(n));
+    for (i, (reward, end)) in steps.iter().take(n).enumerate() {
+        if *end == End::TimedOut && spec.timeout == TimeoutRule::Bootstrap {
+            follows = Some(i);
+            break;
         }
-        let largest = f64::from(f32::MAX);
-        let sizes = exact_sum(terms.iter().map(|term| term.abs()));
-        let discount = follows.map_or(0.0, |i| self.gamma.powi(i as i32));
-        (exact_sum(terms).clamp(-largest, largest), sizes, discount)
+        terms.push(spec.gamma.powi(i as i32) * f64::from(*reward));
+        if end.is_episode_end() {
+            follows = None;
+            break;
+        }
     }
+    let largest = f64::from(f32::MAX);
+    let sizes = exact_sum(terms.iter().map(|term| term.abs()));
+    let discount = follows.map_or(0.0, |i| spec.gamma.powi(i as i32));
+    (exact_sum(terms).clamp(-largest, largest), sizes, discount)
 }
 
 fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
@@ -122,32 +104,31 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let count = cases.of(&[2 * n + 40], |rng| n + rng.random_range(17..60));
     let likely = cases.of(&[0.5 / n as f64], |rng| rng.random_range(0.0..0.2));
     let most = f32::MAX / n as f32;
-    let patterns: [&[f32]; 5] = [
-        &[0.0],
-        &[1e-45],
-        &[1e30, 1.0, -1e30],
-        &[most],
-        &[-most, most],
+    let patterns = [
+        vec![0.0],
+        vec![1e-45],
+        vec![1e30, 1.0, -1e30],
+        vec![most],
+        vec![-most, most],
     ];
-    let repeated = patterns.map(|it| it.iter().copied().cycle().take(count).collect());
+    let repeated = patterns.map(|it| it.into_iter().cycle().take(count).collect());
     let rewards: Vec<f32> = cases.of(&repeated, |rng| clamped(count, most, rng));
-    let ends = (0..count).map(|_| match cases.rng.random_bool(likely) {
-        true => one_of(
-            &[End::Terminal, End::TimedOut, End::LevelChange],
-            &mut cases.rng,
-        ),
+    let ends = [End::Terminal, End::TimedOut, End::LevelChange];
+    let end = |_| match cases.rng.random_bool(likely) {
+        true => one_of(&ends, &mut cases.rng),
         false => End::Running,
-    });
-    let stream = Stream {
-        n,
-        gamma,
-        timeout,
-        steps: rewards.into_iter().zip(ends).collect(),
     };
+    let ends = (0..count).map(end);
+    let steps: Vec<_> = rewards.into_iter().zip(ends).collect();
 
     let rows = 16;
-    let spec = spec(n as u32, gamma, timeout);
-    let mut replay = replay(&spec, Sampling::default(), rows, &stream.steps)?;
+    let spec = RunSpec {
+        n_step: n as u32,
+        gamma,
+        timeout,
+        ..spec()
+    };
+    let mut replay = replay(&spec, Sampling::default(), rows, &steps)?;
     // An episode may have ended nowhere in reach.
     let Ok(batch) = replay.sample(rows) else {
         return Ok(());
@@ -156,11 +137,10 @@ fn returns(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let found = found.zip(batch.bootstrap_discounts());
     for (state, (found, discount)) in batch.states_t().chunks_exact(4).zip(found) {
         let t = number(state);
-        let (expected, sizes, expected_discount) = stream.expected(t);
+        let (expected, sizes, expected_discount) = expected(&spec, &steps[t..]);
         let allowed = RETURN_ERROR * expected.abs().max(LEAST) + return_sum_error(n) * sizes;
         let of_return = (f64::from(found) - expected).abs() / allowed;
-        let allowed = RETURN_ERROR * expected_discount.max(LEAST);
-        let of_discount = (f64::from(discount) - expected_discount).abs() / allowed;
+        let of_discount = off(discount, expected_discount) / RETURN_ERROR;
         let input = format_args!("n = {n}, gamma = {gamma:e}, the row at {t}: {found:e}");
         cases.see(input, [of_return.max(of_discount)])?;
     }

@@ -2,9 +2,7 @@
 
 use anyhow::Context;
 use driml_learner::importance::{WEIGHT_ERROR, importance_weights};
-use driml_protocol::{
-    AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling, TimeoutRule,
-};
+use driml_protocol::{AffinityUpdate, End, PriorityPart, PriorityUpdate, RunSpec, Sampling};
 use driml_replay_server::{
     CHANCE_ERROR, PRIORITY_MIN, Replay,
     horizon::{
@@ -28,41 +26,25 @@ const PRIORITIES: &str =
 const CHANCES: &str =
     "2 to 64 rows, chances 1.2e-38 to 1 and equal ones, beta 0, 1 and between, drawn";
 
-pub(super) const PROPERTIES: &[Property] = &[
-    Property {
-        routine: "k by NHG",
-        range: "A 0 to 1; k_max 1 to 1,000",
-        promises: &[
-            ("the probability of a step, beside A", GO_ON_ERROR),
-            ("chi-square of k, in deviations", DEVIATIONS),
-        ],
-        extremes: &[
-            (EVERY, Listed, probability_of_a_step),
-            (WALKS, Listed, law_of_k),
-        ],
-    },
-    Property {
-        routine: "prioritised draw",
-        range: "priorities, which are C51 losses, 0 to 3.4e38; alpha 0 to 1",
-        promises: &[
-            ("a row's chance, as a share of it", CHANCE_ERROR),
-            ("chi-square of the draws, in deviations", DEVIATIONS),
-        ],
-        extremes: &[
-            (PRIORITIES, Listed, prioritised),
-            ("drawn", Drawn(0.01), prioritised),
-        ],
-    },
-    Property {
-        routine: "importance weight",
-        range: "chances 1.2e-38 to 1; beta 0 to 1",
-        promises: &[
+pub(super) fn properties() -> Vec<Property> {
+    let priorities = "priorities, which are C51 losses, 0 to 3.4e38; alpha 0 to 1";
+    vec![
+        Property::new("k by NHG", "A 0 to 1; k_max 1 to 1,000")
+            .promise("the probability of a step, beside A", GO_ON_ERROR)
+            .promise("chi-square of k, in deviations", DEVIATIONS)
+            .on(EVERY, Listed, probability_of_a_step)
+            .on(WALKS, Listed, law_of_k),
+        Property::new("prioritised draw", priorities)
+            .promise("a row's chance, as a share of it", CHANCE_ERROR)
+            .promise("chi-square of the draws, in deviations", DEVIATIONS)
+            .on(PRIORITIES, Listed, prioritised)
+            .on("drawn", Drawn(0.01), prioritised),
+        Property::new("importance weight", "chances 1.2e-38 to 1; beta 0 to 1")
             // The least likely row's is 1.
-            ("a weight, as a share of it", WEIGHT_ERROR),
-        ],
-        extremes: &[(CHANCES, Drawn(1.0), weights)],
-    },
-];
+            .promise("a weight, as a share of it", WEIGHT_ERROR)
+            .on(CHANCES, Drawn(1.0), weights),
+    ]
+}
 
 /// Gives every value that a float can be drawn as, one after the other.
 struct EveryFloat(u32);
@@ -198,7 +180,7 @@ fn prioritised(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     };
     let spec = RunSpec {
         seed: cases.rng.random(),
-        ..spec(1, 0.99, TimeoutRule::Terminal)
+        ..spec()
     };
     // The last one lacks a step that follows.
     let steps = [(1.0, End::Running); HELD + 1];
