@@ -67,10 +67,22 @@ pub(super) fn clamped(count: usize, most: f32, rng: &mut impl Rng) -> Vec<f32> {
     values.map(|x| x.clamp(-most, most)).collect()
 }
 
-/// Numbers from -scale / 2 to scale / 2, of which neighbours are far apart.
-pub(super) fn ramp(count: usize, scale: f32) -> Vec<f32> {
-    let place = |i: usize| (i * 37 % count) as f32 / count as f32;
-    (0..count).map(|i| place(i) * scale - scale / 2.0).collect()
+/// `count` numbers at which sums and exponentials may go wrong: all the same, ramps whose neighbours are far apart, one unlike the rest.
+pub(super) fn listed(count: usize) -> Vec<Vec<f32>> {
+    let sizes = [0.0, 1e-45, 1e-38, 1e4, 1e12, 1e20, 1e38, f32::MAX];
+    let equal = sizes.iter().flat_map(|&x| [x, -x]);
+    let equal = equal.map(|x| vec![x; count]);
+    let ramps = [1e-40, 1.0, 80.0, 104.0, 200.0, 1e4, 1e20, f32::MAX].map(|scale| {
+        let place = |i: usize| (i * 37 % count) as f32 / count as f32;
+        let values = (0..count).map(|i| place(i) * scale - scale / 2.0);
+        values.collect::<Vec<_>>()
+    });
+    let unlike = [1e-45, f32::MIN].map(|rest| {
+        let mut values = vec![rest; count];
+        values[count / 2] = f32::MAX;
+        values
+    });
+    equal.chain(ramps).chain(unlike).collect()
 }
 
 /// Weights of `count` atoms that sum to 1, some of them 0 or tiny.

@@ -1,7 +1,5 @@
 //! C51's losses: projection, softmax, and the divergence with its slopes.
 
-use std::sync::LazyLock;
-
 use driml_learner::losses::{
     c51::{self, ENTRY_ERROR, KL_ERROR, SLOPE_ERROR},
     projection::{MASS_ERROR, entry_error, project},
@@ -125,24 +123,9 @@ fn one_hot(atoms: usize, at: usize) -> Vec<f32> {
     probs
 }
 
-/// Rows of logits at which a softmax may go wrong.
-static LISTED_LOGITS: LazyLock<Vec<Vec<f32>>> = LazyLock::new(|| {
-    let equal = [0.0, 1e-45, 1e4, -1e4, 1e12, 1e38, -1e38, f32::MAX, f32::MIN];
-    let equal = equal
-        .iter()
-        .flat_map(|&x| [51, 2, 1001].map(|atoms| vec![x; atoms]));
-    let ramps = [1e-40, 1.0, 80.0, 104.0, 200.0, 1e4, 1e20, f32::MAX];
-    let ramps = ramps.map(|scale| ramp(51, scale));
-    let mut apart = vec![f32::MIN; 51];
-    apart[17] = f32::MAX;
-    equal.chain(ramps).chain([apart]).collect()
-});
-
 fn softmax(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let logits = cases.of(&LISTED_LOGITS, |rng| {
-        let count = rng.random_range(1..120);
-        finites(count, rng)
-    });
+    let atoms = cases.of(&[2, 51, 1001], |rng| rng.random_range(1..120));
+    let logits = cases.of(&listed(atoms), |rng| finites(atoms, rng));
     let mut probs = vec![f32::NAN; logits.len()];
     c51::softmax(&logits, &mut probs);
     let (expected, ..) = shares(&widened(&logits));
@@ -209,8 +192,8 @@ impl Batch {
 }
 
 fn kl(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let logits = cases.each(&LISTED_LOGITS);
-    let atoms = logits.len();
+    let atoms = cases.each(&[2, 51, 1001]);
+    let logits = cases.each(&listed(atoms));
     let target = match cases.each(&["one-hot", "any"]) {
         "any" => law(atoms, &mut cases.rng),
         _ => one_hot(atoms, atoms / 2),
