@@ -38,13 +38,14 @@ impl Picture {
         Augment::new(strongest, self.size, self.frame_channels)
     }
 
-    fn seen(&self, augment: &Augment, view: &View) -> Vec<u8> {
-        let mut seen = vec![0; self.state.len()];
+    /// The largest error of a view in bytes, beside what each byte should be.
+    fn error(&self, augment: &Augment, view: &View, expected: impl Fn(usize) -> f64) -> f64 {
+        let mut seen = vec![0u8; self.state.len()];
         augment.apply_view(&self.state, view, &mut seen);
-        seen
+        let seen = seen.into_iter().enumerate();
+        worst(seen.map(|(at, found)| (f64::from(found) - expected(at)).abs()))
     }
 
-    /// The largest error of a crop, in bytes.
     fn crop_error(&self, augment: &Augment, view: &View) -> f64 {
         let (height, width, channels) = self.size;
         let (rows, columns) = augment.crop();
@@ -55,8 +56,7 @@ impl Picture {
             let near = place as usize;
             (near, (near + 1).min(crop - 1), place.fract())
         };
-        let seen = self.seen(augment, view);
-        worst(seen.iter().enumerate().map(|(at, &found)| {
+        self.error(augment, view, |at| {
             let (pixel, channel) = (at / channels, at % channels);
             let (top, bottom, down) = place(pixel / width, rows, height);
             let (left, right, across) = place(pixel % width, columns, width);
@@ -65,20 +65,17 @@ impl Picture {
                 f64::from(self.state[pixel * channels + channel])
             };
             let line = |row| pixel(row, left) * (1.0 - across) + pixel(row, right) * across;
-            let expected = line(top) * (1.0 - down) + line(bottom) * down;
-            (f64::from(found) - expected).abs()
-        }))
+            line(top) * (1.0 - down) + line(bottom) * down
+        })
     }
 
-    /// The largest error of a recoloured state, in bytes.
     fn colour_error(&self, view: &View) -> f64 {
-        let seen = self.seen(&self.augment(1.0), view);
         let mean = |bytes: &[u8]| {
             bytes.iter().map(|&byte| f64::from(byte)).sum::<f64>() / bytes.len() as f64
         };
         let of_state = mean(&self.state);
         let (sin, cos) = (view.hue * std::f64::consts::TAU).sin_cos();
-        worst(seen.iter().enumerate().map(|(at, &found)| {
+        self.error(&self.augment(1.0), view, |at| {
             let (first, i) = (at - at % self.frame_channels, at % self.frame_channels);
             let pixel = &self.state[first..first + self.frame_channels];
             let grey = mean(pixel);
@@ -92,8 +89,8 @@ impl Picture {
                 _ => grey,
             };
             let expected = view.brightness * (of_state + view.contrast * (coloured - of_state));
-            (f64::from(found) - expected.clamp(0.0, 255.0)).abs()
-        }))
+            expected.clamp(0.0, 255.0)
+        })
     }
 }
 

@@ -142,19 +142,16 @@ impl Layer {
             exact[3] = (&exact[3] * y.gt(0.0)?.to_dtype(DType::F64)?)?;
         }
         let traced = |operands: &Operands| traced(operands, |vars| self.exact(vars));
-        let [mut sizes, mut ones] = [exact.clone(), exact.clone()];
+        let [mut sizes, mut ones, mut sums] = [(); 3].map(|()| exact.clone());
         for (at, tensor) in exact.iter().enumerate() {
-            (sizes[at], ones[at]) = (tensor.abs()?, tensor.ones_like()?);
+            sizes[at] = tensor.abs()?;
+            ones[at] = tensor.ones_like()?;
+            sums[at] = (&sizes[at] + &ones[at])?;
         }
-        ones[2] = exact[2].zeros_like()?;
-        // Both operands' sizes and 1, each summed over the terms of a sum.
-        let mut beside_ones = Vec::new();
-        for at in [0, 1, 3] {
-            let mut operands = ones.clone();
-            operands[at] = sizes[at].clone();
-            beside_ones.push(traced(&operands)?);
-        }
-        let [exact, sizes, terms] = [traced(&exact)?, traced(&sizes)?, traced(&ones)?];
+        // Biases are in no product.
+        (ones[2], sums[2]) = (exact[2].zeros_like()?, sizes[2].clone());
+        let [exact, sizes] = [traced(&exact)?, traced(&sizes)?];
+        let [terms, sums] = [traced(&ones)?, traced(&sums)?];
         let mut errors = Vec::new();
         for of in 0..4 {
             // Sums of gradients are not products, and f32 in either precision.
@@ -171,9 +168,8 @@ impl Layer {
                 if error == 0.0 || size * 1.01 >= f64::from(f32::MAX) {
                     continue;
                 }
-                // The promise is of the largest operand; their mean allows less.
-                let operands: f64 = beside_ones.iter().map(|sums| sums[of][at]).sum();
-                let mean = (operands - terms) / (2.0 * terms);
+                // The promise is of the largest operand; their mean allows less: (1 + a) (1 + b) = 1 + a + b + a b.
+                let mean = (sums[of][at] - size - terms) / (2.0 * terms);
                 let terms = (terms + roundings) as usize;
                 let allowed = precision.product_error(terms) * size;
                 errors.push(error / (allowed + precision.product_floor(terms, mean)));

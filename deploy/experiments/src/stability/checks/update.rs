@@ -89,7 +89,6 @@ impl Setting {
             embedding_dim: 16,
             action_embed: 4,
             dim: settings.dim_heads(ACTIONS),
-            loss_layers: vec![],
             ..small::config(51, 32, self.support)
         }
     }

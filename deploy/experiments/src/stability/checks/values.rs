@@ -91,8 +91,8 @@ fn greedy(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     for action in actions.iter().map(|&action| usize::from(action)) {
         let is_lowest = !logits[..action].contains(&logits[action]);
         let input = format_args!("action {action}, logits {}", Shown(&logits));
-        cases.see(input, [most - value(logits[action])])?;
-        cases.keeps(1, input, is_lowest)?;
+        let below = most - value(logits[action]);
+        cases.see(input, [below, f64::from(!is_lowest)])?;
     }
     Ok(())
 }
