@@ -26,8 +26,6 @@ pub(super) struct Settings {
     pub(super) draws: u64,
     /// Steps of the longest run of Adam.
     pub(super) adam_steps: u64,
-    /// Most moves of a target network towards one that stands still; a tau that needs more is left out.
-    pub(super) follow_moves: u64,
     /// Updates of the learned affinity.
     pub(super) affinity_updates: u64,
     /// Draws from each law that is tested.

@@ -120,7 +120,7 @@ fn loss(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let equal = [0.0, f32::MAX].map(|x| vec![x; rows * rows]);
     let spread = [1.0, 1e4, 1e30].map(|scale| {
         let dot = |i: usize| ((i * 37 % 101) as f32 / 50.0 - 1.0) * scale;
-        (0..rows * rows).map(dot).collect()
+        (0..rows * rows).map(dot).collect::<Vec<_>>()
     });
     let dots = cases.of(&[&equal[..], &spread].concat(), |rng| {
         finites(rng.random_range(1..3) * rows * rows, rng)

@@ -52,12 +52,6 @@ fn step_at(stored: StoredAs, x: f32) -> f64 {
     2f64.powi(exponent.max(least) - bits + 1)
 }
 
-/// The nearest number of the type, ties to even.
-fn nearest(stored: StoredAs, x: f32) -> f64 {
-    let step = step_at(stored, x);
-    (f64::from(x) / step).round_ties_even() * step
-}
-
 /// All places where rounding turns.
 fn turning_points(stored: StoredAs) -> Vec<f32> {
     let mut values = Vec::new();
@@ -82,8 +76,10 @@ fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Resul
     let bytes = small::parameters(&config, &all)?.to_safetensors_as(stored, |_| true)?;
     let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
     for (&x, found) in values.iter().zip(small::values(&config, &read)?) {
+        let step = step_at(stored, x);
+        let nearest = (f64::from(x) / step).round_ties_even() * step;
         let has_its_sign = x.is_sign_negative() == found.is_sign_negative();
-        let is_nearest = has_its_sign && f64::from(found) == nearest(stored, x);
+        let is_nearest = has_its_sign && f64::from(found) == nearest;
         let scale = f64::from(x.abs().max(stored.least_normal()));
         let error = (f64::from(found) - f64::from(x)) / scale;
         let input = format_args!("{x:e} became {found:e}");

@@ -149,23 +149,6 @@ impl Setting {
     }
 }
 
-/// Errors of one update, the larger of those with equal states each and once: of the loss, as a share of 1 + loss, and of all
-/// gradients together, as a share of their norm; none of the gradient where of two values that are nearly the same another is the
-/// larger, after which the target is another too.
-fn errors(setting: &Setting, rng: &mut ChaCha8Rng) -> anyhow::Result<(f64, Option<f64>)> {
-    let [mut agent, reference] = setting.agents(rng)?;
-    let batch = setting.batch(agent.model().frame_len(), rng);
-    let (mut losses, mut gradients) = (Vec::new(), Vec::new());
-    for deduplicate in [false, true] {
-        agent = agent.with_deduplication(deduplicate);
-        let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
-        losses.push(loss_error(found.own_loss, found.reference_loss));
-        gradients.push((found.same_next_action == 1.0).then_some(found.gradient));
-    }
-    let gradients: Option<Vec<f64>> = gradients.into_iter().collect();
-    Ok((worst(losses), gradients.map(worst)))
-}
-
 /// The error of a loss, which may be 0, as a share of 1 + loss.
 const fn loss_error(own: f64, reference: f64) -> f64 {
     (own - reference).abs() / (1.0 + reference.abs())
@@ -183,9 +166,20 @@ fn check(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     let mut gradients = Vec::new();
     for _ in 0..cases.draws(0.0015) {
         let setting = Setting::drawn(scale, &mut cases.rng);
-        let (loss, gradient) = errors(&setting, &mut cases.rng)?;
-        cases.see(format_args!("{setting:?}"), [loss])?;
-        gradients.extend(gradient);
+        let [mut agent, reference] = setting.agents(&mut cases.rng)?;
+        let batch = setting.batch(agent.model().frame_len(), &mut cases.rng);
+        // The larger of those with equal states each and once.
+        let (mut loss, mut gradient) = (Vec::new(), Vec::new());
+        for deduplicate in [false, true] {
+            agent = agent.with_deduplication(deduplicate);
+            let found = ErrorOfUpdate::of(&agent, &batch.batch(), &reference)?;
+            loss.push(loss_error(found.own_loss, found.reference_loss));
+            // None where of two values that are nearly the same another is the larger, after which the target is another too.
+            gradient.push((found.same_next_action == 1.0).then_some(found.gradient));
+        }
+        cases.see(format_args!("{setting:?}"), [worst(loss)])?;
+        let gradient: Option<Vec<f64>> = gradient.into_iter().collect();
+        gradients.extend(gradient.map(worst));
     }
     // Not of each case: where states are equal, or losses saturate, a gradient's terms cancel, and its norm is that of rounding.
     // Of a few cases none may have a gradient that can be compared.
