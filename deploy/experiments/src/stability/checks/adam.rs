@@ -23,6 +23,7 @@ const RANGE: &str = "gradients within 1e15; lr 1e-30 to 1e38, beta 0 to 0.99999,
 const OF_WAY: &str = "a parameter, as a share of its way";
 
 const EQUAL: &str = "up to 120 equal gradients of 0, 1e-45, 1e-38, 1e-19, 1, 1e15; eps 1e-15, 1e-8, 1, 1e30; beta 0, 0.9, 0.99999";
+const DRAWN: &str = "drawn, up to 120 gradients";
 const NUMBERS: &str = "step number 1, 2, 1000, 2^24, 2^31, 2^32, 2^33, 2^53, 2^64, and each less 1";
 
 pub(super) fn properties(settings: &Settings) -> Vec<Property> {
@@ -33,8 +34,8 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
             // Where f32 holds second moments, and where they are near the least that it holds.
             .promise(OF_WAY, STEP_ERROR / 10.0)
             .promise("the same at the least second moments", STEP_ERROR)
-            .on(EQUAL, Listed, equal_gradients)
-            .on("drawn, up to 120 gradients", Drawn(0.5), any_gradients),
+            .on(EQUAL, Listed, |cases| few_steps(cases, 0))
+            .on(DRAWN, Drawn(0.5), |cases| few_steps(cases, 1)),
         Property::new("Adam", RANGE)
             .promise(OF_WAY, MOMENTS_ERROR)
             // Where half of its last place is below 0.4% of a step.
@@ -100,51 +101,43 @@ fn step(settings: AdamSettings, t: u64, all: &mut [Stepped], gradients: &[f32]) 
     }
 }
 
-/// The error of one parameter after these gradients.
-fn error_after(settings: AdamSettings, gradients: &[f32]) -> f64 {
+/// Those with which drawn gradients are tried.
+const DRAWN_BETAS: [(f64, f64); 5] = [
+    (0.0, 0.0),
+    (0.0, 0.9),
+    (0.9, 0.99),
+    (0.9, 0.999),
+    (0.5, 0.99999),
+];
+
+/// Up to 120 steps from 0, whose error counts for this promise.
+fn few_steps(cases: &mut Cases<'_>, promise: usize) -> anyhow::Result<()> {
+    let betas = [(0.0, 0.0), (0.9, 0.999), (0.99999, 0.99999), (0.0, 0.99999)];
+    let (beta1, beta2) = cases.of(&betas, |rng| one_of(&DRAWN_BETAS, rng));
+    let lrs = [1e-30, 2.5e-4, 1.0];
+    let lr = cases.of(&lrs, |rng| one_of(&[1e-30, 1e-4, 1.0], rng));
+    let all_eps = [1e-15, 1e-8, 1.0, 1e30];
+    let eps = cases.of(&all_eps, |rng| {
+        one_of(&[1e-15, 1e-8, 3.9e-5, 1.0, 1e30], rng)
+    });
+    let equal = [0.0, 1e-45, 1e-38, 1e-19, 1e-8, 1.0, 1e15].map(|g| [vec![g], vec![g; 120]]);
+    let gradients = cases.of(&equal.concat(), |rng| {
+        clamped(rng.random_range(1..120), LARGEST, rng)
+    });
+    let settings = AdamSettings {
+        lr,
+        beta1,
+        beta2,
+        eps,
+    };
     let mut one = [Stepped::default()];
-    for (t, &g) in (1..).zip(gradients) {
+    for (t, &g) in (1..).zip(&gradients) {
         step(settings, t, &mut one, &[g]);
     }
-    one[0].error()
-}
-
-fn equal_gradients(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let betas = [(0.0, 0.0), (0.9, 0.999), (0.99999, 0.99999), (0.0, 0.99999)];
-    let (beta1, beta2) = cases.each(&betas);
-    let settings = AdamSettings {
-        lr: cases.each(&[1e-30, 2.5e-4, 1.0]),
-        beta1,
-        beta2,
-        eps: cases.each(&[1e-15, 1e-8, 1.0, 1e30]),
-    };
-    let g = cases.each(&[0.0, 1e-45, 1e-38, 1e-19, 1e-8, 1.0, 1e15]);
-    let count = cases.each(&[1, 120]);
-    let error = error_after(settings, &vec![g; count]);
-    let input = format_args!("{settings:?}, {count} gradients of {g:e}");
-    cases.see(input, [error])
-}
-
-fn any_gradients(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let betas = [
-        (0.0, 0.0),
-        (0.0, 0.9),
-        (0.9, 0.99),
-        (0.9, 0.999),
-        (0.5, 0.99999),
-    ];
-    let rng = &mut cases.rng;
-    let (beta1, beta2) = one_of(&betas, rng);
-    let settings = AdamSettings {
-        lr: one_of(&[1e-30, 1e-4, 1.0], rng),
-        beta1,
-        beta2,
-        eps: one_of(&[1e-15, 1e-8, 3.9e-5, 1.0, 1e30], rng),
-    };
-    let gradients = clamped(rng.random_range(1..120), LARGEST, rng);
-    let error = error_after(settings, &gradients);
+    let mut errors = [None; 2];
+    errors[promise] = Some(one[0].error());
     let input = format_args!("{settings:?}, gradients {}", Shown(&gradients));
-    cases.see(input, [None, Some(error)])
+    cases.see(input, errors)
 }
 
 /// A name, and the gradient of a step beside noise from -1 to 1.
