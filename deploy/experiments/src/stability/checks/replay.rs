@@ -59,10 +59,7 @@ pub(super) fn replay(
     }
     let stored = replay.insert(&chunk);
     let is_stored = matches!(stored, InsertReply::Stored { .. });
-    anyhow::ensure!(
-        is_stored,
-        "a chunk within the limits was not stored: {stored:?}"
-    );
+    anyhow::ensure!(is_stored, "the chunk was not stored: {stored:?}");
     Ok(replay)
 }
 
