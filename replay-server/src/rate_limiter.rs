@@ -91,7 +91,7 @@ impl RateLimiter {
     }
 
     fn credit(&self) -> f64 {
-        // No row for the transitions before it beyond those sampled then.
+        // No row for the transitions before the start of the ratio, beyond those sampled by then.
         let start = self.config.ratio_start();
         let after = self.inserted_total().saturating_sub(start.transitions);
         let allowed = start.rows as f64 + self.config.replay_ratio * after as f64;

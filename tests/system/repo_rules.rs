@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 8_000),
-    ("actor", 11_640),
-    ("replay-server", 11_220),
-    ("learner", 24_450),
-    ("deploy", 32_410),
-    ("tests", 10_820),
+    ("protocol", 7_760),
+    ("actor", 11_470),
+    ("replay-server", 11_130),
+    ("learner", 24_200),
+    ("deploy", 31_990),
+    ("tests", 10_870),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -100,7 +100,6 @@ fn memory() -> Option<String> {
 mod tests {
     use super::*;
 
-    /// That the files of a process are counted is tested with the launcher's `panics`, and in `tests/system/limits.rs`.
     #[test]
     fn open_files_are_scarce_where_a_library_may_want_more() {
         let said = "53 of at most 60 files are open: raise the limit (`ulimit -n`)";

@@ -72,12 +72,13 @@ impl Batch {
     fn fill<const BYTES: usize>(
         &mut self,
         column: Column,
-        values: impl Iterator<Item = [u8; BYTES]>,
+        mut values: impl Iterator<Item = [u8; BYTES]>,
     ) {
-        let (places, _) = self.payload[self.header.range(column)].as_chunks_mut();
-        for (place, value) in places.iter_mut().zip(values) {
-            *place = value;
+        let (places, rest) = self.payload[self.header.range(column)].as_chunks_mut();
+        for place in places {
+            *place = values.next().expect("a value for each place");
         }
+        assert!(rest.is_empty() && values.next().is_none(), "{column:?}");
     }
 
     /// A batch in memory that may hold anything.

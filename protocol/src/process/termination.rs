@@ -48,7 +48,7 @@ pub(super) fn listen(
         (
             signal(SignalKind::interrupt())?,
             signal(SignalKind::terminate())?,
-            // By the kernel's own table.
+            // None where it was set to be ignored before this process started, by the kernel's own table.
             match is_set("SigIgn:", Number::SIGHUP as u32 - 1) {
                 true => None,
                 false => Some(signal(SignalKind::hangup())?),

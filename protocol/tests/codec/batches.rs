@@ -24,6 +24,10 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     let (plain, prioritised) = (batch(), prioritised_batch());
     let more = prioritised.header.payload_bytes() - plain.header.payload_bytes();
     assert_eq!((more, plain.probabilities()), (3 * 12, None));
+    let (_, payload) = prioritised.clone().into_payload();
+    let mut columns = [1u64 << 40, 7, u64::MAX].map(u64::to_le_bytes).concat();
+    columns.extend([0.5f32, 1.0, 1e-30].map(f32::to_le_bytes).concat());
+    assert!(payload.ends_with(&columns), "transitions, then chances");
     let sent = [sealed(plain.clone()), sealed(prioritised.clone())].map(|bytes| bytes.len());
     // The origin: a byte of the shard, nine of the incarnation.
     assert_eq!(sent[1] - sent[0], 3 * 12 + 10);

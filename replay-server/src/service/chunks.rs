@@ -13,7 +13,7 @@ use super::{
 };
 use crate::storage::pack::PackedChunk;
 
-/// How far the version that acted may be ahead of the newest that is here, where this server was started anew.
+/// How far the version that acted may be ahead of the newest that is here: it is where this server was started anew, but not by any number.
 const VERSION_AHEAD_MAX: u64 = 1 << 32;
 
 /// Answers that are to be sent once the lock is free.

@@ -143,6 +143,12 @@ fn chunks_that_make_no_sense_in_this_run() {
     ]);
     served.stores(0);
     served.client.join_as_actor(0, 10);
+    let mut second_life = served.chunk(0);
+    second_life.header.incarnation = 10;
+    let reply = served.client.insert(&second_life);
+    let is_second =
+        matches!(reply, InsertReply::Stored { inserted_total, .. } if inserted_total == 12);
+    assert!(is_second, "{reply:?}");
     let late = served.client.seal(&served.chunk(1));
     served.refuses_chunks([(late, "give each actor another number (--id)")]);
 }

@@ -223,7 +223,7 @@ impl Cases<'_> {
         self.of(items, |rng| one_of(items, rng))
     }
 
-    /// One of these where inputs are listed, as [`Cases::each`] takes it; else one that is drawn.
+    /// One of these where inputs are listed, as [`Cases::each`] takes it; else one that is drawn. A list is as long in each case.
     pub(super) fn of<T: Clone>(
         &mut self,
         items: &[T],

@@ -110,6 +110,8 @@ fn a_run_that_was_interrupted_computes_what_it_would_have() {
             assert_eq!(resumed, whole, "{what}");
         }
     }
+    let of = |sets: &[&str]| weights(&config("mspacman", "driml-ada", 800, sets));
+    assert_eq!(of(&small), of(&packed), "compressed frames are the same");
 }
 
 fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {

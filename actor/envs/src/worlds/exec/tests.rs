@@ -169,7 +169,6 @@ fn each_way_a_process_can_fail_has_its_sentence() {
 const NO_WORLDS: &str = r#"
 no-such-command --now               => exit status 127: the shell found no such command
 exit 3                              => ended before it declared itself (exit status: 3)
-echo the ROM is missing >&2; exit 4 => Its last words: | the ROM is missing
 sleep 60                            => --set world.start_timeout_ms=N
 exec >&-; sleep 60                  => closed its stdout before it declared itself
 echo hello; read -r line            => does not declare itself as a world: its first line on stdout is "hello"
@@ -185,6 +184,9 @@ fn each_way_a_start_can_fail_has_its_sentence() {
     for (command, sentences) in rows(NO_WORLDS) {
         says(command, &sentences);
     }
+    // The command itself is said, too.
+    let said = "Its last words:\n  the ROM is missing";
+    says("echo the ROM is missing >&2; exit 4", &[said]);
     let refused = |line: &str, sentence| says(&declares(line), &[sentence]);
     refused("{}", "\"driml_env\" is missing");
     refused(r#"{"driml_env": 1, "copies": 1}"#, "missing field");

@@ -111,6 +111,7 @@ impl ProcgenWorld {
         seed: u64,
         threads: usize,
     ) -> Result<ProcgenWorld, EnvError> {
+        config.validate()?;
         let options = config.options(num_envs, seed, threads)?;
         let engine = config.engine(&mut |_| {})?;
         let levels = if config.use_sequential_levels {

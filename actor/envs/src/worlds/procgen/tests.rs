@@ -149,6 +149,7 @@ fn wrong_settings_are_refused_without_an_engine() {
         let mut config = maze();
         change(&mut config);
         fails(config.validate(), &[text]);
+        fails(ProcgenWorld::new(&config, 1, 1, 0), &[text]);
     }
     for (num_envs, threads, text) in [(0, 0, "0 environments"), (1, 1000, "1000 threads")] {
         fails(ProcgenWorld::new(&maze(), num_envs, 1, threads), &[text]);

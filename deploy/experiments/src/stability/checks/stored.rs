@@ -87,3 +87,13 @@ fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Resul
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_finite_f16_has_its_turning_points() {
+        assert_eq!(turning_points(StoredAs::F16).len(), 2 * (4 * 0x7bff + 1));
+    }
+}
