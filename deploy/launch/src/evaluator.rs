@@ -72,7 +72,7 @@ pub fn keep(
         again.add(folder)?;
         best_before = Some(again);
     }
-    let is_best = candidate.judge(folder, &earned, best_before.as_ref())?;
+    let is_best = candidate.judge(folder, &earned)?;
     Ok(Judged {
         earned,
         is_best,

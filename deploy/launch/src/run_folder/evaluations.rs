@@ -144,13 +144,15 @@ impl Candidate {
 
     /// Adds what it earned to the run's table, and keeps it if it earned more than the best before it, over at least as many episodes.
     /// Says whether it is the best.
-    pub(crate) fn judge(
-        &self,
-        folder: &RunFolder,
-        earned: &Evaluated,
-        best: Option<&Evaluated>,
-    ) -> anyhow::Result<bool> {
-        let is_best = best.is_none_or(|best| {
+    pub(crate) fn judge(&self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
+        let path = folder.evaluations();
+        let file = File::options().create(true).append(true).open(&path);
+        let file = file.with_context(|| format!("writing {}", path.display()))?;
+        // Where several processes evaluate one run, each judges by what the others kept.
+        if let Err(e) = file.lock() {
+            tracing::debug!("{} cannot be locked: {e}", path.display());
+        }
+        let is_best = Evaluated::best(folder)?.is_none_or(|best| {
             best.updates == earned.updates
                 || earned.episodes >= best.episodes && earned.mean_return > best.mean_return
         });
@@ -202,8 +204,7 @@ mod tests {
         let candidate = Candidate::read(&path).unwrap();
         fs::remove_dir_all(path).unwrap();
         let earned = Evaluated::at(folder, updates, episodes, (mean, 0.5));
-        let best = Evaluated::best(folder).unwrap();
-        candidate.judge(folder, &earned, best.as_ref())
+        candidate.judge(folder, &earned)
     }
 
     #[test]
@@ -238,6 +239,20 @@ mod tests {
         fs::write(folder.evaluations(), "a,b\n1,2\n").unwrap();
         let said = Evaluated::all(&folder).unwrap_err().to_string();
         assert!(said.contains("is not a table of evaluations"), "{said}");
+    }
+
+    #[test]
+    fn of_evaluations_at_once_the_best_is_kept() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = &RunFolder::new(root.path());
+        std::thread::scope(|scope| {
+            for updates in 1..=8 {
+                scope.spawn(move || judge(folder, updates, updates as f64, 4).unwrap());
+            }
+        });
+        assert_eq!(Evaluated::best(folder).unwrap().unwrap().updates, 8);
+        assert_eq!(fs::read_dir(folder.best()).unwrap().count(), 1);
+        assert_eq!(Evaluated::all(folder).unwrap().len(), 8);
     }
 
     #[test]
