@@ -49,21 +49,21 @@ fn first_clause(help: &str) -> &str {
     ends.min().map_or(help, |end| &help[..end])
 }
 
-/// Every command that does something, by the words that call it.
-fn leaves(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
-    if command.has_subcommands() {
-        for sub in command.get_subcommands() {
-            leaves(sub, &format!("{name} {}", sub.get_name()), found);
-        }
-    } else {
+/// Every command that does something or has flags for those below it, by the words that call it.
+fn commands_of(command: &Command, name: &str, found: &mut Vec<(String, Command)>) {
+    let has_flags = command.get_arguments().any(|it| !it.is_hide_set());
+    if has_flags || !command.has_subcommands() {
         found.push((name.to_owned(), command.clone()));
+    }
+    for sub in command.get_subcommands() {
+        commands_of(sub, &format!("{name} {}", sub.get_name()), found);
     }
 }
 
 /// The page of all commands; a flag that several commands have in the same words stands once.
 fn commands() -> String {
     let mut found = Vec::new();
-    leaves(&Cli::command(), "driml", &mut found);
+    commands_of(&Cli::command(), "driml", &mut found);
     let mut uses = BTreeMap::<String, usize>::new();
     let arguments = found.iter().flat_map(|(_, it)| it.get_arguments());
     for arg in arguments.filter(|it| !it.is_hide_set()) {

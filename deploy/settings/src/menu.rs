@@ -48,6 +48,7 @@ pub fn menu() -> Result<String, Usage> {
     }
     text += "\noff in every preset\n";
     text += "--set 'actor.epsilon_ladder={base=0.4,alpha=7}'  fixed epsilons from actor to actor smaller, as Ape-X has them\n";
+    text += "\nof tuned on bigfish, fruitbot and starpilot alone, for any game\n";
     text += "--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4\n";
     text += "\nof rainbow alone, for any agent\n";
     text += "--set 'model.head={dueling=true,noisy_sigma=0.5}'  two streams of the C51 head; noisy layers (then --set actor.epsilon_start=0 too)\n";
