@@ -15,7 +15,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("actor", 11_470),
     ("replay-server", 11_130),
     ("learner", 24_200),
-    ("deploy", 31_990),
+    ("deploy", 32_000),
     ("tests", 10_870),
 ];
 /// Most lines of one file.

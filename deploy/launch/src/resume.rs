@@ -142,7 +142,6 @@ pub struct Resumed {
 /// it could not be resumed afterwards.
 fn check_changes(
     folder: &RunFolder,
-    newest: &Path,
     before: &RunConfig,
     config: &RunConfig,
     lockstep: bool,
@@ -156,8 +155,7 @@ fn check_changes(
     let (had, has) = (before.local.actors, config.local.actors);
     if lockstep && had != has {
         bail!(usage!(
-            "local.actors = {has}, but the checkpoint {} of this run in lockstep has {had}: resume with as many",
-            newest.display()
+            "local.actors = {has}, but this run in lockstep has {had}: resume with as many"
         ));
     }
     let replay = folder.replay();
@@ -208,7 +206,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
             folder.display()
         ));
     }
-    check_changes(folder, newest, &before, &config, lockstep)?;
+    check_changes(folder, &before, &config, lockstep)?;
     // Where nothing was learned, only a run in lockstep keeps what it has.
     let (frames, rows) = match updates {
         0 if !lockstep => (0, 0),

@@ -73,6 +73,15 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
     }
 }
 
+/// A random crop reads what no convolution of the whole frame does.
+#[test]
+fn where_states_are_augmented_frames_stay_whole() {
+    let config = config("chain", "curl", 400, &WIDE_CHAIN);
+    assert_eq!(frame(&config), (15, 17));
+    assert_eq!((config.model.height, config.model.width), (15, 17));
+    weights(&config);
+}
+
 /// A run that was saved after so many rounds.
 fn begun(config: &RunConfig, rounds: usize) -> (tempfile::TempDir, RunFolder, Lockstep) {
     let folder = tempfile::tempdir().unwrap();

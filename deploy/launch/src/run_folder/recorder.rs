@@ -60,6 +60,11 @@ impl RunRecorder {
         }
         let lock = folder.lock()?;
         let header = header(config, &processes);
+        let resume_point = resumed.unwrap_or_default();
+        let kept = match resume_point.replay_is_kept {
+            true => Some(Uncounted::read(folder)?),
+            false => None,
+        };
         let (rows, episodes, seconds) = match resumed {
             None => {
                 // First: by its settings a folder in which nothing was learned is known as a run's.
@@ -70,27 +75,19 @@ impl RunRecorder {
             }
             Some(point) => {
                 let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
-                let known = match point.replay_is_kept {
-                    true => Some(Uncounted::read(folder)?.episodes),
-                    false => None,
-                };
-                let episodes = TrainingEpisodes::go_on(folder, point.frames, known)?;
+                let unknown = kept.map(|it| it.episodes);
+                let episodes = TrainingEpisodes::go_on(folder, point.frames, unknown)?;
                 folder.write_config(config)?;
                 (rows, episodes, seconds)
             }
         };
         Summary::remove(folder)?;
-        let resume_point = resumed.unwrap_or_default();
-        let uncounted = match resume_point.replay_is_kept {
-            true => Uncounted::read(folder)?,
-            false => Uncounted {
-                after_updates: resume_point.after_updates,
-                rows: resume_point.rows,
-                episodes: rows.last("episodes").unwrap_or(0).max(episodes.episode),
-                k: (rows.last("mean_k").zip(rows.last("sd_k")))
-                    .map(|(mean, sd)| Spread { mean, sd }),
-            },
-        };
+        let uncounted = kept.unwrap_or_else(|| Uncounted {
+            after_updates: resume_point.after_updates,
+            rows: resume_point.rows,
+            episodes: rows.last("episodes").unwrap_or(0).max(episodes.episode),
+            k: (rows.last("mean_k").zip(rows.last("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
+        });
         if resumed.is_some() {
             uncounted.write(folder)?;
         }
