@@ -63,7 +63,7 @@ impl<T> Newest<T> {
         })
     }
 
-    /// Hands it over, in place of the oldest that was not sent yet where there is no room.
+    /// Queues it; in a full queue it replaces the oldest.
     pub(crate) fn put(&self, value: T) {
         let mut waiting = lock(&self.waiting);
         if waiting.len() == self.most {

@@ -193,7 +193,7 @@ impl BatchHeader {
     }
 
     /// Bytes of all columns; none if they are more than the address space, if there are more states than rows can have, or if
-    /// states are no stacks of the frames.
+    /// states are not stacks of the frames.
     fn bytes(&self) -> Option<usize> {
         let positives = u64::from(self.rows) * u64::from(self.positives);
         let states = self.states().try_into().ok()?;

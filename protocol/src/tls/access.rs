@@ -26,7 +26,7 @@ pub const ACTORS_MAX: u32 = 1024;
 pub enum Role {
     /// The actor of this number.
     Actor(u32),
-    /// The learner.
+    /// The one learner of a run.
     Learner,
     /// A replay server: the side that listens.
     ReplayServer,

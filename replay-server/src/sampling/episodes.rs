@@ -187,7 +187,7 @@ pub fn return_sum_error(n: usize) -> f64 {
 /// [`return_sum_error`].
 ///
 /// After a terminal step nothing follows. A time-out counts as one (`TimeoutRule::Terminal`), or cuts the return short
-/// of its own step and bootstraps from that step's state (`TimeoutRule::Bootstrap`).
+/// of the step that timed out and bootstraps from its state (`TimeoutRule::Bootstrap`).
 fn n_step_return<'a>(
     discounts: &[f64],
     timeout: TimeoutRule,

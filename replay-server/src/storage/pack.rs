@@ -3,7 +3,7 @@
 //!
 //! What is compressed is a block: consecutive frames of one stream, of which the first is the key of the others.
 //! A block's parts are LZ4 blocks of their own: the key alone, then a few frames each with the key as LZ4's dictionary. To
-//! read a frame, its part and the key are unpacked and no more. There are no differences between frames: LZ4 finds what
+//! read a frame, its part and the key are unpacked and no more. Frames are not stored as differences: LZ4 finds what
 //! frames have in common also where the picture scrolls, where differences would destroy it.
 
 use std::{borrow::Cow, ops::Range, sync::Arc};

@@ -165,7 +165,7 @@ fn each_way_a_process_can_fail_has_its_sentence() {
     }
 }
 
-/// Commands that are no worlds, and the sentences that say so.
+/// Commands that declare no world, and the error of each.
 const NO_WORLDS: &str = r#"
 no-such-command --now               => exit status 127: the shell found no such command
 exit 3                              => ended before it declared itself (exit status: 3)
@@ -184,7 +184,7 @@ fn each_way_a_start_can_fail_has_its_sentence() {
     for (command, sentences) in rows(NO_WORLDS) {
         says(command, &sentences);
     }
-    // The command itself is said, too.
+    // The error quotes the command, too.
     let said = "Its last words:\n  the ROM is missing";
     says("echo the ROM is missing >&2; exit 4", &[said]);
     let refused = |line: &str, sentence| says(&declares(line), &[sentence]);
