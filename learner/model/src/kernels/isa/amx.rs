@@ -3,8 +3,11 @@
 #![allow(unsafe_code, reason = "instructions of one kind of processor")]
 #![cfg(target_arch = "x86_64")]
 
-use std::mem::MaybeUninit;
-use std::sync::OnceLock;
+use std::{
+    mem::MaybeUninit,
+    slice::{from_raw_parts, from_raw_parts_mut},
+    sync::OnceLock,
+};
 
 use half::bf16;
 
@@ -161,6 +164,11 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
             // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
             unsafe {
                 tiles.configure(count, tail);
+                let sums = Sums {
+                    rows: (first, count, groups),
+                    vecs: (first_vec, block_vecs),
+                };
+                sums.load(tiles, tile);
                 for run in 0..tile.runs {
                     let left = tile
                         .left
@@ -191,7 +199,7 @@ unsafe fn by_rows<T: Tiles>(tiles: &mut T, tile: &RawTile<bf16>, rows: usize, ve
                         }
                     }
                 }
-                write_sums(tiles, tile, (first, count, groups), (first_vec, block_vecs));
+                sums.store(tiles, tile);
             }
         }
         first += groups * count;
@@ -223,6 +231,11 @@ unsafe fn by_columns<S: Simd, T: Tiles>(
         // SAFETY: rows, runs and steps are within the tile's, columns within its panel's.
         unsafe {
             tiles.configure(count, tail);
+            let sums = Sums {
+                rows: (first, count, 1),
+                vecs: (0, vecs),
+            };
+            sums.load(tiles, tile);
             let (mut run, mut step) = (tile.left.add(first * 2), 0);
             for part in (0..steps).step_by(STEPS) {
                 let in_part = STEPS.min(steps - part);
@@ -250,72 +263,108 @@ unsafe fn by_columns<S: Simd, T: Tiles>(
                     tiles.dot(vec, in_tail);
                 }
             }
-            write_sums(tiles, tile, (first, count, 1), (0, vecs));
+            sums.store(tiles, tile);
         }
     }
 }
 
-/// Writes or adds the sums of `groups` registers of `count` rows from `first` on, by `vecs` registers of columns from `first_vec` on.
-///
-/// # Safety
-/// The output has them, as far as `tile.cols` goes.
-#[inline(always)]
-unsafe fn write_sums<T: Tiles>(
-    tiles: &mut T,
-    tile: &RawTile<bf16>,
-    (first, count, groups): (usize, usize, usize),
-    (first_vec, vecs): (usize, usize),
-) {
-    let place = |sums: usize| {
-        let (row, col) = (
-            first + sums / vecs * ROWS,
-            (first_vec + sums % vecs) * LANES,
-        );
-        let cols = tile.cols.saturating_sub(col).min(LANES);
-        // Without columns it is not used.
-        (tile.out.wrapping_add(row * tile.out_stride + col), cols)
-    };
-    let is_direct = |cols| tile.mode == Mode::Replace && cols == LANES;
-    // All of them first: what was just stored is slow to read.
-    let mut blocks = [const { MaybeUninit::<Block<f32>>::uninit() }; SUMS];
-    for (sums, block) in blocks.iter_mut().enumerate().take(groups * vecs) {
-        let (out, cols) = place(sums);
-        // SAFETY: the caller's; a block has room for a register.
-        unsafe {
-            match is_direct(cols) {
-                true => tiles.store(sums, out, tile.out_stride * 4),
-                false => tiles.store(sums, block.as_mut_ptr().cast(), LANES * 4),
+/// Registers of sums, and the rows and columns of the output that they are for.
+struct Sums {
+    /// The first row, rows of a register, and registers of rows.
+    rows: (usize, usize, usize),
+    /// The first register of columns, and how many there are.
+    vecs: (usize, usize),
+}
+
+impl Sums {
+    /// Each register's number, where its sums go, and how many columns it has there; without columns the place is not used.
+    #[inline(always)]
+    fn places(&self, tile: &RawTile<bf16>) -> impl Iterator<Item = (usize, *mut f32, usize)> {
+        let ((first, _, groups), (first_vec, vecs)) = (self.rows, self.vecs);
+        let (out, stride, cols) = (tile.out, tile.out_stride, tile.cols);
+        (0..groups * vecs).map(move |sums| {
+            let row = first + sums / vecs * ROWS;
+            let col = (first_vec + sums % vecs) * LANES;
+            let cols = cols.saturating_sub(col).min(LANES);
+            (sums, out.wrapping_add(row * stride + col), cols)
+        })
+    }
+
+    /// Whether sums begin with what is in the output. To be added afterwards they leave the registers, and what was just stored is
+    /// slow to read; where rows of the output overlap, as those of a convolution's gradient do, they are.
+    #[inline(always)]
+    fn begin_with_output(tile: &RawTile<bf16>) -> bool {
+        tile.mode == Mode::Add && tile.out_stride >= tile.cols
+    }
+
+    /// # Safety
+    /// The output has them, as far as `tile.cols` goes.
+    #[inline(always)]
+    unsafe fn load<T: Tiles>(&self, tiles: &mut T, tile: &RawTile<bf16>) {
+        if !Self::begin_with_output(tile) {
+            return;
+        }
+        for (sums, out, cols) in self.places(tile) {
+            if cols == LANES {
+                // SAFETY: the caller's.
+                unsafe { tiles.load_sums(sums, out, tile.out_stride * 4) }
+            } else if cols > 0 {
+                let mut block = Block([[0.0; LANES]; ROWS]);
+                for (row, to) in block.0.iter_mut().enumerate().take(self.rows.1) {
+                    // SAFETY: the caller's.
+                    let from = unsafe { from_raw_parts(out.add(row * tile.out_stride), cols) };
+                    to[..cols].copy_from_slice(from);
+                }
+                // SAFETY: a block has room for a register.
+                unsafe { tiles.load_sums(sums, block.0.as_ptr().cast(), LANES * 4) }
             }
         }
     }
-    for (sums, block) in blocks.iter().enumerate().take(groups * vecs) {
-        let (out, cols) = place(sums);
-        if is_direct(cols) || cols == 0 {
-            continue;
-        }
-        for row in 0..count {
-            // SAFETY: so many rows were stored; the output is exclusively borrowed by the tile.
+
+    /// Writes them, or adds them if they were to be added and did not begin with the output.
+    ///
+    /// # Safety
+    /// As for `load`.
+    #[inline(always)]
+    unsafe fn store<T: Tiles>(&self, tiles: &mut T, tile: &RawTile<bf16>) {
+        let replaces = tile.mode == Mode::Replace || Self::begin_with_output(tile);
+        // All of them first: what was just stored is slow to read.
+        let mut blocks = [const { MaybeUninit::<Block<f32>>::uninit() }; SUMS];
+        for ((sums, out, cols), block) in self.places(tile).zip(&mut blocks) {
+            // SAFETY: the caller's; a block has room for a register.
             unsafe {
-                let sums = &*block.as_ptr().cast::<[f32; LANES]>().add(row);
-                let out = std::slice::from_raw_parts_mut(out.add(row * tile.out_stride), cols);
-                write_row(tile.mode, sums, out);
+                match replaces && cols == LANES {
+                    true => tiles.store(sums, out, tile.out_stride * 4),
+                    false => tiles.store(sums, block.as_mut_ptr().cast(), LANES * 4),
+                }
+            }
+        }
+        for ((_, out, cols), block) in self.places(tile).zip(&blocks) {
+            if cols == 0 || (replaces && cols == LANES) {
+                continue;
+            }
+            for row in 0..self.rows.1 {
+                // SAFETY: so many rows were stored; the output is exclusively borrowed by the tile.
+                unsafe {
+                    let sums = &*block.as_ptr().cast::<[f32; LANES]>().add(row);
+                    let out = from_raw_parts_mut(out.add(row * tile.out_stride), cols);
+                    if replaces {
+                        out.copy_from_slice(&sums[..cols]);
+                    } else if let Ok(out) = <&mut [f32; LANES]>::try_from(&mut *out) {
+                        // A length that is known is one instruction.
+                        add(out, sums);
+                    } else {
+                        add(out, sums);
+                    }
+                }
             }
         }
     }
 }
 
 #[inline(always)]
-fn write_row(mode: Mode, sums: &[f32; LANES], out: &mut [f32]) {
-    if let (Mode::Add, Ok(out)) = (mode, <&mut [f32; LANES]>::try_from(&mut *out)) {
-        for (out, sum) in out.iter_mut().zip(sums) {
-            *out += sum;
-        }
-        return;
-    }
+fn add(out: &mut [f32], sums: &[f32; LANES]) {
     for (out, sum) in out.iter_mut().zip(sums) {
-        *out = match mode {
-            Mode::Add => *out + sum,
-            Mode::Replace => *sum,
-        };
+        *out += sum;
     }
 }

@@ -30,6 +30,8 @@ pub(super) trait Tiles {
     unsafe fn load_right(&mut self, at: *const bf16, stride: usize, tail: bool);
     /// Adds left times right to the sums of this number.
     unsafe fn dot(&mut self, sums: usize, tail: bool);
+    /// Sums that begin with what is at `at`.
+    unsafe fn load_sums(&mut self, sums: usize, at: *const f32, stride: usize);
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize);
 }
 
@@ -153,6 +155,18 @@ impl Tiles for Hardware {
                 (1, true) => dot!("tmm1", "tmm6", "tmm7"),
                 (2, true) => dot!("tmm2", "tmm6", "tmm7"),
                 (_, true) => dot!("tmm3", "tmm6", "tmm7"),
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn load_sums(&mut self, sums: usize, at: *const f32, stride: usize) {
+        unsafe {
+            match sums {
+                0 => load!("tmm0", at, stride),
+                1 => load!("tmm1", at, stride),
+                2 => load!("tmm2", at, stride),
+                _ => load!("tmm3", at, stride),
             }
         }
     }

@@ -78,6 +78,15 @@ impl Tiles for Registers {
         }
     }
 
+    unsafe fn load_sums(&mut self, sums: usize, at: *const f32, stride: usize) {
+        for (row, to) in self.sums[sums][..self.rows].iter_mut().enumerate() {
+            for (col, to) in to.iter_mut().enumerate() {
+                let at = at.cast::<u8>().wrapping_add(row * stride + col * 4);
+                *to = unsafe { at.cast::<f32>().read_unaligned() };
+            }
+        }
+    }
+
     unsafe fn store(&mut self, sums: usize, at: *mut f32, stride: usize) {
         for row in 0..self.rows {
             for col in 0..LANES {

@@ -9,7 +9,8 @@ use super::element::{Element, Rounding};
 pub(crate) enum Mode {
     /// out = a b
     Replace,
-    /// out = out + a b, row after row, so that rows of the output may overlap.
+    /// out = out + a b, row after row, so that rows of the output may overlap. Where they do not, an instruction set may begin the
+    /// sum with `out`.
     Add,
 }
 
