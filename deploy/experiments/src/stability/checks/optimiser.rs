@@ -8,7 +8,7 @@ use driml_learner::{
         target::{FOLLOWED_MAX, follow, follow_error},
     },
 };
-use driml_model::{ModelConfig, Parameters};
+use driml_model::ModelConfig;
 
 use crate::{small, stability::property::*};
 
@@ -35,7 +35,7 @@ pub(super) fn properties() -> Vec<Property> {
             // Of the largest that either ever was.
             .promise("a parameter, as a share of `follow_error`", 1.0)
             .promise("copies of other bits", 0.0)
-            .on(MOVES, Listed, followed_to_the_end)
+            .on(MOVES, Listed, followed)
             .on(A_FEW_MOVES, Drawn(0.02), followed)
             .on("tau 1, drawn", Drawn(0.02), copied),
     ]
@@ -101,79 +101,50 @@ fn clipping(cases: &mut Cases<'_>) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A target network of the smallest kind; in f64 its parameters, and how large they or the online network's ever were.
-struct Followed {
-    target: Parameters,
-    exact: Vec<(f64, f64)>,
-}
-
-impl Followed {
-    /// A network of eight of these parameters.
-    fn new(target: &[f32]) -> anyhow::Result<Self> {
-        let exact = target.iter().map(|&x| (x.into(), x.abs().into()));
-        Ok(Self {
-            target: small::parameters(&small::least(), target)?,
-            exact: exact.collect(),
-        })
-    }
-
-    /// Moves so often towards these parameters.
-    fn follow(&mut self, online: &[f32], tau: f64, moves: u64) -> anyhow::Result<()> {
+/// A target network of the smallest kind, led towards one network after the other.
+fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
+    let start = vec![-0.4, -1.1, 0.6, 2.6, 0.0, 1e-45, -1e30, 1.0];
+    let start = cases.of(&[start], |rng| clamped(10, FOLLOWED_MAX, rng));
+    let taus = [0.95, 0.5, 0.005, 1e-3, 1e-4, 1e-5];
+    let tau: f64 = cases.of(&taus, |rng| 10f64.powf(rng.random_range(-5.0..0.0)));
+    // How often it moves towards each.
+    let end = vec![0.7, -1.3, 0.011, 2.5, 1e-38, 1e-40, 1e30, -1.0];
+    let ways: Vec<(u64, Vec<f32>)> = cases.of(&[vec![((3.0 / tau) as u64, end)]], |rng| {
+        let count = rng.random_range(1..8);
+        let way = |_| (rng.random_range(1..5), clamped(10, FOLLOWED_MAX, rng));
+        (0..count).map(way).collect()
+    });
+    let target = small::parameters(&small::least(), &start)?;
+    // In f64 its parameters, and how large they or the online network's ever were.
+    let mut exact: Vec<_> = widened(&start).iter().map(|&x| (x, x.abs())).collect();
+    for (moves, online) in &ways {
         let source = small::parameters(&small::least(), online)?;
-        for _ in 0..moves {
-            follow(&self.target, &source, tau, Kernels::FUSED)?;
+        for _ in 0..*moves {
+            follow(&target, &source, tau, Kernels::FUSED)?;
         }
         // All moves at once: what is left of the distance is (1 - tau)^moves.
-        let left = (moves as f64 * (-tau).ln_1p()).exp();
-        for ((exact, largest), online) in self.exact.iter_mut().zip(widened(online)) {
+        let left = (*moves as f64 * (-tau).ln_1p()).exp();
+        for ((exact, largest), online) in exact.iter_mut().zip(widened(online)) {
             *exact = online + left * (*exact - online);
             *largest = largest.max(online.abs());
         }
-        Ok(())
     }
-
-    /// The largest error, as a share of what is promised.
-    fn error(&self, tau: f64) -> anyhow::Result<f64> {
-        let found = small::values(&small::least(), &self.target)?;
-        let errors = found
-            .iter()
-            .zip(&self.exact)
-            .map(|(&found, (exact, largest))| {
-                (f64::from(found) - exact).abs() / largest.max(LEAST) / follow_error(tau)
-            });
-        Ok(worst(errors))
-    }
-}
-
-fn followed_to_the_end(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let tau = cases.each(&[0.95, 0.5, 0.005, 1e-3, 1e-4, 1e-5]);
-    let moves = (3.0 / tau) as u64;
-    let mut network = Followed::new(&[-0.4, -1.1, 0.6, 2.6, 0.0, 1e-45, -1e30, 1.0])?;
-    let end = [0.7, -1.3, 0.011, 2.5, 1e-38, 1e-40, 1e30, -1.0];
-    network.follow(&end, tau, moves)?;
-    let input = format_args!("tau {tau}, {moves} moves");
-    cases.see(input, [network.error(tau)?])
-}
-
-fn followed(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let rng = &mut cases.rng;
-    let start = clamped(10, FOLLOWED_MAX, rng);
-    let mut network = Followed::new(&start)?;
-    let tau = 10f64.powf(rng.random_range(-5.0..0.0));
-    for _ in 0..rng.random_range(1..8) {
-        let moves = rng.random_range(1..5);
-        network.follow(&clamped(10, FOLLOWED_MAX, rng), tau, moves)?;
-    }
-    let input = format_args!("tau {tau:e}, from {}", Shown(&start));
-    cases.see(input, [network.error(tau)?])
+    let found = widened(&small::values(&small::least(), &target)?);
+    let errors = found.iter().zip(exact).map(|(found, (exact, largest))| {
+        (found - exact).abs() / largest.max(LEAST) / follow_error(tau)
+    });
+    let moves: u64 = ways.iter().map(|(moves, _)| moves).sum();
+    let input = format_args!("tau {tau:e}, {moves} moves, from {}", Shown(&start));
+    cases.see(input, [worst(errors)])
 }
 
 fn copied(cases: &mut Cases<'_>) -> anyhow::Result<()> {
-    let mut network = Followed::new(&finites(10, &mut cases.rng))?;
+    let config = small::least();
+    let target = small::parameters(&config, &finites(10, &mut cases.rng))?;
     let online = finites(8, &mut cases.rng);
-    network.follow(&online, 1.0, 1)?;
-    let found = small::values(&small::least(), &network.target)?;
-    for (found, online) in found.iter().zip(&online) {
+    let source = small::parameters(&config, &online)?;
+    follow(&target, &source, 1.0, Kernels::FUSED)?;
+    for (found, online) in small::values(&config, &target)?.iter().zip(&online) {
         let is_copied = found.to_bits() == online.to_bits();
         cases.keeps(1, format_args!("{online:e}"), is_copied)?;
     }
