@@ -2,11 +2,11 @@
 
 use candle_core::Device;
 use driml_learner::{
-    Agent, Compute, Lambda, LearnerSettings, NetworkParameters, OwnedBatch,
+    Agent, Compute, LearnerSettings, NetworkParameters, OwnedBatch,
     parity::deviation::{ErrorOfUpdate, REFERENCE},
 };
 use driml_machine::resources::Machine;
-use driml_model::{ConvLayer, ModelConfig, Parameters};
+use driml_model::{ModelConfig, Parameters};
 use driml_protocol::NO_ACTION;
 use driml_settings::flags::of_names;
 
@@ -28,6 +28,17 @@ pub(super) fn properties() -> Vec<Property> {
 }
 
 const ACTIONS: usize = 4;
+
+/// How a small network and its loss differ from those of a run: all four pairs of DIM have a weight.
+const SETS: [&str; 7] = [
+    "learner.update.lambda.3t3=0.5",
+    "learner.update.lambda.3t4=0.5",
+    "learner.update.lambda.4t3=0.5",
+    "model.conv=[{out=8,kernel=4,stride=2},{out=8,kernel=3,stride=1}]",
+    "model.hidden=32",
+    "model.embedding_dim=16",
+    "model.action_embed=4",
+];
 
 /// What an update computes with, beside its weights and rows.
 #[derive(Debug)]
@@ -60,54 +71,32 @@ impl Setting {
         }
     }
 
-    fn learner(&self) -> anyhow::Result<LearnerSettings> {
-        let run = of_names("paper", "chain", "driml-fix", &[], &Machine::this())?;
-        Ok(LearnerSettings {
-            lambda: Lambda {
-                l3t3: 0.5,
-                l3t4: 0.5,
-                l4t3: 0.5,
-                l4t4: 1.0,
-            },
-            tanh_clip: self.tanh_clip,
-            ..run.learner.update
-        })
-    }
-
-    fn model(&self, settings: &LearnerSettings) -> ModelConfig {
-        let layer = |kernel, stride| ConvLayer {
-            out: 8,
-            kernel,
-            stride,
-        };
-        ModelConfig {
+    /// Two agents of one network, which has initial weights times the scale: with our kernels, and with candle's.
+    fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
+        let run = of_names("paper", "chain", "driml-fix", &SETS, &Machine::this())?;
+        let model = ModelConfig {
             height: 20,
             width: 20,
             input_channels: 2,
             num_actions: ACTIONS,
-            conv: vec![layer(4, 2), layer(3, 1)],
-            embedding_dim: 16,
-            action_embed: 4,
-            dim: settings.dim_heads(ACTIONS),
-            ..small::config(51, 32, self.support)
-        }
-    }
-
-    /// Two agents of one network, which has initial weights times the scale: with our kernels, and with candle's.
-    fn agents(&self, rng: &mut ChaCha8Rng) -> anyhow::Result<[Agent; 2]> {
-        let settings = self.learner()?;
-        let model = self.model(&settings);
-        let mut weights = || -> anyhow::Result<Parameters> {
-            let drawn = Parameters::init(&model, rng, &Device::Cpu)?;
-            let mut values = small::values(&model, &drawn)?;
-            values.iter_mut().for_each(|value| *value *= self.scale);
-            Ok(small::parameters(&model, &values)?)
+            v_min: self.support.0,
+            v_max: self.support.1,
+            ..run.model
         };
-        let (online, target) = (weights()?, weights()?.without_dim()?);
+        let settings = LearnerSettings {
+            tanh_clip: self.tanh_clip,
+            ..run.learner.update
+        };
+        let mut weights = || -> anyhow::Result<Vec<f32>> {
+            let drawn = Parameters::init(&model, rng, &Device::Cpu)?;
+            let values = small::values(&model, &drawn)?.into_iter();
+            Ok(values.map(|value| value * self.scale).collect())
+        };
+        let (online, target) = (weights()?, weights()?);
         let agent = |compute: &Compute| -> anyhow::Result<Agent> {
             let parameters = NetworkParameters {
-                online: online.copy()?,
-                target: target.copy()?,
+                online: small::parameters(&model, &online)?,
+                target: small::parameters(&model, &target)?.without_dim()?,
                 key: None,
             };
             let (model, settings) = (model.clone(), settings.clone());
