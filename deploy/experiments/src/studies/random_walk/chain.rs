@@ -95,21 +95,11 @@ impl Chain {
         apart * apart + 4.0 * up * down * sine * sine
     }
 
-    /// The stationary law as the rows of T^(2^40), by squaring.
+    /// The stationary law as the rows of T^(2^40), whose trace is 1.
     fn stationary_numerically(&self) -> Vec<f64> {
-        let (mut power, k) = (self.transitions(), self.states);
-        for _ in 0..40 {
-            let square =
-                |i: usize, j: usize| (0..k).map(|l| power[i * k + l] * power[l * k + j]).sum();
-            let next: Vec<f64> = (0..k * k).map(|at| square(at / k, at % k)).collect();
-            // Rounding would let the rows' sums drift, and squaring double the drift.
-            let normalised = next.chunks(k).flat_map(|row| {
-                let sum: f64 = row.iter().sum();
-                row.iter().map(move |p| p / sum)
-            });
-            power = normalised.collect();
-        }
-        power[..k].to_vec()
+        let mut rows = high_power(self.transitions(), self.states);
+        rows.truncate(self.states);
+        rows
     }
 
     /// Sum of rho_i T_ij ln(T_ij / rho_j), in nats.
@@ -123,13 +113,24 @@ impl Chain {
         (0..k * k).map(term).sum()
     }
 
-    /// 1 - lambda_2 from the eigenvalues of the symmetric matrix sqrt(T_ij T_ji), which has T's as T balances in detail.
+    /// 1 - lambda_2 from the symmetric matrix sqrt(T_ij T_ji), which has T's eigenvalues as T balances in detail.
+    ///
+    /// Its first eigenvalue, 1 of the vector sqrt(rho), is taken out. Of what is left, lambda_2 is the largest, and a high power of
+    /// 1 + matrix is v v^T of its vector v.
     pub(super) fn spectral_gap_numerically(&self) -> f64 {
         let (t, k) = (self.transitions(), self.states);
-        let entry = |at: usize| (t[at] * t[at % k * k + at / k]).sqrt();
-        let mut values = eigenvalues((0..k * k).map(entry).collect(), k);
-        values.sort_by(f64::total_cmp);
-        values[k - 1] - values[k - 2]
+        let rho = self.stationary_numerically();
+        let entry = |at: usize| {
+            let (i, j) = (at / k, at % k);
+            (t[at] * t[j * k + i]).sqrt() - (rho[i] * rho[j]).sqrt()
+        };
+        let matrix: Vec<f64> = (0..k * k).map(entry).collect();
+        let mut shifted = matrix.clone();
+        shifted.iter_mut().step_by(k + 1).for_each(|it| *it += 1.0);
+        let projection = high_power(shifted, k);
+        // v^T matrix v.
+        let terms = matrix.iter().zip(projection).map(|(a, b)| a * b);
+        1.0 - terms.sum::<f64>()
     }
 
     pub(super) fn step(&self, state: usize, rng: &mut impl Rng) -> usize {
@@ -147,29 +148,17 @@ fn entropy(law: &[f64]) -> f64 {
     -terms.sum::<f64>()
 }
 
-/// Eigenvalues of a symmetric matrix [k, k] by Jacobi's rotations.
-fn eigenvalues(mut a: Vec<f64>, k: usize) -> Vec<f64> {
-    // Each sweep at least halves what is off the diagonal; later ones square it.
-    for _ in 0..60 {
-        for p in 0..k {
-            for q in p + 1..k {
-                let off = a[p * k + q];
-                if off.abs() < 1e-300 {
-                    continue;
-                }
-                let theta = (a[q * k + q] - a[p * k + p]) / (2.0 * off);
-                let tan = theta.signum() / (theta.abs() + theta.hypot(1.0));
-                let cos = 1.0 / tan.hypot(1.0);
-                let sin = tan * cos;
-                let mut rotate = |x: usize, y: usize| {
-                    (a[x], a[y]) = (cos * a[x] - sin * a[y], sin * a[x] + cos * a[y]);
-                };
-                (0..k).for_each(|i| rotate(i * k + p, i * k + q));
-                (0..k).for_each(|i| rotate(p * k + i, q * k + i));
-            }
-        }
+/// The power 2^40 of a matrix [k, k], by squaring, over its trace.
+fn high_power(mut matrix: Vec<f64>, k: usize) -> Vec<f64> {
+    for _ in 0..40 {
+        let term = |at: usize, l: usize| matrix[at / k * k + l] * matrix[l * k + at % k];
+        let entry = |at| (0..k).map(|l| term(at, l)).sum();
+        let square: Vec<f64> = (0..k * k).map(entry).collect();
+        // Each time, as squaring would double how far rounding lets it drift.
+        let trace: f64 = square.iter().step_by(k + 1).sum();
+        matrix = square.into_iter().map(|it| it / trace).collect();
     }
-    (0..k).map(|i| a[i * k + i]).collect()
+    matrix
 }
 
 #[cfg(test)]
