@@ -317,12 +317,8 @@ mod tests {
             ("none was tried", 0, 0.0, "", false),
         ];
         for (row, expected) in rows.iter().zip(expected) {
-            let Seen {
-                cases,
-                worst,
-                input,
-            } = &row.seen;
-            let found = (&*row.extreme, *cases, *worst, &**input, row.is_kept());
+            let (extreme, seen) = (&*row.extreme, &row.seen);
+            let found = (extreme, seen.cases, seen.worst, &*seen.input, row.is_kept());
             assert_eq!(found, expected);
             assert_eq!(row.is_drawn, row.extreme == "drawn");
         }

@@ -49,14 +49,9 @@ fn estimate(groups: &[&Scores], of: impl Fn(&[Scores]) -> f64) -> Option<Interva
         });
         seeds as f64 * mean - (seeds - 1) as f64 * of(&others)
     };
-    let ends = match seeds {
-        1 => None,
-        _ => {
-            let found = interval(&(0..seeds).map(pseudo_value).collect::<Vec<_>>())?;
-            let around = |end: f64| mean + end - found.mean;
-            found.ends.map(|(low, high)| (around(low), around(high)))
-        }
-    };
+    let found = interval(&(0..seeds).map(pseudo_value).collect::<Vec<_>>())?;
+    let around = |end: f64| mean + end - found.mean;
+    let ends = found.ends.map(|(low, high)| (around(low), around(high)));
     Some(Interval { mean, ends })
 }
 

@@ -13,6 +13,7 @@ const ROW_SUM_ERROR: f64 = 2.5e-7;
 /// 15 has.
 const UNIFORM_ERROR: f64 = 3e-8;
 
+const ALWAYS: &str = "always the same action: an entry, beside 1 / actions";
 const COUNTS: &str = "2, 15, 60 actions, five uses of them; counts from 0, 2^24, 2^53, 1e299; decay 1, 0.999, 0.5, 1e-300; smoothing 1e-100, 1, 1e100";
 
 pub(super) fn properties(settings: &Settings) -> Vec<Property> {
@@ -29,10 +30,7 @@ pub(super) fn properties(settings: &Settings) -> Vec<Property> {
         Property::new("affinity, learned", "any pairs of 1 to 255 actions")
             .promise("a row's sum, beside 1, at any update", ROW_SUM_ERROR)
             // One pair says nothing of how actions follow each other.
-            .promise(
-                "always the same action: an entry, beside 1 / actions",
-                UNIFORM_ERROR,
-            )
+            .promise(ALWAYS, UNIFORM_ERROR)
             .on(&updates, Listed, learned),
     ]
 }
@@ -77,24 +75,21 @@ fn row_sum_error(matrix: &[f32], actions: usize) -> f64 {
 
 /// A of these counts: each row of (c + s) / (e + s), e = what independent actions would have, over its sum.
 fn closed_form(counts: &[f64], actions: usize, smoothing: f64) -> Vec<f64> {
-    let column = |j: usize| exact_sum((0..actions).map(|i| counts[i * actions + j]));
+    let rows = || counts.chunks_exact(actions);
+    let column = |j: usize| exact_sum(rows().map(|row| row[j]));
     let columns: Vec<f64> = (0..actions).map(column).collect();
-    let total = exact_sum(columns.iter().copied());
-    let mut matrix = Vec::new();
-    for row in counts.chunks_exact(actions) {
-        let sum_of_row = exact_sum(row.iter().copied());
-        let ratios = row.iter().zip(&columns).map(|(count, column)| {
-            let independent = match total {
-                0.0 => 0.0,
-                _ => sum_of_row * (column / total),
-            };
-            (count + smoothing) / (independent + smoothing)
-        });
-        let ratios: Vec<f64> = ratios.collect();
+    // Where nothing was counted, 0 of any total is 0.
+    let total = exact_sum(columns.iter().copied()).max(f64::MIN_POSITIVE);
+    let chances = rows().flat_map(|row| {
+        let of_row = exact_sum(row.iter().copied());
+        let ratio = |(count, column): (&f64, &f64)| {
+            (count + smoothing) / (of_row * (column / total) + smoothing)
+        };
+        let ratios: Vec<f64> = row.iter().zip(&columns).map(ratio).collect();
         let sum = exact_sum(ratios.iter().copied());
-        matrix.extend(ratios.into_iter().map(|ratio| ratio / sum));
-    }
-    matrix
+        ratios.into_iter().map(move |ratio| ratio / sum)
+    });
+    chances.collect()
 }
 
 fn exact(cases: &mut Cases<'_>) -> anyhow::Result<()> {

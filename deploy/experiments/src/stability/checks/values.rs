@@ -9,6 +9,7 @@ use driml_model::{
 use crate::{small, stability::property::*};
 
 const LOGITS: &str = "2, 51, 1,001 atoms; supports from 0, far from 0 ([1e6, 1e6 + 1], [1000, 1001]), 1 ulp and 2e30 wide; logits equal, +-1e38, some -inf";
+const EQUAL: &str = "logits equal, ramps, +-3.4e38, subnormal, one unlike the rest";
 const TOO_LARGE: &str = "weights that take a value beyond 3.4e38 in some rows of a batch";
 
 pub(super) fn properties() -> Vec<Property> {
@@ -24,11 +25,7 @@ pub(super) fn properties() -> Vec<Property> {
             .promise("how far its value is below the largest", F32_STEP)
             .promise("actions of which a lower one has the same logits", 0.0)
             .promise("rows beyond the finite numbers not refused by number", 0.0)
-            .on(
-                "logits equal, ramps, +-3.4e38, subnormal, one unlike the rest",
-                Listed,
-                greedy,
-            )
+            .on(EQUAL, Listed, greedy)
             .on("drawn logits, some of them equal", Drawn(0.05), greedy)
             .on(TOO_LARGE, Drawn(0.05), too_large),
     ]

@@ -99,7 +99,8 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         }
         batches_left -= 1;
         let (now, next) = episodes.pairs(settings.batch_size, &mut rng);
-        loss.push(scorer.learn(&now, &next)?);
+        let (now, next) = (scorer.features(&now)?, scorer.features(&next)?);
+        loss.push(scorer.learner.learn(&now, &next)?);
         progress.advance(1)?;
     }
     let (last, maps) = scorer.measure(settings.episodes)?;
@@ -178,12 +179,6 @@ impl Scorer<'_> {
         let shape = (rows, model.height, model.width, model.input_channels);
         let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
         Ok(self.learner.network.features(&frames)?)
-    }
-
-    /// An update on pairs (s_t, s_{t+1}); gives InfoNCE's loss before it.
-    fn learn(&mut self, now: &[u8], next: &[u8]) -> anyhow::Result<f32> {
-        let (now, next) = (self.features(now)?, self.features(next)?);
-        self.learner.learn(&now, &next)
     }
 
     /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
