@@ -1,6 +1,6 @@
 //! Networks that are as small as networks can be, to carry numbers through routines that work on all parameters at once.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, iter};
 
 use candle_core::{Device, Tensor};
 use driml_model::{ConvLayer, DimHeads, HeadConfig, ModelConfig, Parameters, Result, TorsoName};
@@ -46,18 +46,17 @@ pub(crate) fn len(config: &ModelConfig) -> usize {
         .sum()
 }
 
-/// Tensors with these scalars, one after the other.
+/// Tensors with these scalars, one after the other; 0 where there are no more.
 pub(crate) fn tensors(config: &ModelConfig, values: &[f32]) -> Result<HashMap<String, Tensor>> {
-    let mut rest = values;
+    let mut rest = values.iter().copied().chain(iter::repeat(0.0));
     let each = config.parameter_shapes().into_iter().map(|(name, shape)| {
-        let (first, after) = rest.split_at(shape.iter().product());
-        rest = after;
-        Ok((name, Tensor::from_slice(first, shape, &Device::Cpu)?))
+        let first: Vec<f32> = rest.by_ref().take(shape.iter().product()).collect();
+        Ok((name, Tensor::from_vec(first, shape, &Device::Cpu)?))
     });
     each.collect()
 }
 
-/// Parameters with these scalars, which are finite.
+/// Parameters with these scalars, which are finite, as [`tensors`] takes them.
 pub(crate) fn parameters(config: &ModelConfig, values: &[f32]) -> Result<Parameters> {
     Parameters::from_tensors(config, tensors(config, values)?, &Device::Cpu)
 }

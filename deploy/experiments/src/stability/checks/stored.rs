@@ -71,9 +71,7 @@ fn turning_points(stored: StoredAs) -> Vec<f32> {
 fn see(cases: &mut Cases<'_>, stored: StoredAs, values: &[f32]) -> anyhow::Result<()> {
     let atoms = values.len().div_ceil(HIDDEN).max(2);
     let config = small::config(atoms, HIDDEN, (-1.0, 1.0));
-    let mut all = vec![0.0; small::len(&config)];
-    all[..values.len()].copy_from_slice(values);
-    let bytes = small::parameters(&config, &all)?.to_safetensors_as(stored, |_| true)?;
+    let bytes = small::parameters(&config, values)?.to_safetensors_as(stored, |_| true)?;
     let read = Parameters::load_safetensors(&config, &bytes, &Device::Cpu)?;
     for (&x, found) in values.iter().zip(small::values(&config, &read)?) {
         let step = step_at(stored, x);

@@ -44,8 +44,7 @@ fn expected(cases: &mut Cases<'_>) -> anyhow::Result<()> {
         }
     }
     let config = small::config(atoms, 1, support);
-    let parameters = small::parameters(&config, &vec![0.0; small::len(&config)])?;
-    let network = Network::new(&config, &parameters)?;
+    let network = Network::new(&config, &small::parameters(&config, &[])?)?;
     let batch = Tensor::from_slice(&logits, (1, 1, atoms), &Device::Cpu)?;
     let found = network.q_values(&batch)?.flatten_all()?.to_vec1::<f32>()?[0];
     let (low, high) = (f64::from(support.0), f64::from(support.1));
