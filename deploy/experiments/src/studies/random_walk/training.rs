@@ -92,16 +92,20 @@ pub(super) fn train(
     progress: &mut Progress,
 ) -> anyhow::Result<Learnt> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut heads = Heads::new(chain.states, settings, &mut rng)?;
+    let mut learner = heads(chain.states, settings, &mut rng)?;
+    let all = one_hot(chain.states, 0..chain.states)?;
     let mut source = source(chain, settings, sampling, &mut rng);
     let (mut learnt, mut measure_next) = (Learnt::default(), 0);
     for update in 0..=settings.updates {
         if update >= measure_next || update == settings.updates {
-            learnt.measure(update, chain, heads.scores()?);
+            learnt.measure(update, chain, learner.scores(&all, &all)?);
             measure_next = ((update as f64 * MEASURE_GROWTH).ceil() as u64).max(update + 1);
         }
         if update < settings.updates {
-            heads.learn(&source(&mut rng))?;
+            let pairs = source(&mut rng);
+            let now = one_hot(chain.states, pairs.iter().map(|pair| pair.0))?;
+            let next = one_hot(chain.states, pairs.iter().map(|pair| pair.1))?;
+            learner.learn(&now, &next)?;
             progress.advance(1)?;
         }
     }
@@ -147,57 +151,36 @@ impl Learnt {
     }
 }
 
-/// The heads Psi_4 and Phi_4 with their optimiser.
-struct Heads {
-    learner: DimLearner,
-    states: usize,
+/// The heads Psi_4 and Phi_4, and how they learn.
+///
+/// They read f4, which is here the one-hot state itself; torso and C51 head are as small as can be, and no loss reaches them.
+fn heads(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<DimLearner> {
+    let lambda = Lambda {
+        l4t4: 1.0,
+        ..Lambda::NONE
+    };
+    let model = ModelConfig {
+        embedding_dim: settings.embedding_dim,
+        dim: lambda.dim_heads(false),
+        ..small::config(2, states, (0.0, 1.0))
+    };
+    let tanh_clip = settings.tanh_clip;
+    let dim = Dim { lambda, tanh_clip };
+    DimLearner::new(&model, dim, settings.adam, settings.max_grad_norm, rng)
 }
 
-impl Heads {
-    fn new(states: usize, settings: &Settings, rng: &mut ChaCha8Rng) -> anyhow::Result<Self> {
-        let lambda = Lambda {
-            l4t4: 1.0,
-            ..Lambda::NONE
-        };
-        // The heads read f4, which is here the one-hot state itself; torso and C51 head are as small as can be, and
-        // no loss reaches them.
-        let model = ModelConfig {
-            embedding_dim: settings.embedding_dim,
-            dim: lambda.dim_heads(false),
-            ..small::config(2, states, (0.0, 1.0))
-        };
-        let tanh_clip = settings.tanh_clip;
-        let dim = Dim { lambda, tanh_clip };
-        let norm_max = settings.max_grad_norm;
-        Ok(Self {
-            learner: DimLearner::new(&model, dim, settings.adam, norm_max, rng)?,
-            states,
-        })
-    }
-
-    fn features(&self, states: impl ExactSizeIterator<Item = usize>) -> anyhow::Result<Features> {
-        let rows = states.len();
-        let row = |state: usize| (0..self.states).map(move |it| f32::from(it == state));
-        let one_hot: Vec<f32> = states.flat_map(row).collect();
-        Ok(Features {
-            f3: None,
-            f4: Tensor::from_vec(one_hot, (rows, self.states), &Device::Cpu)?,
-        })
-    }
-
-    /// One update on pairs (s_t, s_{t+1}).
-    fn learn(&mut self, pairs: &[(usize, usize)]) -> anyhow::Result<()> {
-        let now = self.features(pairs.iter().map(|pair| pair.0))?;
-        let next = self.features(pairs.iter().map(|pair| pair.1))?;
-        self.learner.learn(&now, &next)?;
-        Ok(())
-    }
-
-    /// Scores [K, K] of each state with each.
-    fn scores(&self) -> anyhow::Result<Vec<f64>> {
-        let all = self.features(0..self.states)?;
-        self.learner.scores(&all, &all)
-    }
+/// Features of these states of a chain of `count`, a row each.
+fn one_hot(
+    count: usize,
+    states: impl ExactSizeIterator<Item = usize>,
+) -> candle_core::Result<Features> {
+    let rows = states.len();
+    let row = |state: usize| (0..count).map(move |it| f32::from(it == state));
+    let values: Vec<f32> = states.flat_map(row).collect();
+    Ok(Features {
+        f3: None,
+        f4: Tensor::from_vec(values, (rows, count), &Device::Cpu)?,
+    })
 }
 
 /// Draws a batch of pairs.
