@@ -81,14 +81,13 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         tanh_clip: given.tanh_clip,
     };
     let norm_max = given.max_grad_norm;
-    let learner = DimLearner::new(&task.model, dim, given.adam, norm_max, &mut rng)?;
-    let mut scorer = Scorer { task, learner };
+    let mut learner = DimLearner::new(&task.model, dim, given.adam, norm_max, &mut rng)?;
     let (mut episodes, mut batches_left) = (Episodes::default(), 0);
     let (mut loss, mut checks) = (Vec::new(), Vec::new());
     let period = (settings.updates / settings.checks.max(1)).max(1);
     for update in 0..settings.updates {
         if update.is_multiple_of(period) {
-            checks.push((update, scorer.measure(settings.check_episodes)?.0));
+            checks.push((update, measure(task, &learner, settings.check_episodes)?.0));
         }
         if batches_left == 0 {
             // As many batches as there are pairs in an episode: each is used once, on average.
@@ -99,11 +98,11 @@ pub(super) fn train(task: &Task, seed: u64, progress: &mut Progress) -> anyhow::
         }
         batches_left -= 1;
         let (now, next) = episodes.pairs(settings.batch_size, &mut rng);
-        let (now, next) = (scorer.features(&now)?, scorer.features(&next)?);
-        loss.push(scorer.learner.learn(&now, &next)?);
+        let [now, next] = [now, next].map(|frames| features(task, &learner, &frames));
+        loss.push(learner.learn(&now?, &next?)?);
         progress.advance(1)?;
     }
-    let (last, maps) = scorer.measure(settings.episodes)?;
+    let (last, maps) = measure(task, &learner, settings.episodes)?;
     checks.push((settings.updates, last));
     Ok(Trained { loss, checks, maps })
 }
@@ -146,7 +145,7 @@ impl Episodes {
         })
     }
 
-    /// The episodes that `Scorer::measure` looks at first.
+    /// The episodes that [`measure`] looks at first.
     pub(super) fn measured(task: &Task, steps: u32) -> anyhow::Result<Self> {
         let seed = MEASURED_SEED;
         Self::play(&task.world, task.settings.batch_size, steps, seed)
@@ -166,54 +165,50 @@ impl Episodes {
     }
 }
 
-/// The network that learns, and what it is measured on.
-struct Scorer<'a> {
-    task: &'a Task,
-    learner: DimLearner,
+/// What the learner's network sees in these frames, a row each.
+fn features(task: &Task, learner: &DimLearner, frames: &[u8]) -> anyhow::Result<Features> {
+    let model = &task.model;
+    let rows = frames.len() / model.frame_len();
+    let shape = (rows, model.height, model.width, model.input_channels);
+    let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
+    Ok(learner.network.features(&frames)?)
 }
 
-impl Scorer<'_> {
-    fn features(&self, frames: &[u8]) -> anyhow::Result<Features> {
-        let model = &self.task.model;
-        let rows = frames.len() / model.frame_len();
-        let shape = (rows, model.height, model.width, model.input_channels);
-        let frames = Tensor::from_slice(frames, shape, &Device::Cpu)?;
-        Ok(self.learner.network.features(&frames)?)
-    }
-
-    /// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
-    fn measure(&self, episodes: usize) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
-        let (world, settings) = (&self.task.world, &self.task.settings);
-        let (rows, t) = (settings.batch_size, settings.from_t as usize);
-        let view = View::of(&self.task.model);
-        let mut tally = Tally::default();
-        let mut maps = Vec::new();
-        for batch in 0..episodes.div_ceil(rows).max(1) {
-            let seed = MEASURED_SEED + batch as u64;
-            let played = Episodes::play(world, rows, settings.from_t + 1, seed)?;
-            let (now, next) = (&played.frames[t], &played.frames[t + 1]);
-            let (now, next) = (self.features(now)?, self.features(next)?);
-            // [L, B, B] of every anchor with every candidate, at each location.
-            let scores = self.learner.scores(&now, &next)?;
-            let logs = log_softmax(&scores, rows);
-            let locations = scores.len() / (rows * rows);
-            for location in 0..locations {
-                let place = (location / view.columns, location % view.columns);
-                let of = |origin: &(usize, usize)| view.cover(place, *origin, world.patch_size);
-                let cover: Vec<Cover> = played.origins.iter().map(of).collect();
-                tally.add(location, &cover, &scores, &logs, rows);
-            }
-            if batch == 0 {
-                let most = (rows as f64).ln();
-                let map = |row: usize| {
-                    let at = |location: usize| logs[(location * rows + row) * rows + row];
-                    (0..locations).map(|it| at(it) + most).collect()
-                };
-                maps = (0..rows.min(3)).map(map).collect();
-            }
+/// Measures on whole batches of episodes, at least one, and gives the first three episodes' maps.
+fn measure(
+    task: &Task,
+    learner: &DimLearner,
+    episodes: usize,
+) -> anyhow::Result<(Measured, Vec<Vec<f64>>)> {
+    let (world, settings) = (&task.world, &task.settings);
+    let (rows, t) = (settings.batch_size, settings.from_t as usize);
+    let view = View::of(&task.model);
+    let mut tally = Tally::default();
+    let mut maps = Vec::new();
+    for batch in 0..episodes.div_ceil(rows).max(1) {
+        let seed = MEASURED_SEED + batch as u64;
+        let played = Episodes::play(world, rows, settings.from_t + 1, seed)?;
+        let [now, next] = [t, t + 1].map(|t| features(task, learner, &played.frames[t]));
+        // [L, B, B] of every anchor with every candidate, at each location.
+        let scores = learner.scores(&now?, &next?)?;
+        let logs = log_softmax(&scores, rows);
+        let locations = scores.len() / (rows * rows);
+        for location in 0..locations {
+            let place = (location / view.columns, location % view.columns);
+            let of = |origin: &(usize, usize)| view.cover(place, *origin, world.patch_size);
+            let cover: Vec<Cover> = played.origins.iter().map(of).collect();
+            tally.add(location, &cover, &scores, &logs, rows);
         }
-        Ok((tally.measured(), maps))
+        if batch == 0 {
+            let most = (rows as f64).ln();
+            let map = |row: usize| {
+                let at = |location: usize| logs[(location * rows + row) * rows + row];
+                (0..locations).map(|it| at(it) + most).collect()
+            };
+            maps = (0..rows.min(3)).map(map).collect();
+        }
     }
+    Ok((tally.measured(), maps))
 }
 
 /// Scores normalised over the candidates of each anchor, [L, B, B].
