@@ -64,20 +64,13 @@ pub(super) fn figure(rows: &[Row], cases: &str) -> Figure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stability::property::Seen;
+    use crate::stability::tests::row;
 
     #[test]
     fn inputs_have_their_side_and_a_promise_that_was_not_tried_is_not_kept() {
         let row = |is_drawn, cases, worst| Row {
-            routine: "halving",
             is_drawn,
-            bound: 0.5,
-            seen: Seen {
-                cases,
-                worst,
-                ..Seen::default()
-            },
-            ..Row::default()
+            ..row(cases, worst, "")
         };
         let rows = [row(false, 1, 0.25), row(true, 1, 0.0), row(false, 0, 0.0)];
         let names = ["halving".to_owned()];

@@ -118,24 +118,27 @@ fn values(rows: &[Row], settings: &Settings) -> Value {
 mod tests {
     use super::{property::Seen, *};
 
-    #[test]
-    fn the_page_and_the_verdict_name_what_is_broken() {
-        let mut row = Row {
+    /// What was seen of a promise.
+    pub(super) fn row(cases: u64, worst: f64, input: &str) -> Row {
+        Row {
             routine: "halving",
             extreme: "big".into(),
             promise: "error of |x|",
             bound: 0.5,
-            ..Row::default()
-        };
-        let mut reported = |worst: f64, input: &str| {
-            row.seen = Seen {
-                cases: 1,
+            seen: Seen {
+                cases,
                 worst,
                 input: input.into(),
-            };
-            let rows = [row.clone()];
-            let settings = flags::settings(NAME, SETTINGS, true);
-            let values = values(&rows, &settings);
+            },
+            ..Row::default()
+        }
+    }
+
+    #[test]
+    fn the_page_and_the_verdict_name_what_is_broken() {
+        let reported = |worst: f64, input: &str| {
+            let rows = [row(1, worst, input)];
+            let values = values(&rows, &flags::settings(NAME, SETTINGS, true));
             let page = crate::page::page(include_str!("page.md.j2"), values, true, "1 s.");
             (verdict(&rows), page)
         };
