@@ -30,24 +30,19 @@ pub(crate) enum Value {
     Counter(fn(&RunView) -> Option<f64>),
     /// A number that may fall.
     Gauge(fn(&RunView) -> Option<f64>),
-    /// A gauge for each of several things, such as each auxiliary loss: a column each.
+    /// A gauge for each of several things, such as each auxiliary loss: a column each, its name after the prefix.
     Each {
         /// What tells them apart, as Prometheus' label.
         label: &'static str,
+        prefix: &'static str,
         members: fn(&RunView) -> Vec<Member>,
     },
     /// Words, which are in `metrics.csv` and JSON alone.
     Words(fn(&RunView) -> String),
 }
 
-/// One of several things that a metric is known of.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Member {
-    pub(crate) column: String,
-    pub(crate) name: String,
-    /// Its value, in the metric's unit; none where it is not known.
-    pub(crate) value: Option<f64>,
-}
+/// The name of one of several things, and its value in the metric's unit; none where it is not known.
+pub(crate) type Member = (String, Option<f64>);
 
 /// Makes [`COLUMNS`]: a row has a metric's name, unit, group and title, then what it measures, then how it is taken.
 macro_rules! columns {
@@ -85,19 +80,19 @@ columns! {
         Value::Gauge(|it| it.replay.replay_ratio());
     "episodes", "episodes", "return", "Episodes":
         "Training episodes that ended.",
-        Value::Counter(|it| Some(it.episodes().count as f64));
+        Value::Counter(|it| Some(it.episodes.count as f64));
     "mean_return", "mean of the last 100 episodes", "return", "Return":
         "Mean undiscounted return of the newest training episodes.",
-        Value::Gauge(|it| it.episodes().mean_return);
+        Value::Gauge(|it| it.episodes.mean_return);
     "mean_return_of", "episodes", "return", "Episodes in the mean return":
         "Episodes in the mean return: 100, or as many as there were.",
-        Value::Gauge(|it| Some(it.episodes().mean_return_of as f64));
+        Value::Gauge(|it| Some(it.episodes.mean_return_of as f64));
     "c51_kl", "KL divergence [nats]", "learning", "C51 loss":
         "C51's loss of the last update.",
         Value::Gauge(|it| learned(it, |it| it.c51_kl.into()));
     "losses", "auxiliary loss [nats]", "learning", "Auxiliary loss":
         "The last update's auxiliary losses, a column each, such as `dim_4t4`.",
-        Value::Each { label: "loss", members: losses };
+        Value::Each { label: "loss", prefix: "", members: losses };
     "total_loss", "loss [nats]", "learning", "Total loss":
         "The total loss of the last update.",
         Value::Gauge(|it| learned(it, |it| it.total.into()));
@@ -109,10 +104,10 @@ columns! {
         Value::Gauge(|it| learned(it, |it| it.q_mean.into()));
     "mean_k", "k [environment steps]", "k", "How far ahead: k, mean since the start":
         "Mean k of the rows served; of several positives the furthest.",
-        Value::Gauge(|it| it.k().map(|it| it.mean));
+        Value::Gauge(|it| it.k.map(|it| it.mean));
     "sd_k", "environment steps", "k", "Standard deviation of k":
         "Standard deviation of k over the same rows.",
-        Value::Gauge(|it| it.k().map(|it| it.sd));
+        Value::Gauge(|it| it.k.map(|it| it.sd));
     "mean_age", "transitions", "run", "Age of sampled rows":
         "Mean age of the rows served last: transitions stored since theirs.",
         Value::Gauge(|it| Some(it.replay.mean_age));
@@ -148,7 +143,7 @@ columns! {
         Value::Counter(|it| Some(it.replay.actors_waited_s));
     "rss_mib", "resident memory [MiB]", "memory", "Memory":
         "Resident memory of each process, such as `rss_mib_actor_0`.",
-        Value::Each { label: "process", members: memory };
+        Value::Each { label: "process", prefix: "rss_mib_", members: |it| it.rss_mib.clone() };
 }
 
 fn updates(it: &RunView) -> Option<f64> {
@@ -165,48 +160,43 @@ fn learned(it: &RunView, value: fn(&LearnerStatus) -> f64) -> Option<f64> {
 
 fn losses(it: &RunView) -> Vec<Member> {
     let loss = |name: &str| it.learner_shown()?.loss(name).map(f64::from);
-    let member = |name: &&str| Member::new(name, name, loss(name));
-    it.plan.losses.iter().map(member).collect()
-}
-
-fn memory(it: &RunView) -> Vec<Member> {
-    let column = |name: &str| format!("rss_mib_{}", name.replace('-', "_"));
-    let member = |(name, mib): &(String, _)| Member::new(&column(name), name, *mib);
-    let memory = it.recorded.iter().flat_map(|it| &it.rss_mib);
-    memory.map(member).collect()
-}
-
-impl Member {
-    fn new(column: &str, name: &str, value: Option<f64>) -> Self {
-        Self {
-            column: column.into(),
-            name: name.into(),
-            value,
-        }
-    }
+    let losses = it.plan.losses.iter();
+    losses.map(|&name| (name.into(), loss(name))).collect()
 }
 
 impl Column {
-    /// Its numbers: one, or one for each of several things; none of words.
+    /// Its numbers: one of its own name, or one for each of several things; none of words.
     pub(crate) fn members(&self, view: &RunView) -> Vec<Member> {
         match self.value {
-            Value::Counter(value) | Value::Gauge(value) => {
-                vec![Member::new(self.name, self.name, value(view))]
-            }
+            Value::Counter(value) | Value::Gauge(value) => vec![(self.name.into(), value(view))],
             Value::Each { members, .. } => members(view),
             Value::Words(_) => Vec::new(),
         }
     }
+
+    /// The column of `metrics.csv` in which a member stands.
+    fn column_of(&self, member: &str) -> String {
+        match self.value {
+            Value::Each { prefix, .. } => prefix.to_owned() + &member.replace('-', "_"),
+            _ => member.to_owned(),
+        }
+    }
 }
 
-/// The name and the cell of each column of `metrics.csv`, in order. What is not known is empty.
+/// The text of a cell; what is not known is empty.
+pub(crate) fn cell(value: Option<impl ToString>) -> String {
+    value.map_or(String::new(), |it| it.to_string())
+}
+
+/// The name and the cell of each column of `metrics.csv`, in order.
 pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
-    let text = |value: Option<f64>| value.map_or(String::new(), |it| rounded(it).to_string());
     let cells = COLUMNS.iter().flat_map(|column| match column.value {
         Value::Words(words) => vec![(column.name.to_owned(), words(view))],
         _ => {
             let members = column.members(view).into_iter();
-            members.map(|it| (it.column, text(it.value))).collect()
+            let cells =
+                members.map(|(name, value)| (column.column_of(&name), cell(value.map(rounded))));
+            cells.collect()
         }
     });
     cells.collect()
@@ -216,9 +206,9 @@ pub(crate) fn cells(view: &RunView) -> Vec<(String, String)> {
 pub(crate) fn points(view: &RunView) -> Vec<(String, f64)> {
     let drawn = COLUMNS.iter().filter(|it| it.name != "frames");
     let points = drawn.flat_map(|column| {
-        let curve = |it: &Member| format!("{}/{}", column.group, it.column);
+        let curve = |name: &str| format!("{}/{}", column.group, column.column_of(name));
         let members = column.members(view).into_iter();
-        members.filter_map(move |it| Some((curve(&it), rounded(it.value?))))
+        members.filter_map(move |(name, value)| Some((curve(&name), rounded(value?))))
     });
     points.collect()
 }
@@ -232,7 +222,7 @@ pub(crate) fn json(view: &RunView) -> BTreeMap<&'static str, serde_json::Value> 
         Value::Words(words) => words(view).into(),
         Value::Each { members, .. } => {
             let members = members(view).into_iter();
-            let known = members.filter_map(|it| Some((it.name, json_number(it.value?))));
+            let known = members.filter_map(|(name, value)| Some((name, json_number(value?))));
             serde_json::Value::Object(known.collect())
         }
     };
@@ -275,28 +265,26 @@ mod tests {
 
     use super::*;
     use crate::{
-        run_view::{Plan, Recorded},
-        testing::with,
+        run_view::Plan,
+        testing::{view, with},
     };
 
     /// A view of a run that is recorded, or not and whose learner does not answer.
-    fn view(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
-        let losses: &[&str] = &["dim_3t3", "dim_4t4"];
-        let mut view = RunView::new(with(|it: &mut Plan| it.losses = losses));
-        view.take_replay(vec![replay]);
-        view.recorded = learner.is_some().then(|| Recorded {
-            seconds: 12.5,
-            rss_mib: vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)],
-            ..Recorded::default()
-        });
-        view.take_learner(learner);
+    fn of_two_losses(replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
+        let is_recorded = learner.is_some();
+        let plan = with(|it: &mut Plan| it.losses = &["dim_3t3", "dim_4t4"]);
+        let mut view = view(plan, replay, learner);
+        if is_recorded {
+            view.recorded_s = Some(12.5);
+            view.rss_mib = vec![("actor-0".into(), Some(12.34)), ("actor-1".into(), None)];
+        }
         view
     }
 
     /// Scripts read the file by these names.
     #[test]
     fn the_columns_of_the_file_keep_their_names_and_their_order() {
-        let view = view(ReplayStatus::default(), Some(LearnerStatus::default()));
+        let view = of_two_losses(ReplayStatus::default(), Some(LearnerStatus::default()));
         let cells = cells(&view).into_iter();
         let names: Vec<_> = cells.map(|(name, _)| name).collect();
         let before = "seconds,frames,updates,frames_per_second,updates_per_second,replay_ratio,episodes,mean_return,mean_return_of,c51_kl,\
@@ -312,10 +300,10 @@ mod tests {
             it.losses = vec![("dim_4t4".into(), 2.0)];
             (it.updates, it.c51_kl) = (3, 0.5);
         });
-        let unknown = json(&view(replay.clone(), None));
+        let unknown = json(&of_two_losses(replay.clone(), None));
         assert_eq!(unknown["updates"], serde_json::Value::Null);
         assert_eq!(unknown["c51_kl"], serde_json::Value::Null);
-        let known = view(replay, Some(learner));
+        let known = of_two_losses(replay, Some(learner));
         let text = serde_json::to_string(&json(&known)).unwrap();
         for part in [
             r#""frames":7,"#,

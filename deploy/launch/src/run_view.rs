@@ -97,16 +97,6 @@ impl Episodes {
     }
 }
 
-/// What a recorder knows beside its processes: of the whole run, before it was resumed too.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Recorded {
-    pub(crate) seconds: f64,
-    pub(crate) episodes: Episodes,
-    pub(crate) k: Option<Spread>,
-    /// Resident memory of each process by name, MiB; none for one that ended.
-    pub(crate) rss_mib: Vec<(String, Option<f64>)>,
-}
-
 #[derive(Clone, Debug, Default, Serialize)]
 pub(crate) struct ServerAnswer {
     #[serde(skip)]
@@ -183,8 +173,13 @@ pub struct RunView {
     pub(crate) learner_silence: Silence,
     /// Whether the learner has answered ever, or the counts at the start are known without it.
     is_learner_known: bool,
-    /// What its recorder knew after the last counts; none where it is not recorded.
-    pub(crate) recorded: Option<Recorded>,
+    /// Episodes, and k of the rows served: by its recorder of the whole run, else since the replay began to count.
+    pub(crate) episodes: Episodes,
+    pub(crate) k: Option<Spread>,
+    /// Seconds of the whole run; none until its recorder has taken the last counts, or where it has none.
+    pub(crate) recorded_s: Option<f64>,
+    /// Resident memory of each process by name, MiB, by its recorder; none for one that ended.
+    pub(crate) rss_mib: Vec<(String, Option<f64>)>,
     rates: Rates,
     pub(crate) speed: Speed,
 }
@@ -231,7 +226,9 @@ impl RunView {
         self.replay = ReplayStatus::merged(&shards);
         self.shards = shards;
         self.replay_silence.answered();
-        self.recorded = None;
+        self.episodes = Episodes::of(self.replay.episodes, self.replay.returns.newest.iter());
+        self.k = Spread::of_k(&self.replay);
+        (self.recorded_s, self.rss_mib) = (None, Vec::new());
         let (frames, updates) = (self.replay.transitions_inserted, self.learner.updates);
         self.rates.add(Instant::now(), frames, updates);
         self.speed = self.rates.speed();
@@ -283,20 +280,7 @@ impl RunView {
 
     /// Seconds since the run began: without the time between its interruption and its resumption where it is recorded.
     pub(crate) fn seconds(&self) -> Option<f64> {
-        let recorded = self.recorded.as_ref();
-        recorded.map_or_else(|| self.up_s(), |it| Some(it.seconds))
-    }
-
-    pub(crate) fn episodes(&self) -> Episodes {
-        let of_replay = || Episodes::of(self.replay.episodes, self.replay.returns.newest.iter());
-        self.recorded
-            .as_ref()
-            .map_or_else(of_replay, |it| it.episodes)
-    }
-
-    pub(crate) fn k(&self) -> Option<Spread> {
-        let recorded = self.recorded.as_ref();
-        recorded.map_or_else(|| Spread::of_k(&self.replay), |it| it.k)
+        self.recorded_s.or_else(|| self.up_s())
     }
 
     /// The probability with which all actors act at random; none where they differ in it.
@@ -307,7 +291,7 @@ impl RunView {
 
     /// The learner's status that the metrics are taken from: where they are recorded its last one, until it answers.
     pub(crate) fn learner_shown(&self) -> Option<&LearnerStatus> {
-        match self.recorded {
+        match self.recorded_s {
             Some(_) => Some(&self.learner),
             None => self.learner_status(),
         }

@@ -3,11 +3,15 @@
 use driml_learner::Compute;
 use driml_machine::resources::Machine;
 use driml_model::Parameters;
+use driml_protocol::{LearnerStatus, ReplayStatus};
 use driml_settings::{config::RunConfig, flags::of_names};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::evaluate::{EPSILON, Levels, Player, Who};
+use crate::{
+    evaluate::{EPSILON, Levels, Player, Who},
+    run_view::{Plan, RunView},
+};
 
 pub(crate) const MACHINE: Machine = Machine {
     cores: 2,
@@ -20,6 +24,14 @@ pub(crate) fn with<T: Default>(set: impl FnOnce(&mut T)) -> T {
     let mut it = T::default();
     set(&mut it);
     it
+}
+
+/// A run of one replay server after these answers.
+pub(crate) fn view(plan: Plan, replay: ReplayStatus, learner: Option<LearnerStatus>) -> RunView {
+    let mut view = RunView::new(plan);
+    view.take_learner(learner);
+    view.take_replay(vec![replay]);
+    view
 }
 
 pub(crate) fn config(preset: &str, world: &str, agent: &str, sets: &[&str]) -> RunConfig {

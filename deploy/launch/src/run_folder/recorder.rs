@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     metrics::{cells, points},
-    run_view::{Episodes, Plan, Recorded, RunView, Spread},
+    run_view::{Episodes, Plan, RunView, Spread},
 };
 
 /// Writes a run folder.
@@ -131,12 +131,10 @@ impl RunRecorder {
 
     /// Lets a view tell of the whole run, before it was resumed too.
     pub(crate) fn complete(&self, view: &mut RunView) {
-        view.recorded = Some(Recorded {
-            seconds: self.seconds(),
-            episodes: self.episodes(&view.replay),
-            k: self.k(&view.replay),
-            rss_mib: self.rss_mib.clone(),
-        });
+        view.recorded_s = Some(self.seconds());
+        view.episodes = self.episodes(&view.replay);
+        view.k = self.k(&view.replay);
+        view.rss_mib.clone_from(&self.rss_mib);
     }
 
     fn seconds(&self) -> f64 {
@@ -206,10 +204,7 @@ impl RunRecorder {
 
 fn header(config: &RunConfig, processes: &[String]) -> Vec<String> {
     let mut nothing = RunView::new(Plan::of(config));
-    nothing.recorded = Some(Recorded {
-        rss_mib: processes.iter().map(|it| (it.clone(), None)).collect(),
-        ..Recorded::default()
-    });
+    nothing.rss_mib = processes.iter().map(|it| (it.clone(), None)).collect();
     cells(&nothing).into_iter().map(|(name, _)| name).collect()
 }
 

@@ -129,7 +129,7 @@ impl Summary {
         let (plan, replay, learner) = (&view.plan, &view.replay, &view.learner);
         let frames = replay.transitions_inserted.max(before.frames);
         let updates = learner.updates.max(before.updates);
-        let episodes = view.episodes();
+        let episodes = view.episodes;
         Self {
             outcome,
             world: plan.world.clone(),
@@ -145,7 +145,7 @@ impl Summary {
             wall_seconds,
             frames_per_second: frames as f64 / wall_seconds,
             updates_per_second: updates as f64 / wall_seconds,
-            mean_k: view.k().map(|it| it.mean),
+            mean_k: view.k.map(|it| it.mean),
             weights_version: learner.weights_version,
             weights_sha256: learner.weights_sha256.clone(),
             replay_servers_restarted: 0,

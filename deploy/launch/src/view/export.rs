@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::advice::{needed, waits};
 use crate::{
-    metrics::{self, COLUMNS, Column, Value},
+    metrics::{self, COLUMNS, Member, Value},
     run_view::{Plan, RunView, ServerAnswer},
 };
 
@@ -110,18 +110,14 @@ struct Page {
 
 impl Page {
     /// A metric: its head, and a sample for each member that has a value; nothing if none has. `label` tells several members apart.
-    fn metric(
-        &mut self,
-        kind: &str,
-        name: &str,
-        help: &str,
-        label: &str,
-        members: &[(String, f64)],
-    ) {
-        if !members.is_empty() {
-            self.text += &format!("# HELP driml_{name} {help}\n# TYPE driml_{name} {kind}\n");
-        }
-        for (member, value) in members {
+    fn metric(&mut self, kind: &str, name: &str, help: &str, label: &str, members: &[Member]) {
+        let known = members
+            .iter()
+            .filter_map(|(member, value)| Some((member, (*value)?)));
+        for (nth, (member, value)) in known.enumerate() {
+            if nth == 0 {
+                self.text += &format!("# HELP driml_{name} {help}\n# TYPE driml_{name} {kind}\n");
+            }
             let more = match label {
                 "" => String::new(),
                 label => format!(",{label}=\"{}\"", escaped(member)),
@@ -131,23 +127,18 @@ impl Page {
     }
 
     fn gauge(&mut self, name: &str, help: &str, value: f64) {
-        self.metric("gauge", name, help, "", &[(String::new(), value)]);
+        self.metric("gauge", name, help, "", &[(String::new(), Some(value))]);
     }
 
     fn columns(&mut self, view: &RunView) {
         for column in COLUMNS {
-            let Column {
-                name, help, value, ..
-            } = column;
-            let members = column.members(view).into_iter();
-            let known = members.filter_map(|it| Some((it.name, it.value?)));
-            let (kind, label, ending) = match value {
+            let (kind, label, ending) = match column.value {
                 Value::Counter(_) => ("counter", "", "_total"),
-                Value::Each { label, .. } => ("gauge", *label, ""),
+                Value::Each { label, .. } => ("gauge", label, ""),
                 Value::Gauge(_) | Value::Words(_) => ("gauge", "", ""),
             };
-            let known: Vec<_> = known.collect();
-            self.metric(kind, &format!("{name}{ending}"), help, label, &known);
+            let name = format!("{}{ending}", column.name);
+            self.metric(kind, &name, column.help, label, &column.members(view));
         }
     }
 
@@ -158,9 +149,8 @@ impl Page {
         let processes = statuses.flat_map(|it| &it.processes);
         let processes: Vec<_> = processes.filter(|it| seen.insert(it.who)).collect();
         let mut each = |kind, name, help, value: fn(&ProcessStatus) -> Option<f64>| {
-            let known = processes.iter();
-            let known = known.filter_map(|it| Some((it.who.to_string(), value(it)?)));
-            self.metric(kind, name, help, "process", &known.collect::<Vec<_>>());
+            let members = processes.iter().map(|it| (it.who.to_string(), value(it)));
+            self.metric(kind, name, help, "process", &members.collect::<Vec<_>>());
         };
         let connected = "Whether a process that has joined the run is connected.";
         each("gauge", "process_connected", connected, |it| {

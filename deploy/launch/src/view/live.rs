@@ -96,14 +96,14 @@ impl Display {
             format!("  C51 {:.3}{}", learner.c51_kl, others.collect::<String>())
         });
         let losses = losses.unwrap_or_default();
-        let k = view.k().map(|k| format!("  mean k {:.2}", k.mean));
+        let k = view.k.map(|k| format!("  mean k {:.2}", k.mean));
         let is_steady = |since: &Instant| since.elapsed() >= STEADY_MIN;
         let left = self.learns_since.filter(is_steady).and_then(|_| {
             let frames = plan.frames_planned.saturating_sub(frames);
             let updates = plan.updates_planned.saturating_sub(updates);
             time_left((frames, speed.frames), (updates, speed.updates))
         });
-        let episodes = view.episodes();
+        let episodes = view.episodes;
         [
             progress(view, Some(frames), Some(updates)),
             format!(
@@ -154,20 +154,16 @@ mod tests {
 
     use super::*;
     use crate::{
-        run_view::{Episodes, Plan, Recorded, Speed, Spread},
-        testing::with,
+        run_view::{Plan, Speed, Spread},
+        testing::{view, with},
     };
 
     fn display() -> Display {
         Display::new(8_000, Instant::now(), 0)
     }
 
-    fn view(planned: (u64, u64), replay: ReplayStatus, learner: LearnerStatus) -> RunView {
-        let plan = with(|it: &mut Plan| (it.frames_planned, it.updates_planned) = planned);
-        let mut view = RunView::new(plan);
-        view.take_learner(Some(learner));
-        view.take_replay(vec![replay]);
-        view
+    fn plan(frames: u64, updates: u64) -> Plan {
+        with(|it: &mut Plan| (it.frames_planned, it.updates_planned) = (frames, updates))
     }
 
     #[test]
@@ -186,15 +182,10 @@ mod tests {
             (it.updates, it.c51_kl) = (1000, 0.1234);
             it.losses = vec![("dim_4t4".into(), 4.0)];
         });
-        let mut view = view((200_000, 6_218), replay, learner);
-        let (mean, sd) = (2.25, 1.0);
-        view.recorded = Some(Recorded {
-            seconds: 9.0,
-            episodes: with(|it: &mut Episodes| (it.count, it.mean_return) = (45, Some(1.234))),
-            k: Some(Spread { mean, sd }),
-            rss_mib: Vec::new(),
-        });
-        let (frames, updates) = (160.0, 5.0);
+        let mut view = view(plan(200_000, 6_218), replay, Some(learner));
+        (view.episodes.count, view.episodes.mean_return) = (45, Some(1.234));
+        let (mean, sd, frames, updates) = (2.25, 1.0, 160.0, 5.0);
+        view.k = Some(Spread { mean, sd });
         view.speed = Speed { frames, updates };
         display.learns_since = Instant::now().checked_sub(STEADY_MIN);
         expect![[r#"
@@ -209,7 +200,7 @@ mod tests {
         let mut shown = |frames, updates| {
             let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = frames);
             let learner = with(|it: &mut LearnerStatus| it.updates = updates);
-            let view = view((8_000, 218), replay, learner);
+            let view = view(plan(8_000, 218), replay, Some(learner));
             display.show(&view);
             display.text(&view).join("\n")
         };
