@@ -8,22 +8,32 @@
 
 use std::collections::VecDeque;
 
-use driml_machine::error::usage;
-use driml_protocol::{EndedEpisode, EpisodesReply, Played, RETURNS_OF, ReplayStatus};
+use driml_protocol::{EndedEpisode, EpisodesReply, RETURNS_OF, ReplayStatus};
+use serde::Deserialize;
 
 use super::{
     folder::RunFolder,
     table::{AppendLog, Table, csv_row},
 };
-use crate::{metrics::rounded, run_view::Episodes};
+use crate::{
+    metrics::{cell, rounded},
+    run_view::Episodes,
+};
 
 /// Answers that are asked of one shard at a time; what they do not hold comes the next time.
 const ASKS_MAX: usize = 16;
 
 const HEADER: &str = "seconds,frames,episode,actor,env,return,length";
-/// Places in it.
-const EPISODE: usize = 2;
-const ACTOR: usize = 3;
+
+/// What is read again of a row.
+#[derive(Deserialize)]
+struct Row {
+    frames: u64,
+    episode: u64,
+    actor: u64,
+    #[serde(rename = "return")]
+    episode_return: Option<f64>,
+}
 
 #[derive(Debug)]
 pub(super) struct TrainingEpisodes {
@@ -57,28 +67,25 @@ impl TrainingEpisodes {
     ) -> anyhow::Result<Self> {
         let path = folder.episodes();
         let mut rows = Table::read(&path)?;
-        rows.keep(&path, |_, row| {
-            let (frames, ..) = read(row)
-                .ok_or_else(|| usage!("{}: {row:?} is not a row of episodes", path.display()))?;
-            // A replay that was kept says itself how far it is, once it answers.
-            Ok(unknown.is_some() || frames <= frames_max)
+        // A replay that was kept says itself how far it is, once it answers.
+        rows.keep(&path, |row: Row| {
+            unknown.is_some() || row.frames <= frames_max
         })?;
         Self::begin(folder, rows, unknown)
     }
 
     fn begin(folder: &RunFolder, mut rows: Table, unknown: Option<u64>) -> anyhow::Result<Self> {
+        let known: Vec<Row> = rows.all().unwrap_or_default();
         rows.header = HEADER.split(',').map(String::from).collect();
         let table = AppendLog::create(&folder.episodes(), &rows.text())?;
-        let known: Vec<_> = rows.rows.iter().filter_map(read).collect();
-        let returns = known.iter().filter_map(|&(.., value)| value);
-        let mut newest: VecDeque<_> = returns.rev().take(RETURNS_OF).collect();
-        newest.make_contiguous().reverse();
-        let (frames, episode, _) = known.last().copied().unwrap_or_default();
+        let mut returns: Vec<_> = known.iter().filter_map(|it| it.episode_return).collect();
+        let newest = returns.split_off(returns.len().saturating_sub(RETURNS_OF));
+        let last = known.last();
         Ok(Self {
             table,
-            newest,
-            episode,
-            frames,
+            newest: newest.into(),
+            episode: last.map_or(0, |it| it.episode),
+            frames: last.map_or(0, |it| it.frames),
             frames_at_status: None,
             received: Vec::new(),
             lost: 0,
@@ -95,7 +102,13 @@ impl TrainingEpisodes {
         ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
         seconds: Option<f64>,
     ) -> Vec<String> {
-        let frames = shards.iter().map(|it| it.transitions_inserted).sum();
+        let frames: u64 = shards.iter().map(|it| it.transitions_inserted).sum();
+        let mut warnings = Vec::new();
+        if let Some((mut rows, unknown)) = self.known.take() {
+            let cut = self.cut(&mut rows, frames);
+            warnings.extend(cut.err().map(|e| format!("{e:#}")));
+            self.take_as_received(shards, &rows, unknown);
+        }
         // They were not there the last time; what a shard knows of the others is older.
         let received = self.frames_at_status.replace(frames);
         let later = received.map_or(0, |before| before.saturating_add(1).min(frames));
@@ -103,12 +116,6 @@ impl TrainingEpisodes {
         self.frames = self.frames.max(later);
         self.received
             .resize(shards.len().max(self.received.len()), 0);
-        let mut warnings = Vec::new();
-        if let Some((mut rows, unknown)) = self.known.take() {
-            let cut = self.cut(&mut rows, frames);
-            warnings.extend(cut.err().map(|e| format!("{e:#}")));
-            self.take_as_received(shards, &rows, unknown);
-        }
         let mut rows = Vec::new();
         for (shard, status) in shards.iter().enumerate() {
             // A server that knows of fewer than before is another one.
@@ -150,15 +157,9 @@ impl TrainingEpisodes {
     /// Sets aside the episodes that ended after the run had so many frames: what came after is done again.
     fn cut(&mut self, rows: &mut Table, frames_max: u64) -> anyhow::Result<()> {
         let all = rows.rows.len();
-        let is_kept = |row: &_| read(row).is_some_and(|it| it.0 <= frames_max);
-        rows.keep(&self.folder.episodes(), |_, row| Ok(is_kept(row)))?;
+        rows.keep(&self.folder.episodes(), |row: Row| row.frames <= frames_max)?;
         if rows.rows.len() < all {
-            let received = std::mem::take(&mut self.received);
-            *self = Self {
-                received,
-                frames_at_status: self.frames_at_status,
-                ..Self::begin(&self.folder, rows.clone(), None)?
-            };
+            *self = Self::begin(&self.folder, rows.clone(), None)?;
         }
         Ok(())
     }
@@ -167,43 +168,39 @@ impl TrainingEpisodes {
     /// shards with fewer rows.
     fn take_as_received(&mut self, shards: &[ReplayStatus], rows: &Table, unknown: u64) {
         let mut of_shards = vec![0; shards.len()];
-        for row in &rows.rows {
-            let number = |at: usize| row.get(at).and_then(|it| it.parse::<u64>().ok());
-            let (episode, actor) = (number(EPISODE), number(ACTOR).unwrap_or(0));
-            let shard = actor as usize % shards.len();
-            of_shards[shard] += u64::from(episode > Some(unknown));
+        for row in rows.all::<Row>().unwrap_or_default() {
+            let shard = row.actor as usize % shards.len();
+            of_shards[shard] += u64::from(row.episode > unknown);
         }
         let mut left: u64 = shards.iter().map(|it| it.episodes).sum();
         left = left.saturating_sub(self.episode.saturating_sub(unknown));
-        for ((received, status), rows) in self.received.iter_mut().zip(shards).zip(of_shards) {
+        let received = shards.iter().zip(of_shards).map(|(status, rows)| {
             let here = left.min(status.episodes.saturating_sub(rows));
-            *received = status.episodes - here;
             left -= here;
-        }
+            status.episodes - here
+        });
+        self.received = received.collect();
     }
 
     fn take(&mut self, ended: &EndedEpisode, seconds: Option<f64>) -> [String; 7] {
         self.episode += 1;
         self.frames = self.frames.max(ended.frames);
-        let played = ended.played.map(|it| Played {
-            episode_return: rounded(it.episode_return),
-            ..it
-        });
-        if let Some(played) = played {
+        let played = ended.played;
+        let episode_return = played.map(|it| rounded(it.episode_return));
+        if let Some(newest) = episode_return {
             if self.newest.len() == RETURNS_OF {
                 self.newest.pop_front();
             }
-            self.newest.push_back(played.episode_return);
+            self.newest.push_back(newest);
         }
-        let of_whole = |cell: fn(Played) -> String| played.map_or(String::new(), cell);
         [
-            seconds.map_or(String::new(), |it| format!("{it:.3}")),
+            cell(seconds.map(|it| format!("{it:.3}"))),
             self.frames.to_string(),
             self.episode.to_string(),
             ended.actor.to_string(),
             ended.env.to_string(),
-            of_whole(|it| it.episode_return.to_string()),
-            of_whole(|it| it.steps.to_string()),
+            cell(episode_return),
+            cell(played.map(|it| it.steps)),
         ]
     }
 
@@ -220,16 +217,6 @@ impl TrainingEpisodes {
         });
         self.table.missing().into_iter().chain(lost).collect()
     }
-}
-
-/// Frames, number and return in a row.
-fn read(row: &csv::StringRecord) -> Option<(u64, u64, Option<f64>)> {
-    let [_, frames, episode, _, _, value, _] = [0, 1, 2, 3, 4, 5, 6].map(|at| row.get(at));
-    let value = match value? {
-        "" => None,
-        value => Some(value.parse().ok()?),
-    };
-    Some((frames?.parse().ok()?, episode?.parse().ok()?, value))
 }
 
 #[cfg(test)]

@@ -2,6 +2,8 @@
 
 use std::fs;
 
+use driml_protocol::Played;
+
 use super::*;
 use crate::testing::with;
 

@@ -8,16 +8,15 @@ use std::{
 };
 
 use anyhow::Context;
-use csv::StringRecord;
 use driml_machine::error::usage;
 use driml_protocol::atomic_write;
 use serde::Deserialize;
 
 use super::{
     folder::RunFolder,
-    table::{Table, append, csv_row},
+    table::{Table, append, csv_row, open_to_append},
 };
-use crate::metrics::rounded;
+use crate::metrics::{cell, rounded};
 
 const HEADER: &str = "seconds,frames,updates,episodes,evaluated_return,evaluated_return_sd";
 
@@ -50,11 +49,7 @@ impl Evaluated {
     /// A file that is not a table of evaluations, or that cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
-        let table = Table::read(&path)?;
-        let header = StringRecord::from(table.header);
-        let rows = table.rows.iter();
-        let rows = rows.map(|row| row.deserialize(Some(&header)).ok());
-        rows.collect::<Option<_>>().with_context(|| {
+        Table::read(&path)?.all().with_context(|| {
             usage!(
                 "{} is not a table of evaluations: move it away",
                 path.display()
@@ -105,12 +100,11 @@ impl Evaluated {
     pub(crate) fn add(&self, folder: &RunFolder) -> anyhow::Result<()> {
         let path = folder.evaluations();
         let doing = || format!("writing {}", path.display());
-        let file = File::options().create(true).append(true).open(&path);
-        let mut file = file.with_context(doing)?;
+        let mut file = open_to_append(&path)?;
         let is_new = file.metadata().with_context(doing)?.len() == 0;
         let row = csv_row([
-            self.seconds.map_or(String::new(), |it| it.to_string()),
-            self.frames.map_or(String::new(), |it| it.to_string()),
+            cell(self.seconds),
+            cell(self.frames),
             self.updates.to_string(),
             self.episodes.to_string(),
             rounded(self.mean_return).to_string(),
@@ -146,8 +140,7 @@ impl Candidate {
     /// Says whether it is the best.
     pub(crate) fn judge(&self, folder: &RunFolder, earned: &Evaluated) -> anyhow::Result<bool> {
         let path = folder.evaluations();
-        let file = File::options().create(true).append(true).open(&path);
-        let file = file.with_context(|| format!("writing {}", path.display()))?;
+        let file = open_to_append(&path)?;
         // Where several processes evaluate one run, each judges by what the others kept.
         if let Err(e) = file.lock() {
             tracing::debug!("{} cannot be locked: {e}", path.display());

@@ -8,7 +8,6 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_machine::error::usage;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -63,6 +62,13 @@ impl Uncounted {
 /// Bytes at the end of the file in which its last row lies.
 const LAST_ROW_BYTES: u64 = 1 << 16;
 
+/// What decides whether a resumed run keeps a row.
+#[derive(Deserialize)]
+struct Counts {
+    frames: u64,
+    updates: u64,
+}
+
 /// The rows of an interrupted run up to `resume_point`, under this header; none without the file. The others, which
 /// contradict what the run will do, are set aside. And the seconds that the run has taken, with those that are set aside.
 pub(super) fn rows_up_to(
@@ -74,16 +80,12 @@ pub(super) fn rows_up_to(
     let seconds = found.rows.iter();
     let seconds = seconds.filter_map(|row| found.value::<f64>(row, "seconds"));
     let seconds = seconds.fold(0.0, f64::max);
-    found.keep(path, |found, row| {
-        let count = |name| found.value::<u64>(row, name);
-        let (Some(updates), Some(frames)) = (count("updates"), count("frames")) else {
-            return Err(usage!("{}: {row:?} is not a row of metrics", path.display()).into());
-        };
+    found.keep(path, |it: Counts| {
         // Actors run ahead: without the second condition a run that now ends sooner would end before its rows. A replay that is filled
         // anew counts from the checkpoint's frames.
-        let is_counted = resume_point.replay_is_kept || frames <= resume_point.frames;
-        let is_before = updates <= resume_point.updates && frames <= resume_point.frames_max;
-        Ok(is_before && is_counted)
+        let is_counted = resume_point.replay_is_kept || it.frames <= resume_point.frames;
+        let is_before = it.updates <= resume_point.updates && it.frames <= resume_point.frames_max;
+        is_before && is_counted
     })?;
     let places: Vec<_> = header.iter().map(|name| found.place(name)).collect();
     let rows = found.rows.iter().map(|row| {

@@ -12,7 +12,9 @@ use std::{
 
 use anyhow::Context;
 use csv::StringRecord;
+use driml_machine::error::usage;
 use driml_protocol::atomic_write;
+use serde::de::DeserializeOwned;
 
 use crate::console;
 
@@ -73,18 +75,31 @@ impl Table {
         csv_row(&self.header).into_iter().chain(rows).collect()
     }
 
+    /// The rows as `T`, whose fields have the columns' names; none if a row is something else.
+    pub(super) fn all<T: DeserializeOwned>(&self) -> Option<Vec<T>> {
+        let header = StringRecord::from(&self.header[..]);
+        let rows = self.rows.iter();
+        rows.map(|row| row.deserialize(Some(&header)).ok())
+            .collect()
+    }
+
     /// Leaves the rows in the table at `path` that are to be kept; the others are written into a file beside it, and a line names it.
-    pub(super) fn keep(
+    pub(super) fn keep<T: DeserializeOwned>(
         &mut self,
         path: &Path,
-        is_kept: impl Fn(&Self, &StringRecord) -> anyhow::Result<bool>,
+        is_kept: impl Fn(T) -> bool,
     ) -> anyhow::Result<()> {
+        let header = StringRecord::from(&self.header[..]);
         let mut aside = Self {
             header: self.header.clone(),
             rows: Vec::new(),
         };
         for row in std::mem::take(&mut self.rows) {
-            match is_kept(self, &row)? {
+            let read = row.deserialize(Some(&header)).map_err(|_| {
+                let of = path.file_stem().unwrap_or_default().display();
+                usage!("{}: {row:?} is not a row of {of}", path.display())
+            })?;
+            match is_kept(read) {
                 true => self.rows.push(row),
                 false => aside.rows.push(row),
             }
@@ -135,12 +150,10 @@ impl AppendLog {
         unit: &'static str,
         waiting_max: usize,
     ) -> anyhow::Result<Self> {
-        let file = File::options().create(true).append(true).open(path);
-        let file = file.with_context(|| format!("writing {}", path.display()))?;
         Ok(Self {
             name,
             unit,
-            file,
+            file: open_to_append(path)?,
             waiting: VecDeque::new(),
             waiting_max,
             lost: 0,
@@ -179,6 +192,12 @@ impl AppendLog {
     }
 }
 
+/// Opens a file, which is made where there is none.
+pub(super) fn open_to_append(path: &Path) -> anyhow::Result<File> {
+    let file = File::options().create(true).append(true).open(path);
+    file.with_context(|| format!("writing {}", path.display()))
+}
+
 /// Writes all bytes at the end of a file, or none.
 pub(super) fn append(file: &mut File, bytes: &[u8]) -> io::Result<()> {
     let before = file.metadata()?.len();
@@ -202,6 +221,8 @@ pub(super) fn csv_row<T: AsRef<[u8]>>(cells: impl IntoIterator<Item = T>) -> Vec
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
 
     #[test]
@@ -220,7 +241,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.csv");
         let mut table = Table::parse(b"a,b\n1,2\n3,\"4, of five\"\n5,6\n").unwrap();
-        let is_kept = |table: &Table, row: &StringRecord| Ok(table.value(row, "a") != Some(3));
+        let is_kept = |row: BTreeMap<String, String>| row["a"] != "3";
         table.keep(&path, is_kept).unwrap();
         assert_eq!(table.text(), b"a,b\n1,2\n5,6\n");
         let beside = fs::read(folder.path().join("x.aside-1.csv")).unwrap();
