@@ -102,6 +102,10 @@ impl TrainingEpisodes {
         ask: impl Fn(usize, u64) -> Option<EpisodesReply>,
         seconds: Option<f64>,
     ) -> Vec<String> {
+        if shards.is_empty() {
+            // None has answered yet, so that nothing is known of what was done.
+            return Vec::new();
+        }
         let frames: u64 = shards.iter().map(|it| it.transitions_inserted).sum();
         let mut warnings = Vec::new();
         if let Some((mut rows, unknown)) = self.known.take() {

@@ -153,8 +153,10 @@ fn a_run_that_continues_has_the_episodes_before() {
     assert_eq!(mean(&episodes), (Some(expected / 100.0), 100));
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
-    // A server that knows of those before, and of four more; it hands out all that it keeps.
+    // A server that knows of those before, and of four more; it hands out all that it keeps. A run that ends before its answer keeps all.
     let mut episodes = TrainingEpisodes::go_on(&folder, 2_500, Some(0)).unwrap();
+    assert!(update(&mut episodes, &[]).is_empty());
+    assert_eq!(rows(&folder).len(), 110);
     update(&mut episodes, &[shard(2_600, 0, 114, 0)]);
     update(&mut episodes, &[shard(2_600, 114, 115, 0)]);
     let text = rows(&folder);
