@@ -2,17 +2,16 @@
 //! The recorder writes it, with the columns of `crate::metrics`.
 
 use std::{
-    fs::{self, File},
+    fs::File,
     io::{BufRead, BufReader, Read, Seek, SeekFrom},
     path::Path,
 };
 
-use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
 use super::{
     folder::RunFolder,
-    table::{Table, write_whole},
+    table::{Table, read_json, write_whole},
 };
 use crate::run_view::Spread;
 
@@ -47,11 +46,10 @@ pub(crate) struct Uncounted {
 impl Uncounted {
     pub(crate) fn read(folder: &RunFolder) -> anyhow::Result<Self> {
         let path = folder.resumed();
-        if !path.exists() {
-            return Ok(Self::default());
+        match path.exists() {
+            true => read_json(&path),
+            false => Ok(Self::default()),
         }
-        let text = fs::read(&path).with_context(|| format!("reading {}", path.display()))?;
-        serde_json::from_slice(&text).with_context(|| format!("reading {}", path.display()))
     }
 
     pub(crate) fn write(&self, folder: &RunFolder) -> anyhow::Result<()> {
@@ -127,6 +125,8 @@ pub fn progress(folder: &RunFolder) -> Option<Progress> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -61,10 +61,8 @@ impl RunRecorder {
         let lock = folder.lock()?;
         let header = header(config, &processes);
         let resume_point = resumed.unwrap_or_default();
-        let kept = match resume_point.replay_is_kept {
-            true => Some(Uncounted::read(folder)?),
-            false => None,
-        };
+        let kept = resume_point.replay_is_kept;
+        let kept = kept.then(|| Uncounted::read(folder)).transpose()?;
         let (rows, episodes, seconds) = match resumed {
             None => {
                 // First: by its settings a folder in which nothing was learned is known as a run's.

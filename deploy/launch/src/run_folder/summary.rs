@@ -8,7 +8,11 @@ use driml_machine::units::duration;
 use driml_protocol::ReplayStatus;
 use serde::{Deserialize, Serialize};
 
-use super::{folder::RunFolder, metrics::ResumePoint, table::write_whole};
+use super::{
+    folder::RunFolder,
+    metrics::ResumePoint,
+    table::{read_json, write_whole},
+};
 use crate::{
     console::aligned,
     run_view::RunView,
@@ -165,10 +169,7 @@ impl Summary {
 
     /// Reads that of the run in `folder`.
     pub fn read(folder: &RunFolder) -> anyhow::Result<Self> {
-        let path = folder.summary();
-        let doing = || format!("reading {}", path.display());
-        let text = fs::read(&path).with_context(doing)?;
-        serde_json::from_slice(&text).with_context(doing)
+        read_json(&folder.summary())
     }
 
     pub(super) fn remove(folder: &RunFolder) -> anyhow::Result<()> {

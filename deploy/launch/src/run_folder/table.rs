@@ -27,6 +27,13 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     atomic_write::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
 
+/// Reads a file of JSON.
+pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
+    let doing = || format!("reading {}", path.display());
+    let text = fs::read(path).with_context(doing)?;
+    serde_json::from_slice(&text).with_context(doing)
+}
+
 /// The whole rows of a file that a run writes.
 #[derive(Clone, Debug, Default)]
 pub struct Table {
