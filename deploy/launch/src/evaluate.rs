@@ -12,7 +12,7 @@ use driml_learner::{
     insight::{Insight, Seen},
 };
 use driml_machine::error::{Usage, usage};
-use driml_model::{Enlarge, Parameters, Precision, StoredAs};
+use driml_model::{Enlarge, Parameters, Precision, StoredAs, is_dim};
 use driml_settings::config::RunConfig;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -55,9 +55,7 @@ pub enum Who {
 pub struct Player {
     /// The settings of the run that trained them.
     pub config: RunConfig,
-    /// The network's parameters as it plays with them, a safetensors file.
-    pub(crate) weights: Vec<u8>,
-    /// The same as they were learned, with DIM's heads if they are known.
+    /// The network as it was learned, with DIM's heads if they are known. It plays with what actors get of it.
     pub(crate) network: Parameters,
     /// Updates behind its weights.
     pub updates: u64,
@@ -84,7 +82,6 @@ impl Player {
         let mut agent = loaded.agent;
         let is_averaged = weights == Weights::Average && agent.take_average()?;
         Ok(Self {
-            weights: agent.weights_as(config.learner.publish_dtype)?,
             network: agent.online().clone(),
             updates: agent.updates(),
             is_averaged,
@@ -102,11 +99,11 @@ impl Player {
     }
 
     /// The same with f32 weights and arithmetic, whatever the actors of the run have.
-    pub fn exact(mut self) -> anyhow::Result<Self> {
-        self.weights = self.network.without_dim()?.to_safetensors(|_| true)?;
+    #[must_use]
+    pub fn exact(mut self) -> Self {
         self.config.learner.publish_dtype = StoredAs::F32;
         self.config.actor.precision = Precision::F32;
-        Ok(self)
+        self
     }
 
     /// Returns of whole episodes on the levels asked for; none if the world does not have them.
@@ -145,7 +142,9 @@ impl Player {
         let mut policy: Box<dyn Policy> = match who {
             Who::Agent => {
                 let (enlarge, precision) = (self.enlarge()?, config.actor.precision);
-                let policy = NetworkPolicy::new(&config.model, enlarge, &self.weights, precision)?;
+                let dtype = config.learner.publish_dtype;
+                let weights = self.network.to_safetensors_as(dtype, |it| !is_dim(it))?;
+                let policy = NetworkPolicy::new(&config.model, enlarge, &weights, precision)?;
                 Box::new(policy)
             }
             Who::Random => Box::new(random_policy(config)?),

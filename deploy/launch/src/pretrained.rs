@@ -54,7 +54,7 @@ pub fn find(name: &Path) -> anyhow::Result<Option<Player>> {
         return Ok(None);
     }
     let bytes = fs::read(name).map_err(|e| usage!("reading {shown}: {e}"))?;
-    read(&shown, bytes).map(Some)
+    read(&shown, &bytes).map(Some)
 }
 
 fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
@@ -67,7 +67,7 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
         };
         bail!(usage!("no pretrained weights of {game:?}{near}; {known}"));
     };
-    let player = read(&format!("{PREFIX}{game}"), bytes.to_vec())?;
+    let player = read(&format!("{PREFIX}{game}"), bytes)?;
     let world = &player.config.run.world;
     if world.rsplit(':').next() != Some(game) {
         bail!("{PREFIX}{game} holds weights of {world}");
@@ -75,8 +75,8 @@ fn built_in(all: &[(&str, &[u8])], game: &str) -> anyhow::Result<Player> {
     Ok(player)
 }
 
-fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
-    let exported = described(&bytes).and_then(|it| it.get(EXPORTED).cloned());
+fn read(name: &str, bytes: &[u8]) -> anyhow::Result<Player> {
+    let exported = described(bytes).and_then(|it| it.get(EXPORTED).cloned());
     let exported: Exported = exported
         .and_then(|it| serde_json::from_value(it).ok())
         .with_context(|| {
@@ -92,11 +92,10 @@ fn read(name: &str, bytes: Vec<u8>) -> anyhow::Result<Player> {
         config.actor.precision = Precision::F32;
     }
     let model = config.model.without_dim();
-    let network = Parameters::load_safetensors(&model, &bytes, &Compute::CPU.device)
+    let network = Parameters::load_safetensors(&model, bytes, &Compute::CPU.device)
         .with_context(|| format!("{name} does not have the weights of its settings"))?;
     Ok(Player {
         config,
-        weights: bytes,
         network,
         updates: exported.updates,
         is_averaged: exported.is_averaged,
@@ -159,7 +158,7 @@ mod tests {
         let again = export(&read).unwrap();
         let again = built_in(&[("chain", &again[..])], "chain").unwrap();
         assert_eq!(played(&read), played(&again));
-        assert_eq!(played(&read), played(&read.exact().unwrap()));
+        assert_eq!(played(&read), played(&read.exact()));
     }
 
     #[test]

@@ -43,9 +43,7 @@ pub(crate) fn untrained(world: &str, agent: &str) -> Player {
     let config = config("smoke", world, agent, &[]);
     let rng = &mut ChaCha8Rng::seed_from_u64(1);
     let network = Parameters::init(&config.model, rng, &Compute::CPU.device).unwrap();
-    let weights = network.without_dim().unwrap();
     Player {
-        weights: weights.to_safetensors(|_| true).unwrap(),
         network,
         config,
         updates: 7,

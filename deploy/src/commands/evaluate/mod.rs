@@ -119,7 +119,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         return export(&player, path);
     }
     if args.exact {
-        player = player.exact()?;
+        player = player.exact();
     }
     player.epsilon = args.epsilon.unwrap_or(EPSILON);
     player.config.world.install(&mut console::line)?;
