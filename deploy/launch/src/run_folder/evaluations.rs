@@ -167,18 +167,16 @@ impl Candidate {
         for (name, bytes) in &self.files {
             atomic_write::write(&new.join(name), bytes).with_context(doing)?;
         }
-        let there = driml_learner::checkpoint::list(best)?;
-        let there = there.into_iter().map(|(_, path)| path);
+        let older = driml_learner::checkpoint::list(best)?;
         // Only for one of the same name there is a moment without a best.
-        let (same, others): (Vec<_>, Vec<_>) = there.partition(|it| *it == path);
-        for older in same {
-            fs::remove_dir_all(older).with_context(doing)?;
+        if path.is_dir() {
+            fs::remove_dir_all(&path).with_context(doing)?;
         }
         fs::rename(&new, &path).with_context(doing)?;
         // The older best may be the only one that a power cut leaves.
         let best = File::open(best).and_then(|folder| folder.sync_all());
         best.with_context(doing)?;
-        for older in others {
+        for (_, older) in older.into_iter().filter(|(_, it)| *it != path) {
             fs::remove_dir_all(older).with_context(doing)?;
         }
         Ok(())
