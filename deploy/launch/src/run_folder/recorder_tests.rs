@@ -7,11 +7,11 @@ use expect_test::expect;
 use super::*;
 use crate::{
     run_folder::{Earned, LastPlay},
-    testing::{config, with},
+    testing::{self, with},
 };
 
 fn settings() -> RunConfig {
-    config("smoke", "chain", "driml-ada", &[])
+    testing::config("smoke", "chain", "driml-ada", &[])
 }
 
 fn open(
@@ -19,15 +19,8 @@ fn open(
     processes: &[&str],
     resumed: Option<ResumePoint>,
 ) -> anyhow::Result<RunRecorder> {
-    RunRecorder::open(folder, &settings(), names(processes), resumed, false)
-}
-
-fn names(processes: &[&str]) -> Vec<String> {
-    processes.iter().map(ToString::to_string).collect()
-}
-
-fn header_of(processes: &[&str]) -> Vec<String> {
-    header(&settings(), &names(processes))
+    let processes = processes.iter().map(ToString::to_string).collect();
+    RunRecorder::open(folder, &settings(), processes, resumed, false)
 }
 
 /// Where a run is resumed, with 16 rows an update.
@@ -38,40 +31,39 @@ fn point(updates: u64) -> ResumePoint {
     })
 }
 
-fn statuses() -> (ReplayStatus, LearnerStatus) {
+fn view(replay: ReplayStatus, learner: LearnerStatus) -> RunView {
+    let epsilon = Schedule::Falling {
+        start: 0.5,
+        end: 0.1,
+        decay_frames: 4_000,
+    };
+    let plan = Plan {
+        epsilon: Some(epsilon),
+        ..Plan::of(&settings())
+    };
+    testing::view(plan, replay, Some(learner))
+}
+
+/// A run after so many frames, updates of 16 rows, and episodes.
+fn after(frames: u64, updates: u64, episodes: u64, k_histogram: [u64; 3]) -> RunView {
     let replay = ReplayStatus {
-        transitions_inserted: 2_000,
+        transitions_inserted: frames,
         warmup_transitions: 1_000,
-        rows_sampled: 8_000,
-        episodes: 7,
-        k_histogram: vec![2, 1, 1],
+        rows_sampled: updates * 16,
+        episodes,
+        k_histogram: k_histogram.to_vec(),
         waiting: Waiting::Finished,
         ..ReplayStatus::default()
     };
     let learner = LearnerStatus {
-        updates: 31,
+        updates,
         losses: vec![("dim_4t4".into(), 2.0)],
         weights_version: 4,
         weights_sha256: "abcd".into(),
         finished: true,
         ..LearnerStatus::default()
     };
-    (replay, learner)
-}
-
-fn view(replay: &ReplayStatus, learner: &LearnerStatus) -> RunView {
-    let epsilon = Schedule::Falling {
-        start: 0.5,
-        end: 0.1,
-        decay_frames: 4_000,
-    };
-    let mut view = RunView::new(Plan {
-        epsilon: Some(epsilon),
-        ..Plan::of(&settings())
-    });
-    view.take_learner(Some(learner.clone()));
-    view.take_replay(vec![replay.clone()]);
-    view
+    view(replay, learner)
 }
 
 #[test]
@@ -79,11 +71,8 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunFolder::new(folder.path().join("run"));
     let mut recorder = open(&run, &["replay-server", "actor-0"], None).unwrap();
-    let (replay, learner) = statuses();
-    let mut all = view(&replay, &learner);
-    let mut nothing = view(&ReplayStatus::default(), &LearnerStatus::default());
-    let said = recorder.record(&mut nothing, &[]);
-    assert!(said.is_empty(), "{said:?}");
+    let mut all = after(2_000, 31, 7, [2, 1, 1]);
+    let mut said = recorder.record(&mut after(0, 0, 0, [0; 3]), &[]);
     let episode = EndedEpisode {
         frames: 2_000,
         actor: 0,
@@ -98,21 +87,20 @@ fn a_run_leaves_settings_metrics_and_a_summary() {
         before: 0,
         episodes: vec![episode; 7],
     };
-    let said = recorder.record_episodes(&all, |_, _| Some(ended.clone()));
+    said.extend(recorder.record_episodes(&all, |_, _| Some(ended.clone())));
+    said.extend(recorder.record(&mut all, &[Some(12.34), None]));
+    said.extend(recorder.missing());
     assert!(said.is_empty(), "{said:?}");
-    let said = recorder.record(&mut all, &[Some(12.34), None]);
-    assert!(said.is_empty(), "{said:?}");
-    assert!(recorder.missing().is_empty());
     let summary = recorder.summarise(Outcome::Finished, &mut all);
     summary.write(&run).unwrap();
     assert!(Summary::is_finished(&run));
     let counts = (summary.frames, summary.replay_ratio, summary.mean_k);
-    assert_eq!(counts, (2_000, Some(8.0), Some(1.5)));
+    assert_eq!(counts, (2_000, Some(0.496), Some(1.5)));
 
-    let csv = fs::read_to_string(run.metrics()).unwrap();
-    let header = header_of(&["replay-server", "actor-0"]).join(",");
-    assert_eq!(csv.lines().next().unwrap(), header);
-    let table = Table::parse(csv.as_bytes()).unwrap();
+    let table = Table::read(&run.metrics()).unwrap();
+    assert_eq!(table.header[..2], ["seconds", "frames"]);
+    let memory = ["rss_mib_replay_server", "rss_mib_actor_0"].map(String::from);
+    assert!(table.header.ends_with(&memory), "{:?}", table.header);
     let epsilons = table.rows.iter().map(|row| table.value(row, "epsilon"));
     assert_eq!(epsilons.collect::<Vec<_>>(), [Some(0.5), Some(0.3)]);
 
@@ -137,16 +125,16 @@ fn a_resumed_run_continues_in_its_metrics() {
     let run = RunFolder::new(folder.path().join("run"));
     let processes = ["replay-server"];
     let mut recorder = open(&run, &processes, None).unwrap();
-    let (mut replay, mut learner) = statuses();
     // Mean k is 1.5 before the run is resumed, and 2 since.
+    let (k_before, k_since) = ([2, 1, 1], [0, 0, 5]);
+    let mut view = RunView::default();
     for (frames, updates, episodes) in [(1_000, 0, 1), (2_000, 31, 7), (3_000, 62, 9)] {
-        (replay.transitions_inserted, replay.episodes) = (frames, episodes);
-        learner.updates = updates;
-        recorder.record(&mut view(&replay, &learner), &[]);
+        view = after(frames, updates, episodes, k_before);
+        recorder.record(&mut view, &[]);
     }
     let said = open(&run, &processes, Some(point(31))).unwrap_err();
     assert!(said.to_string().contains("is still running"), "{said}");
-    let summary = recorder.summarise(Outcome::Interrupted, &mut view(&replay, &learner));
+    let summary = recorder.summarise(Outcome::Interrupted, &mut view);
     summary.write(&run).unwrap();
     drop(recorder);
     // A launcher that was killed while it wrote.
@@ -157,17 +145,10 @@ fn a_resumed_run_continues_in_its_metrics() {
     let mut recorder = open(&run, &processes, Some(point(31))).unwrap();
     assert!(!run.summary().exists());
     // While the replay fills again nothing is new.
-    (replay.transitions_inserted, replay.episodes) = (2_000, 1);
-    replay.rows_sampled = 31 * 16;
-    learner.updates = 31;
-    recorder.record(&mut view(&replay, &learner), &[]);
-    (replay.transitions_inserted, replay.episodes) = (2_100, 2);
-    replay.k_histogram = vec![0, 0, 5];
-    replay.rows_sampled = 62 * 16;
-    learner.updates = 62;
-    recorder.record(&mut view(&replay, &learner), &[]);
-    let mut resumed = view(&replay, &learner);
+    recorder.record(&mut after(2_000, 31, 1, k_before), &[]);
+    let mut resumed = after(2_100, 62, 2, k_since);
     resumed.after_updates = Some(31);
+    recorder.record(&mut resumed, &[]);
     let summary = recorder.summarise(Outcome::Finished, &mut resumed);
     let counts = (summary.frames, summary.updates, summary.episodes);
     assert_eq!(counts, (2_100, 62, 7 + 2));
@@ -175,21 +156,17 @@ fn a_resumed_run_continues_in_its_metrics() {
     assert_eq!(summary.resumed_after_updates, 31);
     drop(recorder);
     // Its replay, which is kept from now on, counts what came after the first resumption.
-    let kept = ResumePoint {
+    let kept = |updates, frames_max| ResumePoint {
         replay_is_kept: true,
-        ..point(62)
+        frames_max,
+        ..point(updates)
     };
-    let recorder = open(&run, &processes, Some(kept)).unwrap();
-    assert_eq!(recorder.episodes(&replay).count, 7 + 2);
-    assert_eq!(recorder.k(&replay).map(|it| it.mean), Some(1.75));
-    let header = header_of(&processes);
+    let recorder = open(&run, &processes, Some(kept(62, 9_999))).unwrap();
+    assert_eq!(recorder.episodes(&resumed.replay).count, 7 + 2);
+    assert_eq!(recorder.k(&resumed.replay).map(|it| it.mean), Some(1.75));
     let read = |frames_max| {
-        let all = ResumePoint {
-            replay_is_kept: true,
-            frames_max,
-            ..point(99)
-        };
-        rows_up_to(&path, header.clone(), all).unwrap().0
+        let header = Table::read(&path).unwrap().header;
+        rows_up_to(&path, header, kept(99, frames_max)).unwrap().0
     };
     assert_eq!(read(2_050).rows.len(), 2);
     let rows = read(9_999);
@@ -233,7 +210,7 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         assert_eq!(rows_of_metrics, (kept, kept / 2), "{what}");
         let nothing = ReplayStatus::default();
         assert_eq!(recorder.episodes(&nothing).count, 2, "{what}");
-        let mut view = view(&nothing, &LearnerStatus::default());
+        let mut view = view(nothing, LearnerStatus::default());
         let summary = recorder.summarise(Outcome::Finished, &mut view);
         let took = summary.wall_seconds;
         assert!(took >= seconds, "{what}: {took}");
@@ -273,8 +250,8 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
     }
 }
 
-fn summary(replay: &ReplayStatus) -> Summary {
-    let view = view(replay, &LearnerStatus::default());
+fn summary(replay: ReplayStatus) -> Summary {
+    let view = view(replay, LearnerStatus::default());
     Summary::of(Outcome::Finished, &view, 2.0, ResumePoint::default())
 }
 
@@ -282,7 +259,7 @@ fn summary(replay: &ReplayStatus) -> Summary {
 fn next_steps_stand_in_columns() {
     let replay = with(|it: &mut ReplayStatus| it.transitions_inserted = 1_280);
     let earned = |mean, low, high| Earned { mean, low, high };
-    let mut summary = summary(&replay);
+    let mut summary = summary(replay);
     summary.played = Some(LastPlay {
         weights: "averaged".into(),
         episodes: 100,
@@ -306,7 +283,7 @@ fn a_time_that_cannot_be_is_described_as_none() {
     for wall_seconds in [-1.0, 1e300, f64::NAN] {
         let summary = Summary {
             wall_seconds,
-            ..summary(&ReplayStatus::default())
+            ..summary(ReplayStatus::default())
         };
         assert!(summary.counts().contains(" in 0 s ("), "{wall_seconds}");
     }
@@ -315,5 +292,5 @@ fn a_time_that_cannot_be_is_described_as_none() {
 #[test]
 fn a_run_without_an_episode_has_no_mean_return() {
     expect!["finished: 0 frames and 0 updates in 2 s (0 frames/s, 0.00 updates/s), replay ratio -, no episode ended"]
-        .assert_eq(&summary(&ReplayStatus::default()).counts());
+        .assert_eq(&summary(ReplayStatus::default()).counts());
 }
