@@ -54,13 +54,9 @@ pub(super) struct TrainingEpisodes {
 }
 
 impl TrainingEpisodes {
-    pub(super) fn create(folder: &RunFolder) -> anyhow::Result<Self> {
-        Self::begin(folder, Table::default(), None)
-    }
-
-    /// Of a run that is resumed: with what ended until it had `frames_max` frames. The others are set aside. If its replay knows of them,
-    /// the number of the first ones of which it does not.
-    pub(super) fn go_on(
+    /// With what ended until the run had `frames_max` frames: nothing of one that begins. Of one that is resumed the others are set aside.
+    /// If its replay knows of them, the number of the first ones of which it does not.
+    pub(super) fn open(
         folder: &RunFolder,
         frames_max: u64,
         unknown: Option<u64>,

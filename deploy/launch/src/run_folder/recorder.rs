@@ -63,22 +63,20 @@ impl RunRecorder {
         let resume_point = resumed.unwrap_or_default();
         let kept = resume_point.replay_is_kept;
         let kept = kept.then(|| Uncounted::read(folder)).transpose()?;
-        let (rows, episodes, seconds) = match resumed {
+        let (rows, seconds) = match resumed {
             None => {
                 // First: by its settings a folder in which nothing was learned is known as a run's.
                 folder.write_config(config)?;
                 let rows = Vec::new();
-                let episodes = TrainingEpisodes::create(folder)?;
-                (Table { header, rows }, episodes, 0.0)
+                (Table { header, rows }, 0.0)
             }
-            Some(point) => {
-                let (rows, seconds) = rows_up_to(&folder.metrics(), header, point)?;
-                let unknown = kept.map(|it| it.episodes);
-                let episodes = TrainingEpisodes::go_on(folder, point.frames, unknown)?;
-                folder.write_config(config)?;
-                (rows, episodes, seconds)
-            }
+            Some(point) => rows_up_to(&folder.metrics(), header, point)?,
         };
+        let unknown = kept.map(|it| it.episodes);
+        let episodes = TrainingEpisodes::open(folder, resume_point.frames, unknown)?;
+        if resumed.is_some() {
+            folder.write_config(config)?;
+        }
         Summary::remove(folder)?;
         let uncounted = kept.unwrap_or_else(|| Uncounted {
             after_updates: resume_point.after_updates,
