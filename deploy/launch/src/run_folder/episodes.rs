@@ -204,8 +204,9 @@ impl TrainingEpisodes {
         ]
     }
 
+    /// So many, or as many as have a number: a replay that was kept counts none before it answers.
     pub(super) fn so_far(&self, count: u64) -> Episodes {
-        Episodes::of(count, self.newest.iter())
+        Episodes::of(count.max(self.episode), self.newest.iter())
     }
 
     pub(super) fn missing(&self) -> Vec<String> {
