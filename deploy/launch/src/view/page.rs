@@ -108,16 +108,15 @@ fn log_line(server: &ServerAnswer, log: &LogStatus, of: usize) -> String {
     );
     if let Some((since, why)) = &log.refused {
         let since = seconds(*since);
-        line += &format!(
-            "; REFUSED for {since} ({why}): nothing is taken or served. If the replay server dies now, "
-        );
-        // What a disk that refuses costs then.
-        line += &match log.unwritten_bytes {
+        let lost = match log.unwritten_bytes {
             0 => "nothing is lost".to_owned(),
             bytes => format!(
                 "it forgets who joined or left and what was drawn since, {bytes} bytes, and no transition"
             ),
         };
+        line += &format!(
+            "; REFUSED for {since} ({why}): nothing is taken or served. If the replay server dies now, {lost}"
+        );
     }
     line
 }
