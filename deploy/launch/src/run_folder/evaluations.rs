@@ -49,12 +49,9 @@ impl Evaluated {
     /// A file that is not a table of evaluations, or that cannot be read.
     pub fn all(folder: &RunFolder) -> anyhow::Result<Vec<Self>> {
         let path = folder.evaluations();
-        Table::read(&path)?.all().with_context(|| {
-            usage!(
-                "{} is not a table of evaluations: move it away",
-                path.display()
-            )
-        })
+        let name = path.display();
+        let rows = Table::read(&path)?.all();
+        rows.with_context(|| usage!("{name} is not a table of evaluations: move it away"))
     }
 
     /// The kept best checkpoint and what it earned when it was played for the most episodes; none of a folder that has none.
@@ -202,11 +199,8 @@ mod tests {
     fn the_best_is_kept_and_all_are_in_the_table() {
         let root = tempfile::tempdir().unwrap();
         let folder = RunFolder::new(root.path());
-        fs::write(
-            folder.metrics(),
-            "seconds,frames,updates\n0.5,100,0\n1.5,300,9\n2.5,500,25\n",
-        )
-        .unwrap();
+        let metrics = "seconds,frames,updates\n0.5,100,0\n1.5,300,9\n2.5,500,25\n";
+        fs::write(folder.metrics(), metrics).unwrap();
         assert_eq!(Evaluated::all(&folder).unwrap(), []);
         let judge = |updates, mean, episodes| judge(&folder, updates, mean, episodes).unwrap();
         assert!(judge(10, -1.0, 4));

@@ -183,10 +183,8 @@ impl RunFolder {
 
     pub(super) fn write_config(&self, config: &RunConfig) -> anyhow::Result<()> {
         let head = "# The resolved settings of this run; `driml train --config` with this file repeats it.\n\n";
-        write_whole(
-            &self.config(),
-            (head.to_owned() + &config.to_toml()).as_bytes(),
-        )
+        let text = head.to_owned() + &config.to_toml();
+        write_whole(&self.config(), text.as_bytes())
     }
 }
 

@@ -234,17 +234,11 @@ fn rows_of_frames_that_a_resumed_run_makes_again_are_set_aside() {
     ] {
         let folder = tempfile::tempdir().unwrap();
         let run = RunFolder::new(folder.path());
-        fs::write(
-            run.metrics(),
-            format!("seconds,frames,updates,episodes\n{metrics}"),
-        )
-        .unwrap();
+        let text = format!("seconds,frames,updates,episodes\n{metrics}");
+        fs::write(run.metrics(), text).unwrap();
         let recorder = open(&run, &[], Some(point)).unwrap();
-        assert_eq!(
-            Table::read(&run.metrics()).unwrap().rows.len(),
-            kept,
-            "{metrics}"
-        );
+        let rows = Table::read(&run.metrics()).unwrap().rows;
+        assert_eq!(rows.len(), kept, "{metrics}");
         let episodes = recorder.episodes(&ReplayStatus::default()).count;
         assert_eq!(episodes, 2 * kept as u64, "{metrics}");
     }

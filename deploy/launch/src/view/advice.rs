@@ -25,10 +25,8 @@ fn statuses(view: &RunView) -> impl Iterator<Item = (&ServerAnswer, &ProcessesSt
 /// The status of the learner and of all actors, each with the endpoint of the server that it is connected to.
 fn processes(view: &RunView) -> impl Iterator<Item = (&str, &ProcessStatus)> {
     statuses(view).flat_map(|(server, account)| {
-        account
-            .processes
-            .iter()
-            .map(|process| (&*server.endpoint, process))
+        let processes = account.processes.iter();
+        processes.map(|it| (&*server.endpoint, it))
     })
 }
 
