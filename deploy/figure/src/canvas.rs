@@ -12,17 +12,22 @@ const FONTS: &str = "DejaVu Sans, Verdana, Segoe UI, Helvetica, Arial, sans-seri
 /// A point: x to the right, y downwards.
 pub(super) type Point = (f64, f64);
 
-/// A rectangle by its upper left corner.
+/// An upright rectangle by its upper left corner.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Rect {
-    pub(super) x: f64,
-    pub(super) y: f64,
-    pub(super) width: f64,
-    pub(super) height: f64,
+pub struct Rect {
+    /// From the left.
+    pub x: f64,
+    /// From above.
+    pub y: f64,
+    /// To its right edge.
+    pub width: f64,
+    /// To its lower edge.
+    pub height: f64,
 }
 
 impl Rect {
-    pub(super) const fn new(x: f64, y: f64, width: f64, height: f64) -> Self {
+    /// The rectangle of this corner and size.
+    pub const fn new(x: f64, y: f64, width: f64, height: f64) -> Self {
         Self {
             x,
             y,
@@ -56,6 +61,8 @@ pub(super) struct TextStyle {
     pub(super) anchor: Anchor,
     /// Turned to run upwards.
     pub(super) upright: bool,
+    /// The length to which a text is cut.
+    length_max: f64,
 }
 
 impl TextStyle {
@@ -67,6 +74,7 @@ impl TextStyle {
             colour,
             anchor,
             upright: false,
+            length_max: f64::INFINITY,
         }
     }
 
@@ -78,6 +86,10 @@ impl TextStyle {
     pub(super) const fn upright(self) -> Self {
         let upright = true;
         Self { upright, ..self }
+    }
+
+    pub(super) const fn within(self, length_max: f64) -> Self {
+        Self { length_max, ..self }
     }
 }
 
@@ -127,11 +139,11 @@ impl Canvas {
     }
 
     /// The picture as a text that ends with a line's end.
-    pub(super) fn into_svg(self) -> String {
+    pub(super) fn svg(&self) -> String {
         let [width, height] = [self.width, self.height].map(number);
         let size = format!(r#"width="{width}" height="{height}" viewBox="0 0 {width} {height}""#);
         let style = format!(r#"font-family="{FONTS}" stroke-linejoin="round""#);
-        let elements = self.elements;
+        let elements = &self.elements;
         format!("<svg xmlns='http://www.w3.org/2000/svg' {size} {style}>\n{elements}</svg>\n")
     }
 
@@ -204,8 +216,9 @@ impl Canvas {
         self.add(&format!(r#"<rect {sides} rx="8" {brush} {pen}/>"#));
     }
 
-    /// Writes a line of text whose baseline is at the point.
+    /// Writes a line of text whose baseline is at the point, cut to the style's length.
     pub(super) fn text(&mut self, (x, y): Point, text: &str, style: TextStyle) {
+        let text = font::fit(text, style.size, style.weight, style.length_max);
         if text.is_empty() {
             return;
         }
@@ -218,8 +231,8 @@ impl Canvas {
         let turn = if style.upright { " rotate(-90)" } else { "" };
         let place = format!(r#"transform="translate({x} {y}){turn}""#);
         if self.letters == Letters::Outlines {
-            let left = -share_left * font::width(text, style.size, style.weight);
-            let path = font::outline(text, style.size, style.weight, left);
+            let left = -share_left * font::width(&text, style.size, style.weight);
+            let path = font::outline(&text, style.size, style.weight, left);
             self.add(&format!(r#"<path d="{path}" {place} {brush}/>"#));
             return;
         }

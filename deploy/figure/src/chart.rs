@@ -27,7 +27,7 @@ pub struct Axis {
     /// Whether it spreads values by their logarithm; those of 0 and below are left out.
     is_log: bool,
     /// Values that it shows whatever the series have.
-    pub shows: Vec<f64>,
+    shows: Vec<f64>,
     /// Names of 0, 1, 2, ... instead of numbers; empty for numbers.
     names: Vec<String>,
 }
@@ -76,8 +76,8 @@ impl Axis {
         }
     }
 
-    /// First and last value, evenly spread, with slack; none if there is no value.
-    fn range(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<(f64, f64)> {
+    /// Its range for these values, with slack; none if there is no value.
+    fn scale(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<Scale<'_>> {
         let all = values.chain(self.shows.iter().copied());
         let kept = all.filter(|value| self.keeps(*value));
         let (low, high) = ticks::bounds(kept.map(|value| self.spread(value)))?;
@@ -85,17 +85,36 @@ impl Axis {
             0.0 => low.abs().max(1.0) * SLACK,
             by => by,
         };
-        Some((low - by, high + by))
+        Some(Scale {
+            axis: self,
+            low: low - by,
+            high: high + by,
+        })
+    }
+}
+
+/// An axis, and the first and last value, evenly spread, that its side of the plot stands for.
+struct Scale<'a> {
+    axis: &'a Axis,
+    low: f64,
+    high: f64,
+}
+
+impl Scale<'_> {
+    /// Where on the side a value lies, in 0..=1.
+    fn share(&self, value: f64) -> f64 {
+        (self.axis.spread(value) - self.low) / (self.high - self.low)
     }
 
-    fn ticks(&self, (low, high): (f64, f64), length: f64, each: f64) -> Vec<f64> {
-        if !self.names.is_empty() {
-            return (0..self.names.len()).map(|place| place as f64).collect();
-        }
-        match self.is_log {
-            true => ticks::log(10f64.powf(low), 10f64.powf(high)),
-            false => ticks::linear(low, high, (length / each).max(2.0) as usize),
-        }
+    /// Values to mark on a side of this length, about one each so many units, with their labels.
+    fn ticks(&self, length: f64, each: f64) -> Vec<(f64, String)> {
+        let ticks = match (&self.axis.names[..], self.axis.is_log) {
+            ([], true) => ticks::log(10f64.powf(self.low), 10f64.powf(self.high)),
+            ([], false) => ticks::linear(self.low, self.high, (length / each).max(2.0) as usize),
+            (names, _) => return (0..).map(f64::from).zip(names.iter().cloned()).collect(),
+        };
+        let labels = ticks::labels(&ticks);
+        ticks.into_iter().zip(labels).collect()
     }
 }
 
@@ -159,6 +178,32 @@ impl Series {
         self.band = band;
         self
     }
+
+    /// Draws its marks at these places.
+    fn marks(&self, canvas: &mut Canvas, places: &[Point]) {
+        let (colour, dashed) = (self.colour, self.mark == Mark::Dashed);
+        match (self.mark, places) {
+            // A line of one point would be invisible.
+            (Mark::Line | Mark::Dashed, [only]) => canvas.dot(*only, DOT_RADIUS, colour),
+            (Mark::Line | Mark::Dashed, _) => {
+                let width = 1.8;
+                canvas.line(
+                    places,
+                    Stroke {
+                        colour,
+                        width,
+                        dashed,
+                    },
+                );
+            }
+            (Mark::Rings, _) => places
+                .iter()
+                .for_each(|it| canvas.ring(*it, RING_RADIUS, colour)),
+            (Mark::Bars, _) => places
+                .iter()
+                .for_each(|it| canvas.dot(*it, DOT_RADIUS, colour)),
+        }
+    }
 }
 
 /// Series over two axes, with a title and a legend.
@@ -194,80 +239,30 @@ impl Chart {
         let ys = points()
             .map(|point| point.1)
             .chain(bands().flat_map(|(_, low, high)| [*low, *high]));
-        let (Some(x_range), Some(y_range)) =
-            (self.x.range(xs, SLACK / 2.0), self.y.range(ys, SLACK))
-        else {
+        let (Some(x), Some(y)) = (self.x.scale(xs, SLACK / 2.0), self.y.scale(ys, SLACK)) else {
             let middle = (place.x + place.width / 2.0, place.y + place.height / 2.0);
             canvas.text(middle, "no values yet", soft(LABEL_SIZE, Anchor::Middle));
             return;
         };
 
         let below = TICK_SIZE + LABEL_SIZE + 16.0;
-        let y_ticks = self.y.ticks(y_range, place.height - below, 42.0);
-        let y_labels = ticks::labels(&y_ticks);
-        let left = font::widest(&y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
-        let plot = Rect::new(
-            place.x + left,
-            place.y + 4.0,
-            place.width - left - 8.0,
-            place.height - below - 4.0,
-        );
-        let frame = Plot {
-            rect: plot,
-            x: (&self.x, x_range),
-            y: (&self.y, y_range),
+        let y_ticks = y.ticks(place.height - below, 42.0);
+        let y_labels = y_ticks.iter().map(|(_, label)| label);
+        let left = font::widest(y_labels, TICK_SIZE) + LABEL_SIZE + 18.0;
+        let plot = Plot {
+            rect: Rect::new(
+                place.x + left,
+                place.y + 4.0,
+                place.width - left - 8.0,
+                place.height - below - 4.0,
+            ),
+            x,
+            y,
         };
-        self.axes(canvas, &frame, &y_ticks, &y_labels, place.x);
+        plot.axes(canvas, &y_ticks, place.x);
         for series in &self.series {
-            draw_series(canvas, &frame, series);
+            plot.series(canvas, series);
         }
-    }
-
-    fn axes(
-        &self,
-        canvas: &mut Canvas,
-        frame: &Plot<'_>,
-        y_ticks: &[f64],
-        y_labels: &[String],
-        left: f64,
-    ) {
-        let plot = frame.rect;
-        let x_ticks = self.x.ticks(frame.x.1, plot.width, 74.0);
-        let x_labels = match &self.x.names[..] {
-            [] => ticks::labels(&x_ticks),
-            names => {
-                let room = plot.width / names.len() as f64 - 4.0;
-                let fit = |name: &String| font::fit(name, TICK_SIZE, Weight::Regular, room);
-                names.iter().map(fit).collect()
-            }
-        };
-        for (tick, label) in x_ticks.iter().zip(x_labels) {
-            let x = frame.at(*tick, 1.0).0;
-            let line = [(x, plot.y), (x, plot.bottom())];
-            canvas.line(&line, Stroke::solid(GRID, 1.0));
-            let at = (x, plot.bottom() + TICK_SIZE + 5.0);
-            canvas.text(at, &label, soft(TICK_SIZE, Anchor::Middle));
-        }
-        for (tick, label) in y_ticks.iter().zip(y_labels) {
-            let y = frame.at(1.0, *tick).1;
-            let line = [(plot.x, y), (plot.right(), y)];
-            canvas.line(&line, Stroke::solid(GRID, 1.0));
-            let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
-            canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
-        }
-        let corner = [
-            (plot.x, plot.y),
-            (plot.x, plot.bottom()),
-            (plot.right(), plot.bottom()),
-        ];
-        canvas.line(&corner, Stroke::solid(INK_SOFT, 1.2));
-        let label = |text: &str, room: f64| font::fit(text, LABEL_SIZE, Weight::Regular, room);
-        let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
-        let y = plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0;
-        let x_at = (plot.x + plot.width / 2.0, y);
-        canvas.text(x_at, &label(&self.x.label, plot.width), ink);
-        let y_at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
-        canvas.text(y_at, &label(&self.y.label, plot.height), ink.upright());
     }
 
     /// Draws the legend in as many rows as it needs; returns what is left below it.
@@ -290,12 +285,10 @@ impl Chart {
                 let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
                 canvas.rects(&[patch], series.colour.with_alpha(BAND_ALPHA));
             }
+            let points = [0.0, 0.5, 1.0].map(|share| (x + share * LEGEND_MARK, middle));
             match series.mark {
-                Mark::Line | Mark::Dashed => canvas.line(
-                    &[(x, middle), (x + LEGEND_MARK, middle)],
-                    pen(series.colour, series.mark),
-                ),
-                mark => point_mark(canvas, (x + LEGEND_MARK / 2.0, middle), mark, series.colour),
+                Mark::Line | Mark::Dashed => series.marks(canvas, &[points[0], points[2]]),
+                Mark::Rings | Mark::Bars => series.marks(canvas, &points[1..2]),
             }
             let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
             let ink = TextStyle::new(LEGEND_SIZE, INK, Anchor::Start);
@@ -307,71 +300,80 @@ impl Chart {
     }
 }
 
-/// The plot's place, and the ranges that its sides stand for.
+/// The plot's place, and what its sides stand for.
 struct Plot<'a> {
     rect: Rect,
-    x: (&'a Axis, (f64, f64)),
-    y: (&'a Axis, (f64, f64)),
+    x: Scale<'a>,
+    y: Scale<'a>,
 }
 
 impl Plot<'_> {
     fn at(&self, x: f64, y: f64) -> Point {
-        let share = |(axis, (low, high)): (&Axis, (f64, f64)), value| {
-            (axis.spread(value) - low) / (high - low)
-        };
         (
-            self.rect.x + share(self.x, x) * self.rect.width,
-            self.rect.bottom() - share(self.y, y) * self.rect.height,
+            self.rect.x + self.x.share(x) * self.rect.width,
+            self.rect.bottom() - self.y.share(y) * self.rect.height,
         )
     }
 
     fn keeps(&self, x: f64, y: f64) -> bool {
-        self.x.0.keeps(x) && self.y.0.keeps(y)
+        self.x.axis.keeps(x) && self.y.axis.keeps(y)
     }
-}
 
-fn draw_series(canvas: &mut Canvas, plot: &Plot<'_>, series: &Series) {
-    let kept = |(x, low, high): &&(f64, f64, f64)| plot.keeps(*x, *low) && plot.keeps(*x, *high);
-    let band: Vec<_> = series.band.iter().filter(kept).collect();
-    if series.mark == Mark::Bars {
-        for (x, low, high) in band {
-            let bar = [plot.at(*x, *low), plot.at(*x, *high)];
-            canvas.line(&bar, Stroke::solid(series.colour, 1.4));
+    /// Draws the grid and what stands around it, from `left` on.
+    fn axes(&self, canvas: &mut Canvas, y_ticks: &[(f64, String)], left: f64) {
+        let plot = self.rect;
+        let x_ticks = self.x.ticks(plot.width, 74.0);
+        let x_room = match self.x.axis.names.len() {
+            0 => f64::INFINITY,
+            names => plot.width / names as f64 - 4.0,
+        };
+        for (tick, label) in &x_ticks {
+            let x = self.at(*tick, 1.0).0;
+            let line = [(x, plot.y), (x, plot.bottom())];
+            canvas.line(&line, Stroke::solid(GRID, 1.0));
+            let at = (x, plot.bottom() + TICK_SIZE + 5.0);
+            canvas.text(at, label, soft(TICK_SIZE, Anchor::Middle).within(x_room));
         }
-    } else {
-        let low = band.iter().map(|(x, low, _)| plot.at(*x, *low));
-        let high = band.iter().rev().map(|(x, _, high)| plot.at(*x, *high));
-        let rim: Vec<Point> = low.chain(high).collect();
-        canvas.area(&rim, series.colour.with_alpha(BAND_ALPHA));
+        for (tick, label) in y_ticks {
+            let y = self.at(1.0, *tick).1;
+            let line = [(plot.x, y), (plot.right(), y)];
+            canvas.line(&line, Stroke::solid(GRID, 1.0));
+            let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
+            canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
+        }
+        let corner = [
+            (plot.x, plot.y),
+            (plot.x, plot.bottom()),
+            (plot.right(), plot.bottom()),
+        ];
+        canvas.line(&corner, Stroke::solid(INK_SOFT, 1.2));
+        let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
+        let y = plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0;
+        let at = (plot.x + plot.width / 2.0, y);
+        canvas.text(at, &self.x.axis.label, ink.within(plot.width));
+        let at = (left + LABEL_SIZE - 2.0, plot.y + plot.height / 2.0);
+        let upright = ink.upright().within(plot.height);
+        canvas.text(at, &self.y.axis.label, upright);
     }
-    let kept = series.points.iter().filter(|(x, y)| plot.keeps(*x, *y));
-    let points: Vec<Point> = kept.map(|(x, y)| plot.at(*x, *y)).collect();
-    match series.mark {
-        Mark::Line | Mark::Dashed => {
-            // A line of one point would be invisible.
-            if let [only] = points[..] {
-                canvas.dot(only, DOT_RADIUS, series.colour);
+
+    fn series(&self, canvas: &mut Canvas, series: &Series) {
+        let kept =
+            |(x, low, high): &&(f64, f64, f64)| self.keeps(*x, *low) && self.keeps(*x, *high);
+        let band: Vec<_> = series.band.iter().filter(kept).collect();
+        if series.mark == Mark::Bars {
+            for (x, low, high) in band {
+                let bar = [self.at(*x, *low), self.at(*x, *high)];
+                canvas.line(&bar, Stroke::solid(series.colour, 1.4));
             }
-            canvas.line(&points, pen(series.colour, series.mark));
+        } else {
+            let low = band.iter().map(|(x, low, _)| self.at(*x, *low));
+            let high = band.iter().rev().map(|(x, _, high)| self.at(*x, *high));
+            let rim: Vec<Point> = low.chain(high).collect();
+            canvas.area(&rim, series.colour.with_alpha(BAND_ALPHA));
         }
-        mark => points
-            .iter()
-            .for_each(|it| point_mark(canvas, *it, mark, series.colour)),
-    }
-}
-
-fn point_mark(canvas: &mut Canvas, at: Point, mark: Mark, colour: Colour) {
-    match mark {
-        Mark::Rings => canvas.ring(at, RING_RADIUS, colour),
-        _ => canvas.dot(at, DOT_RADIUS, colour),
-    }
-}
-
-const fn pen(colour: Colour, mark: Mark) -> Stroke {
-    Stroke {
-        colour,
-        width: 1.8,
-        dashed: matches!(mark, Mark::Dashed),
+        let kept = series.points.iter().filter(|(x, y)| self.keeps(*x, *y));
+        let points: Vec<Point> = kept.map(|(x, y)| self.at(*x, *y)).collect();
+        series.marks(canvas, &points);
     }
 }
 

@@ -43,7 +43,7 @@ pub(super) const CELL_DARK: Colour = Colour::new(38, 42, 48);
 pub(super) const CELL_LIGHT: Colour = Colour::new(246, 247, 249);
 pub(super) const OUTLINE: Colour = Colour::new(213, 94, 0);
 /// A cell of a heat map without a value.
-pub(super) const NO_VALUE: Colour = Colour::new(220, 222, 226);
+const NO_VALUE: Colour = Colour::new(220, 222, 226);
 
 /// How many series there are before a colour comes again.
 pub(crate) const SERIES_COLOURS: usize = 7;
@@ -76,8 +76,11 @@ const VIRIDIS: [[u8; 3]; 9] = [
     [253, 231, 37],
 ];
 
-/// The colour of `share` in 0..=1: dark to light, of even steps to the eye, apart for colour-blind readers.
+/// The colour of `share` in 0..=1: dark to light, of even steps to the eye, apart for colour-blind readers; grey for no number.
 pub(super) fn heat_colour(share: f64) -> Colour {
+    if !share.is_finite() {
+        return NO_VALUE;
+    }
     let place = share.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f64;
     let low = (place as usize).min(VIRIDIS.len() - 2);
     let part = place - low as f64;
@@ -108,6 +111,7 @@ mod tests {
         assert_eq!(heat_colour(1.0).rgb, VIRIDIS[8]);
         assert_eq!(heat_colour(7.0), heat_colour(1.0));
         assert_eq!(heat_colour(0.5).rgb, VIRIDIS[4]);
+        assert_eq!(heat_colour(f64::NAN), NO_VALUE);
         assert_eq!(ink_on(heat_colour(0.0)), CARD);
         assert_eq!(ink_on(heat_colour(1.0)), INK);
     }

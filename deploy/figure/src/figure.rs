@@ -7,7 +7,7 @@ use crate::{
     chart::Chart,
     colours::{CARD, CARD_BORDER, INK, INK_SOFT},
     error::FigureError,
-    font::{self, Weight},
+    font,
     heat::Heat,
     lattice::Lattice,
     render,
@@ -83,7 +83,7 @@ impl Figure {
     /// Writes the figure in the format of the file's extension.
     pub fn save(&self, path: &Path, look: Look) -> Result<(), FigureError> {
         let format = Format::of(path)?;
-        let svg = |letters| self.draw(look, letters).into_svg();
+        let svg = |letters| self.draw(look, letters).svg();
         let bytes = match format {
             Format::Svg => svg(Letters::Text).into_bytes(),
             Format::Pdf => render::pdf(&svg(Letters::Outlines))?,
@@ -141,11 +141,8 @@ impl Figure {
             CARD_BORDER,
         );
         let title = TextStyle::new(TITLE_SIZE, INK, Anchor::Start).bold();
-        canvas.text(
-            (MARGIN, MARGIN + TITLE_SIZE - 3.0),
-            &font::fit(&self.title, TITLE_SIZE, Weight::Bold, width - 2.0 * MARGIN),
-            title,
-        );
+        let title = title.within(width - 2.0 * MARGIN);
+        canvas.text((MARGIN, MARGIN + TITLE_SIZE - 3.0), &self.title, title);
         for (line, note) in notes.iter().enumerate() {
             let y = MARGIN + TITLE_SIZE + 4.0 + (line + 1) as f64 * NOTE_LEADING - 4.0;
             let style = TextStyle::new(NOTE_SIZE, INK_SOFT, Anchor::Start);
@@ -244,7 +241,7 @@ mod tests {
             let mut canvas = Canvas::new(80.0, 30.0, Letters::Outlines);
             let style = TextStyle::new(16.0, INK, Anchor::Start);
             canvas.text((4.0, 20.0), text, style);
-            render::png(&canvas.into_svg(), 1.0).unwrap()
+            render::png(&canvas.svg(), 1.0).unwrap()
         };
         assert_ne!(canvas("alpha"), canvas(""));
         assert_ne!(canvas("\u{3b1}"), canvas("\u{3c1}"));

@@ -8,6 +8,7 @@ use std::{
 };
 
 use gif::{Encoder, Frame, Repeat};
+use tempfile::TempPath;
 
 use crate::{error::FigureError, picture::Picture};
 
@@ -16,10 +17,11 @@ const DELAY_MIN: u16 = 2;
 
 /// A film that is being written.
 ///
-/// It lies beside its place under another name until it is whole, so that one that is given up leaves the older one there.
+/// It lies beside its place under another name until it is whole: one that is dropped before that is removed, and leaves the older one
+/// there.
 pub struct Film {
     path: PathBuf,
-    aside: PathBuf,
+    aside: TempPath,
     encoder: Encoder<BufWriter<File>>,
     width: u16,
     height: u16,
@@ -55,14 +57,15 @@ impl Film {
         };
         let mut aside = path.as_os_str().to_owned();
         aside.push(".tmp");
-        let aside = PathBuf::from(aside);
-        let begin = || {
+        let begin = || -> io::Result<_> {
+            let aside = TempPath::try_from_path(aside)?;
             let file = BufWriter::new(File::create(&aside)?);
             let mut encoder = Encoder::new(file, width, height, &[]).map_err(io::Error::other)?;
             let repeated = encoder.set_repeat(Repeat::Infinite);
-            repeated.map_err(io::Error::other).map(|()| encoder)
+            repeated.map_err(io::Error::other)?;
+            Ok((aside, encoder))
         };
-        let encoder = begin().map_err(|source| FigureError::Write {
+        let (aside, encoder) = begin().map_err(|source| FigureError::Write {
             path: path.to_owned(),
             source,
         })?;
@@ -109,15 +112,8 @@ impl Film {
         let path = self.path;
         let ended = self.encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
-        let ended = ended.and_then(|()| std::fs::rename(self.aside, &path));
+        let ended = ended.and_then(|()| self.aside.persist(&path).map_err(io::Error::from));
         ended.map_err(|source| FigureError::Write { path, source })
-    }
-
-    /// Gives the film up: what was written of it is removed.
-    pub fn discard(self) {
-        drop(self.encoder);
-        // A file that stays takes room and nothing else.
-        let _ = std::fs::remove_file(&self.aside);
     }
 }
 
@@ -141,18 +137,15 @@ mod tests {
     /// Delays, and whole pictures as a viewer builds them.
     fn play(path: &Path) -> (Vec<u16>, Vec<Vec<[u8; 3]>>) {
         let mut decoder = gif::Decoder::new(File::open(path).unwrap()).unwrap();
-        let width = usize::from(decoder.width());
-        let mut shown = vec![[9; 3]; width * usize::from(decoder.height())];
+        let pixels = usize::from(decoder.width()) * usize::from(decoder.height());
+        let mut shown = vec![[9; 3]; pixels];
         let (mut delays, mut pictures) = (Vec::new(), Vec::new());
         while let Some(frame) = decoder.read_next_frame().unwrap() {
             let palette = frame.palette.as_ref().unwrap();
-            for (at, &index) in frame.buffer.iter().enumerate() {
-                let (row, column) = (at / usize::from(frame.width), at % usize::from(frame.width));
+            assert_eq!(frame.buffer.len(), shown.len(), "frames are whole pictures");
+            for (pixel, &index) in shown.iter_mut().zip(frame.buffer.iter()) {
                 if Some(index) != frame.transparent {
-                    let place =
-                        (usize::from(frame.top) + row) * width + usize::from(frame.left) + column;
-                    let colour = &palette[3 * usize::from(index)..][..3];
-                    shown[place].copy_from_slice(colour);
+                    pixel.copy_from_slice(&palette[3 * usize::from(index)..][..3]);
                 }
             }
             delays.push(frame.delay);
@@ -226,7 +219,7 @@ mod tests {
         let path = folder.path().join("x.gif");
         assert!(Film::create(&path, (70_000, 4), 10.0).is_err());
         std::fs::write(&path, "older").unwrap();
-        Film::create(&path, (4, 4), 10.0).unwrap().discard();
+        drop(Film::create(&path, (4, 4), 10.0).unwrap());
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "older");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }

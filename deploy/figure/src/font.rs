@@ -11,19 +11,15 @@ pub(super) enum Weight {
     Bold,
 }
 
-static REGULAR: LazyLock<Face<'static>> = LazyLock::new(|| face(dejavu::sans::regular()));
-static BOLD: LazyLock<Face<'static>> = LazyLock::new(|| face(dejavu::sans::bold()));
-
-fn face(bytes: &'static [u8]) -> Face<'static> {
-    Face::parse(bytes, 0).expect("the font is built in, and a test reads it")
-}
+/// The faces, in the order of [`Weight`].
+static FACES: LazyLock<[Face<'static>; 2]> = LazyLock::new(|| {
+    let fonts = [dejavu::sans::regular(), dejavu::sans::bold()];
+    fonts.map(|font| Face::parse(font, 0).expect("the font is built in, and a test reads it"))
+});
 
 impl Weight {
     fn face(self) -> &'static Face<'static> {
-        match self {
-            Self::Regular => &REGULAR,
-            Self::Bold => &BOLD,
-        }
+        &FACES[self as usize]
     }
 }
 
@@ -34,8 +30,9 @@ pub(super) fn width(text: &str, size: f64, weight: Weight) -> f64 {
 }
 
 /// Width of the longest of these texts in regular letters.
-pub(super) fn widest(texts: &[String], size: f64) -> f64 {
-    let widths = texts.iter().map(|text| width(text, size, Weight::Regular));
+pub(super) fn widest<'a>(texts: impl IntoIterator<Item = &'a String>, size: f64) -> f64 {
+    let texts = texts.into_iter();
+    let widths = texts.map(|text| width(text, size, Weight::Regular));
     widths.fold(0.0, f64::max)
 }
 

@@ -3,9 +3,8 @@
 
 use super::{
     canvas::{Anchor, Canvas, Rect, Stroke, TextStyle, titled},
-    colours::{CELL_LIGHT, INK, INK_SOFT, NO_VALUE, OUTLINE, heat_colour, ink_on},
-    font::{self, Weight},
-    ticks,
+    colours::{CARD, CELL_LIGHT, INK, INK_SOFT, OUTLINE, heat_colour, ink_on},
+    font, ticks,
 };
 
 const TICK_SIZE: f64 = 11.5;
@@ -91,14 +90,14 @@ impl Heat {
         let (low, high) = self.ends();
         let bar_ticks = ticks::linear(low, high, 5);
         let bar_labels = ticks::labels(&bar_ticks);
-        let widest = |texts: &[String]| font::widest(texts, TICK_SIZE);
-        let names_width = widest(&self.names);
+        let bar_labels_width = font::widest(&bar_labels, TICK_SIZE);
+        let names_width = font::widest(&self.names, TICK_SIZE);
         let left = match (self.names.is_empty(), self.labels.1.is_empty()) {
             (true, true) => 0.0,
             (false, true) => names_width + 6.0,
             (_, false) => names_width + LABEL_SIZE + 12.0,
         };
-        let right = 14.0 + BAR_WIDTH + 6.0 + widest(&bar_labels) + LABEL_SIZE + 8.0;
+        let right = 14.0 + BAR_WIDTH + 6.0 + bar_labels_width + LABEL_SIZE + 8.0;
         // Names of columns stand upright if they are longer than a cell is wide.
         let cell_guess = (place.width - left - right) / self.side as f64;
         let turned = names_width > cell_guess - 2.0;
@@ -130,13 +129,11 @@ impl Heat {
         };
         self.cells(canvas, cells, cells.width / self.side as f64, (low, high));
         self.names(canvas, map, cell, turned);
-        let label = |text: &str| font::fit(text, LABEL_SIZE, Weight::Regular, room);
-        let level = style(LABEL_SIZE, Anchor::Middle);
+        let level = style(LABEL_SIZE, Anchor::Middle).within(room);
         let y = map.bottom() + names_below + LABEL_SIZE + 3.0;
-        canvas.text((map.x + room / 2.0, y), &label(&self.labels.0), level);
-        let upright = level.upright();
+        canvas.text((map.x + room / 2.0, y), &self.labels.0, level);
         let beside = (place.x + LABEL_SIZE - 2.0, map.y + room / 2.0);
-        canvas.text(beside, &label(&self.labels.1), upright);
+        canvas.text(beside, &self.labels.1, level.upright());
         if let Some(outline) = self.outline {
             point_out(canvas, map, unit, outline);
         }
@@ -155,18 +152,15 @@ impl Heat {
             let at = (bar.right() + 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, text, style(TICK_SIZE, Anchor::Start));
         }
-        let far = bar.right() + 6.0 + widest(&bar_labels) + LABEL_SIZE + 4.0;
-        canvas.text((far, bar.y + room / 2.0), &label(&self.unit), upright);
+        let far = bar.right() + 6.0 + bar_labels_width + LABEL_SIZE + 4.0;
+        canvas.text((far, bar.y + room / 2.0), &self.unit, level.upright());
     }
 
     fn cells(&self, canvas: &mut Canvas, map: Rect, cell: f64, (low, high): (f64, f64)) {
         for (index, value) in self.values.iter().enumerate() {
             let (row, column) = (index / self.side, index % self.side);
             let (x, y) = (map.x + column as f64 * cell, map.y + row as f64 * cell);
-            let colour = match value.filter(|value| value.is_finite()) {
-                Some(value) => heat_colour((value - low) / (high - low)),
-                None => NO_VALUE,
-            };
+            let colour = heat_colour((value.unwrap_or(f64::NAN) - low) / (high - low));
             // A little over the next cell, so that no line shows between them.
             canvas.rects(&[Rect::new(x, y, cell + 0.3, cell + 0.3)], colour);
             if let (Some(value), Some(decimals)) = (value, self.decimals)
@@ -201,7 +195,7 @@ pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outl
     let Outline { left, top, side } = outline;
     let [left, top, side] = [left, top, side].map(|length| length * cell);
     let rect = Rect::new(map.x + left, map.y + top, side, side);
-    canvas.frame(rect, Stroke::solid(super::colours::CARD, 4.0));
+    canvas.frame(rect, Stroke::solid(CARD, 4.0));
     canvas.frame(rect, Stroke::solid(OUTLINE, 2.2));
 }
 

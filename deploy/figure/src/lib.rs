@@ -44,6 +44,7 @@ mod render;
 mod ticks;
 
 pub use crate::{
+    canvas::Rect,
     chart::{Axis, Chart, Mark, Series},
     colours::{Colour, GREY},
     error::FigureError,
@@ -51,5 +52,5 @@ pub use crate::{
     film::Film,
     heat::{Field, Heat, Outline},
     lattice::Lattice,
-    picture::{Area, Image, Ink, Picture},
+    picture::{Image, Ink, Picture},
 };

@@ -164,16 +164,8 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         played
     };
     let see = &mut |step: &Step<'_>| film.iter_mut().for_each(|film| film.see(step));
-    let returns = match (play(Who::Agent, &spec.agent, see), film) {
-        (Err(e), film) => {
-            film.into_iter().for_each(Recording::discard);
-            return Err(e);
-        }
-        (Ok(returns), film) => {
-            film.map_or(Ok(()), |film| said(&film.finish()?))?;
-            returns
-        }
-    };
+    let returns = play(Who::Agent, &spec.agent, see)?;
+    film.map_or(Ok(()), |film| said(&film.finish()?))?;
     said(&describe(&spec.agent, &returns))?;
     let random = play(Who::Random, "random", &mut |_| ())?;
     said(&describe("random", &random))?;

@@ -13,7 +13,7 @@ use driml_learner::insight::Seen;
 use driml_machine::error::{Usage, usage};
 use driml_protocol::Horizon;
 
-use super::tile::{Layout, Look, Shot};
+use super::tile::{Layout, Local, Shot};
 
 /// Times as long as others that the last picture of an episode is shown, where one environment is.
 const PAUSE: f64 = 8.0;
@@ -41,30 +41,16 @@ pub(crate) struct Recording {
     path: PathBuf,
     film: Film,
     layout: Layout,
-    overlay: Option<Overlay>,
-    envs: Vec<Filmed>,
+    /// Asked what the network makes of the states, if that is shown.
+    viewer: Option<Viewer>,
+    /// The newest of each environment; the last one stays once all its episodes are filmed.
+    shots: Vec<Shot>,
     episodes_max: u32,
     steps_max: u32,
     steps: u32,
     /// Steps that are not drawn yet, as local DIM is asked what came after them.
     waiting: VecDeque<Moment>,
     failed: Option<anyhow::Error>,
-}
-
-/// What the network is asked.
-struct Overlay {
-    viewer: Viewer,
-    /// Steps from a state to the one that local DIM is to know; none where the agent has no such loss, or there is nothing to tell it from.
-    local_k: Option<usize>,
-}
-
-#[derive(Clone, Default)]
-struct Filmed {
-    episode: u32,
-    step: u32,
-    total: f64,
-    /// Its last shot, once all its episodes are filmed.
-    over: Option<Shot>,
 }
 
 /// One step of all environments.
@@ -76,7 +62,7 @@ struct Moment {
 }
 
 impl Recording {
-    /// Begins the film of an evaluation of so many episodes, if one is asked for.
+    /// Begins the film of an evaluation of so many episodes, if one is asked for. One that is dropped leaves no file.
     pub(crate) fn begin(
         args: &RecordArgs,
         player: &Player,
@@ -88,26 +74,31 @@ impl Recording {
         let played = Player::envs(episodes as usize);
         let envs = (args.record_envs as usize).min(played);
         let viewer = args.overlay.then(|| player.viewer()).transpose()?;
-        let overlay = viewer.map(|viewer| {
-            let ahead = match player.config.run.horizon {
-                Horizon::Fixed { k } => k as usize,
-                _ => 1,
-            };
-            let is_local = viewer.insight.local_shape().is_some() && played > 1;
-            let local_k = is_local.then_some(ahead);
-            Overlay { viewer, local_k }
+        let k = match player.config.run.horizon {
+            Horizon::Fixed { k } => k as usize,
+            _ => 1,
+        };
+        let shape = viewer.as_ref().and_then(|it| it.insight.local_shape());
+        let local = shape.filter(|_| played > 1).map(|(rows, columns)| Local {
+            k,
+            rows,
+            columns,
+            candidates: played,
         });
-        let shown = overlay.as_ref();
-        let local = shown.and_then(|it| it.local_k.zip(it.viewer.insight.local_shape()));
-        let layout = Layout::new(&player.config, envs, overlay.is_some(), local, played);
+        let layout = Layout::new(&player.config, envs, viewer.is_some(), local);
         let rate = player.config.world.steps_per_second();
         let film = Film::create(path, layout.size(), rate).map_err(cannot)?;
+        // As if an episode had ended before the first.
+        let before = Shot {
+            is_last: true,
+            ..Shot::default()
+        };
         Ok(Some(Self {
             path: path.clone(),
             film,
             layout,
-            overlay,
-            envs: vec![Filmed::default(); envs],
+            viewer,
+            shots: vec![before; envs],
             episodes_max: args.record_episodes,
             steps_max: args.record_steps,
             steps: 0,
@@ -116,15 +107,12 @@ impl Recording {
         }))
     }
 
-    fn is_over(&self) -> bool {
-        self.failed.is_some()
-            || self.steps >= self.steps_max
-            || self.envs.iter().all(|env| env.over.is_some())
-    }
-
     /// Films a step. [`finish`](Self::finish) returns the errors.
     pub(crate) fn see(&mut self, step: &Step<'_>) {
-        if !self.is_over()
+        let is_over = |shot: &Shot| shot.is_over(self.episodes_max);
+        if self.failed.is_none()
+            && self.steps < self.steps_max
+            && !self.shots.iter().all(is_over)
             && let Err(e) = self.add(step)
         {
             self.failed = Some(e);
@@ -133,64 +121,63 @@ impl Recording {
 
     fn add(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let played = step.actions.len();
-        let frame_bytes = step.frames.len() / played;
-        let mut shots = Vec::with_capacity(self.envs.len());
-        for (i, env) in self.envs.iter_mut().enumerate() {
-            let frame = &step.frames[i * frame_bytes..][..frame_bytes];
-            shots.push(env.take(frame, step, i, self.episodes_max));
+        let frames = step.frames.chunks_exact(step.frames.len() / played);
+        for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
+            if !shot.is_over(self.episodes_max) {
+                shot.follow(frame, step, i);
+            }
         }
-        let (mut seen, mut ahead) = (None, 0);
-        if let Some(Overlay { viewer, local_k }) = &mut self.overlay {
+        let mut seen = None;
+        if let Some(viewer) = &mut self.viewer {
             // Other environments than the filmed are what local DIM tells a state from.
-            let looked_at = local_k.map_or(self.envs.len(), |_| played);
+            let looked_at = match self.layout.local {
+                Some(_) => played,
+                None => self.shots.len(),
+            };
             let states = &step.states[..step.states.len() / played * looked_at];
             seen = Some(viewer.look(states)?);
-            ahead = local_k.unwrap_or(0);
         }
         self.waiting.push_back(Moment {
-            shots,
+            shots: self.shots.clone(),
             seen,
             actions: step.actions.to_vec(),
             ends: step.ends.to_vec(),
         });
         self.steps += 1;
-        if self.waiting.len() > ahead {
-            self.draw_next(ahead)?;
+        if self.waiting.len() > self.ahead() {
+            self.draw_next()?;
         }
         Ok(())
     }
 
-    /// Draws the step that waits longest, with what local DIM says of the one `ahead` of it.
-    fn draw_next(&mut self, ahead: usize) -> anyhow::Result<()> {
+    /// Steps from one to that of which local DIM is asked; 0 where it is not.
+    fn ahead(&self) -> usize {
+        self.layout.local.as_ref().map_or(0, |it| it.k)
+    }
+
+    /// Draws the step that waits longest, with what local DIM says of the one [`ahead`](Self::ahead) of it, if that was played.
+    fn draw_next(&mut self) -> anyhow::Result<()> {
         let Some(moment) = self.waiting.pop_front() else {
             return Ok(());
         };
-        let mut matches = None;
-        if let Some(overlay) = &self.overlay
-            && overlay.local_k == Some(ahead)
-            && let Some(later) = self.waiting.get(ahead - 1).and_then(|it| it.seen.as_ref())
-            && let Some(now) = &moment.seen
-        {
-            let insight = &overlay.viewer.insight;
-            matches = insight.local_matches(now, &moment.actions, later)?;
-        }
+        let between = self.ahead().saturating_sub(1);
+        let later = self.waiting.get(between).and_then(|it| it.seen.as_ref());
+        let matches = match (&self.viewer, &moment.seen, later) {
+            (Some(viewer), Some(now), Some(later)) => {
+                let insight = &viewer.insight;
+                insight.local_matches(now, &moment.actions, later)?
+            }
+            _ => None,
+        };
         let (width, height) = self.layout.size();
         let mut picture = Picture::new(width, height)?;
         for (i, shot) in moment.shots.iter().enumerate() {
             // The end of an episode lies between a state and the one looked for: there is nothing to know.
-            let between = self.waiting.iter().take(ahead.saturating_sub(1));
-            let between = between.filter_map(|it| it.ends.get(i));
-            let mut ends = between.chain(moment.ends.get(i));
-            let continues = ends.all(|end| *end == StepEnd::Running);
-            let look = moment.seen.as_ref().map(|seen| Look {
-                q_values: row(&seen.q_values, self.layout.actions(), i),
-                probabilities: row(&seen.probabilities, self.layout.logits(), i),
-                matches: matches
-                    .as_deref()
-                    .filter(|_| continues)
-                    .map(|all| row(all, self.layout.locations(), i)),
-            });
-            self.layout.draw(&mut picture, i, shot, look);
+            let mut before = self.waiting.iter().take(between).chain([&moment]);
+            let continues = before.all(|it| it.ends[i] == StepEnd::Running);
+            let matches = matches.as_deref().filter(|_| continues);
+            let seen = moment.seen.as_ref();
+            self.layout.draw(&mut picture, i, shot, seen, matches);
         }
         let ended = matches!(moment.shots[..], [Shot { is_last: true, .. }]);
         self.film.add(&picture, if ended { PAUSE } else { 1.0 })?;
@@ -200,56 +187,36 @@ impl Recording {
     /// Ends the film, and says what it shows.
     pub(crate) fn finish(mut self) -> anyhow::Result<String> {
         while self.failed.is_none() && !self.waiting.is_empty() {
-            self.failed = self.draw_next(0).err();
+            self.failed = self.draw_next().err();
         }
-        let doing = || format!("filming to {}", self.path.display());
-        if let Some(e) = self.failed.take() {
-            let e = e.context(doing());
-            self.film.discard();
-            return Err(e);
-        }
-        self.film.finish().with_context(doing)?;
-        let steps = self.steps;
-        Ok(format!("filmed {steps} steps: {}\n", self.path.display()))
-    }
-
-    pub(crate) fn discard(self) {
-        self.film.discard();
-    }
-}
-
-impl Filmed {
-    /// What is shown of environment `i` in this step.
-    fn take(&mut self, frame: &[u8], step: &Step<'_>, i: usize, episodes_max: u32) -> Shot {
-        if let Some(shot) = &self.over {
-            return Shot {
-                is_last: false,
-                ..shot.clone()
-            };
-        }
-        let reward = f64::from(step.rewards[i]);
-        self.total += reward;
-        let is_last = matches!(step.ends[i], StepEnd::Terminal | StepEnd::TimedOut);
-        let shot = Shot {
-            frame: frame.to_vec(),
-            episode: self.episode + 1,
-            step: self.step,
-            total: self.total,
-            reward,
-            action: step.actions[i],
-            is_last,
+        let ended = match self.failed {
+            Some(e) => Err(e),
+            None => self.film.finish().map_err(anyhow::Error::from),
         };
-        self.step += 1;
-        if is_last {
-            (self.episode, self.step, self.total) = (self.episode + 1, 0, 0.0);
-            self.over = (self.episode == episodes_max).then(|| shot.clone());
-        }
-        shot
+        let path = self.path.display();
+        ended.with_context(|| format!("filming to {path}"))?;
+        Ok(format!("filmed {} steps: {path}\n", self.steps))
     }
 }
 
-fn row<T>(all: &[T], length: usize, index: usize) -> &[T] {
-    &all[index * length..][..length]
+impl Shot {
+    fn is_over(&self, episodes_max: u32) -> bool {
+        self.is_last && self.episode == episodes_max
+    }
+
+    /// Takes the next step of its environment `i`.
+    fn follow(&mut self, frame: &[u8], step: &Step<'_>, i: usize) {
+        if self.is_last {
+            (self.episode, self.step, self.total) = (self.episode + 1, 0, 0.0);
+        } else {
+            self.step += 1;
+        }
+        self.frame = frame.to_vec();
+        self.action = step.actions[i];
+        self.reward = f64::from(step.rewards[i]);
+        self.total += self.reward;
+        self.is_last = matches!(step.ends[i], StepEnd::Terminal | StepEnd::TimedOut);
+    }
 }
 
 /// A film that cannot be begun is a flag that cannot work.

@@ -1,24 +1,28 @@
 //! One filmed environment in a picture: its frame, enlarged, and beside it what the network makes of it. Where things stand, and their words.
 //! It asks no network: it is told.
 
-use driml_figure::{Area, Image, Ink, Picture};
+use driml_envs::FrameShape;
+use driml_figure::{Image, Ink, Picture, Rect};
+use driml_learner::insight::Seen;
 use driml_settings::config::RunConfig;
 
 /// Pixels that the longer side of a frame is enlarged to, or nearly: each pixel becomes a square of whole pixels.
 const FRAME_SIDE: usize = 224;
 /// Pixels around and between what is shown.
-const MARGIN: usize = 10;
+const MARGIN: f64 = 10.0;
 /// Pixels across of the words and bars.
-const PANEL_WIDTH: usize = 216;
+const PANEL_WIDTH: f64 = 216.0;
 /// Pixels down of the words and bars at least.
-const PANEL_HEIGHT: usize = 230;
+const PANEL_HEIGHT: f64 = 230.0;
 /// Pixels from line to line.
-const LEADING: usize = 19;
+const LEADING: f64 = 19.0;
 
-#[derive(Clone, Debug)]
+/// An environment's newest step.
+#[derive(Clone, Debug, Default)]
 pub(super) struct Shot {
     /// The newest frame [H, W, C] in which the action was taken.
     pub(super) frame: Vec<u8>,
+    /// Counted from 1.
     pub(super) episode: u32,
     pub(super) step: u32,
     /// The episode's return up to this step's reward.
@@ -28,76 +32,49 @@ pub(super) struct Shot {
     pub(super) is_last: bool,
 }
 
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Look<'a> {
-    /// [A].
-    pub(super) q_values: &'a [f32],
-    /// [A, N].
-    pub(super) probabilities: &'a [f32],
-    /// [L]: how surely local DIM knows each location of the later state; none where it was not asked.
-    pub(super) matches: Option<&'a [f64]>,
+/// What local DIM is asked: which places of a later state it knows.
+#[derive(Debug)]
+pub(super) struct Local {
+    /// Steps from a state to the later one.
+    pub(super) k: usize,
+    pub(super) rows: usize,
+    pub(super) columns: usize,
+    /// States among which it looks: those of all environments that are played.
+    pub(super) candidates: usize,
 }
 
 #[derive(Debug)]
 pub(super) struct Layout {
-    frame: (usize, usize, usize),
+    frame: FrameShape,
     zoom: usize,
     envs: usize,
     has_panel: bool,
-    local: Option<Local>,
+    /// None where the agent has no such loss, or there is nothing to tell a state from.
+    pub(super) local: Option<Local>,
     action_names: Vec<String>,
     support: Vec<f32>,
 }
 
-#[derive(Debug)]
-struct Local {
-    k: usize,
-    rows: usize,
-    columns: usize,
-    candidates: usize,
-}
-
 impl Layout {
-    /// Of `envs` filmed out of `candidates` environments played; `local` is k and the shape of the local features, if they are asked.
+    /// Of `envs` filmed environments.
     pub(super) fn new(
         config: &RunConfig,
         envs: usize,
         has_panel: bool,
-        local: Option<(usize, (usize, usize))>,
-        candidates: usize,
+        local: Option<Local>,
     ) -> Self {
         let spec = &config.run;
         let (height, width) = (spec.frame_height as usize, spec.frame_width as usize);
         let longer = height.max(width).max(1);
         Self {
-            frame: (height, width, spec.frame_channels as usize),
+            frame: FrameShape::new(height, width, spec.frame_channels as usize),
             zoom: ((FRAME_SIDE + longer / 2) / longer).max(1),
             envs,
             has_panel,
-            local: local.map(|(k, (rows, columns))| Local {
-                k,
-                rows,
-                columns,
-                candidates,
-            }),
+            local,
             action_names: config.action_names(),
             support: config.model.atoms_support(),
         }
-    }
-
-    /// A: actions that the agent has.
-    pub(super) fn actions(&self) -> usize {
-        self.action_names.len()
-    }
-
-    /// A * N: numbers of all its distributions.
-    pub(super) fn logits(&self) -> usize {
-        self.actions() * self.support.len()
-    }
-
-    /// L: places of local features.
-    pub(super) fn locations(&self) -> usize {
-        self.local.as_ref().map_or(0, |it| it.rows * it.columns)
     }
 
     /// Pixels across and down of a picture.
@@ -105,8 +82,8 @@ impl Layout {
         let (width, height) = self.tile();
         let columns = self.columns();
         let rows = self.envs.div_ceil(columns);
-        let along = |count: usize, side: usize| MARGIN + count * (side + MARGIN);
-        (along(columns, width), along(rows, height))
+        let along = |count: usize, side: f64| MARGIN + count as f64 * (side + MARGIN);
+        (along(columns, width) as usize, along(rows, height) as usize)
     }
 
     /// Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
@@ -117,12 +94,12 @@ impl Layout {
         }
     }
 
-    fn enlarged(&self) -> (usize, usize) {
-        let (height, width, _) = self.frame;
-        (width * self.zoom, height * self.zoom)
+    fn enlarged(&self) -> (f64, f64) {
+        let enlarged = |side: usize| (side * self.zoom) as f64;
+        (enlarged(self.frame.width), enlarged(self.frame.height))
     }
 
-    fn tile(&self) -> (usize, usize) {
+    fn tile(&self) -> (f64, f64) {
         let (width, height) = self.enlarged();
         if !self.has_panel {
             return (width, height);
@@ -137,82 +114,82 @@ impl Layout {
         }
     }
 
+    /// Draws environment `i`: its shot, and beside it what the network has `seen` of all, and with which probability [B, L] local DIM
+    /// knows each location of the later states; none where it was not asked.
     pub(super) fn draw(
         &self,
         picture: &mut Picture,
         i: usize,
         shot: &Shot,
-        look: Option<Look<'_>>,
+        seen: Option<&Seen>,
+        matches: Option<&[f64]>,
     ) {
         let (tile_width, tile_height) = self.tile();
         let (column, row) = (i % self.columns(), i / self.columns());
-        let x = MARGIN + column * (tile_width + MARGIN);
-        let y = MARGIN + row * (tile_height + MARGIN);
-        let (height, width, channels) = self.frame;
+        let x = MARGIN + column as f64 * (tile_width + MARGIN);
+        let y = MARGIN + row as f64 * (tile_height + MARGIN);
         let image = Image {
             pixels: &shot.frame,
-            height,
-            width,
-            channels,
+            height: self.frame.height,
+            width: self.frame.width,
+            channels: self.frame.channels,
         };
-        picture.image((x, y), self.zoom, image);
-        let Some(look) = look else { return };
+        picture.image((x as usize, y as usize), self.zoom, image);
+        let Some(seen) = seen else { return };
         let (frame_width, frame_height) = self.enlarged();
-        let panel = Area {
-            x: x + frame_width + MARGIN,
-            y,
-            width: PANEL_WIDTH,
-            height: tile_height,
-        };
-        self.draw_panel(picture, panel, shot, look);
+        let panel = Rect::new(x + frame_width + MARGIN, y, PANEL_WIDTH, tile_height);
+        self.draw_panel(picture, panel, i, shot, seen);
         if let Some(local) = &self.local {
-            let map = Area {
-                x: panel.x + PANEL_WIDTH + MARGIN,
-                y,
-                width: frame_width,
-                height: frame_height,
-            };
-            let unknown = vec![f64::NAN; local.rows * local.columns];
-            picture.cells(map, local.columns, look.matches.unwrap_or(&unknown));
+            let x = panel.x + PANEL_WIDTH + MARGIN;
+            let map = Rect::new(x, y, frame_width, frame_height);
+            let locations = local.rows * local.columns;
+            let unknown = vec![f64::NAN; locations];
+            let matches = matches.map_or(&unknown[..], |all| row_of(all, locations, i));
+            picture.cells(map, local.columns, matches);
             let words = format!("local DIM, k = {}, chance 1/{}", local.k, local.candidates);
-            let below = (map.x, y + frame_height + LEADING - 4);
-            picture.text(below, map.width, Ink::Soft, &words);
+            let below = (x, y + frame_height + LEADING - 4.0);
+            picture.text(below, frame_width, Ink::Soft, &words);
         }
     }
 
-    fn draw_panel(&self, picture: &mut Picture, area: Area, shot: &Shot, look: Look<'_>) {
+    fn draw_panel(&self, picture: &mut Picture, area: Rect, i: usize, shot: &Shot, seen: &Seen) {
+        let (actions, atoms) = (self.action_names.len(), self.support.len());
         let action = usize::from(shot.action);
-        let name = &self.action_names[action];
-        let q_values = look.q_values.iter().copied();
-        let best = q_values.fold(f32::NEG_INFINITY, f32::max);
-        let q = look.q_values[action];
+        let q_values = row_of(&seen.q_values, actions, i);
+        let probabilities = row_of(&seen.probabilities, atoms, i * actions + action);
+        let best = q_values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let (q, name) = (q_values[action], &self.action_names[action]);
         let chance = if q < best { " (by chance)" } else { "" };
-        let Shot { episode, step, .. } = shot;
-        let Shot { total, reward, .. } = shot;
-        let lines = [
-            (Ink::Soft, format!("episode {episode}, step {step}")),
-            (Ink::Plain, format!("return {total:.2} ({reward:+.2})")),
+        let mut y = area.y + 13.0;
+        for (ink, text) in [
+            (
+                Ink::Soft,
+                format!("episode {}, step {}", shot.episode, shot.step),
+            ),
+            (
+                Ink::Plain,
+                format!("return {:.2} ({:+.2})", shot.total, shot.reward),
+            ),
             (Ink::Plain, format!("value {best:.3}")),
             (Ink::Bold, format!("{name}{chance}")),
-        ];
-        for (line, (ink, text)) in lines.iter().enumerate() {
-            let at = (area.x, area.y + 13 + line * LEADING);
-            picture.text(at, area.width, *ink, text);
+        ] {
+            picture.text((area.x, y), area.width, ink, &text);
+            y += LEADING;
         }
-        let (atoms, used) = (self.support.len(), lines.len() * LEADING + 8);
-        let bars = Area {
-            y: area.y + used,
-            height: area.height - used - LEADING,
-            ..area
-        };
-        let probabilities = &look.probabilities[action * atoms..][..atoms];
+        let top = y - 5.0;
+        let bottom = area.y + area.height - LEADING;
+        let bars = Rect::new(area.x, top, area.width, bottom - top);
         let most = probabilities.iter().copied();
         let most = most.fold(f32::MIN_POSITIVE, f32::max);
         let heights: Vec<_> = probabilities.iter().map(|p| f64::from(p / most)).collect();
         let (low, high) = (self.support[0], self.support[atoms - 1]);
-        picture.bars(bars, &heights, Some(f64::from((q - low) / (high - low))));
+        picture.bars(bars, &heights, f64::from((q - low) / (high - low)));
         let words = format!("its return, {low} to {high}: {q:.3}");
-        let below = (area.x, area.y + area.height - 4);
+        let below = (area.x, area.y + area.height - 4.0);
         picture.text(below, area.width, Ink::Soft, &words);
     }
+}
+
+fn row_of<T>(rows: &[T], length: usize, index: usize) -> &[T] {
+    &rows[index * length..][..length]
 }

@@ -12,7 +12,7 @@ use std::{
 };
 
 use anyhow::Context;
-use driml_figure::{Area, Ink, Picture};
+use driml_figure::{Ink, Picture, Rect};
 use driml_learner::{AffinityEstimator, checkpoint};
 use driml_protocol::ReplayStatus;
 
@@ -152,16 +152,11 @@ fn draw(side: usize, matrix: &[f32]) -> anyhow::Result<Picture> {
     let mut picture = Picture::new(width, length + 2 * MARGIN + CAPTION)?;
     let most = matrix.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
     let shares: Vec<_> = matrix.iter().map(|a| f64::from(a / most)).collect();
-    let area = Area {
-        x: MARGIN,
-        y: MARGIN,
-        width: length,
-        height: length,
-    };
-    picture.cells(area, side, &shares);
+    let [left, length, room] = [MARGIN, length, width - 2 * MARGIN].map(|it| it as f64);
+    picture.cells(Rect::new(left, left, length, length), side, &shares);
     let caption = format!("A: row, action; column, next; light: {most:.3}");
-    let below = (MARGIN, length + MARGIN + CAPTION - 5);
-    picture.text(below, width - 2 * MARGIN, Ink::Soft, &caption);
+    let below = (left, left + length + CAPTION as f64 - 5.0);
+    picture.text(below, room, Ink::Soft, &caption);
     Ok(picture)
 }
 
