@@ -7,7 +7,7 @@ use driml_machine::effort::Effort;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{report::Measurement, settings};
+use crate::{report::Bench, settings};
 
 pub(super) const GAMES: [&str; 4] = ["bigfish", "coinrun", "maze", "starpilot"];
 /// Environments that are stepped together.
@@ -23,7 +23,7 @@ pub(super) fn name(game: &str, threads: usize) -> String {
 }
 
 /// Steps a second of some worlds, Procgen's if none is named, each environment's counted.
-pub(super) fn measure(worlds: &[String], effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(worlds: &[String], bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let mut cases = Vec::new();
     for world in worlds {
         cases.push((format!("{world}, {ENVS} environments"), world.clone(), 0));
@@ -36,12 +36,11 @@ pub(super) fn measure(worlds: &[String], effort: &Effort) -> anyhow::Result<Vec<
         }
     }
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut figures = Vec::new();
     for (name, world, threads) in cases {
-        let rate = rate(&world, threads, effort, &mut rng)?;
-        figures.push(Measurement::found(name, rate, "steps/s"));
+        let rate = rate(&world, threads, &bench.effort, &mut rng)?;
+        bench.figures.found(name, rate, "steps/s");
     }
-    Ok(figures)
+    Ok(())
 }
 
 fn rate(world: &str, threads: usize, effort: &Effort, rng: &mut ChaCha8Rng) -> anyhow::Result<f64> {

@@ -4,7 +4,7 @@
 use std::hint::black_box;
 
 use anyhow::{anyhow, ensure};
-use driml_machine::effort::{Effort, Work};
+use driml_machine::effort::Work;
 use driml_protocol::{ActorJoin, Batch, BufferPool, InsertReply, Sampling};
 use driml_replay_server::Replay;
 use driml_settings::config::RunConfig;
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::{
     recording::{CHUNKS, INCARNATION, Recording},
-    report::Measurement,
+    report::Bench,
     settings::{self, AGENT, CAPACITY},
 };
 
@@ -32,22 +32,20 @@ const PRIORITISED: Sampling = Sampling::Prioritised {
 };
 
 /// Batches of recorded frames a second, and as many bytes merely copied.
-pub(super) fn assembling(
-    recording: &Recording,
-    effort: &Effort,
-) -> anyhow::Result<[Measurement; 2]> {
+pub(super) fn assembling(recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
     let (rows, frame_bytes) = (config.learner.batch_size, recording.frame_bytes);
     let mut filled = Filled::new(&config, CAPACITY, recording)?;
-    let sampling = effort.rate_by_median(|| {
+    let sampling = bench.effort.rate_by_median(|| {
         black_box(filled.draw()?);
         Ok(())
     })?;
+    bench.figures.found(ASSEMBLED, sampling, "batches/s");
     drop(filled);
 
     let held = vec![1_u8; CAPACITY as usize * frame_bytes];
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let copying = effort.rate_by_median(|| {
+    let copying = bench.effort.rate_by_median(|| {
         let mut copy = Vec::with_capacity(3 * rows as usize * frame_bytes);
         for _ in 0..3 * rows {
             let from = rng.random_range(0..CAPACITY as usize) * frame_bytes;
@@ -56,15 +54,13 @@ pub(super) fn assembling(
         black_box(copy);
         Ok(())
     })?;
-    Ok([
-        Measurement::found(ASSEMBLED, sampling, "batches/s"),
-        Measurement::found(COPIED, copying, "batches/s"),
-    ])
+    bench.figures.found(COPIED, copying, "batches/s");
+    Ok(())
 }
 
 /// Batches a second of a replay that holds `held` transitions: drawn uniformly, by priority, and by priorities that are then set,
 /// in turn.
-pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn sampling(held: u64, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let blank = Recording::blank((SIDE * SIDE) as usize);
     let filled = |sampling| {
         let mut config = settings::of_run(settings::WORLD, AGENT, "paper", &settings::REPLAY)?;
@@ -93,12 +89,11 @@ pub(super) fn sampling(held: u64, effort: &Effort) -> anyhow::Result<Vec<Measure
         Box::new(|| prioritised.draw().map(|batch| drop(black_box(batch)))),
         Box::new(|| learned_from.learn()),
     ];
-    let figures = names.into_iter().zip(effort.rates_in_turn(&mut works)?);
-    let figures = figures.map(|(what, rate)| {
+    for (what, rate) in names.iter().zip(bench.effort.rates_in_turn(&mut works)?) {
         let what = format!("{rows} rows of {held} transitions {what}");
-        Measurement::found(what, rate, "batches/s")
-    });
-    Ok(figures.collect())
+        bench.figures.found(what, rate, "batches/s");
+    }
+    Ok(())
 }
 
 /// A replay that is full, and what its learner finds.

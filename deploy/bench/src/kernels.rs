@@ -3,15 +3,13 @@
 
 use candle_core::{Device, Tensor};
 use driml_learner::DeviceName;
-use driml_machine::effort::Effort;
 use driml_model::{conv2d_relu, multiply_in_first_cache};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    flags::BenchFlags,
     learner::counted_updates,
-    report::{Measurement, named},
+    report::{Bench, named},
 };
 
 const ROWS: usize = 256;
@@ -23,12 +21,12 @@ const TORSOS: [&str; 2] = ["nature", "impala"];
 const TILES: usize = 10_000;
 
 /// GFLOP/s in each precision.
-pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
-    let mut figures = Vec::new();
-    for precision in flags.precisions(DeviceName::Cpu) {
+pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
+    let effort = bench.effort;
+    for precision in bench.flags.precisions(DeviceName::Cpu) {
         let mut found = |what: &str, gflop: f64, calls: f64| {
-            let what = named(what, precision);
-            figures.push(Measurement::found(what, gflop * calls, "GFLOP/s"));
+            let figures = &mut bench.figures;
+            figures.found(named(what, precision), gflop * calls, "GFLOP/s");
         };
         let gflop = multiply_in_first_cache(precision, TILES) / 1e9;
         let calls = effort.rate_by_median(|| {
@@ -55,7 +53,7 @@ pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec
             found(&what, gflop, effort.rate_by_median(work)?);
         }
     }
-    Ok(figures)
+    Ok(())
 }
 
 /// A tensor of numbers of a usual size.

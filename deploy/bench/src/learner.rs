@@ -5,14 +5,14 @@ use driml_learner::{
     Agent, Compute, DeviceName, Kernels, OwnedBatch, Precision,
     cost::{UpdateCost, UpdateShape},
 };
-use driml_machine::effort::{Effort, Work};
+use driml_machine::effort::Work;
 use driml_settings::config::RunConfig;
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    flags::{BenchFlags, BenchLearnerArgs},
-    report::{Measurement, named},
+    flags::BenchLearnerArgs,
+    report::{Bench, named},
     settings::{self, AGENT, WORLD},
 };
 
@@ -56,90 +56,77 @@ const SIZES: [(&str, &[&str]); 13] = [
     ("vectors of 256", &["model.embedding_dim=256"]),
     ("vectors of 1024", &["model.embedding_dim=1024"]),
 ];
+
 /// Updates a second on a device, in each precision; on the CPU also with candle's own operations.
-pub(super) fn measure(
-    args: &BenchLearnerArgs,
-    flags: &BenchFlags,
-    effort: &Effort,
-) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(args: &BenchLearnerArgs, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let device = args.on.device;
-    let mut figures = Vec::new();
-    for precision in flags.precisions(device) {
-        let mut bench = Bench {
-            effort,
-            precision,
-            compute: device.open(precision)?,
-            figures,
-        };
+    for precision in bench.flags.precisions(device) {
+        let compute = device.open(precision)?;
         match args.growth {
-            true => bench.growth()?,
-            false => bench.paper(device == DeviceName::Cpu)?,
+            true => growth(precision, &compute, bench)?,
+            false => paper(precision, &compute, device == DeviceName::Cpu, bench)?,
         }
-        figures = bench.figures;
     }
-    Ok(figures)
+    Ok(())
 }
 
-/// What measures on one device in one precision, and what it has found.
-struct Bench<'a> {
-    effort: &'a Effort,
+/// Updates at the paper's sizes; on a CPU with candle's own operations too, and where states of a batch repeat.
+fn paper(
     precision: Precision,
-    compute: Compute,
-    figures: Vec<Measurement>,
+    compute: &Compute,
+    on_cpu: bool,
+    bench: &mut Bench<'_>,
+) -> anyhow::Result<()> {
+    let effort = bench.effort;
+    let mut found = |what: &str, rate| {
+        let figures = &mut bench.figures;
+        figures.found(named(what, precision), rate, "updates/s");
+    };
+    for case in CASES.lines() {
+        let words: Vec<&str> = case.split('|').collect();
+        let (name, sets) = (words[0], &words[3..]);
+        let config = settings::of_run(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
+        let rate = effort.rate_by_median(updates(&config, compute, 0.0)?)?;
+        found(name, rate);
+        if name == GLOBAL_DIM && on_cpu && precision == Precision::F32 {
+            let mut stock = compute.clone();
+            stock.kernels = Kernels::Candle;
+            let rate = effort.rate_by_median(updates(&config, &stock, 0.0)?)?;
+            found(&format!("{name}, {CANDLE}"), rate);
+        }
+    }
+    if !on_cpu {
+        return Ok(());
+    }
+    let (mut names, mut works) = (Vec::new(), Vec::new());
+    for (share, repeated) in REPEATED {
+        for (set, computed) in DEDUPLICATION {
+            let config = settings::of_run(WORLD, AGENT, "paper", &[set])?;
+            works.push(updates(&config, compute, share)?);
+            names.push(format!(
+                "C51 + global-global DIM, 60x60x3, {repeated}, {computed}"
+            ));
+        }
+    }
+    for (name, rate) in names.iter().zip(effort.rates_in_turn(&mut works)?) {
+        found(name, rate);
+    }
+    Ok(())
 }
 
-impl Bench<'_> {
-    fn found(&mut self, what: &str, value: f64, unit: &str) {
-        let what = named(what, self.precision);
-        self.figures.push(Measurement::found(what, value, unit));
+/// For each size updates a second, and the arithmetic that this is: the products that `driml inspect` counts.
+fn growth(precision: Precision, compute: &Compute, bench: &mut Bench<'_>) -> anyhow::Result<()> {
+    for (name, sets) in SIZES {
+        let sets = [sets, &["learner.deduplicate_states=false"]].concat();
+        let (work, gflop) = counted_updates(AGENT, &sets, compute)?;
+        let rate = bench.effort.rate_by_median(work)?;
+        let name = format!("{name}: {gflop:.2} GFLOP");
+        let (what, figures) = (named(&name, precision), &mut bench.figures);
+        figures.found(what, rate, "updates/s");
+        let what = named(&format!("{name}, arithmetic"), precision);
+        figures.found(what, rate * gflop, "GFLOP/s");
     }
-
-    /// Updates at the paper's sizes; on a CPU with candle's own operations too, and where states of a batch repeat.
-    fn paper(&mut self, on_cpu: bool) -> anyhow::Result<()> {
-        for case in CASES.lines() {
-            let words: Vec<&str> = case.split('|').collect();
-            let (name, sets) = (words[0], &words[3..]);
-            let config = settings::of_run(WORLD, words[1], words[2], sets)?.with_whole_frames()?;
-            let work = updates(&config, &self.compute, 0.0)?;
-            self.found(name, self.effort.rate_by_median(work)?, "updates/s");
-            if name == GLOBAL_DIM && on_cpu && self.precision == Precision::F32 {
-                let mut stock = self.compute.clone();
-                stock.kernels = Kernels::Candle;
-                let rate = self.effort.rate_by_median(updates(&config, &stock, 0.0)?)?;
-                self.found(&format!("{name}, {CANDLE}"), rate, "updates/s");
-            }
-        }
-        if !on_cpu {
-            return Ok(());
-        }
-        let (mut names, mut works) = (Vec::new(), Vec::new());
-        for (share, repeated) in REPEATED {
-            for (set, computed) in DEDUPLICATION {
-                let config = settings::of_run(WORLD, AGENT, "paper", &[set])?;
-                works.push(updates(&config, &self.compute, share)?);
-                names.push(format!(
-                    "C51 + global-global DIM, 60x60x3, {repeated}, {computed}"
-                ));
-            }
-        }
-        for (name, rate) in names.iter().zip(self.effort.rates_in_turn(&mut works)?) {
-            self.found(name, rate, "updates/s");
-        }
-        Ok(())
-    }
-
-    /// For each size updates a second, and the arithmetic that this is: the products that `driml inspect` counts.
-    fn growth(&mut self) -> anyhow::Result<()> {
-        for (name, sets) in SIZES {
-            let sets = [sets, &["learner.deduplicate_states=false"]].concat();
-            let (work, gflop) = counted_updates(AGENT, &sets, &self.compute)?;
-            let name = format!("{name}: {gflop:.2} GFLOP");
-            let rate = self.effort.rate_by_median(work)?;
-            self.found(&name, rate, "updates/s");
-            self.found(&format!("{name}, arithmetic"), rate * gflop, "GFLOP/s");
-        }
-        Ok(())
-    }
+    Ok(())
 }
 
 /// Updates of this agent with settings over those of the paper, and the GFLOP of one.

@@ -42,7 +42,7 @@ use driml_machine::{device, effort::Effort, resources::MachineNote};
 
 use crate::{
     flags::{BenchArgs, BenchCommand},
-    report::{Report, publish},
+    report::{Bench, Figures, Report, publish},
 };
 
 /// Runs one bench and reports its figures. A bench that computes in this process starts the program again in its place, if it has
@@ -61,30 +61,32 @@ pub fn run(BenchArgs { command, flags }: &BenchArgs) -> anyhow::Result<()> {
         subprocess::ensure_threads(flags.threads)?;
     }
     let machine = MachineNote::this(device::gpu(on));
-    let (effort, mut table) = (Effort::new(flags.quick), None);
-    let (bench, figures) = match command {
-        BenchCommand::Learner(args) if args.kernels => {
-            ("learner", kernels::measure(flags, &effort)?)
-        }
-        BenchCommand::Learner(args) => ("learner", learner::measure(args, flags, &effort)?),
-        BenchCommand::Policy => ("policy", policy::measure(flags, &effort)?),
-        BenchCommand::Replay(args) => ("replay", replay::measure(args, &effort)?),
-        BenchCommand::Env { env } => ("env", env::measure(env, &effort)?),
-        BenchCommand::System { frames } => ("system", system::measure(*frames, flags)?),
+    let mut bench = Bench {
+        flags,
+        effort: Effort::new(flags.quick),
+        figures: Figures::default(),
+        table: None,
+    };
+    let (name, measured) = match command {
+        BenchCommand::Learner(args) if args.kernels => ("learner", kernels::measure(&mut bench)),
+        BenchCommand::Learner(args) => ("learner", learner::measure(args, &mut bench)),
+        BenchCommand::Policy => ("policy", policy::measure(&mut bench)),
+        BenchCommand::Replay(args) => ("replay", replay::measure(args, &mut bench)),
+        BenchCommand::Env { env } => ("env", env::measure(env, &mut bench)),
+        BenchCommand::System { frames } => ("system", system::measure(*frames, &mut bench)),
         BenchCommand::Scale { actors, seconds } => {
-            let (figures, text) = system::scale(actors, *seconds, flags)?;
-            table = Some(text);
-            ("scale", figures)
+            ("scale", system::scale(actors, *seconds, &mut bench))
         }
         BenchCommand::Peers(args) => return peers::run(args, flags, machine),
     };
+    measured?;
     let report = Report {
-        bench: bench.to_owned(),
+        bench: name.to_owned(),
         quick: flags.quick,
         threads: flags.threads,
         machine,
-        figures,
+        figures: bench.figures.medians(),
     };
-    let table = table.unwrap_or_else(|| report.rows());
+    let table = bench.table.unwrap_or_else(|| report.rows());
     publish(&report, &table, flags.json.as_deref())
 }

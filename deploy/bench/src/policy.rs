@@ -2,14 +2,12 @@
 //! It takes no action in a world.
 
 use driml_learner::DeviceName;
-use driml_machine::effort::Effort;
 use driml_model::{Parameters, PolicyNetwork};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::{
-    flags::BenchFlags,
-    report::{Measurement, named},
+    report::{Bench, named},
     settings,
 };
 
@@ -23,9 +21,8 @@ const NETWORKS: [(&str, &str, &[&str]); 3] = [
 ];
 
 /// Frames a second in each precision.
-pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
-    let mut figures = Vec::new();
-    for precision in flags.precisions(DeviceName::Cpu) {
+pub(super) fn measure(bench: &mut Bench<'_>) -> anyhow::Result<()> {
+    for precision in bench.flags.precisions(DeviceName::Cpu) {
         for (network, preset, sets) in NETWORKS {
             let config = settings::of_run(settings::WORLD, "c51", preset, sets)?;
             let model = config.with_whole_frames()?.model;
@@ -37,14 +34,15 @@ pub(super) fn measure(flags: &BenchFlags, effort: &Effort) -> anyhow::Result<Vec
                 let mut frames = vec![0; batch * model.frame_len()];
                 rng.fill_bytes(&mut frames);
                 let mut actions = vec![0; batch];
-                let rate = effort.rate_by_median(|| {
+                let rate = bench.effort.rate_by_median(|| {
                     policy.greedy_actions(&frames, &mut actions)?;
                     Ok(())
                 })?;
                 let name = named(&format!("{batch} frames of {network}"), precision);
-                figures.push(Measurement::found(name, rate * batch as f64, "frames/s"));
+                let rate = rate * batch as f64;
+                bench.figures.found(name, rate, "frames/s");
             }
         }
     }
-    Ok(figures)
+    Ok(())
 }

@@ -1,13 +1,14 @@
 //! Frames of Procgen, recorded once, or black ones, from which benches make transitions.
-//! It keeps no time: recording is not measured.
+//! Both are done as an actor does them. It keeps no time: recording is not measured.
 
-use std::path::Path;
+use std::{iter::Cycle, path::Path, slice};
 
 use anyhow::Context;
+use driml_actor::{Acting, ChunkRecorder, RandomPolicy};
 use driml_envs::{ActionSet, RestrictedWorld, StepEnd};
 use driml_launch::console;
-use driml_protocol::{BufferPool, Chunk, ChunkHeader, End};
-use rand::{Rng, SeedableRng};
+use driml_protocol::{BufferPool, Chunk};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::settings;
@@ -49,10 +50,15 @@ impl ChunkShape {
 /// Transitions of [`STREAMS`] environments of bigfish under a random policy, for [`STEPS`] steps.
 pub(super) struct Recording {
     pub(super) frame_bytes: usize,
-    /// [STEPS, STREAMS, frame bytes].
+    steps: Vec<Step>,
+}
+
+/// One step of all environments: frames [`STREAMS`, frame bytes], and one of everything else for each.
+struct Step {
     frames: Vec<u8>,
-    /// Action, reward and end of each step [STEPS, STREAMS].
-    steps: Vec<(u8, f32, End)>,
+    actions: Vec<u8>,
+    rewards: Vec<f32>,
+    ends: Vec<StepEnd>,
 }
 
 impl Recording {
@@ -62,99 +68,78 @@ impl Recording {
         let run = &config.run;
         let sent = (run.frame_height as usize, run.frame_width as usize);
         let whole = config.world.build(STREAMS, 1, 0)?;
-        let mut world = RestrictedWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
+        let world = RestrictedWorld::of(whole, config.world.actions(ActionSet::All), sent)?;
         let frame_bytes = world.frame_shape().bytes();
-        let mut frames = vec![0; STEPS * STREAMS * frame_bytes];
-        let mut steps = Vec::with_capacity(STEPS * STREAMS);
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let (mut rewards, mut ends) = ([0.0; STREAMS], [StepEnd::Running; STREAMS]);
-        for frames in frames.chunks_exact_mut(STREAMS * frame_bytes) {
-            world.observe(frames);
-            let actions: [u8; STREAMS] =
-                std::array::from_fn(|_| rng.random_range(0..world.num_actions()) as u8);
-            world.step(&actions, &mut rewards, &mut ends)?;
-            for ((action, reward), end) in actions.into_iter().zip(rewards).zip(ends) {
-                let end = End::from_byte(end as u8).expect("both enums have the same ends");
-                steps.push((action, reward, end));
-            }
+        let mut policy = RandomPolicy::new(world.num_actions() as u8);
+        let mut acting = Acting::new(world, 1, ChaCha8Rng::seed_from_u64(1))?;
+        let mut steps = Vec::with_capacity(STEPS);
+        for _ in 0..STEPS {
+            let step = acting.step(&mut policy, 0.0)?;
+            steps.push(Step {
+                frames: step.frames.to_vec(),
+                actions: step.actions.to_vec(),
+                rewards: step.rewards.to_vec(),
+                ends: step.ends.to_vec(),
+            });
         }
-        Ok(Self {
-            frame_bytes,
-            frames,
-            steps,
-        })
+        Ok(Self { frame_bytes, steps })
     }
 
     /// Black frames of so many bytes; an episode is as long as the recording.
     pub(super) fn blank(frame_bytes: usize) -> Self {
-        let end = |step| match step + 1 == STEPS {
-            true => End::Terminal,
-            false => End::Running,
+        let step = |number: usize| Step {
+            frames: vec![0; STREAMS * frame_bytes],
+            actions: vec![0; STREAMS],
+            rewards: vec![0.0; STREAMS],
+            ends: match number + 1 == STEPS {
+                true => vec![StepEnd::Terminal; STREAMS],
+                false => vec![StepEnd::Running; STREAMS],
+            },
         };
-        let steps = (0..STEPS).flat_map(|step| [(0, 0.0, end(step)); STREAMS]);
-        Self {
-            frame_bytes,
-            frames: vec![0; STEPS * STREAMS * frame_bytes],
-            steps: steps.collect(),
-        }
+        let steps = (0..STEPS).map(step).collect();
+        Self { frame_bytes, steps }
     }
 
-    /// Writes the frames, raw, for a process that is not ours.
+    /// Writes the frames, raw [`STEPS`, `STREAMS`, frame bytes], for a process that is not ours.
     pub(super) fn write_frames(&self, path: &Path) -> anyhow::Result<()> {
-        std::fs::write(path, &self.frames).with_context(|| format!("writing {}", path.display()))
+        let frames: Vec<&[u8]> = self.steps.iter().map(|it| &it.frames[..]).collect();
+        std::fs::write(path, frames.concat()).with_context(|| format!("writing {}", path.display()))
     }
 
     /// Chunk after chunk of one actor, each of `shape` and in memory of `pool`; the recording plays round and round.
     pub(super) fn chunks(&self, actor: u32, shape: ChunkShape, pool: BufferPool) -> Chunks<'_> {
-        let ChunkShape { streams, steps } = shape;
+        let (streams, bytes) = (shape.streams, self.frame_bytes);
+        let mut recorder = ChunkRecorder::new(pool, actor, INCARNATION, streams, bytes as u32);
+        recorder.begin(1, shape.steps);
         Chunks {
-            recording: self,
-            pool,
-            next: ChunkHeader {
-                actor,
-                incarnation: INCARNATION,
-                weights_version: 1,
-                streams,
-                steps,
-                frame_bytes: self.frame_bytes as u32,
-                ..ChunkHeader::default()
-            },
+            recorder,
+            steps: self.steps.iter().cycle(),
+            step_bytes: streams as usize * bytes,
         }
     }
 }
 
 /// An actor's chunks without end, each filled anew as a real actor's are.
 pub(super) struct Chunks<'a> {
-    recording: &'a Recording,
-    pool: BufferPool,
-    next: ChunkHeader,
+    recorder: ChunkRecorder,
+    steps: Cycle<slice::Iter<'a, Step>>,
+    /// Bytes of the frames that are taken of a step.
+    step_bytes: usize,
 }
 
 impl Chunks<'_> {
     /// Transitions in all chunks so far.
     pub(super) const fn transitions(&self) -> u64 {
-        self.next.first_transition
+        self.recorder.produced()
     }
 
     pub(super) fn next_chunk(&mut self) -> Chunk {
-        let recording = self.recording;
-        let bytes = self.next.payload_bytes();
-        let bytes = bytes.expect("a chunk of a bench is far below the address space");
-        let mut chunk = Chunk::in_memory(self.next, self.pool.take(bytes));
-        let (streams, steps) = (self.next.streams as usize, self.next.steps as usize);
-        let first_step = self.next.first_transition as usize / streams;
-        for row in 0..streams * steps {
-            let step = first_step + row % steps;
-            let from = step % STEPS * STREAMS + row / steps;
-            let frame = &recording.frames[from * recording.frame_bytes..];
-            let frame = &frame[..recording.frame_bytes];
-            chunk.frame_mut(row).copy_from_slice(frame);
-            let (action, reward, end) = recording.steps[from];
-            chunk.set(row, action, reward, end);
-        }
-        self.next.sequence += 1;
-        self.next.first_transition += chunk.header.transitions() as u64;
-        chunk
+        let chunk = self.steps.find_map(|it| {
+            let frames = &it.frames[..self.step_bytes];
+            let recorder = &mut self.recorder;
+            recorder.record(frames, &it.actions, &it.rewards, &it.ends)
+        });
+        chunk.expect("a recording that plays round and round has no end")
     }
 }
 
@@ -164,12 +149,11 @@ mod tests {
 
     #[test]
     fn chunks_are_consecutive_steps_of_each_stream() {
-        let place = |i: usize| [(i / STREAMS) as u8, (i % STREAMS) as u8];
-        let recording = Recording {
-            frame_bytes: 2,
-            frames: (0..STEPS * STREAMS).flat_map(place).collect(),
-            steps: vec![(1, 0.5, End::Running); STEPS * STREAMS],
-        };
+        let mut recording = Recording::blank(2);
+        for (number, step) in (0..=u8::MAX).zip(&mut recording.steps) {
+            let frames = (0..STREAMS as u8).flat_map(|stream| [number, stream]);
+            step.frames = frames.collect();
+        }
         let mut chunks = recording.chunks(3, ChunkShape::new(2, 3), BufferPool::new(1));
         let (first, second) = (chunks.next_chunk(), chunks.next_chunk());
         assert_eq!(first.frames(), [0, 0, 1, 0, 2, 0, 0, 1, 1, 1, 2, 1]);

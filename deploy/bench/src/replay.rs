@@ -9,13 +9,12 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::managed_process::ManagedProcess;
-use driml_machine::effort::Effort;
 
 use crate::{
     flags::BenchReplayArgs,
     in_process,
     recording::{CHUNKS, Recording},
-    report::{Measurement, Samples},
+    report::Bench,
     server::{REPLAY_DIR, Server, TLS_DIR, Wire},
 };
 
@@ -24,9 +23,9 @@ const ROUNDS_ON_DISK: u32 = 3;
 
 /// What the flags ask for: rows drawn without a wire; or transitions stored a second and batches a second over wires, or in memory
 /// and on disk. Medians of the rounds.
-pub(super) fn measure(args: &BenchReplayArgs, effort: &Effort) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     if args.sampling {
-        return in_process::sampling(args.held, effort);
+        return in_process::sampling(args.held, bench);
     }
     let recording = Recording::play()?;
     let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
@@ -57,25 +56,24 @@ pub(super) fn measure(args: &BenchReplayArgs, effort: &Effort) -> anyhow::Result
         }
     };
     let rounds = args.replay_dir.as_ref().map_or(1, |_| ROUNDS_ON_DISK);
-    let mut samples = Samples::default();
     for _ in 0..args.rounds.unwrap_or(rounds) {
         for wire in &wires {
             let dir = args.replay_dir.as_deref();
             let on_disk = dir.filter(|_| wire.name == "on disk");
             on_disk.map_or(Ok(()), empty)?;
             let mut server = Server::start(wire, folder.path())?;
-            samples.add(rates(&mut server, &recording, effort)?);
+            rates(&mut server, &recording, bench)?;
             match on_disk {
-                Some(dir) => samples.add(restart(server, folder.path(), dir)?),
+                Some(dir) => restart(server, folder.path(), dir, bench)?,
                 None => drop(server.end(ManagedProcess::ask_to_stop)),
             }
             on_disk.map_or(Ok(()), empty)?;
         }
         if args.replay_dir.is_none() && args.tls_dir.is_none() {
-            samples.add(in_process::assembling(&recording, effort)?);
+            in_process::assembling(&recording, bench)?;
         }
     }
-    Ok(samples.medians())
+    Ok(())
 }
 
 /// The name of the figure of chunks of `transitions` over a wire.
@@ -84,26 +82,22 @@ pub(super) fn insert_name(transitions: u32, wire: &str) -> String {
 }
 
 /// Transitions that a server stores a second and batches that it gives a second, once its replay is full.
-fn rates(
-    server: &mut Server,
-    recording: &Recording,
-    effort: &Effort,
-) -> anyhow::Result<Vec<Measurement>> {
-    let (mut figures, held) = (Vec::new(), server.wire.held);
+fn rates(server: &mut Server, recording: &Recording, bench: &mut Bench<'_>) -> anyhow::Result<()> {
+    let (effort, held) = (bench.effort, server.wire.held);
     server.deliver(recording, CHUNKS[3], |sent, _| sent >= held)?;
     for chunk in CHUNKS {
         let rate = server.deliver(recording, chunk, |_, started| effort.is_spent(started))?;
         let name = insert_name(chunk.transitions(), server.wire.name);
-        figures.push(Measurement::found(name, rate, "transitions/s"));
+        bench.figures.found(name, rate, "transitions/s");
     }
-    let (rate, wire) = (server.fetch(effort)?, server.wire.name);
+    let (rate, wire) = (server.fetch(&effort)?, server.wire.name);
     let name = format!("batch of 3 states, {wire}");
-    figures.push(Measurement::found(name, rate, "batches/s"));
-    Ok(figures)
+    bench.figures.found(name, rate, "batches/s");
+    Ok(())
 }
 
 /// Kills a server and measures how long the next one takes until it has read the log in `dir` back and answers.
-fn restart(server: Server, logs: &Path, dir: &Path) -> anyhow::Result<[Measurement; 3]> {
+fn restart(server: Server, logs: &Path, dir: &Path, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     let mut bytes = 0;
     for entry in fs::read_dir(dir).with_context(|| format!("reading {}", dir.display()))? {
         bytes += entry?.metadata()?.len();
@@ -115,11 +109,11 @@ fn restart(server: Server, logs: &Path, dir: &Path) -> anyhow::Result<[Measureme
     let took = started.elapsed().max(Duration::from_millis(1));
     let seconds = took.as_secs_f64();
     server.end(ManagedProcess::kill);
-    Ok([
-        Measurement::found("log", megabytes, "MB"),
-        Measurement::found("restart", seconds, "s"),
-        Measurement::found("restart, rate", megabytes / seconds, "MB/s"),
-    ])
+    bench.figures.found("log", megabytes, "MB");
+    bench.figures.found("restart", seconds, "s");
+    let rate = megabytes / seconds;
+    bench.figures.found("restart, rate", rate, "MB/s");
+    Ok(())
 }
 
 fn empty(dir: &Path) -> anyhow::Result<()> {

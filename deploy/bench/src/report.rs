@@ -1,4 +1,4 @@
-//! What a bench found, as a table and as JSON, and the machine that it was measured on.
+//! What a bench is told and what it has found, as a table and as JSON, and the machine that it was measured on.
 //! It measures nothing and compares nothing.
 
 use std::{fs, path::Path};
@@ -6,9 +6,23 @@ use std::{fs, path::Path};
 use anyhow::Context;
 use driml_launch::console::{self, aligned, print};
 use driml_learner::Precision;
-use driml_machine::effort::median;
-use driml_machine::{resources::MachineNote, units::number};
+use driml_machine::{
+    effort::{Effort, median},
+    resources::MachineNote,
+    units::number,
+};
 use serde::{Deserialize, Serialize};
+
+use crate::flags::BenchFlags;
+
+/// What a bench is told, and what it has found so far.
+pub(super) struct Bench<'a> {
+    pub(super) flags: &'a BenchFlags,
+    pub(super) effort: Effort,
+    pub(super) figures: Figures,
+    /// What is printed in place of a row for each figure.
+    pub(super) table: Option<String>,
+}
 
 /// One thing that was measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,27 +35,23 @@ pub(super) struct Measurement {
     pub(super) unit: String,
 }
 
-impl Measurement {
-    /// A figure, which is printed to stderr at once.
-    pub(super) fn found(what: impl Into<String>, value: f64, unit: &str) -> Self {
+/// What was found, each figure with its values in the order of the rounds.
+#[derive(Debug, Default)]
+pub(super) struct Figures(Vec<(Measurement, Vec<f64>)>);
+
+impl Figures {
+    /// Adds a figure, or its value in another round, and prints it to stderr at once.
+    pub(super) fn found(&mut self, what: impl Into<String>, value: f64, unit: &str) {
         let (what, unit) = (what.into(), unit.to_owned());
         console::line(&format!("  {what}: {} {unit}", number(value)));
-        Self { what, value, unit }
+        self.add(Measurement { what, value, unit });
     }
-}
 
-/// What was found in every round, each figure with its values in the order of the rounds.
-#[derive(Debug, Default)]
-pub(super) struct Samples(Vec<(Measurement, Vec<f64>)>);
-
-impl Samples {
-    /// Adds the figures of a round.
-    pub(super) fn add(&mut self, figures: impl IntoIterator<Item = Measurement>) {
-        for figure in figures {
-            match self.0.iter_mut().find(|(it, _)| it.what == figure.what) {
-                Some((_, values)) => values.push(figure.value),
-                None => self.0.push((figure.clone(), vec![figure.value])),
-            }
+    /// Adds a figure, or its value in another round.
+    pub(super) fn add(&mut self, figure: Measurement) {
+        match self.0.iter_mut().find(|(it, _)| it.what == figure.what) {
+            Some((_, values)) => values.push(figure.value),
+            None => self.0.push((figure.clone(), vec![figure.value])),
         }
     }
 
@@ -53,13 +63,11 @@ impl Samples {
 
     /// Each figure's median.
     pub(super) fn medians(self) -> Vec<Measurement> {
-        let of_rounds = self.0.into_iter();
-        of_rounds
-            .map(|(figure, values)| Measurement {
-                value: median(&values),
-                ..figure
-            })
-            .collect()
+        let median_of = |(figure, values): (Measurement, Vec<f64>)| Measurement {
+            value: median(&values),
+            ..figure
+        };
+        self.0.into_iter().map(median_of).collect()
     }
 }
 
@@ -120,21 +128,17 @@ mod tests {
 
     #[test]
     fn a_report_is_a_table_and_reads_back_as_it_was_written() {
-        let mut samples = Samples::default();
+        let mut found = Figures::default();
         for value in [5.25, 1.0, 9.0] {
-            samples.add([Measurement::found("C51 + DIM", value, "updates/s")]);
+            found.found("C51 + DIM", value, "updates/s");
         }
-        samples.add([Measurement::found(
-            "32 rows: 1.20 GFLOP",
-            61_234.5,
-            "GFLOP/s",
-        )]);
+        found.found("32 rows: 1.20 GFLOP", 61_234.5, "GFLOP/s");
         let report = Report {
             bench: "learner".into(),
             quick: true,
             threads: 2,
             machine: MachineNote::this(None),
-            figures: samples.medians(),
+            figures: found.medians(),
         };
         expect![[r#"
              5.25  updates/s  C51 + DIM

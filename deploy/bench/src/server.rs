@@ -101,12 +101,12 @@ impl Server {
     ) -> anyhow::Result<f64> {
         self.actors += 1;
         let (actor, pool) = (self.actors, self.actor.chunk_memory());
-        let client = self.client(Role::Actor(actor), self.actor.spec.hash())?;
         let join = ActorJoin {
             actor,
             incarnation: INCARNATION,
         };
-        let alive = take_part(&client, Alive::actor(actor, INCARNATION), &join)?;
+        let who = Alive::actor(actor, INCARNATION);
+        let (client, alive) = self.take_part(Role::Actor(actor), who, &join)?;
         let limits = DeliveryLimits::of(&self.actor.actor);
         let delivery = Delivery::start(client, 0, limits, pool.clone(), Shutdown::default())?;
         let mut chunks = recording.chunks(actor, shape, pool);
@@ -126,17 +126,16 @@ impl Server {
     /// Batches a second, each read as a learner would.
     pub(super) fn fetch(&mut self, effort: &Effort) -> anyhow::Result<f64> {
         let shutdown = Shutdown::default();
-        let client = self.client(Role::Learner, self.learner.spec.hash())?;
-        let LearnerConfig {
-            learner, transport, ..
-        } = &self.learner;
         // One that has learned from nothing.
         let join = LearnerJoin {
             learner: LEARNER,
             run: LEARNER,
             ..LearnerJoin::default()
         };
-        let _alive = take_part(&client, Alive::learner(LEARNER), &join)?;
+        let (client, _alive) = self.take_part(Role::Learner, Alive::learner(LEARNER), &join)?;
+        let LearnerConfig {
+            learner, transport, ..
+        } = &self.learner;
         let requests = Requests {
             learner: LEARNER,
             rows: learner.batch_size,
@@ -150,14 +149,10 @@ impl Server {
             Next::Batch(served) => {
                 // One byte of each cache line, so that all of the states have come.
                 let batch = &served.batch;
-                let states = [batch.states_t(), batch.states_k(), batch.states_n()];
-                black_box(states.map(|plane| {
-                    plane
-                        .iter()
-                        .step_by(64)
-                        .map(|&byte| u64::from(byte))
-                        .sum::<u64>()
-                }));
+                for plane in [batch.states_t(), batch.states_k(), batch.states_n()] {
+                    let bytes = plane.iter().step_by(64);
+                    black_box(bytes.map(|&byte| u64::from(byte)).sum::<u64>());
+                }
                 Ok(())
             }
             Next::NotYet(waiting) => {
@@ -171,13 +166,24 @@ impl Server {
         rate
     }
 
-    fn client(&mut self, role: Role, spec_hash: u64) -> anyhow::Result<RunClient> {
+    /// A client that takes part in the run as `join` says, and counts as connected until the token is dropped.
+    fn take_part(
+        &mut self,
+        role: Role,
+        who: Alive,
+        join: &impl Request<Reply = JoinReply>,
+    ) -> anyhow::Result<(RunClient, LivelinessToken)> {
         let mut session = self.sessions[0].clone();
         if matches!(self.wire.folder, Some((TLS_DIR, _))) {
             session = self.wire.open(&self.keys, role)?;
             self.sessions.push(session.clone());
         }
-        Ok(RunClient::new(session, self.keys.clone(), spec_hash))
+        let client = RunClient::new(session, self.keys.clone(), self.actor.spec.hash());
+        let alive = client.declare_alive(who);
+        let alive = alive.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))?;
+        join::take_part(&client, join, &Shutdown::default())?
+            .context("this client was not told to stop")?;
+        Ok((client, alive))
     }
 
     /// Ends the server as its process is told to, and waits for it; another one can take its place.
@@ -210,17 +216,4 @@ impl Wire {
             MESSAGE_BYTES_MAX,
         )?)
     }
-}
-
-/// Takes part in the run as `join` says, and counts as connected until the result is dropped.
-fn take_part(
-    client: &RunClient,
-    who: Alive,
-    join: &impl Request<Reply = JoinReply>,
-) -> anyhow::Result<LivelinessToken> {
-    let alive = client.declare_alive(who);
-    let alive = alive.map_err(|e| anyhow::anyhow!("declaring a client alive: {e}"))?;
-    join::take_part(client, join, &Shutdown::default())?
-        .context("this client was not told to stop")?;
-    Ok(alive)
 }

@@ -18,8 +18,7 @@ use driml_protocol::{LearnerStatus, ReplayStatus};
 use tempfile::TempDir;
 
 use crate::{
-    flags::BenchFlags,
-    report::Measurement,
+    report::{Bench, Measurement},
     settings::{self, AGENT, WORLD},
     subprocess::{start, wait_for},
 };
@@ -41,13 +40,13 @@ const ACTORS: [u32; 6] = [1, 2, 4, 8, 16, 32];
 const RATIOS: [(f64, u64); 2] = [(8.0, 256), (0.1, 10_000)];
 
 /// Updates and frames a second of a run, the share of time in which the learner computes, and the highest memory of each process.
-pub(super) fn measure(frames: Option<u64>, flags: &BenchFlags) -> anyhow::Result<Vec<Measurement>> {
+pub(super) fn measure(frames: Option<u64>, bench: &mut Bench<'_>) -> anyhow::Result<()> {
     procgen_sys::Engine::install(&mut console::line)?;
-    let frames = frames.unwrap_or(match flags.quick {
+    let frames = frames.unwrap_or(match bench.flags.quick {
         true => FRAMES.1,
         false => FRAMES.0,
     });
-    let threads = format!("local.learner_threads={}", flags.threads);
+    let threads = format!("local.learner_threads={}", bench.flags.threads);
     let mut run = Run::start(&["--frames", &frames.to_string()], &[&threads])?;
     let seen = run.watch_to_end()?;
     let summary = run.finish(0)?;
@@ -58,41 +57,44 @@ pub(super) fn measure(frames: Option<u64>, flags: &BenchFlags) -> anyhow::Result
     let updates = rate(&seen, |it| it.learner.updates);
     let frames = rate(&seen, |it| it.replay.transitions_inserted);
     let computes = "share of its time in which the learner computes";
-    let mut figures = vec![
-        Measurement::found("updates", updates, "updates/s"),
-        Measurement::found("frames", frames, "frames/s"),
-        Measurement::found(computes, share, "%"),
-    ];
+    let figures = &mut bench.figures;
+    figures.found("updates", updates, "updates/s");
+    figures.found("frames", frames, "frames/s");
+    figures.found(computes, share, "%");
     for (process, mib) in &summary.rss_mib_max {
-        let what = format!("memory of {process}");
-        figures.extend(mib.map(|mib| Measurement::found(what, mib, "MiB")));
+        if let Some(mib) = *mib {
+            figures.found(format!("memory of {process}"), mib, "MiB");
+        }
     }
-    Ok(figures)
+    Ok(())
 }
 
 /// Runs at both ratios with more and more actors, as figures and as a table.
 pub(super) fn scale(
     actors: &[u32],
     seconds: Option<u32>,
-    flags: &BenchFlags,
-) -> anyhow::Result<(Vec<Measurement>, String)> {
+    bench: &mut Bench<'_>,
+) -> anyhow::Result<()> {
     procgen_sys::Engine::install(&mut console::line)?;
-    let actors = match (actors, flags.quick) {
+    let quick = bench.flags.quick;
+    let actors = match (actors, quick) {
         ([], true) => &ACTORS[..2],
         ([], false) => &ACTORS,
         (asked, _) => asked,
     };
-    let seconds = seconds.unwrap_or(if flags.quick { 2 } else { 5 });
-    let (mut figures, mut rows) = (Vec::new(), Vec::new());
+    let seconds = seconds.unwrap_or(if quick { 2 } else { 5 });
+    let mut rows = Vec::new();
     for (ratio, slack) in RATIOS {
         for &actors in actors {
             let mut heads = ["ratio", "actors"].map(String::from).to_vec();
             let mut row = vec![ratio.to_string(), actors.to_string()];
             for (column, value) in columns(actors, ratio, slack, seconds)? {
                 row.push(value.map_or("-".into(), number));
-                let what = format!("ratio {ratio}, {actors} actors: {column}");
-                let unit = column.clone();
-                figures.extend(value.map(|value| Measurement { what, value, unit }));
+                if let Some(value) = value {
+                    let what = format!("ratio {ratio}, {actors} actors: {column}");
+                    let unit = column.clone();
+                    bench.figures.add(Measurement { what, value, unit });
+                }
                 heads.push(column);
             }
             console::line(&format!("  {}", row.join("  ")));
@@ -103,7 +105,8 @@ pub(super) fn scale(
         }
     }
     let columns: Vec<_> = (0..rows[0].len()).collect();
-    Ok((figures, aligned(&rows, &columns)))
+    bench.table = Some(aligned(&rows, &columns));
+    Ok(())
 }
 
 /// A row of the table of actors: what is seen of a run with so many, from its start until it has been watched for `seconds`.

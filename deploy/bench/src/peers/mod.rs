@@ -12,8 +12,7 @@ use std::{
 use anyhow::Context;
 use clap::ValueEnum;
 use driml_launch::console::{self, aligned};
-use driml_machine::effort::median;
-use driml_machine::{resources::MachineNote, units::number};
+use driml_machine::{effort::median, resources::MachineNote, units::number};
 use serde::Serialize;
 
 use crate::{
@@ -23,7 +22,7 @@ use crate::{
         script::Script,
     },
     recording::Recording,
-    report::{self, Measurement, Samples},
+    report::{self, Figures},
 };
 
 /// The load above which something else is running, which slows the two sides unequally.
@@ -34,8 +33,9 @@ const ROUNDS: (u32, u32) = (5, 1);
 /// A component's figures, and its peer's or why there are none.
 #[derive(Debug, Default)]
 struct Sides {
-    ours: Samples,
-    theirs: Samples,
+    ours: Figures,
+    /// Values of the rounds.
+    theirs: BTreeMap<String, Vec<f64>>,
     peer: String,
     absent: Option<String>,
 }
@@ -112,7 +112,8 @@ pub(super) fn run(
         for (component, (script, sides)) in &mut sides {
             let name = component.name();
             console::line(&format!("round {round} of {rounds}: {name} of ours"));
-            sides.ours.add(script::ours(*component, flags)?);
+            let ours = script::ours(*component, flags)?;
+            ours.into_iter().for_each(|it| sides.ours.add(it));
             if sides.absent.is_none() {
                 console::line(&format!("round {round} of {rounds}: {}", sides.peer));
                 match script.run(folder.path()) {
@@ -140,12 +141,9 @@ pub(super) fn run(
 impl Sides {
     fn add_theirs(&mut self, peer: String, figures: BTreeMap<String, f64>) {
         self.peer = peer;
-        self.theirs
-            .add(figures.into_iter().map(|(what, value)| Measurement {
-                what,
-                value,
-                unit: String::new(),
-            }));
+        for (what, value) in figures {
+            self.theirs.entry(what).or_default().push(value);
+        }
     }
 
     /// Measures on without the peer.
@@ -158,13 +156,16 @@ impl Sides {
 /// Medians and ratio of one pair; none if ours was not measured, as in a precision that was not asked for.
 fn row(pair: &Pair, sides: &Sides) -> Option<Row> {
     let (ours, unit) = sides.ours.of(&pair.ours)?;
-    let (what, own_peer) = (&pair.theirs, &sides.peer);
-    let (peer, theirs) = match pair.of_ours {
-        Some(name) => (name.to_owned(), sides.ours.of(what)),
-        None if *what == pair.ours => (own_peer.clone(), sides.theirs.of(what)),
-        None => (format!("{own_peer}: {what}"), sides.theirs.of(what)),
+    let what = &pair.theirs;
+    let theirs = match pair.of_ours {
+        Some(_) => sides.ours.of(what).map(|(values, _)| values),
+        None => sides.theirs.get(what).map(Vec::as_slice),
     };
-    let theirs = theirs.map(|(values, _)| values);
+    let peer = match pair.of_ours {
+        Some(name) => name.to_owned(),
+        None if *what == pair.ours => sides.peer.clone(),
+        None => format!("{}: {what}", sides.peer),
+    };
     let rounds = ours.iter().zip(theirs.unwrap_or_default());
     let ratios: Vec<_> = rounds.map(|(ours, theirs)| ours / theirs).collect();
     let absent = || match &sides.absent {

@@ -11,9 +11,7 @@ fn sides(ours: &[(&str, &[f64])]) -> Sides {
     };
     for (what, values) in ours {
         for value in *values {
-            sides
-                .ours
-                .add([Measurement::found(*what, *value, "updates/s")]);
+            sides.ours.found(*what, *value, "updates/s");
         }
     }
     sides
