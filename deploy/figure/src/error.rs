@@ -1,6 +1,6 @@
 //! What kept a figure, a picture or a film from its file.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What kept a figure from its file.
 #[derive(Debug, thiserror::Error)]
@@ -30,4 +30,12 @@ pub enum FigureError {
         /// What the file system said.
         source: std::io::Error,
     },
+}
+
+impl FigureError {
+    /// A file that cannot be written.
+    pub(super) fn write(path: &Path, source: std::io::Error) -> Self {
+        let path = path.to_owned();
+        Self::Write { path, source }
+    }
 }

@@ -89,8 +89,7 @@ impl Figure {
             Format::Pdf => render::pdf(&svg(Letters::Outlines))?,
             Format::Png => render::png(&svg(Letters::Outlines), PNG_ZOOM)?,
         };
-        let path = path.to_owned();
-        std::fs::write(&path, bytes).map_err(|source| FigureError::Write { path, source })
+        std::fs::write(path, bytes).map_err(|e| FigureError::write(path, e))
     }
 
     fn draw(&self, look: Look, letters: Letters) -> Canvas {

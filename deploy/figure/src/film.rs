@@ -65,10 +65,7 @@ impl Film {
             repeated.map_err(io::Error::other)?;
             Ok((aside, encoder))
         };
-        let (aside, encoder) = begin().map_err(|source| FigureError::Write {
-            path: path.to_owned(),
-            source,
-        })?;
+        let (aside, encoder) = begin().map_err(|e| FigureError::write(path, e))?;
         Ok(Self {
             path: path.to_owned(),
             aside,
@@ -101,19 +98,15 @@ impl Film {
         frame.delay = delay as u16;
         self.shown = Some(pixels);
         let written = self.encoder.write_frame(&frame);
-        written.map_err(|e| FigureError::Write {
-            path: self.path.clone(),
-            source: io::Error::other(e),
-        })
+        written.map_err(|e| FigureError::write(&self.path, io::Error::other(e)))
     }
 
     /// Ends the film and gives it its name.
     pub fn finish(self) -> Result<(), FigureError> {
-        let path = self.path;
         let ended = self.encoder.into_inner().map_err(io::Error::other);
         let ended = ended.and_then(|mut file| file.flush());
-        let ended = ended.and_then(|()| self.aside.persist(&path).map_err(io::Error::from));
-        ended.map_err(|source| FigureError::Write { path, source })
+        let ended = ended.and_then(|()| self.aside.persist(&self.path).map_err(io::Error::from));
+        ended.map_err(|e| FigureError::write(&self.path, e))
     }
 }
 

@@ -51,11 +51,7 @@ pub(super) fn labels(ticks: &[f64]) -> Vec<String> {
     let sizes = ticks.iter().map(|tick| tick.abs());
     let (_, largest) = bounds(sizes.clone()).unwrap_or_default();
     let (smallest, _) = bounds(sizes.filter(|size| *size > 0.0)).unwrap_or_default();
-    let (divisor, unit) = match largest {
-        size if size >= 1e6 => (1e6, "M"),
-        size if size >= 1e4 => (1e3, "k"),
-        _ => (1.0, ""),
-    };
+    let (divisor, unit) = unit_of(largest);
     let wide = largest / smallest >= 1000.0;
     let is_enough = |decimals: &i32| {
         let scale = 10f64.powi(*decimals);
@@ -83,18 +79,21 @@ pub(super) fn bounds(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
     })
 }
 
+fn unit_of(size: f64) -> (f64, &'static str) {
+    match size {
+        1e6.. => (1e6, "M"),
+        1e4.. => (1e3, "k"),
+        _ => (1.0, ""),
+    }
+}
+
 /// One number on its own, in as few characters as it needs.
 fn plain(value: f64) -> String {
-    let size = value.abs();
-    if !WRITTEN_OUT.contains(&size) {
-        power_of_ten(value)
-    } else if size >= 1e6 {
-        format!("{}M", value / 1e6)
-    } else if size >= 1e4 {
-        format!("{}k", value / 1e3)
-    } else {
-        ((value * 1e6).round() / 1e6).to_string()
+    if !WRITTEN_OUT.contains(&value.abs()) {
+        return power_of_ten(value);
     }
+    let (divisor, unit) = unit_of(value.abs());
+    format!("{}{unit}", (value / divisor * 1e6).round() / 1e6)
 }
 
 /// A number as a few digits and a power of ten; more digits would be the rounding of a multiple of the step.

@@ -87,7 +87,7 @@ impl Recording {
         });
         let layout = Layout::new(&player.config, envs, viewer.is_some(), local);
         let rate = player.config.world.steps_per_second();
-        let film = Film::create(path, layout.size(), rate).map_err(cannot)?;
+        let film = Film::create(path, layout.size, rate).map_err(cannot)?;
         // As if an episode had ended before the first.
         let before = Shot {
             is_last: true,
@@ -169,7 +169,7 @@ impl Recording {
             }
             _ => None,
         };
-        let (width, height) = self.layout.size();
+        let (width, height) = self.layout.size;
         let mut picture = Picture::new(width, height)?;
         for (i, shot) in moment.shots.iter().enumerate() {
             // The end of an episode lies between a state and the one looked for: there is nothing to know.

@@ -47,8 +47,12 @@ pub(super) struct Local {
 pub(super) struct Layout {
     frame: FrameShape,
     zoom: usize,
-    envs: usize,
-    has_panel: bool,
+    /// Pixels across and down of a frame as it is shown, and of all that is shown of an environment.
+    enlarged: (f64, f64),
+    tile: (f64, f64),
+    columns: usize,
+    /// Pixels across and down of a picture.
+    pub(super) size: (usize, usize),
     /// None where the agent has no such loss, or there is nothing to tell a state from.
     pub(super) local: Option<Local>,
     action_names: Vec<String>,
@@ -66,51 +70,33 @@ impl Layout {
         let spec = &config.run;
         let (height, width) = (spec.frame_height as usize, spec.frame_width as usize);
         let longer = height.max(width).max(1);
+        let zoom = ((FRAME_SIDE + longer / 2) / longer).max(1);
+        let enlarged = ((width * zoom) as f64, (height * zoom) as f64);
+        let mut tile = enlarged;
+        // Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
+        let mut columns = envs.clamp(1, 4);
+        if has_panel {
+            tile.0 += MARGIN + PANEL_WIDTH;
+            columns = envs.div_ceil(4).max(1);
+        }
+        if local.is_some() {
+            tile = (tile.0 + MARGIN + enlarged.0, tile.1 + LEADING);
+        }
+        if has_panel {
+            tile.1 = tile.1.max(PANEL_HEIGHT);
+        }
+        let along = |count: usize, side: f64| MARGIN + count as f64 * (side + MARGIN);
+        let across = along(columns, tile.0) as usize;
         Self {
             frame: FrameShape::new(height, width, spec.frame_channels as usize),
-            zoom: ((FRAME_SIDE + longer / 2) / longer).max(1),
-            envs,
-            has_panel,
+            zoom,
+            enlarged,
+            tile,
+            columns,
+            size: (across, along(envs.div_ceil(columns), tile.1) as usize),
             local,
             action_names: config.action_names(),
             support: config.model.atoms_support(),
-        }
-    }
-
-    /// Pixels across and down of a picture.
-    pub(super) fn size(&self) -> (usize, usize) {
-        let (width, height) = self.tile();
-        let columns = self.columns();
-        let rows = self.envs.div_ceil(columns);
-        let along = |count: usize, side: f64| MARGIN + count as f64 * (side + MARGIN);
-        (along(columns, width) as usize, along(rows, height) as usize)
-    }
-
-    /// Up to four frames beside each other; where words stand beside each, they stand below each other, up to four.
-    fn columns(&self) -> usize {
-        match self.has_panel {
-            false => self.envs.clamp(1, 4),
-            true => self.envs.div_ceil(4).max(1),
-        }
-    }
-
-    fn enlarged(&self) -> (f64, f64) {
-        let enlarged = |side: usize| (side * self.zoom) as f64;
-        (enlarged(self.frame.width), enlarged(self.frame.height))
-    }
-
-    fn tile(&self) -> (f64, f64) {
-        let (width, height) = self.enlarged();
-        if !self.has_panel {
-            return (width, height);
-        }
-        let with_panel = width + MARGIN + PANEL_WIDTH;
-        match self.local {
-            None => (with_panel, height.max(PANEL_HEIGHT)),
-            Some(_) => (
-                with_panel + MARGIN + width,
-                (height + LEADING).max(PANEL_HEIGHT),
-            ),
         }
     }
 
@@ -124,8 +110,8 @@ impl Layout {
         seen: Option<&Seen>,
         matches: Option<&[f64]>,
     ) {
-        let (tile_width, tile_height) = self.tile();
-        let (column, row) = (i % self.columns(), i / self.columns());
+        let (tile_width, tile_height) = self.tile;
+        let (column, row) = (i % self.columns, i / self.columns);
         let x = MARGIN + column as f64 * (tile_width + MARGIN);
         let y = MARGIN + row as f64 * (tile_height + MARGIN);
         let image = Image {
@@ -136,7 +122,7 @@ impl Layout {
         };
         picture.image((x as usize, y as usize), self.zoom, image);
         let Some(seen) = seen else { return };
-        let (frame_width, frame_height) = self.enlarged();
+        let (frame_width, frame_height) = self.enlarged;
         let panel = Rect::new(x + frame_width + MARGIN, y, PANEL_WIDTH, tile_height);
         self.draw_panel(picture, panel, i, shot, seen);
         if let Some(local) = &self.local {
