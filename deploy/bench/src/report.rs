@@ -128,17 +128,17 @@ mod tests {
 
     #[test]
     fn a_report_is_a_table_and_reads_back_as_it_was_written() {
-        let mut found = Figures::default();
+        let mut figures = Figures::default();
         for value in [5.25, 1.0, 9.0] {
-            found.found("C51 + DIM", value, "updates/s");
+            figures.found("C51 + DIM", value, "updates/s");
         }
-        found.found("32 rows: 1.20 GFLOP", 61_234.5, "GFLOP/s");
+        figures.found("32 rows: 1.20 GFLOP", 61_234.5, "GFLOP/s");
         let report = Report {
             bench: "learner".into(),
             quick: true,
             threads: 2,
             machine: MachineNote::this(None),
-            figures: found.medians(),
+            figures: figures.medians(),
         };
         expect![[r#"
              5.25  updates/s  C51 + DIM

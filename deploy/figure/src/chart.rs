@@ -111,7 +111,12 @@ impl Scale<'_> {
         let ticks = match (&self.axis.names[..], self.axis.is_log) {
             ([], true) => ticks::log(10f64.powf(self.low), 10f64.powf(self.high)),
             ([], false) => ticks::linear(self.low, self.high, (length / each).max(2.0) as usize),
-            (names, _) => return (0..).map(f64::from).zip(names.iter().cloned()).collect(),
+            (names, _) => {
+                return (0_u32..)
+                    .map(f64::from)
+                    .zip(names.iter().cloned())
+                    .collect();
+            }
         };
         let labels = ticks::labels(&ticks);
         ticks.into_iter().zip(labels).collect()
@@ -182,26 +187,18 @@ impl Series {
     /// Draws its marks at these places.
     fn marks(&self, canvas: &mut Canvas, places: &[Point]) {
         let (colour, dashed) = (self.colour, self.mark == Mark::Dashed);
-        match (self.mark, places) {
-            // A line of one point would be invisible.
-            (Mark::Line | Mark::Dashed, [only]) => canvas.dot(*only, DOT_RADIUS, colour),
-            (Mark::Line | Mark::Dashed, _) => {
-                let width = 1.8;
-                canvas.line(
-                    places,
-                    Stroke {
-                        colour,
-                        width,
-                        dashed,
-                    },
-                );
+        let is_line = dashed || self.mark == Mark::Line;
+        // A line of one point would be invisible.
+        if is_line && places.len() > 1 {
+            let solid = Stroke::solid(colour, 1.8);
+            canvas.line(places, Stroke { dashed, ..solid });
+            return;
+        }
+        for place in places {
+            match self.mark {
+                Mark::Rings => canvas.ring(*place, RING_RADIUS, colour),
+                _ => canvas.dot(*place, DOT_RADIUS, colour),
             }
-            (Mark::Rings, _) => places
-                .iter()
-                .for_each(|it| canvas.ring(*it, RING_RADIUS, colour)),
-            (Mark::Bars, _) => places
-                .iter()
-                .for_each(|it| canvas.dot(*it, DOT_RADIUS, colour)),
         }
     }
 }
@@ -285,10 +282,10 @@ impl Chart {
                 let patch = Rect::new(x, middle - 5.0, LEGEND_MARK, 10.0);
                 canvas.rects(&[patch], series.colour.with_alpha(BAND_ALPHA));
             }
-            let points = [0.0, 0.5, 1.0].map(|share| (x + share * LEGEND_MARK, middle));
+            let ends = [(x, middle), (x + LEGEND_MARK, middle)];
             match series.mark {
-                Mark::Line | Mark::Dashed => series.marks(canvas, &[points[0], points[2]]),
-                Mark::Rings | Mark::Bars => series.marks(canvas, &points[1..2]),
+                Mark::Line | Mark::Dashed => series.marks(canvas, &ends),
+                _ => series.marks(canvas, &[(x + LEGEND_MARK / 2.0, middle)]),
             }
             let at = (x + LEGEND_MARK + 6.0, middle + LEGEND_SIZE * 0.36);
             let ink = TextStyle::new(LEGEND_SIZE, INK, Anchor::Start);
