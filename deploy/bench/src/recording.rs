@@ -1,5 +1,5 @@
 //! Frames of Procgen, recorded once, or black ones, from which benches make transitions.
-//! Both are done as an actor does them. It keeps no time: recording is not measured.
+//! The loop and the recorder are those of an actor. It keeps no time: recording is not measured.
 
 use std::{iter::Cycle, path::Path, slice};
 
