@@ -122,11 +122,6 @@ impl Recording {
     fn add(&mut self, step: &Step<'_>) -> anyhow::Result<()> {
         let played = step.actions.len();
         let frames = step.frames.chunks_exact(step.frames.len() / played);
-        for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
-            if !shot.is_over(self.episodes_max) {
-                shot.follow(frame, step, i);
-            }
-        }
         let mut seen = None;
         if let Some(viewer) = &mut self.viewer {
             // Other environments than the filmed are what local DIM tells a state from.
@@ -136,6 +131,13 @@ impl Recording {
             };
             let states = &step.states[..step.states.len() / played * looked_at];
             seen = Some(viewer.look(states)?);
+        }
+        for (i, (shot, frame)) in self.shots.iter_mut().zip(frames).enumerate() {
+            if !shot.is_over(self.episodes_max) {
+                shot.follow(frame, step, i);
+                let look = |seen| self.layout.look(seen, i, shot.action);
+                shot.look = seen.as_ref().map(look);
+            }
         }
         self.waiting.push_back(Moment {
             shots: self.shots.clone(),
@@ -174,10 +176,9 @@ impl Recording {
         for (i, shot) in moment.shots.iter().enumerate() {
             // The end of an episode lies between a state and the one looked for: there is nothing to know.
             let mut before = self.waiting.iter().take(between).chain([&moment]);
-            let continues = before.all(|it| it.ends[i] == StepEnd::Running);
+            let continues = !shot.is_last && before.all(|it| it.ends[i] == StepEnd::Running);
             let matches = matches.as_deref().filter(|_| continues);
-            let seen = moment.seen.as_ref();
-            self.layout.draw(&mut picture, i, shot, seen, matches);
+            self.layout.draw(&mut picture, i, shot, matches);
         }
         let ended = matches!(moment.shots[..], [Shot { is_last: true, .. }]);
         self.film.add(&picture, if ended { PAUSE } else { 1.0 })?;

@@ -30,6 +30,17 @@ pub(super) struct Shot {
     pub(super) reward: f64,
     pub(super) action: u8,
     pub(super) is_last: bool,
+    /// None where the network is not asked.
+    pub(super) look: Option<Look>,
+}
+
+/// What the network makes of a state.
+#[derive(Clone, Debug)]
+pub(super) struct Look {
+    /// [A].
+    q_values: Vec<f32>,
+    /// [N]: of the action that was taken.
+    probabilities: Vec<f32>,
 }
 
 /// What local DIM is asked: which places of a later state it knows.
@@ -100,14 +111,23 @@ impl Layout {
         }
     }
 
-    /// Draws environment `i`: its shot, and beside it what the network has `seen` of all, and with which probability [B, L] local DIM
-    /// knows each location of the later states; none where it was not asked.
+    /// What was `seen` of environment `i`, in which this action was taken.
+    pub(super) fn look(&self, seen: &Seen, i: usize, action: u8) -> Look {
+        let (actions, atoms) = (self.action_names.len(), self.support.len());
+        let taken = i * actions + usize::from(action);
+        Look {
+            q_values: row_of(&seen.q_values, actions, i).to_vec(),
+            probabilities: row_of(&seen.probabilities, atoms, taken).to_vec(),
+        }
+    }
+
+    /// Draws the shot of environment `i`, and with which probability local DIM knows each location of the later states [B, L]; none
+    /// where it was not asked.
     pub(super) fn draw(
         &self,
         picture: &mut Picture,
         i: usize,
         shot: &Shot,
-        seen: Option<&Seen>,
         matches: Option<&[f64]>,
     ) {
         let (tile_width, tile_height) = self.tile;
@@ -121,10 +141,10 @@ impl Layout {
             channels: self.frame.channels,
         };
         picture.image((x as usize, y as usize), self.zoom, image);
-        let Some(seen) = seen else { return };
+        let Some(look) = &shot.look else { return };
         let (frame_width, frame_height) = self.enlarged;
         let panel = Rect::new(x + frame_width + MARGIN, y, PANEL_WIDTH, tile_height);
-        self.draw_panel(picture, panel, i, shot, seen);
+        self.draw_panel(picture, panel, shot, look);
         if let Some(local) = &self.local {
             let x = panel.x + PANEL_WIDTH + MARGIN;
             let map = Rect::new(x, y, frame_width, frame_height);
@@ -138,13 +158,11 @@ impl Layout {
         }
     }
 
-    fn draw_panel(&self, picture: &mut Picture, area: Rect, i: usize, shot: &Shot, seen: &Seen) {
-        let (actions, atoms) = (self.action_names.len(), self.support.len());
+    fn draw_panel(&self, picture: &mut Picture, area: Rect, shot: &Shot, look: &Look) {
         let action = usize::from(shot.action);
-        let q_values = row_of(&seen.q_values, actions, i);
-        let probabilities = row_of(&seen.probabilities, atoms, i * actions + action);
-        let best = q_values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        let (q, name) = (q_values[action], &self.action_names[action]);
+        let (q, name) = (look.q_values[action], &self.action_names[action]);
+        let q_values = look.q_values.iter().copied();
+        let best = q_values.fold(f32::NEG_INFINITY, f32::max);
         let chance = if q < best { " (by chance)" } else { "" };
         let mut y = area.y + 13.0;
         for (ink, text) in [
@@ -165,10 +183,11 @@ impl Layout {
         let top = y - 5.0;
         let bottom = area.y + area.height - LEADING;
         let bars = Rect::new(area.x, top, area.width, bottom - top);
-        let most = probabilities.iter().copied();
+        let probabilities = look.probabilities.iter();
+        let most = probabilities.clone().copied();
         let most = most.fold(f32::MIN_POSITIVE, f32::max);
-        let heights: Vec<_> = probabilities.iter().map(|p| f64::from(p / most)).collect();
-        let (low, high) = (self.support[0], self.support[atoms - 1]);
+        let heights: Vec<_> = probabilities.map(|p| f64::from(p / most)).collect();
+        let (low, high) = (self.support[0], self.support[self.support.len() - 1]);
         picture.bars(bars, &heights, f64::from((q - low) / (high - low)));
         let words = format!("its return, {low} to {high}: {q:.3}");
         let below = (area.x, area.y + area.height - 4.0);
