@@ -24,8 +24,7 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use crate::{
     recording::{ChunkShape, INCARNATION, Recording},
-    settings,
-    subprocess::{start, wait_for},
+    settings, subprocess,
 };
 
 /// The number of a bench's learner.
@@ -70,13 +69,12 @@ impl Server {
         let shared_memory = format!("transport.shared_memory={}", wire.shared_memory);
         let held = format!("replay.capacity_transitions={}", wire.held);
         let sets = [&settings::REPLAY[..], &[&*shared_memory, &*held]].concat();
-        let mut args = vec!["replay-server", "--keep-alive", "--listen", &wire.endpoint];
+        let mut args = vec!["replay-server", "--keep-alive"];
         if let Some((flag, dir)) = &wire.folder {
             args.extend([*flag, dir]);
         }
-        let mut process = start("replay-server", &args, &sets, folder)?;
+        let process = subprocess::start("replay-server", &args, &wire.endpoint, &sets, folder)?;
         let keys = Keys::new(NAMESPACE).map_err(anyhow::Error::msg)?;
-        wait_for(&mut process, &wire.endpoint)?;
         let session = wire.open(&keys, Role::Observer)?;
         let run_info = join::run_info(&session, &keys, &Shutdown::default())?
             .context("this client was not told to stop")?;

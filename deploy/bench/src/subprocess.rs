@@ -25,23 +25,21 @@ pub(super) fn ensure_threads(threads: u32) -> anyhow::Result<()> {
     again.context("starting this program again with other threads")
 }
 
-/// Starts this program with other arguments, for driml-ada on bigfish, preset `paper` and the settings `sets`, and its log in `folder`.
-/// It ends when the result is dropped.
+/// Starts this program with other arguments, for driml-ada on bigfish, preset `paper` and the settings `sets`, and its log in `folder`;
+/// waits until it listens at `endpoint`. It ends when the result is dropped.
 pub(super) fn start(
     name: &str,
     args: &[&str],
+    endpoint: &str,
     sets: &[&str],
     folder: &Path,
 ) -> anyhow::Result<ManagedProcess> {
     let (world, agent) = (settings::WORLD, settings::AGENT);
     let run = ["--env", world, "--agent", agent, "--preset", "paper"];
     let sets: Vec<_> = sets.iter().flat_map(|&set| ["--set", set]).collect();
-    let args = [args, &run, &sets].concat();
-    ManagedProcess::start(name, &args, 1, folder, &Screen::default(), None)
-}
-
-/// Waits until a process listens at `endpoint`.
-pub(super) fn wait_for(process: &mut ManagedProcess, endpoint: &str) -> anyhow::Result<()> {
+    let args = [args, &["--listen", endpoint], &run, &sets].concat();
+    let mut process = ManagedProcess::start(name, &args, 1, folder, &Screen::default(), None)?;
     // A benchmark does not listen for signals.
-    wait_until_listening(endpoint, &Shutdown::default(), || process.check_alive()).map(drop)
+    wait_until_listening(endpoint, &Shutdown::default(), || process.check_alive())?;
+    Ok(process)
 }

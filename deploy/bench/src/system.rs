@@ -20,7 +20,7 @@ use tempfile::TempDir;
 use crate::{
     report::{Bench, Measurement},
     settings::{self, AGENT, WORLD},
-    subprocess::{start, wait_for},
+    subprocess,
 };
 
 /// Frames of the run, and of a quick one.
@@ -188,17 +188,8 @@ impl Run {
         let folder = tempfile::Builder::new().prefix("driml-").tempdir()?;
         let endpoint = format!("unixsock-stream/{}", folder.path().join("s").display());
         let run_dir = folder.path().join("run").display().to_string();
-        let listen = [
-            "local",
-            "--no-play",
-            "--listen",
-            &endpoint,
-            "--run-dir",
-            &run_dir,
-        ];
-        let args = [&listen[..], flags].concat();
-        let mut launcher = start("launcher", &args, sets, folder.path())?;
-        wait_for(&mut launcher, &endpoint)?;
+        let args = [&["local", "--no-play", "--run-dir", &*run_dir][..], flags].concat();
+        let launcher = subprocess::start("launcher", &args, &endpoint, sets, folder.path())?;
         let reached = Reached::open("replay-server", &endpoint, config.run.hash())?;
         Ok(Self {
             poller: Poller::new(&config, vec![reached]),

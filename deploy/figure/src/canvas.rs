@@ -93,23 +93,6 @@ impl TextStyle {
     }
 }
 
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Stroke {
-    pub(super) colour: Colour,
-    pub(super) width: f64,
-    pub(super) dashed: bool,
-}
-
-impl Stroke {
-    pub(super) const fn solid(colour: Colour, width: f64) -> Self {
-        Self {
-            colour,
-            width,
-            dashed: false,
-        }
-    }
-}
-
 /// How letters are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Letters {
@@ -152,10 +135,19 @@ impl Canvas {
         self.elements.push('\n');
     }
 
-    pub(super) fn line(&mut self, points: &[Point], stroke: Stroke) {
+    pub(super) fn line(&mut self, points: &[Point], colour: Colour, width: f64) {
+        self.polyline(points, &pen(colour, width));
+    }
+
+    pub(super) fn dashed_line(&mut self, points: &[Point], colour: Colour, width: f64) {
+        let pen = pen(colour, width);
+        self.polyline(points, &format!(r#"{pen} stroke-dasharray="6 4""#));
+    }
+
+    fn polyline(&mut self, points: &[Point], pen: &str) {
         // A line without length has no direction to be drawn in.
         if points.iter().any(|point| *point != points[0]) {
-            let (points, pen) = (corners(points), pen(stroke));
+            let points = corners(points);
             self.add(&format!(
                 r#"<polyline points="{points}" fill="none" {pen}/>"#
             ));
@@ -177,7 +169,7 @@ impl Canvas {
 
     /// Draws a circle that is not filled.
     pub(super) fn ring(&mut self, middle: Point, radius: f64, colour: Colour) {
-        let pen = pen(Stroke::solid(colour, 1.4));
+        let pen = pen(colour, 1.4);
         self.circle(middle, radius, &format!(r#"fill="none" {pen}"#));
     }
 
@@ -204,14 +196,14 @@ impl Canvas {
     }
 
     /// Draws a rectangle's rim.
-    pub(super) fn frame(&mut self, rect: Rect, stroke: Stroke) {
-        let (sides, pen) = (sides(rect), pen(stroke));
+    pub(super) fn frame(&mut self, rect: Rect, colour: Colour, width: f64) {
+        let (sides, pen) = (sides(rect), pen(colour, width));
         self.add(&format!(r#"<rect {sides} fill="none" {pen}/>"#));
     }
 
     /// Draws a background with round corners.
     pub(super) fn card(&mut self, rect: Rect, fill: Colour, border: Colour) {
-        let pen = pen(Stroke::solid(border, 1.0));
+        let pen = pen(border, 1.0);
         let (sides, brush) = (sides(rect), brush(fill));
         self.add(&format!(r#"<rect {sides} rx="8" {brush} {pen}/>"#));
     }
@@ -265,13 +257,9 @@ fn brush(colour: Colour) -> String {
     format!(r#"fill="{}"{opacity}"#, colour.hex())
 }
 
-fn pen(stroke: Stroke) -> String {
-    let (hex, width) = (stroke.colour.hex(), number(stroke.width));
-    let dash = match stroke.dashed {
-        true => r#" stroke-dasharray="6 4""#,
-        false => "",
-    };
-    format!(r#"stroke="{hex}" stroke-width="{width}"{dash}"#)
+fn pen(colour: Colour, width: f64) -> String {
+    let (hex, width) = (colour.hex(), number(width));
+    format!(r#"stroke="{hex}" stroke-width="{width}""#)
 }
 
 /// Two decimals; more would make the file longer, not the picture better.

@@ -2,7 +2,7 @@
 //! It computes no statistics; what a band means is for the caller to say.
 
 use super::{
-    canvas::{Anchor, Canvas, Point, Rect, Stroke, TextStyle, titled},
+    canvas::{Anchor, Canvas, Point, Rect, TextStyle, titled},
     colours::{Colour, GRID, INK, INK_SOFT, SERIES_COLOURS, series_colour},
     font::{self, Weight},
     ticks,
@@ -14,6 +14,7 @@ const LEGEND_SIZE: f64 = 12.0;
 const LEGEND_LEADING: f64 = 18.0;
 const LEGEND_MARK: f64 = 22.0;
 const BAND_ALPHA: f32 = 0.18;
+const LINE_WIDTH: f64 = 1.8;
 const DOT_RADIUS: f64 = 3.0;
 const RING_RADIUS: f64 = 5.0;
 /// Share of an axis's range that is left free at its ends.
@@ -186,18 +187,18 @@ impl Series {
 
     /// Draws its marks at these places.
     fn marks(&self, canvas: &mut Canvas, places: &[Point]) {
-        let (colour, dashed) = (self.colour, self.mark == Mark::Dashed);
-        let is_line = dashed || self.mark == Mark::Line;
-        // A line of one point would be invisible.
-        if is_line && places.len() > 1 {
-            let solid = Stroke::solid(colour, 1.8);
-            canvas.line(places, Stroke { dashed, ..solid });
-            return;
-        }
-        for place in places {
-            match self.mark {
-                Mark::Rings => canvas.ring(*place, RING_RADIUS, colour),
-                _ => canvas.dot(*place, DOT_RADIUS, colour),
+        let (colour, has_length) = (self.colour, places.len() > 1);
+        match self.mark {
+            Mark::Line if has_length => canvas.line(places, colour, LINE_WIDTH),
+            Mark::Dashed if has_length => canvas.dashed_line(places, colour, LINE_WIDTH),
+            Mark::Rings => {
+                let ring = |place: &Point| canvas.ring(*place, RING_RADIUS, colour);
+                places.iter().for_each(ring);
+            }
+            // A line of one point would be invisible.
+            Mark::Bars | Mark::Line | Mark::Dashed => {
+                let dot = |place: &Point| canvas.dot(*place, DOT_RADIUS, colour);
+                places.iter().for_each(dot);
             }
         }
     }
@@ -327,14 +328,14 @@ impl Plot<'_> {
         for (tick, label) in &x_ticks {
             let x = self.at(*tick, 1.0).0;
             let line = [(x, plot.y), (x, plot.bottom())];
-            canvas.line(&line, Stroke::solid(GRID, 1.0));
+            canvas.line(&line, GRID, 1.0);
             let at = (x, plot.bottom() + TICK_SIZE + 5.0);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::Middle).within(x_room));
         }
         for (tick, label) in y_ticks {
             let y = self.at(1.0, *tick).1;
             let line = [(plot.x, y), (plot.right(), y)];
-            canvas.line(&line, Stroke::solid(GRID, 1.0));
+            canvas.line(&line, GRID, 1.0);
             let at = (plot.x - 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, label, soft(TICK_SIZE, Anchor::End));
         }
@@ -343,7 +344,7 @@ impl Plot<'_> {
             (plot.x, plot.bottom()),
             (plot.right(), plot.bottom()),
         ];
-        canvas.line(&corner, Stroke::solid(INK_SOFT, 1.2));
+        canvas.line(&corner, INK_SOFT, 1.2);
         let ink = TextStyle::new(LABEL_SIZE, INK, Anchor::Middle);
         let y = plot.bottom() + TICK_SIZE + LABEL_SIZE + 12.0;
         let at = (plot.x + plot.width / 2.0, y);
@@ -360,7 +361,7 @@ impl Plot<'_> {
         if series.mark == Mark::Bars {
             for (x, low, high) in band {
                 let bar = [self.at(*x, *low), self.at(*x, *high)];
-                canvas.line(&bar, Stroke::solid(series.colour, 1.4));
+                canvas.line(&bar, series.colour, 1.4);
             }
         } else {
             let low = band.iter().map(|(x, low, _)| self.at(*x, *low));

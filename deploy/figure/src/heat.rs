@@ -2,7 +2,7 @@
 //! It scales no number by itself beyond the range it is given or finds.
 
 use super::{
-    canvas::{Anchor, Canvas, Rect, Stroke, TextStyle, titled},
+    canvas::{Anchor, Canvas, Rect, TextStyle, titled},
     colours::{CARD, CELL_LIGHT, INK, INK_SOFT, OUTLINE, heat_colour, ink_on},
     font, ticks,
 };
@@ -148,7 +148,7 @@ impl Heat {
         for (tick, text) in bar_ticks.iter().zip(&bar_labels) {
             let y = bar.bottom() - (tick - low) / (high - low) * room;
             let mark = [(bar.right(), y), (bar.right() + 3.0, y)];
-            canvas.line(&mark, Stroke::solid(INK_SOFT, 1.0));
+            canvas.line(&mark, INK_SOFT, 1.0);
             let at = (bar.right() + 6.0, y + TICK_SIZE * 0.36);
             canvas.text(at, text, style(TICK_SIZE, Anchor::Start));
         }
@@ -195,8 +195,8 @@ pub(super) fn point_out(canvas: &mut Canvas, map: Rect, cell: f64, outline: Outl
     let Outline { left, top, side } = outline;
     let [left, top, side] = [left, top, side].map(|length| length * cell);
     let rect = Rect::new(map.x + left, map.y + top, side, side);
-    canvas.frame(rect, Stroke::solid(CARD, 4.0));
-    canvas.frame(rect, Stroke::solid(OUTLINE, 2.2));
+    canvas.frame(rect, CARD, 4.0);
+    canvas.frame(rect, OUTLINE, 2.2);
 }
 
 const fn style(size: f64, anchor: Anchor) -> TextStyle {

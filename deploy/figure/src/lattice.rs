@@ -2,7 +2,7 @@
 //! Runs of dark cells are one rectangle, so that a picture of thousands of cells stays small.
 
 use super::{
-    canvas::{Canvas, Rect, Stroke, titled},
+    canvas::{Canvas, Rect, titled},
     colours::{CARD_BORDER, CELL_DARK, CELL_LIGHT},
     heat::{Outline, point_out},
 };
@@ -42,7 +42,7 @@ impl Lattice {
             }
         }
         canvas.rects(&runs, CELL_DARK);
-        canvas.frame(map, Stroke::solid(CARD_BORDER, 1.0));
+        canvas.frame(map, CARD_BORDER, 1.0);
         if let Some(outline) = self.outline {
             point_out(canvas, map, cell, outline);
         }

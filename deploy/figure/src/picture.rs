@@ -4,7 +4,7 @@
 use resvg::tiny_skia::{Color, Pixmap, PremultipliedColorU8, Transform};
 
 use crate::{
-    canvas::{Anchor, Canvas, Letters, Point, Rect, Stroke, TextStyle},
+    canvas::{Anchor, Canvas, Letters, Point, Rect, TextStyle},
     colours::{CARD, GREY, INK, INK_SOFT, heat_colour, series_colour},
     error::FigureError,
     render,
@@ -97,11 +97,10 @@ impl Picture {
         let bars: Vec<Rect> = bars.collect();
         self.shapes.rects(&bars, series_colour(0));
         let floor = [(area.x, area.bottom()), (area.right(), area.bottom())];
-        self.shapes.line(&floor, Stroke::solid(GREY, 2.0));
+        self.shapes.line(&floor, GREY, 2.0);
         let x = area.x + mark.clamp(0.0, 1.0) * area.width;
         let line = [(x, area.y), (x, area.bottom())];
-        self.shapes
-            .line(&line, Stroke::solid(series_colour(1), 2.0));
+        self.shapes.line(&line, series_colour(1), 2.0);
     }
 
     /// Rows of `columns` cells that fill `area`, dark to light for values in 0..=1; one that is not a number is grey.

@@ -151,25 +151,25 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         args.epsilon
             .map_or(String::new(), |it| format!(", epsilon {it}"))
     ))?;
-    let play = |who, name: &str, see: &mut dyn FnMut(&Step<'_>)| {
-        let episodes = args.episodes as usize;
+    let episodes = args.episodes as usize;
+    let mut played: Vec<Played<'_>> = Vec::new();
+    for (who, name) in [(Who::Agent, &*spec.agent), (Who::Random, "random")] {
         let mut screen = Screen::new(episodes as u64, TEMPLATE);
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
-            see(step);
+            film.iter_mut().for_each(|film| film.see(step));
             ControlFlow::Continue(())
         };
-        let played = player.play_watched(who, &world, episodes, args.seed, watch);
+        let returns = player.play_watched(who, &world, episodes, args.seed, watch);
         screen.clear();
-        played
-    };
-    let see = &mut |step: &Step<'_>| film.iter_mut().for_each(|film| film.see(step));
-    let returns = play(Who::Agent, &spec.agent, see)?;
-    film.map_or(Ok(()), |film| said(&film.finish()?))?;
-    said(&describe(&spec.agent, &returns))?;
-    let random = play(Who::Random, "random", &mut |_| ())?;
-    said(&describe("random", &random))?;
-    let played = [(spec.agent.as_str(), returns), ("random", random)];
+        let returns = returns?;
+        // Only the agent is filmed.
+        if let Some(film) = film.take() {
+            said(&film.finish()?)?;
+        }
+        said(&describe(name, &returns))?;
+        played.push((name, returns));
+    }
     if let Some((path, file)) = &table {
         write_returns(file, &played).with_context(|| format!("writing {}", path.display()))?;
     }
