@@ -116,10 +116,11 @@ mod tests {
     use crate::picture::Image;
 
     fn picture(pixels: &[u8], width: usize) -> Picture {
-        let mut picture = Picture::new(width, pixels.len() / 3 / width).unwrap();
+        let height = pixels.len() / 3 / width;
+        let mut picture = Picture::new(width, height).unwrap();
         let image = Image {
             pixels,
-            height: pixels.len() / 3 / width,
+            height,
             width,
             channels: 3,
         };
@@ -127,12 +128,21 @@ mod tests {
         picture
     }
 
-    /// Delays, and whole pictures as a viewer builds them.
-    fn play(path: &Path) -> (Vec<u16>, Vec<Vec<[u8; 3]>>) {
+    /// Delays of a film of these pictures, and whole pictures as a viewer builds them.
+    fn played(pictures: &[Picture], rate: f64) -> (Vec<u16>, Vec<Vec<[u8; 3]>>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.gif");
+        let mut film = Film::create(&path, pictures[0].size(), rate).unwrap();
+        for picture in pictures {
+            film.add(picture, 1.0).unwrap();
+        }
+        film.finish().unwrap();
+        let files = std::fs::read_dir(folder.path()).unwrap();
+        assert_eq!(files.count(), 1, "nothing else is left");
+
         let mut decoder = gif::Decoder::new(File::open(path).unwrap()).unwrap();
-        let pixels = usize::from(decoder.width()) * usize::from(decoder.height());
-        let mut shown = vec![[9; 3]; pixels];
-        let (mut delays, mut pictures) = (Vec::new(), Vec::new());
+        let mut shown = vec![[9; 3]; pictures[0].rgb().len()];
+        let (mut delays, mut seen) = (Vec::new(), Vec::new());
         while let Some(frame) = decoder.read_next_frame().unwrap() {
             let palette = frame.palette.as_ref().unwrap();
             assert_eq!(frame.buffer.len(), shown.len(), "frames are whole pictures");
@@ -142,52 +152,36 @@ mod tests {
                 }
             }
             delays.push(frame.delay);
-            pictures.push(shown.clone());
+            seen.push(shown.clone());
         }
-        (delays, pictures)
+        (delays, seen)
     }
 
     #[test]
     fn a_viewer_sees_the_pictures_at_their_rate() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("x.gif");
         let mut pixels: Vec<u8> = (0..3 * 200).map(|i| (i * 7 % 251) as u8).collect();
-        let mut film = Film::create(&path, (20, 10), 15.0).unwrap();
-        let mut wanted = Vec::new();
-        for step in 0..6 {
-            // One pixel, then none, changes.
-            pixels[3 * 47] = [1, 2, 2, 3, 4, 4][step];
-            let picture = picture(&pixels, 20);
-            wanted.push(picture.rgb());
-            film.add(&picture, 1.0).unwrap();
-        }
-        film.finish().unwrap();
-        let (delays, pictures) = play(&path);
+        // One pixel, then none, changes.
+        let pictures = [1, 2, 2, 3, 4, 4].map(|value| {
+            pixels[3 * 47] = value;
+            picture(&pixels, 20)
+        });
+        let (delays, seen) = played(&pictures, 15.0);
         assert_eq!(delays, [7, 6, 7, 7, 6, 7], "15 a second");
-        assert!(pictures == wanted);
-        let files: Vec<_> = std::fs::read_dir(folder.path()).unwrap().collect();
-        assert_eq!(files.len(), 1, "nothing else is left");
+        assert!(seen == pictures.map(|picture| picture.rgb()));
     }
 
     #[test]
     fn more_colours_than_a_gif_has_are_brought_near() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("x.gif");
         let pixels: Vec<u8> = (0..64 * 64)
             .flat_map(|i| [(i % 64) * 4, (i / 64) * 4, 128].map(|c| c as u8))
             .collect();
-        let mut film = Film::create(&path, (64, 64), 10.0).unwrap();
         // Of the second picture only the lower half is new.
         let mut later = pixels.clone();
         later[3 * 32 * 64..].reverse();
-        let wanted = [pixels, later].map(|pixels| picture(&pixels, 64));
-        for picture in &wanted {
-            film.add(picture, 1.0).unwrap();
-        }
-        film.finish().unwrap();
-        let (_, pictures) = play(&path);
-        for (shown, wanted) in pictures.iter().zip(wanted.map(|picture| picture.rgb())) {
-            let off = shown.iter().flatten().zip(wanted.iter().flatten());
+        let pictures = [pixels, later].map(|pixels| picture(&pixels, 64));
+        let (_, seen) = played(&pictures, 10.0);
+        for (seen, wanted) in seen.iter().zip(pictures.map(|picture| picture.rgb())) {
+            let off = seen.iter().flatten().zip(wanted.iter().flatten());
             let off: Vec<_> = off.map(|(&a, &b)| u32::from(a.abs_diff(b))).collect();
             let mean = f64::from(off.iter().sum::<u32>()) / off.len() as f64;
             let far = off.iter().filter(|&&off| off > 40).count();
@@ -198,21 +192,25 @@ mod tests {
     #[test]
     fn names_and_places_that_no_film_can_have() {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["x", "x.png", "gif"] {
-            let said = Film::create(&folder.path().join(name), (4, 4), 10.0)
-                .err()
-                .unwrap();
-            assert!(said.to_string().contains("ends in .gif"), "{said}");
+        let create = |name: &str, width| {
+            let path = folder.path().join(name);
+            let film = Film::create(&path, (width, 4), 10.0);
+            film.map(drop).map_err(|e| e.to_string())
+        };
+        for (name, width, why) in [
+            ("x", 4, "ends in .gif"),
+            ("x.png", 4, "ends in .gif"),
+            ("gif", 4, "ends in .gif"),
+            ("none/x.gif", 4, "writing "),
+            ("x.gif", 70_000, "70000 x 4 pixels"),
+        ] {
+            let said = create(name, width).unwrap_err();
+            assert!(said.contains(why), "{said}");
         }
-        let nowhere = folder.path().join("none/x.gif");
-        assert!(matches!(
-            Film::create(&nowhere, (4, 4), 10.0),
-            Err(FigureError::Write { .. })
-        ));
+        // One that is given up leaves the older one there, and nothing else.
         let path = folder.path().join("x.gif");
-        assert!(Film::create(&path, (70_000, 4), 10.0).is_err());
         std::fs::write(&path, "older").unwrap();
-        drop(Film::create(&path, (4, 4), 10.0).unwrap());
+        create("x.gif", 4).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "older");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
