@@ -19,7 +19,7 @@ use driml_machine::{
     resources::{self, Machine},
 };
 use driml_protocol::GracefulShutdown;
-use minijinja::Value;
+use minijinja::{Value, context};
 use serde::{
     Deserialize, Serialize,
     de::{DeserializeOwned, IgnoredAny},
@@ -59,6 +59,8 @@ pub(crate) struct Session {
     seconds: f64,
     /// Of how many pieces at once this is the sum.
     at_once: u32,
+    /// Runs that are planned and not finished.
+    missing: Vec<String>,
 }
 
 impl Session {
@@ -106,6 +108,7 @@ impl Session {
             progress: Progress::new(units, shutdown),
             seconds: 0.0,
             at_once: 1,
+            missing: Vec::new(),
         };
         if !report_only {
             session.keep(CORES, Machine::this().cores)?;
@@ -150,10 +153,36 @@ impl Session {
         &mut self.progress
     }
 
-    /// Counts the time that work took which is kept elsewhere, added up over runs that are made `at_once` at a time.
-    pub(crate) fn spend(&mut self, seconds: f64, at_once: u32) {
+    /// Whether only what is there is reported.
+    pub(crate) const fn report_only(&self) -> bool {
+        self.report_only
+    }
+
+    /// Counts runs, which are kept elsewhere: the time of all together, made `at_once` at a time, and the names of those that are not
+    /// finished.
+    pub(crate) fn count_runs(&mut self, seconds: f64, at_once: u32, missing: Vec<String>) {
         self.seconds += seconds;
         self.at_once = at_once;
+        self.missing = missing;
+    }
+
+    /// Makes sure that no run is missing, unless a report of what there is was asked for.
+    pub(crate) fn check_made(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(
+            self.missing.is_empty() || self.report_only,
+            "these runs failed and are in no number of the page; the same command tries them again: {}",
+            self.missing.join(", ")
+        );
+        Ok(())
+    }
+
+    /// Makes sure that there is something to report of these finished runs.
+    pub(crate) fn check_any<T>(&self, made: &[T]) -> anyhow::Result<()> {
+        if made.is_empty() {
+            self.check_made()?;
+            return Err(usage!("no run is finished yet: there is nothing to report").into());
+        }
+        Ok(())
     }
 
     /// The piece of this name, which is `units` of work: read if it is there, else made and kept. `of` names what it is made of, which may
@@ -235,14 +264,19 @@ impl Session {
         Ok(())
     }
 
-    /// Writes the page of this template with these values, says where it is, and ends.
+    /// Writes the page of this template with these values and the runs that are `missing`, says where it is, and ends.
+    ///
+    /// # Errors
+    /// A run failed: the page is without it.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
         let time = time(self.seconds, self.at_once, self.kept_piece(CORES));
+        let values = context! { missing => self.missing, ..values };
         let text = page(template, values, self.smoke, &time);
         let path = self.folder.join("README.md");
         write_whole(&path, text.as_bytes())?;
-        print(&format!("{}{}\n", summary(&text), path.display()))
+        print(&format!("{}{}\n", summary(&text), path.display()))?;
+        self.check_made()
     }
 }
 
@@ -336,5 +370,13 @@ mod tests {
         });
         assert!(stopped.unwrap_err().is::<Interrupted>());
         assert_eq!(session.kept_piece::<u32>("slow"), Some(5));
+        // Runs that failed are no fault of the call.
+        for (session, is_usage) in [(&mut session, false), (&mut reported, true)] {
+            session.count_runs(0.0, 1, vec!["a".into()]);
+            let said = session.check_any::<u32>(&[]).unwrap_err();
+            assert_eq!(said.is::<Usage>(), is_usage);
+            assert_eq!(said.to_string().ends_with(": a"), !is_usage);
+            assert_eq!(session.check_made().is_ok(), is_usage);
+        }
     }
 }

@@ -25,7 +25,7 @@ pub(crate) struct Run {
     pub(super) what: Option<String>,
     pub(super) seed: Option<i64>,
     /// The settings without seed and without what the machine decides; none if there are none.
-    pub(super) settings: Option<toml::Table>,
+    pub(crate) settings: Option<toml::Table>,
     columns: Table,
     /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
     evaluations: Table,

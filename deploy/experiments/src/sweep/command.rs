@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     axes::{Axis, Cell, cells},
-    plan::{self, Call, Made, PlannedRun},
+    plan::{Call, Made, PlannedRun},
     queue,
     runs::SEEDS_FOUND_MAX,
 };
@@ -68,22 +68,22 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
     plans.sort_by_key(|(_, plan)| plan.call.seed);
     queue::install(&plans, args.report)?;
     let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
-    let swept = queue::make(&mut session, plans, args.jobs, args.report)?;
+    let made = queue::make(&mut session, plans, args.jobs)?;
     session.progress().clear();
-    let rows = rows(&cells, &swept.made);
+    let rows = rows(&cells, &made);
     let names = axes.iter().map(|axis| axis.name.as_str());
     let header: Vec<_> = names.chain(MEASURED.split(',')).map(String::from).collect();
     session.csv(NAME, &header.join(","), &rows)?;
     let lines = [vec![header], rows].concat();
     print(&format!("{}{LEGEND}", aligned(&lines, &[])))?;
-    swept.check_any(args.report)?;
-    let runs = swept.made.iter().map(|it| it.run.folder.path().to_owned());
+    session.check_any(&made)?;
+    let runs = made.iter().map(|it| it.run.folder.path().to_owned());
     plot::run(&PlotArgs {
         runs: runs.collect(),
         out: session.folder().join(format!("{NAME}.svg")),
         ..PlotArgs::default()
     })?;
-    plan::check_made(&swept.missing, args.report)
+    session.check_made()
 }
 
 /// What a call asks for, and its seeds. A report that names no axis is of the `kept` settings, and of all seeds that there are.

@@ -2,10 +2,7 @@
 //! It touches no disk and starts nothing.
 
 use driml_launch::run_folder::{RunFolder, Summary};
-use driml_machine::{
-    error::{Usage, usage},
-    resources::Machine,
-};
+use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{
     config::RunConfig,
     flags::{RunFlags, resolve},
@@ -100,45 +97,3 @@ pub(crate) struct Made<P> {
     pub(crate) run: FinishedRun,
 }
 
-pub(crate) struct Swept<P> {
-    /// The finished runs, in the order of their plans.
-    pub(crate) made: Vec<Made<P>>,
-    pub(crate) missing: Vec<String>,
-}
-
-impl<P> Swept<P> {
-    /// Makes sure that there is something to report.
-    pub(crate) fn check_any(&self, report_only: bool) -> anyhow::Result<()> {
-        if self.made.is_empty() {
-            check_made(&self.missing, report_only)?;
-            return Err(usage!("no run is finished yet: there is nothing to report").into());
-        }
-        Ok(())
-    }
-}
-
-/// Makes sure that no run is missing, unless a report of what there is was asked for.
-pub(crate) fn check_made(missing: &[String], report_only: bool) -> anyhow::Result<()> {
-    anyhow::ensure!(
-        missing.is_empty() || report_only,
-        "these runs failed and are in no number of the page; the same command tries them again: {}",
-        missing.join(", ")
-    );
-    Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn runs_that_failed_are_no_fault_of_the_call() {
-        let nothing = Swept::<u32> {
-            made: Vec::new(),
-            missing: vec!["a".into()],
-        };
-        let said = |report_only| nothing.check_any(report_only).unwrap_err();
-        assert!(!said(false).is::<Usage>() && said(false).to_string().ends_with(": a"));
-        assert!(said(true).is::<Usage>());
-    }
-}

@@ -30,7 +30,7 @@ use nix::{
 };
 
 use super::{
-    plan::{Call, Made, Planned, PlannedRun, Swept},
+    plan::{Call, Made, Planned, PlannedRun},
     runs::{Runs, move_aside},
 };
 use crate::{cache::Session, progress::Progress};
@@ -42,14 +42,14 @@ const POLL: Duration = Duration::from_millis(250);
 /// How long children may take to save once they were asked to stop; after that they are killed.
 const DRAIN_MAX: Duration = Duration::from_secs(240);
 
-/// Makes all runs, `jobs` at once, in the order of `plans`, and announces their work; with `report` it makes none.
+/// Makes all runs, `jobs` at once, in the order of `plans`, and announces their work; for a report it makes none. The result is those
+/// that are finished, in the same order.
 pub(crate) fn make<P>(
     session: &mut Session,
     plans: Vec<Planned<P>>,
     jobs: u32,
-    report: bool,
-) -> anyhow::Result<Swept<P>> {
-    let runs = Runs::open(session.folder())?;
+) -> anyhow::Result<Vec<Made<P>>> {
+    let (runs, report_only) = (Runs::open(session.folder())?, session.report_only());
     let progress = session.progress();
     progress.again(plans.iter().map(|(_, plan)| plan.units).sum());
     let mut queue = Queue {
@@ -62,12 +62,8 @@ pub(crate) fn make<P>(
     for (_, plan) in &plans {
         if queue.runs.finished(plan).is_some() {
             progress.find(plan.units);
-        } else if !report {
-            queue.waiting.push_back(Waiting {
-                plan: plan.clone(),
-                tried: 0,
-                anew: false,
-            });
+        } else if !report_only {
+            queue.waiting.push_back(Job::of(plan.clone()));
         }
     }
     if let Err(e) = queue.make(progress) {
@@ -82,8 +78,8 @@ pub(crate) fn make<P>(
         }
     }
     let seconds = made.iter().map(|it| it.run.summary.wall_seconds);
-    session.spend(seconds.sum(), jobs);
-    Ok(Swept { made, missing })
+    session.count_runs(seconds.sum(), jobs, missing);
+    Ok(made)
 }
 
 /// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
@@ -122,23 +118,31 @@ struct Queue {
     jobs: u32,
     /// Of this program.
     commit: String,
-    waiting: VecDeque<Waiting>,
+    waiting: VecDeque<Job>,
     running: Vec<Running>,
 }
 
-struct Waiting {
+/// A run that is to be made.
+struct Job {
     plan: PlannedRun,
-    /// How often it was tried.
+    /// How often it was started.
     tried: u32,
-    /// Its checkpoint may be what fails.
-    anew: bool,
+    /// Whether it was resumed the last time. Its checkpoint may be what fails, so that the next try starts anew.
+    resumed: bool,
+}
+
+impl Job {
+    const fn of(plan: PlannedRun) -> Self {
+        Self {
+            plan,
+            tried: 0,
+            resumed: false,
+        }
+    }
 }
 
 struct Running {
-    plan: PlannedRun,
-    /// Which try this is, from 1.
-    tried: u32,
-    resumed: bool,
+    job: Job,
     child: Child,
     /// Of the plan's units.
     done: u64,
@@ -159,7 +163,7 @@ impl Queue {
             if self.running.is_empty() {
                 return Ok(());
             }
-            let names = self.running.iter().map(|it| it.plan.name.as_str());
+            let names = self.running.iter().map(|it| it.job.plan.name.as_str());
             let waiting = self.waiting.len();
             progress.begin(&format!(
                 "{}; {waiting} waiting",
@@ -175,7 +179,7 @@ impl Queue {
     fn look(&mut self, progress: &mut Progress) -> anyhow::Result<()> {
         let mut at = 0;
         while at < self.running.len() {
-            let (done, enough) = self.done(&self.running[at].plan);
+            let (done, enough) = self.done(&self.running[at].job.plan);
             let running = &mut self.running[at];
             let fresh = done.saturating_sub(running.done);
             running.done += fresh;
@@ -185,7 +189,7 @@ impl Queue {
                 signal(&running.child, Signal::SIGTERM);
             }
             let ended = running.child.try_wait();
-            match ended.with_context(|| format!("waiting for {}", running.plan.name))? {
+            match ended.with_context(|| format!("waiting for {}", running.job.plan.name))? {
                 None => at += 1,
                 Some(status) => {
                     let ended = self.running.remove(at);
@@ -221,13 +225,13 @@ impl Queue {
         status: ExitStatus,
         progress: &mut Progress,
     ) -> anyhow::Result<()> {
-        let Running { plan, tried, .. } = &ended;
+        let Job { plan, tried, .. } = &ended.job;
         if self.runs.finished(plan).is_some() {
             return Ok(progress.advance(plan.units - ended.done)?);
         }
         let (name, words) = (&plan.name, self.runs.last_words(plan));
         // Settings that cannot work will not work for the others either.
-        if status.code() == Some(EXIT_USAGE.into()) && !ended.resumed {
+        if status.code() == Some(EXIT_USAGE.into()) && !ended.job.resumed {
             return Err(usage!("the run {name} cannot be made:\n{words}").into());
         }
         let (failed, then) = match *tried < TRIES {
@@ -239,34 +243,27 @@ impl Queue {
         ));
         if *tried < TRIES {
             progress.again(ended.done);
-            self.waiting.push_back(Waiting {
-                tried: *tried,
-                anew: ended.resumed,
-                plan: ended.plan,
-            });
+            self.waiting.push_back(ended.job);
             return Ok(());
         }
         Ok(progress.advance(plan.units - ended.done)?)
     }
 
     /// Starts a run in a separate process group, so that Ctrl-C reaches it through us alone; none if another process finished it.
-    fn start(
-        &self,
-        Waiting { plan, tried, anew }: Waiting,
-        progress: &mut Progress,
-    ) -> anyhow::Result<Option<Running>> {
-        let path = self.runs.log(&plan);
+    fn start(&self, mut job: Job, progress: &mut Progress) -> anyhow::Result<Option<Running>> {
+        let plan = &job.plan;
+        let path = self.runs.log(plan);
         let doing = || format!("making {}", path.display());
         let log = File::options().create(true).append(true).open(&path);
         let log = log.with_context(doing)?;
-        wait_for_the_last(&log, &plan, progress)?;
-        if self.runs.finished(&plan).is_some() {
+        wait_for_the_last(&log, plan, progress)?;
+        if self.runs.finished(plan).is_some() {
             progress.find(plan.units);
             return Ok(None);
         }
         log.set_len(0).with_context(doing)?;
-        let folder = self.runs.folder(&plan).path().to_owned();
-        let resumed = folder.exists() && !anew && self.is_resumable(&plan, progress)?;
+        let folder = self.runs.folder(plan).path().to_owned();
+        let resumed = folder.exists() && !job.resumed && self.is_resumable(plan, progress)?;
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
@@ -274,7 +271,7 @@ impl Queue {
                 aside.display()
             ));
         }
-        self.runs.write_call(&plan, &self.commit, resumed)?;
+        self.runs.write_call(plan, &self.commit, resumed)?;
         let mut command = Command::new(process_env::program());
         command
             .args(["train", "--no-play"])
@@ -293,13 +290,13 @@ impl Queue {
         let starting = || format!("starting the run {}", plan.name);
         let child = command.spawn().with_context(starting)?;
         let done = match resumed {
-            true => self.find(&plan, progress),
+            true => self.find(plan, progress),
             false => 0,
         };
+        job.tried += 1;
+        job.resumed = resumed;
         Ok(Some(Running {
-            plan,
-            tried: tried + 1,
-            resumed,
+            job,
             child,
             done,
             enough: false,
@@ -401,12 +398,7 @@ mod tests {
             runs,
             jobs: 1,
             commit: "def".into(),
-            waiting: [Waiting {
-                plan: plan.clone(),
-                tried: 0,
-                anew: false,
-            }]
-            .into(),
+            waiting: [Job::of(plan.clone())].into(),
             running: Vec::new(),
         };
         (queue, plan)

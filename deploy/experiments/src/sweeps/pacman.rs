@@ -13,11 +13,7 @@ use self::{
     results::{LOSSES, Results, Trace},
     settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PARTS},
 };
-use crate::{
-    cache::Session,
-    flags::PacmanArgs,
-    sweep::{plan, queue},
-};
+use crate::{cache::Session, flags::PacmanArgs, sweep::queue};
 
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
@@ -28,13 +24,12 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let report = args.queue.report;
     queue::install(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, 0, report)?;
-    let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any(report)?;
-    let results = Results::read(settings, swept)?;
+    let made = queue::make(&mut session, plans, settings.jobs)?;
+    session.check_any(&made)?;
+    let results = Results::read(settings, made)?;
     session.figure("fig3", &figure::figure(&results))?;
     write_data(&session, &results)?;
-    session.finish(include_str!("pacman.md.j2"), values(&results))?;
-    plan::check_made(&results.missing, report)
+    session.finish(include_str!("pacman.md.j2"), values(&results))
 }
 
 fn write_data(session: &Session, results: &Results) -> anyhow::Result<()> {
@@ -90,7 +85,6 @@ fn values(results: &Results) -> Value {
     });
     let differences = (0..PARTS).flat_map(|part| differences(part, results));
     let epsilons = settings.predictability.epsilons.iter();
-    let order = results.order_of_epsilon(LOSSES[1].0);
     context! {
         settings,
         agents => settings.agents,
@@ -101,8 +95,6 @@ fn values(results: &Results) -> Value {
         columns => LOSSES.map(|(column, _)| column),
         losses => results.losses,
         traces => results.traces,
-        missing => results.missing,
-        out_of_order => order.is_some_and(|(rank, _)| rank <= 0.0),
         returns_of => RETURNS_OF,
         episode_frames_max => EPISODE_FRAMES_MAX,
     }

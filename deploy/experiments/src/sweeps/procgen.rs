@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 
 use anyhow::Context;
 use driml_figure::{Axis, Chart, Figure, GREY, Mark, Panel, Series};
-use driml_launch::{evaluate::Levels, metrics::rounded, run_folder::RunFolder};
+use driml_launch::{evaluate::Levels, metrics::rounded};
 use driml_protocol::RETURNS_OF;
 use minijinja::{Value, context};
 use serde::Serialize;
@@ -22,7 +22,7 @@ use crate::{
         over_games::{Scores, improvement, iqm},
     },
     sweep::{
-        plan::{self, FinishedRun, Made, PlannedRun, Swept},
+        plan::{FinishedRun, Made, PlannedRun},
         queue,
     },
     sweeps::published::{normalised, paper},
@@ -45,9 +45,8 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     let report = args.queue.report;
     queue::install(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
-    let swept = queue::make(&mut session, plans, settings.jobs, report)?;
-    swept.check_any(report)?;
-    let Swept { made, missing } = swept;
+    let made = queue::make(&mut session, plans, settings.jobs)?;
+    session.check_any(&made)?;
     let mut scored = Vec::new();
     for Made { point, plan, run } in made {
         let greedy = play.greedy(&mut session, &format!("{}-greedy", plan.name), &run)?;
@@ -58,6 +57,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             greedy: mean(&greedy),
             random: mean(&random),
             is_above_random: is_above(&greedy, &random),
+            metrics: Run::read(&run.folder)?,
             point,
             plan,
             run,
@@ -66,9 +66,8 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     write_data(&session, &scored)?;
     session.figure("curves", &figure(&settings, &scored)?)?;
     let over_games = over_games(&mut session, &settings, &scored)?;
-    let values = values(&settings, &scored, &over_games, &missing);
-    session.finish(include_str!("procgen.md.j2"), values)?;
-    plan::check_made(&missing, report)
+    let values = values(&settings, &scored, &over_games);
+    session.finish(include_str!("procgen.md.j2"), values)
 }
 
 /// A finished run and its mean returns; a line of the data, from which the page is made.
@@ -80,6 +79,8 @@ struct Scored {
     plan: PlannedRun,
     #[serde(skip)]
     run: FinishedRun,
+    #[serde(skip)]
+    metrics: Run,
     training: Option<f64>,
     /// Of its agent, played greedily.
     greedy: Option<f64>,
@@ -115,25 +116,20 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
         let (point, summary) = (&it.point, &it.run.summary);
         let paper = paper(&point.game, &point.agent);
         let returns = [it.training, it.greedy, it.random, paper];
+        let settings = it.metrics.settings.as_ref();
+        let settings = settings
+            .with_context(|| format!("{} cannot be read", it.run.folder.config().display()))?;
+        // Runs without a choice have the torso of Nature's DQN.
+        let torso = settings.get("model").and_then(|model| model.get("torso"));
+        let torso = torso.and_then(toml::Value::as_str).unwrap_or("nature");
         rows.push((
-            (&point.game, &point.agent, torso(&it.run.folder)?),
+            (&point.game, &point.agent, torso),
             (it.plan.call.seed, summary.frames),
             returns.map(|it| it.map(rounded)),
             (summary.wall_seconds.round() as u64, &it.run.commit),
         ));
     }
     session.csv("table", columns, rows)
-}
-
-/// The torso of a run's network, from its settings; those without a choice have the one of Nature's DQN.
-fn torso(folder: &RunFolder) -> anyhow::Result<String> {
-    let path = folder.config();
-    let text = std::fs::read_to_string(&path);
-    let text = text.with_context(|| format!("reading {}", path.display()))?;
-    let config: toml::Table = text.parse()?;
-    let torso = config.get("model").and_then(|model| model.get("torso"));
-    let torso = torso.and_then(toml::Value::as_str);
-    Ok(torso.unwrap_or("nature").to_owned())
 }
 
 /// Training return over frames, a chart a game.
@@ -147,9 +143,8 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
             series.push(Series::line("random", 0, level(random)).coloured(GREY));
         }
         for (index, agent) in settings.agents.iter().enumerate() {
-            let each = of(scored, game, agent)
-                .map(|it| Ok(Run::read(&it.run.folder)?.values("frames", "mean_return")?));
-            let each = each.collect::<anyhow::Result<Vec<_>>>()?;
+            let each = of(scored, game, agent).map(|it| it.metrics.values("frames", "mean_return"));
+            let each = each.collect::<Result<Vec<_>, _>>()?;
             let curve = over_seeds(&each, Band::Range);
             if curve.points.is_empty() {
                 continue;
@@ -231,12 +226,7 @@ fn over_games(
 }
 
 /// What the page says.
-fn values(
-    settings: &Settings,
-    scored: &[Scored],
-    over_games: &[String],
-    missing: &[String],
-) -> Value {
+fn values(settings: &Settings, scored: &[Scored], over_games: &[String]) -> Value {
     let games = games(scored).into_iter().map(|name| {
         let agents = settings.agents.iter();
         context! { name, paper => agents.map(|agent| paper(name, agent)).collect::<Vec<_>>() }
@@ -250,7 +240,6 @@ fn values(
         percent => percent(settings.frames as f64 / PAPER_FRAMES),
         errors => ERRORS,
         over_games,
-        missing,
         returns_of => RETURNS_OF,
         episodes => CHECKPOINTS * settings.episodes,
         some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),

@@ -1,15 +1,14 @@
 //! `driml tradeoff`: what each dial that buys speed costs in accuracy, and the other way round, from short trainings of whole runs,
 //! one dial turned at a time, and benches of single updates beside them.
-//! The menu of dials is in `dials`, what fits a budget in `plan`, data, figures and page in `report`.
+//! The dials are in `menu`, what fits a budget in `plan`, data, figures and page in `report`.
 
-mod dials;
 mod figures;
 mod fixed_batch;
 mod measured;
+mod menu;
 mod plan;
 mod report;
 mod results;
-mod settings;
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -23,10 +22,9 @@ use driml_settings::{config::RunConfig, presets};
 use minijinja::context;
 
 use self::{
-    dials::Point,
-    plan::{Cost, Fit},
+    menu::{Point, Settings},
+    plan::{Budget, Cost},
     results::{Measured, PointResult, Results, SeedResult},
-    settings::Settings,
 };
 use crate::{
     cache::{self, Session},
@@ -34,7 +32,7 @@ use crate::{
     page::fill,
     stats::Spread,
     sweep::{
-        plan::{FinishedRun, Made, Planned, Swept, check_made},
+        plan::{FinishedRun, Made, Planned},
         queue,
         results::Played,
         runs::{Runs, SEEDS_FOUND_MAX},
@@ -66,7 +64,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     let world = presets::world(&args.env).map_err(|e| usage!("--env: {e}"))?;
     let name = format!("tradeoff-{}", world.to_string().replace("procgen:", ""));
     let found = cache::settings_of(&name, &args.flags);
-    let mut settings = settings::of(args, world, found)?;
+    let mut settings = Settings::of(args, world, found)?;
     let report_only = args.queue.report;
     if !report_only {
         let base = settings.common.config(&settings.levels[0].base)?;
@@ -85,17 +83,13 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
     };
     it.measure_speeds()?;
     let left = (budget_seconds - started.elapsed().as_secs_f64()).max(0.0);
-    let costs = it.costs()?;
-    let fit = plan::fit(&costs, left);
-    if !report_only {
-        print(&it.describe(&costs, &fit, left)?)?;
-    }
+    let chosen = it.choose(left)?;
     if args.plan {
         return Ok(());
     }
-    let results = it.make(&fit.chosen)?;
+    let results = it.make(&chosen)?;
     if results.levels.is_empty() {
-        check_made(&results.missing, report_only)?;
+        it.session.check_made()?;
         let what = match results.points.is_empty() {
             true => "no run is finished yet",
             false => "no level has a finished run beside its base's",
@@ -104,8 +98,7 @@ pub fn run(args: &TradeoffArgs) -> anyhow::Result<()> {
             usage!("{what}, and none fits into the budget: there is nothing to report").into(),
         );
     }
-    report::report(it.session, &results)?;
-    check_made(&results.missing, report_only)
+    report::report(it.session, &results)
 }
 
 /// Makes the runs shorter if not even the first level fits into the budget.
@@ -161,18 +154,36 @@ impl Tradeoff<'_> {
         Ok(())
     }
 
-    /// Of every level that is asked for what its base and it still cost; a report costs nothing, as it runs nothing.
-    fn costs(&self) -> anyhow::Result<Vec<Option<[Cost; 2]>>> {
-        let runs = Runs::open(self.session.folder())?;
-        let mut costs = Vec::new();
-        for of in &self.settings.levels {
-            let cost = |point| self.cost(&runs, point, &of.base);
-            costs.push(match of.is_asked && !self.args.queue.report {
-                true => Some([cost(&of.base)?, cost(&of.point)?]),
-                false => None,
-            });
+    /// Whether each level is run: it is asked for, and fits into the seconds that are `left`. Prints that plan; a report runs nothing.
+    fn choose(&self, left: f64) -> anyhow::Result<Vec<bool>> {
+        let levels = &self.settings.levels;
+        if self.args.queue.report {
+            return Ok(vec![false; levels.len()]);
         }
-        Ok(costs)
+        let runs = Runs::open(self.session.folder())?;
+        let mut budget = Budget {
+            seconds_max: left,
+            ..Budget::default()
+        };
+        let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
+        for (of, is_chosen) in levels.iter().zip(&mut chosen).filter(|it| it.0.is_asked) {
+            let costs = [
+                self.cost(&runs, &of.base, &of.base)?,
+                self.cost(&runs, &of.point, &of.base)?,
+            ];
+            let seconds = costs[1].seconds;
+            *is_chosen = budget.takes(&costs);
+            asked.push(context! { name => of.name(), seconds, fits => *is_chosen });
+        }
+        let values = context! {
+            settings => self.settings.common,
+            seeds => self.settings.seeds,
+            levels => asked,
+            seconds => budget.seconds,
+            left,
+        };
+        print(&fill(include_str!("tradeoff_plan.j2"), &values)?)?;
+        Ok(chosen)
     }
 
     /// What is left to run of a point, which is compared with this base or is it.
@@ -209,28 +220,6 @@ impl Tradeoff<'_> {
         })
     }
 
-    /// What is printed of the plan before anything is run.
-    fn describe(
-        &self,
-        costs: &[Option<[Cost; 2]>],
-        fit: &Fit,
-        left: f64,
-    ) -> Result<String, minijinja::Error> {
-        let levels = self.settings.levels.iter().zip(costs).zip(&fit.chosen);
-        let levels = levels.filter_map(|((of, costs), fits)| {
-            let [_, Cost { seconds, .. }] = costs.as_ref()?;
-            Some(context! { name => of.name(), seconds, fits })
-        });
-        let values = context! {
-            settings => self.settings.common,
-            seeds => self.settings.seeds,
-            levels => levels.collect::<Vec<_>>(),
-            seconds => fit.seconds,
-            left,
-        };
-        fill(include_str!("tradeoff_plan.j2"), &values)
-    }
-
     /// The runs of the chosen levels and their bases, and those that are there already.
     fn wanted(&self, chosen: &[bool]) -> anyhow::Result<Vec<Planned<Point>>> {
         let runs = Runs::open(self.session.folder())?;
@@ -262,8 +251,7 @@ impl Tradeoff<'_> {
         let plays = wanted.len() as u64 + 1;
         self.session.progress().again(units * plays);
         let common = self.settings.common.clone();
-        let session = &mut self.session;
-        let Swept { made, missing } = queue::make(session, wanted, common.jobs, report_only)?;
+        let made = queue::make(&mut self.session, wanted, common.jobs)?;
         let play = Played {
             levels: Levels::Train,
             checkpoints: 1,
@@ -308,7 +296,6 @@ impl Tradeoff<'_> {
             points,
             random,
             left_out,
-            missing,
         })
     }
 

@@ -6,7 +6,7 @@ use super::settings::{Continual, PARTS, Point, Settings};
 use crate::{
     plot::Run,
     stats::{mean, rank_correlation},
-    sweep::plan::{Made, Swept},
+    sweep::plan::Made,
 };
 
 /// The DIM losses of the preset: column of the metrics, and what it compares.
@@ -23,7 +23,6 @@ pub(super) struct Results {
     pub(super) losses: Vec<Loss>,
     /// Of (b) and of (c).
     pub(super) traces: [Vec<Trace>; PARTS],
-    pub(super) missing: Vec<String>,
 }
 
 /// A loss over frames, of a run of (a).
@@ -40,7 +39,7 @@ pub(super) struct Loss {
     pub(super) episodes: f64,
 }
 
-/// Training return over episodes.
+/// Training return over episodes, up to the end of the last task.
 #[derive(Serialize)]
 pub(super) struct Trace {
     pub(super) agent: String,
@@ -52,9 +51,9 @@ pub(super) struct Trace {
 }
 
 impl Results {
-    pub(super) fn read(settings: Settings, swept: Swept<Point>) -> anyhow::Result<Self> {
+    pub(super) fn read(settings: Settings, made: Vec<Made<Point>>) -> anyhow::Result<Self> {
         let (mut losses, mut traces) = (Vec::new(), [const { Vec::new() }; PARTS]);
-        for Made { point, plan, run } in swept.made {
+        for Made { point, plan, run } in made {
             let (seed, metrics) = (plan.call.seed, Run::read(&run.folder)?);
             match point {
                 Point::Epsilon(epsilon) => {
@@ -74,7 +73,8 @@ impl Results {
                 }
                 Point::Tasks(part, agent) => {
                     let continual = settings.tasks(part);
-                    let points = trace(&metrics, continual)?;
+                    let mut points = metrics.values("episodes", "mean_return")?;
+                    points.retain(|point| point.0 <= continual.episodes() as f64);
                     traces[part].push(Trace {
                         agent,
                         seed,
@@ -88,7 +88,6 @@ impl Results {
             settings,
             losses,
             traces,
-            missing: swept.missing,
         })
     }
 
@@ -114,13 +113,6 @@ impl Results {
 fn mean_from(points: &Points, frames: f64) -> Option<f64> {
     let late = points.iter().filter(|point| point.0 >= frames);
     mean(&late.map(|point| point.1).collect::<Vec<_>>())
-}
-
-/// Mean return of the last 100 episodes over episodes, up to the end of the last task.
-fn trace(run: &Run, continual: &Continual) -> anyhow::Result<Points> {
-    let mut points = run.values("episodes", "mean_return")?;
-    points.retain(|point| point.0 <= continual.episodes() as f64);
-    Ok(points)
 }
 
 /// See [`Trace::tasks`].

@@ -10,33 +10,32 @@ pub(super) struct Cost {
     pub(super) seconds: f64,
 }
 
-#[derive(Debug, PartialEq)]
-pub(super) struct Fit {
-    /// Whether each level does.
-    pub(super) chosen: Vec<bool>,
-    /// What those cost together, each point counted once.
+/// Machine time, and what it is spent on.
+#[derive(Debug, Default)]
+pub(super) struct Budget {
+    pub(super) seconds_max: f64,
+    /// Of all that was taken, each point counted once.
     pub(super) seconds: f64,
+    /// Keys of the points that were taken.
+    paid: BTreeSet<String>,
 }
 
-/// Which levels fit into `budget_seconds`, in their order, each with all its seeds and its base or not at all; of each the cost of
-/// its base and its own, none for a level that is not asked for. What costs nothing any more always fits. A level that does not fit
-/// leaves room to those after it.
-pub(super) fn fit(levels: &[Option<[Cost; 2]>], budget_seconds: f64) -> Fit {
-    let mut paid = BTreeSet::new();
-    let mut seconds = 0.0;
-    let mut fits = |costs: &'_ [Cost; 2]| {
-        let new = costs.iter().filter(|it| !paid.contains(&it.key));
+impl Budget {
+    /// Takes a level with all its seeds and its base, if both fit. What costs nothing any more always fits. A level that does not fit
+    /// leaves room to those after it.
+    pub(super) fn takes(&mut self, base_and_level: &[Cost; 2]) -> bool {
+        let new = base_and_level
+            .iter()
+            .filter(|it| !self.paid.contains(&it.key));
         let more: f64 = new.map(|it| it.seconds).sum();
-        let fits = more == 0.0 || seconds + more <= budget_seconds;
+        let fits = more == 0.0 || self.seconds + more <= self.seconds_max;
         if fits {
-            seconds += more;
-            paid.extend(costs.iter().map(|it| it.key.clone()));
+            self.seconds += more;
+            self.paid
+                .extend(base_and_level.iter().map(|it| it.key.clone()));
         }
         fits
-    };
-    let chosen = levels.iter().map(|it| it.as_ref().is_some_and(&mut fits));
-    let chosen = chosen.collect();
-    Fit { chosen, seconds }
+    }
 }
 
 /// Frames of a run: `full`, or a half or a quarter of it, so that at least the first level fits into the budget with its base.
@@ -53,35 +52,40 @@ mod tests {
 
     #[test]
     fn a_budget_is_kept_and_a_base_is_paid_once() {
-        let level = |base: (&str, f64), level: (&str, f64)| {
-            Some([base, level].map(|(key, seconds)| Cost {
-                key: key.into(),
-                seconds,
-            }))
-        };
         let all = [
-            level(("c51", 100.0), ("bf16", 60.0)),
-            level(("c51", 100.0), ("driml-fix", 200.0)),
-            level(("c51", 100.0), ("f16", 100.0)),
-            level(("driml-fix", 200.0), ("embedding_dim", 40.0)),
+            [("c51", 100.0), ("bf16", 60.0)],
+            [("c51", 100.0), ("driml-fix", 200.0)],
+            [("c51", 100.0), ("f16", 100.0)],
+            [("driml-fix", 200.0), ("embedding_dim", 40.0)],
         ];
-        // What is finished costs nothing and is always there; what is not asked for never is.
-        let finished = [
-            level(("c51", 0.0), ("bf16", 0.0)),
-            level(("c51", 0.0), ("f16", 50.0)),
-            None,
-        ];
-        for (all, budget, chosen, seconds) in [
-            (&all[..], 0.0, vec![false; 4], 0.0),
-            (&all, 159.9, vec![false; 4], 0.0),
-            (&all, 160.0, vec![true, false, false, false], 160.0),
-            (&all, 260.0, vec![true, false, true, false], 260.0),
-            (&all, 400.0, vec![true, true, false, true], 400.0),
-            (&all, 500.0, vec![true; 4], 500.0),
-            (&finished, 0.0, vec![true, false, false], 0.0),
-            (&finished, 50.0, vec![true, true, false], 50.0),
+        // What is finished costs nothing and is always there.
+        let finished = [[("c51", 0.0), ("bf16", 0.0)], [("c51", 0.0), ("f16", 50.0)]];
+        for (levels, seconds_max, chosen, seconds) in [
+            (&all[..], 0.0, &[false; 4][..], 0.0),
+            (&all, 159.9, &[false; 4], 0.0),
+            (&all, 160.0, &[true, false, false, false], 160.0),
+            (&all, 260.0, &[true, false, true, false], 260.0),
+            (&all, 400.0, &[true, true, false, true], 400.0),
+            (&all, 500.0, &[true; 4], 500.0),
+            (&finished, 0.0, &[true, false], 0.0),
+            (&finished, 50.0, &[true, true], 50.0),
         ] {
-            assert_eq!(fit(all, budget), Fit { chosen, seconds }, "{budget} s");
+            let mut budget = Budget {
+                seconds_max,
+                ..Budget::default()
+            };
+            let costs = levels.iter().map(|both| {
+                both.map(|(key, seconds)| Cost {
+                    key: key.to_owned(),
+                    seconds,
+                })
+            });
+            let found: Vec<_> = costs.map(|it| budget.takes(&it)).collect();
+            assert_eq!(
+                (&found[..], budget.seconds),
+                (chosen, seconds),
+                "{seconds_max} s"
+            );
         }
     }
 

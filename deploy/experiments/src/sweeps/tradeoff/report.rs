@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     cache::Session,
-    stats::{Interval, apart_by_chance, difference, interval},
+    stats::{Interval, apart_by_chance, difference, mean},
 };
 
 /// What the bench and the errors against the reference give, as the data has it.
@@ -26,7 +26,9 @@ const EQUAL_TIME: &str = "agent,base,equal_seconds,\
 const DIM: &str = "DIM";
 
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
-    let equal = equal_time(results)?;
+    let of_dim = results.level_rows().filter(|row| row.dial.name == DIM);
+    let equal = of_dim.filter_map(|row| EqualTime::of(&row).transpose());
+    let equal = equal.collect::<anyhow::Result<Vec<_>>>()?;
     write_runs(&session, results)?;
     write_levels(&session, results)?;
     session.csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
@@ -84,64 +86,55 @@ fn interval_cells(of: Option<Interval>) -> [Option<f64>; 3] {
     [of.map(|it| it.mean), low, high].map(|it| it.map(rounded))
 }
 
-/// C51 beside an agent with DIM in training return, by the base's runs and the level's.
+/// C51 beside an agent with DIM in training return: of the base's runs and of the level's.
 #[derive(Serialize)]
 struct EqualTime {
     agent: String,
     base: String,
     /// When runs of the faster of the two are done.
     seconds: f64,
-    base_end: Vec<f64>,
-    level_end: Vec<f64>,
+    /// At the end of each run.
+    end: [Vec<f64>; 2],
     /// At that time.
-    base_then: Vec<f64>,
-    level_then: Vec<f64>,
+    then: [Vec<f64>; 2],
 }
 
 impl EqualTime {
+    /// Runs that ended alone are compared, in training return: the agent after part of a run was not kept. None where a side has no
+    /// return at that time.
+    fn of(row: &Row<'_>) -> anyhow::Result<Option<Self>> {
+        let curves = [row.base.training_curves()?, row.result.training_curves()?];
+        let done = curves.each_ref().map(|runs| {
+            let ends = runs.iter().filter_map(|curve| Some(curve.last()?.0));
+            mean(&ends.collect::<Vec<_>>())
+        });
+        let [Some(base), Some(level)] = done else {
+            return Ok(None);
+        };
+        let seconds = base.min(level);
+        let returns_at = |seconds: f64| {
+            curves
+                .each_ref()
+                .map(|runs| -> Vec<f64> { runs.iter().filter_map(|it| at(it, seconds)).collect() })
+        };
+        let of = Self {
+            agent: row.agent.into(),
+            base: row.dial.agent.clone(),
+            seconds,
+            end: returns_at(f64::INFINITY),
+            then: returns_at(seconds),
+        };
+        Ok((!of.then.iter().any(Vec::is_empty)).then_some(of))
+    }
+
     /// As [`EQUAL_TIME`] has it.
     fn cells(&self) -> impl Serialize {
-        let minus_base = [
-            (&self.base_end, &self.level_end),
-            (&self.base_then, &self.level_then),
-        ]
-        .map(|(base, level)| interval_cells(difference(base, level).map(|it| it.interval)));
+        let minus_base = [&self.end, &self.then].map(|[base, level]| {
+            let difference = difference(base, level);
+            interval_cells(difference.map(|it| it.interval))
+        });
         (&self.agent, &self.base, rounded(self.seconds), minus_base)
     }
-}
-
-/// Runs that ended alone are compared, in training return: the agent after part of a run was not kept.
-fn equal_time(results: &Results) -> anyhow::Result<Vec<EqualTime>> {
-    let mut all = Vec::new();
-    for row in results.level_rows().filter(|row| row.dial.name == DIM) {
-        let curves = [row.base.training_curves()?, row.result.training_curves()?];
-        let ends = curves.each_ref().map(|curves| -> (Vec<f64>, Vec<f64>) {
-            let ends = curves.iter().filter_map(|curve| curve.last());
-            ends.copied().unzip()
-        });
-        let [Some(base), Some(level)] = ends.each_ref().map(|(seconds, _)| interval(seconds))
-        else {
-            continue;
-        };
-        let seconds = base.mean.min(level.mean);
-        let [base_then, level_then] = curves.map(|curves| -> Vec<f64> {
-            let then = curves.iter().filter_map(|curve| at(curve, seconds));
-            then.collect()
-        });
-        if !base_then.is_empty() && !level_then.is_empty() {
-            let [base_end, level_end] = ends.map(|(_, returns)| returns);
-            all.push(EqualTime {
-                agent: row.agent.into(),
-                base: row.dial.agent.clone(),
-                seconds,
-                base_end,
-                level_end,
-                base_then,
-                level_then,
-            });
-        }
-    }
-    Ok(all)
 }
 
 /// The value at a time: the last one before it.
@@ -169,26 +162,20 @@ fn values(results: &Results, equal: &[EqualTime]) -> anyhow::Result<Value> {
         by_chance,
         rows,
         states,
-        missing => results.missing,
         left_out => results.left_out,
         command => results.commands.join("`, then `"),
     })
 }
 
 /// A line as the template reads it: what was measured, and of each measure the numbers of its runs.
-fn page_row(row: &Row<'_>) -> BTreeMap<&'static str, Value> {
-    let mut values = BTreeMap::new();
-    values.insert("level", row.name.into());
-    values.insert("agent", row.agent.into());
-    values.insert("frames_gain", Value::from_serialize(row.frames_gain()));
-    for name in MEASURED.split(',') {
-        values.insert(name, Value::from_serialize(row.result.measured.get(name)));
-    }
-    for measure in MEASURES {
-        let of_runs = row.result.values(measure);
-        values.insert(measure.name, Value::from_serialize(of_runs));
-    }
-    values
+fn page_row(row: &Row<'_>) -> Value {
+    let measured = |name: &'static str| {
+        let found = row.result.measured.get(name).copied();
+        (name, Value::from(found))
+    };
+    let of_runs = MEASURES.map(|it| (it.name, Value::from_serialize(row.result.values(it))));
+    let named: Value = MEASURED.split(',').map(measured).chain(of_runs).collect();
+    context! { level => row.name, agent => row.agent, frames_gain => row.frames_gain(), ..named }
 }
 
 /// How many seeds the intervals of bases are over, or of the other points, the fewest first.

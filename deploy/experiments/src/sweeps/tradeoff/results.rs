@@ -2,10 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{
-    dials::{Dial, LevelOf, Point},
-    settings::Common,
-};
+use super::menu::{Common, Dial, LevelOf, Point};
 use crate::{
     plot::Run,
     stats::{Difference, Interval, difference, interval, mean},
@@ -38,7 +35,6 @@ pub(super) struct Results {
     pub(super) random: Vec<f64>,
     /// Levels that have no run.
     pub(super) left_out: Vec<String>,
-    pub(super) missing: Vec<String>,
     /// The calls that made it.
     pub(super) commands: Vec<String>,
 }

@@ -1,21 +1,35 @@
-//! What a call of `driml tradeoff` asks for, and the runs and settings that follow from it.
+//! What a call of `driml tradeoff` asks for: the dials that can be turned, their levels as settings, and the runs that follow.
+//! It measures nothing; the menu itself, and what all levels share in a world, is `tradeoff.toml`.
+
+use std::collections::BTreeMap;
 
 use driml_envs::WorldName;
-use driml_machine::error::Usage;
+use driml_machine::error::{Usage, nearest, usage};
 use driml_settings::config::RunConfig;
 use serde::{Deserialize, Serialize};
 
-use super::dials::{self, LevelOf, MENU, Point};
 use crate::{
-    flags::{self, TradeoffArgs},
+    flags::TradeoffArgs,
     sweep::plan::{Call, PlannedRun},
 };
 
 /// Seeds of a base for each of a level's: all levels are compared with it, so that its luck is in all of their differences.
 const BASE_SEEDS: u32 = 2;
 
+/// The file with all of it.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Menu {
+    full: Length,
+    smoke: Length,
+    /// By a world's name or its kind.
+    world: BTreeMap<String, WorldBase>,
+    /// In the order in which they are tried.
+    dial: Vec<Dial>,
+}
+
 /// What every world's runs have at a length.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Length {
     preset: String,
@@ -27,6 +41,119 @@ struct Length {
     frames: Option<u64>,
     /// After those of the world, in the form of `--set`.
     sets: Vec<String>,
+}
+
+/// What all runs in the worlds of one kind have, or in one game of it.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct WorldBase {
+    frames: u64,
+    /// In the form of `--set`.
+    sets: Vec<String>,
+}
+
+/// A dial in one world: a base and the levels that are compared with it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Dial {
+    pub(super) name: String,
+    /// The name of the level that the settings of the world have.
+    pub(super) base: String,
+    buys: String,
+    costs: String,
+    /// The agent of its base; C51 if it names none.
+    #[serde(default = "c51")]
+    pub(super) agent: String,
+    /// Kinds of worlds that have it; all if it names none.
+    #[serde(default)]
+    worlds: Vec<String>,
+    /// Levels that set what the dial is named for.
+    #[serde(default, skip_serializing)]
+    values: Vec<String>,
+    #[serde(default, skip_serializing)]
+    levels: Vec<Level>,
+}
+
+fn c51() -> String {
+    "c51".into()
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Level {
+    name: String,
+    /// In the form of `--set`, over the settings of the world.
+    #[serde(default)]
+    sets: Vec<String>,
+    /// Another agent than the dial's.
+    agent: Option<String>,
+}
+
+/// One choice of all settings: what a run, of any seed, is made with.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Point {
+    /// Names its runs and pieces.
+    pub(super) key: String,
+    pub(super) agent: String,
+    /// Over the settings of the world.
+    pub(super) sets: Vec<String>,
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct LevelOf {
+    pub(super) dial: Dial,
+    pub(super) level: String,
+    pub(super) base: Point,
+    pub(super) point: Point,
+    /// Whether the call asks for its dial. What others have made of a dial is on the page too.
+    pub(super) is_asked: bool,
+}
+
+impl LevelOf {
+    pub(super) fn name(&self) -> String {
+        format!("{} = {}", self.dial.name, self.level)
+    }
+}
+
+impl Dial {
+    fn levels(&self, is_asked: bool) -> impl Iterator<Item = LevelOf> {
+        let base = Point {
+            key: self.agent.clone(),
+            agent: self.agent.clone(),
+            sets: Vec::new(),
+        };
+        let values = self.values.iter().map(move |value| Level {
+            name: value.clone(),
+            sets: vec![format!("{}={value}", self.name)],
+            agent: None,
+        });
+        let levels = values.chain(self.levels.iter().cloned());
+        levels.map(move |level| {
+            let agent = level.agent.unwrap_or_else(|| self.agent.clone());
+            let key = match level.sets.is_empty() {
+                true => agent.clone(),
+                false => format!("{agent}-{}-{}", slug(&self.name), slug(&level.name)),
+            };
+            LevelOf {
+                dial: self.clone(),
+                level: level.name,
+                base: base.clone(),
+                point: Point {
+                    key,
+                    agent,
+                    sets: level.sets,
+                },
+                is_asked,
+            }
+        })
+    }
+}
+
+/// A name as files have it: letters, digits, dots and single dashes.
+fn slug(name: &str) -> String {
+    let parts = name.split(|c: char| !c.is_ascii_alphanumeric() && c != '.');
+    let parts = parts.filter(|part| !part.is_empty());
+    parts.collect::<Vec<_>>().join("-")
 }
 
 /// What all runs of a folder have in common. Dials, levels and seeds can be added.
@@ -54,33 +181,38 @@ pub(super) struct Settings {
     pub(super) frames_open: bool,
 }
 
-/// The settings that the call asks for. A folder that has runs keeps their length.
-pub(super) fn of(
-    args: &TradeoffArgs,
-    world: WorldName,
-    found: Option<Common>,
-) -> Result<Settings, Usage> {
-    let base = dials::world_base(world)?;
-    let length: Length = flags::settings("tradeoff", MENU, args.flags.smoke);
-    let asked = [length.sets, args.queue.sets.clone()];
-    let (found_frames, found_jobs) = found.map(|it| (it.frames, it.jobs)).unzip();
-    let frames = args.frames.or(found_frames);
-    Ok(Settings {
-        common: Common {
-            env: world.to_string(),
-            preset: length.preset,
-            sets: base.sets.into_iter().chain(asked.concat()).collect(),
-            frames: frames.or(length.frames).unwrap_or(base.frames),
-            episodes: args.episodes.unwrap_or(length.episodes),
-            jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
-        },
-        levels: dials::levels(world, &args.dials)?,
-        seeds: args.flags.seeds.unwrap_or(length.seeds),
-        frames_open: frames.is_none() && !args.queue.report,
-    })
-}
-
 impl Settings {
+    /// What the call asks for. A folder that has runs keeps their length.
+    pub(super) fn of(
+        args: &TradeoffArgs,
+        world: WorldName,
+        found: Option<Common>,
+    ) -> Result<Self, Usage> {
+        let menu: Menu = toml::from_str(include_str!("../tradeoff.toml"))
+            .unwrap_or_else(|e| panic!("tradeoff.toml is built in, and a test reads it: {e}"));
+        let length = match args.flags.smoke {
+            true => menu.smoke,
+            false => menu.full,
+        };
+        let base = world_base(menu.world, world)?;
+        let asked = [base.sets, length.sets, args.queue.sets.clone()];
+        let (found_frames, found_jobs) = found.map(|it| (it.frames, it.jobs)).unzip();
+        let frames = args.frames.or(found_frames);
+        Ok(Self {
+            common: Common {
+                env: world.to_string(),
+                preset: length.preset,
+                sets: asked.concat(),
+                frames: frames.or(length.frames).unwrap_or(base.frames),
+                episodes: args.episodes.unwrap_or(length.episodes),
+                jobs: args.queue.jobs.or(found_jobs).unwrap_or(1),
+            },
+            levels: levels(menu.dial, world, &args.dials)?,
+            seeds: args.flags.seeds.unwrap_or(length.seeds),
+            frames_open: frames.is_none() && !args.queue.report,
+        })
+    }
+
     pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
         match is_base {
             true => BASE_SEEDS * self.seeds,
@@ -107,6 +239,37 @@ impl Common {
     }
 }
 
+/// The levels of all dials that a world has, in their order. `names` are the dials that are asked for; all if it is empty.
+fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Vec<LevelOf>, Usage> {
+    dials.retain(|it| it.worlds.is_empty() || it.worlds.iter().any(|kind| kind == world.kind()));
+    let known: Vec<_> = dials.iter().map(|dial| dial.name.as_str()).collect();
+    if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
+        return Err(usage!(
+            "there is no dial {unknown:?} in this world{}; --dials takes {}",
+            nearest(unknown, known.iter().copied()),
+            known.join(", ")
+        ));
+    }
+    let asks_for = |dial: &Dial| names.is_empty() || names.contains(&dial.name);
+    let levels = dials.iter().flat_map(|dial| dial.levels(asks_for(dial)));
+    Ok(levels.collect())
+}
+
+/// What all runs in a world have: the game's own entry comes before that of its kind.
+fn world_base(
+    mut worlds: BTreeMap<String, WorldBase>,
+    world: WorldName,
+) -> Result<WorldBase, Usage> {
+    let own = worlds.remove(&world.to_string());
+    own.or_else(|| worlds.remove(world.kind())).ok_or_else(|| {
+        let kinds = worlds.into_keys().filter(|name| !name.contains(':'));
+        usage!(
+            "driml tradeoff has no settings for {world}, with which something is learned in minutes; it has some for {}",
+            kinds.collect::<Vec<_>>().join(", ")
+        )
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
@@ -118,7 +281,7 @@ mod tests {
 
     fn of(line: &str, found: Option<Common>) -> Result<Settings, Usage> {
         let args: TradeoffArgs = parsed(line);
-        super::of(&args, presets::world(&args.env)?, found)
+        Settings::of(&args, presets::world(&args.env)?, found)
     }
 
     fn settings(world: &str, smoke: &str) -> Settings {
@@ -177,6 +340,15 @@ coinrun|observation|input.height=64 input.width=64";
                 let configs = [base, &said].map(|point| common.config(point).unwrap());
                 assert_eq!(configs[0], configs[1], "{line} in {world}");
             }
+        }
+    }
+
+    #[test]
+    fn the_entry_of_a_game_comes_before_that_of_its_kind() {
+        for (name, sets) in [("fruitbot", 5), ("coinrun", 1)] {
+            let common = of(&format!("--env {name}"), None).unwrap().common;
+            let found = (common.frames, common.sets.len());
+            assert_eq!(found, (30_000, sets), "{name}");
         }
     }
 
