@@ -30,6 +30,7 @@ use crate::{
     cache::{self, Session},
     flags::{TradeoffArgs, this_command},
     page::fill,
+    plot::Run,
     stats::Spread,
     sweep::{
         plan::{FinishedRun, Made, Planned},
@@ -276,6 +277,7 @@ impl Tradeoff<'_> {
             }
             result.seeds.push(SeedResult {
                 seed: plan.call.seed,
+                curve: Run::read(&run.folder)?.values("seconds", "mean_return")?,
                 ran: run,
                 greedy: greedy.unwrap_or_default(),
             });

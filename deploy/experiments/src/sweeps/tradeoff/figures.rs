@@ -86,18 +86,17 @@ fn front(placed: &[Placed]) -> impl Iterator<Item = Placed> {
 }
 
 /// Training return over seconds, a panel for each dial with its base.
-pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
-    let mut panels = Vec::new();
-    for rows in results.by_dial() {
-        let mut series = Vec::new();
-        for (index, row) in rows.iter().enumerate() {
-            let curve = over_seeds(&row.result.training_curves()?, Band::Range);
-            series.push(curve.series(row.name, index));
-        }
+pub(super) fn wall(results: &Results) -> Figure {
+    let panels = results.by_dial().map(|rows| {
+        let series = rows.iter().enumerate().map(|(index, row)| {
+            let each = row.result.seeds.iter().map(|it| it.curve.clone());
+            let curve = over_seeds(&each.collect::<Vec<_>>(), Band::Range);
+            curve.series(row.name, index)
+        });
         let (x, y) = (Axis::linear("seconds"), Axis::linear("mean return"));
-        panels.push(Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series)));
-    }
-    Ok(Figure {
+        Panel::Chart(Chart::new(&rows[0].dial.name, x, y, series.collect()))
+    });
+    Figure {
         title: format!("{}: return against wall-clock time", results.common.env),
         notes: vec![
             "Training return, mean of the last 100 episodes; mean and range over seeds. Every run has the same number of frames."
@@ -105,8 +104,8 @@ pub(super) fn wall(results: &Results) -> anyhow::Result<Figure> {
         ],
         columns: COLUMNS,
         panel_size: PANEL,
-        panels,
-    })
+        panels: panels.collect(),
+    }
 }
 
 #[cfg(test)]

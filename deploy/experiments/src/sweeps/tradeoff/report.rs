@@ -27,8 +27,7 @@ const DIM: &str = "DIM";
 
 pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> {
     let of_dim = results.level_rows().filter(|row| row.dial.name == DIM);
-    let equal = of_dim.filter_map(|row| EqualTime::of(&row).transpose());
-    let equal = equal.collect::<anyhow::Result<Vec<_>>>()?;
+    let equal: Vec<_> = of_dim.filter_map(|row| EqualTime::of(&row)).collect();
     write_runs(&session, results)?;
     write_levels(&session, results)?;
     session.csv("equal_time", EQUAL_TIME, equal.iter().map(EqualTime::cells))?;
@@ -38,7 +37,7 @@ pub(super) fn report(session: Session, results: &Results) -> anyhow::Result<()> 
     ] {
         session.figure(stem, &figures::pareto(results, returns, name))?;
     }
-    session.figure("wall", &figures::wall(results)?)?;
+    session.figure("wall", &figures::wall(results))?;
     session.finish(include_str!("../tradeoff.md.j2"), values(results, &equal)?)
 }
 
@@ -102,20 +101,18 @@ struct EqualTime {
 impl EqualTime {
     /// Runs that ended alone are compared, in training return: the agent after part of a run was not kept. None where a side has no
     /// return at that time.
-    fn of(row: &Row<'_>) -> anyhow::Result<Option<Self>> {
-        let curves = [row.base.training_curves()?, row.result.training_curves()?];
-        let done = curves.each_ref().map(|runs| {
-            let ends = runs.iter().filter_map(|curve| Some(curve.last()?.0));
-            mean(&ends.collect::<Vec<_>>())
+    fn of(row: &Row<'_>) -> Option<Self> {
+        let sides = [row.base, row.result];
+        let [base, level] = sides.map(|point| {
+            let ends = point.seeds.iter().filter_map(|it| it.curve.last());
+            mean(&ends.map(|end| end.0).collect::<Vec<_>>())
         });
-        let [Some(base), Some(level)] = done else {
-            return Ok(None);
-        };
-        let seconds = base.min(level);
+        let seconds = base?.min(level?);
         let returns_at = |seconds: f64| {
-            curves
-                .each_ref()
-                .map(|runs| -> Vec<f64> { runs.iter().filter_map(|it| at(it, seconds)).collect() })
+            sides.map(|point| -> Vec<f64> {
+                let returns = point.seeds.iter().filter_map(|it| at(&it.curve, seconds));
+                returns.collect()
+            })
         };
         let of = Self {
             agent: row.agent.into(),
@@ -124,7 +121,7 @@ impl EqualTime {
             end: returns_at(f64::INFINITY),
             then: returns_at(seconds),
         };
-        Ok((!of.then.iter().any(Vec::is_empty)).then_some(of))
+        (!of.then.iter().any(Vec::is_empty)).then_some(of)
     }
 
     /// As [`EQUAL_TIME`] has it.

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use super::menu::{Common, Dial, LevelOf, Point};
 use crate::{
-    plot::Run,
     stats::{Difference, Interval, difference, interval, mean},
     sweep::plan::FinishedRun,
 };
@@ -19,10 +18,13 @@ pub(super) struct PointResult {
     pub(super) seeds: Vec<SeedResult>,
 }
 
-/// A finished run and the returns of its agent, played greedily.
+/// A finished run.
 pub(super) struct SeedResult {
     pub(super) seed: u32,
     pub(super) ran: FinishedRun,
+    /// Training return over seconds.
+    pub(super) curve: Vec<(f64, f64)>,
+    /// Returns of its agent, played greedily.
     pub(super) greedy: Vec<f64>,
 }
 
@@ -84,13 +86,6 @@ impl PointResult {
 
     pub(super) fn mean(&self, measure: Measure) -> Option<Interval> {
         interval(&self.values(measure))
-    }
-
-    /// Training return over seconds, of each run.
-    pub(super) fn training_curves(&self) -> anyhow::Result<Vec<Vec<(f64, f64)>>> {
-        let read =
-            |it: &SeedResult| Ok(Run::read(&it.ran.folder)?.values("seconds", "mean_return")?);
-        self.seeds.iter().map(read).collect()
     }
 }
 
