@@ -264,10 +264,8 @@ impl Session {
         Ok(())
     }
 
-    /// Writes the page of this template with these values and the runs that are `missing`, says where it is, and ends.
-    ///
-    /// # Errors
-    /// A run failed: the page is without it.
+    /// Writes the page of this template with these values and the runs that are `missing`, says where it is, and ends: with an error if
+    /// a run failed, which the page is then without.
     pub(crate) fn finish(self, template: &str, values: Value) -> anyhow::Result<()> {
         self.progress.clear();
         let time = time(self.seconds, self.at_once, self.kept_piece(CORES));
