@@ -1,10 +1,10 @@
 //! The command line of `driml experiment`.
 //! What a value means is for the experiment that takes it; the settings of its full or smoke length are chosen here.
 
-use std::path::PathBuf;
+use std::{collections::BTreeSet, path::PathBuf};
 
 use clap::{Args, Subcommand};
-use driml_machine::whole_number;
+use driml_machine::{error::Usage, whole_number};
 use serde::de::DeserializeOwned;
 
 /// The paper's experiments.
@@ -163,6 +163,18 @@ pub(crate) fn settings<T: DeserializeOwned>(name: &str, text: &str, smoke: bool)
     read().unwrap_or_else(|e| {
         panic!("the settings of {name} are built in, and a test reads them: {e}")
     })
+}
+
+/// What the names of a list stand for, each once: two runs of one name would be one.
+pub(crate) fn once(
+    names: &[String],
+    of: impl Fn(&str) -> Result<Vec<String>, Usage>,
+) -> Result<Vec<String>, Usage> {
+    let all = names.iter().map(|name| of(name));
+    let all = all.collect::<Result<Vec<_>, _>>()?.concat();
+    let mut seen = BTreeSet::new();
+    let new = |name: &String| seen.insert(name.clone());
+    Ok(all.into_iter().filter(new).collect())
 }
 
 /// The command that this process was called with, for a page: without where it writes, and without asking for a report alone.

@@ -5,7 +5,7 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{self, PacmanArgs},
+    flags::{self, PacmanArgs, once},
     sweep::plan::{Call, Planned, PlannedRun},
 };
 
@@ -140,9 +140,9 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
     let text = include_str!("../pacman.toml");
     let mut settings: Settings = flags::settings(NAME, text, args.flags.smoke);
     if !args.agents.is_empty() {
-        let known = args.agents.iter().map(|name| presets::agent(name));
-        let names = known.map(|agent| agent.map(|agent| agent.name.to_owned()));
-        settings.agents = names.collect::<Result<_, _>>()?;
+        settings.agents = once(&args.agents, |name| {
+            Ok(vec![presets::agent(name)?.name.to_owned()])
+        })?;
     }
     settings.seeds = args.flags.seeds.unwrap_or(settings.seeds);
     settings.jobs = args.queue.jobs.unwrap_or(settings.jobs);
@@ -160,4 +160,16 @@ pub(super) fn with_flags(args: &PacmanArgs) -> Result<Settings, Usage> {
         continual.episodes_per_task = episodes;
     }
     Ok(settings)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flags::tests::parsed;
+
+    #[test]
+    fn an_agent_that_is_named_twice_runs_once() {
+        let settings = with_flags(&parsed("--agents c51,curl,c51")).unwrap();
+        assert_eq!(settings.agents, ["c51", "curl"]);
+    }
 }

@@ -1,7 +1,5 @@
 //! What table 1 can be told, what the command line replaces of it, and the runs that follow.
 
-use std::collections::BTreeSet;
-
 use driml_envs::WorldName;
 use driml_launch::evaluate::Levels;
 use driml_machine::error::{Usage, usage};
@@ -9,7 +7,7 @@ use driml_settings::presets;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    flags::{self, ProcgenArgs},
+    flags::{self, ProcgenArgs, once},
     sweep::{
         plan::{Call, Planned, PlannedRun},
         results::Played,
@@ -143,18 +141,6 @@ fn agents(names: &[String]) -> Result<Vec<String>, Usage> {
             (_, (agent, Some(k))) => vec![format!("{}-k{k}", presets::agent(agent)?.name)],
         })
     })
-}
-
-/// What the names stand for, each once.
-fn once(
-    names: &[String],
-    of: impl Fn(&str) -> Result<Vec<String>, Usage>,
-) -> Result<Vec<String>, Usage> {
-    let all = names.iter().map(|name| of(name));
-    let all = all.collect::<Result<Vec<_>, _>>()?.concat();
-    let mut seen = BTreeSet::new();
-    let new = |name: &String| seen.insert(name.clone());
-    Ok(all.into_iter().filter(new).collect())
 }
 
 #[cfg(test)]
