@@ -22,7 +22,7 @@ use driml_settings::{config::RunConfig, presets};
 use minijinja::context;
 
 use self::{
-    menu::{Point, Settings},
+    menu::{LevelOf, Point, Settings},
     plan::{Budget, Cost},
     results::{Measured, PointResult, Results, SeedResult},
 };
@@ -131,26 +131,24 @@ impl Tradeoff<'_> {
 
     /// The bench of every level that is asked for and of its base; of the others, and for a report, what is there.
     fn measure_speeds(&mut self) -> anyhow::Result<()> {
-        let smoke = self.args.flags.smoke;
+        let (smoke, settings) = (self.args.flags.smoke, &self.settings);
         let (units, program) = (self.piece_units(), cache::program()?);
-        for of in &self.settings.levels {
-            for point in [&of.base, &of.point] {
-                if self.speeds.contains_key(&point.key) {
-                    continue;
-                }
-                let key = format!("speed-{}", point.key);
-                let speed = if self.args.queue.report || !of.is_asked {
-                    // Of whatever program made it: only what is asked for is made anew.
-                    self.session.kept_piece(&key)
-                } else {
-                    let common = &self.settings.common;
-                    let (base, config) = (common.config(&of.base)?, common.config(point)?);
-                    self.session.progress().again(units);
-                    let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
-                    Some(self.session.piece_of(&program, &key, units, measure)?)
-                };
-                self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
+        for point in settings.levels.iter().flat_map(LevelOf::points) {
+            if self.speeds.contains_key(&point.key) {
+                continue;
             }
+            let key = format!("speed-{}", point.key);
+            let speed = if self.args.queue.report || !settings.asks_for(point) {
+                // Of whatever program made it: only what is asked for is made anew.
+                self.session.kept_piece(&key)
+            } else {
+                let base = settings.common.config(settings.base_of(point))?;
+                let config = settings.common.config(point)?;
+                self.session.progress().again(units);
+                let measure = |_: &mut _| measured::speeds(&base, &config, smoke);
+                Some(self.session.piece_of(&program, &key, units, measure)?)
+            };
+            self.speeds.extend(speed.map(|it| (point.key.clone(), it)));
         }
         Ok(())
     }

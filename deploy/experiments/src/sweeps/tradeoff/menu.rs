@@ -110,6 +110,10 @@ pub(super) struct LevelOf {
 }
 
 impl LevelOf {
+    pub(super) const fn points(&self) -> [&Point; 2] {
+        [&self.base, &self.point]
+    }
+
     pub(super) fn name(&self) -> String {
         format!("{} = {}", self.dial.name, self.level)
     }
@@ -211,6 +215,18 @@ impl Settings {
             seeds: args.flags.seeds.unwrap_or(length.seeds),
             frames_open: frames.is_none() && !args.queue.report,
         })
+    }
+
+    /// Whether the call asks for this point, as a level or as the base of one.
+    pub(super) fn asks_for(&self, point: &Point) -> bool {
+        let mut asked = self.levels.iter().filter(|it| it.is_asked);
+        asked.any(|it| it.points().contains(&point))
+    }
+
+    /// The base beside which a point is timed, whichever dial asks for it: that of its level, or itself if it is none.
+    pub(super) fn base_of<'a>(&'a self, point: &'a Point) -> &'a Point {
+        let level = self.levels.iter().find(|it| it.point == *point);
+        level.map_or(point, |it| &it.base)
     }
 
     pub(super) const fn seeds_of(&self, is_base: bool) -> u32 {
@@ -341,6 +357,21 @@ coinrun|observation|input.height=64 input.width=64";
                 assert_eq!(configs[0], configs[1], "{line} in {world}");
             }
         }
+    }
+
+    #[test]
+    fn a_level_that_is_also_a_base_is_timed_beside_its_own() {
+        let settings = of("--env mspacman --dials model.embedding_dim", None).unwrap();
+        let asked: Vec<_> = settings.levels.iter().filter(|it| it.is_asked).collect();
+        let timed = |point: &Point| {
+            (
+                settings.base_of(point).key.clone(),
+                settings.asks_for(point),
+            )
+        };
+        assert_eq!(timed(&asked[0].base), ("c51".into(), true));
+        assert_eq!(timed(&asked[0].point), ("driml-fix".into(), true));
+        assert_eq!(timed(&settings.levels[0].base), ("c51".into(), false));
     }
 
     #[test]
