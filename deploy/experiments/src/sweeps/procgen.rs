@@ -57,6 +57,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
             greedy: mean(&greedy),
             random: mean(&random),
             is_above_random: is_above(&greedy, &random),
+            single: None,
             metrics: Run::read(&run.folder)?,
             point,
             plan,
@@ -65,8 +66,17 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     }
     write_data(&session, &scored)?;
     session.figure("curves", &figure(&settings, &scored)?)?;
-    let over_games = over_games(&mut session, &settings, &scored)?;
-    let values = values(&settings, &scored, &over_games);
+    if has_seeds(&settings, &scored) {
+        let play = settings.play(Levels::TrainSingle);
+        for it in &mut scored {
+            session.progress().again(play.units);
+            let key = format!("{}-single", it.plan.name);
+            let returns = play.greedy(&mut session, &key, &it.run)?;
+            let score = returns.and_then(|it| mean(&it));
+            it.single = score.and_then(|score| normalised(&it.point.game, score));
+        }
+    }
+    let values = values(&settings, &scored);
     session.finish(include_str!("procgen.md.j2"), values)
 }
 
@@ -87,6 +97,9 @@ struct Scored {
     /// Of a random policy in its world.
     random: Option<f64>,
     is_above_random: bool,
+    /// Normalised, of its agent, played greedily in single levels; none where there are no scores over all games.
+    #[serde(skip)]
+    single: Option<f64>,
 }
 
 fn is_above(greedy: &[f64], random: &[f64]) -> bool {
@@ -169,77 +182,48 @@ fn figure(settings: &Settings, scored: &[Scored]) -> anyhow::Result<Figure> {
     })
 }
 
-/// Scores over all games, where each game and agent has enough seeds for an interval.
-fn over_games(
-    session: &mut Session,
-    settings: &Settings,
-    scored: &[Scored],
-) -> anyhow::Result<Vec<String>> {
-    let games = games(scored);
-    let has_seeds = |game: &&str| {
+/// Whether each game and agent has enough seeds for an interval of scores over all games.
+fn has_seeds(settings: &Settings, scored: &[Scored]) -> bool {
+    games(scored).into_iter().all(|game| {
         let mut agents = settings.agents.iter();
         agents.all(|agent| of(scored, game, agent).count() >= SEEDS_MIN)
-    };
-    if !games.iter().all(has_seeds) {
-        return Ok(Vec::new());
-    }
-    let mut lines = Vec::new();
-    let play = settings.play(Levels::TrainSingle);
-    for agent in &settings.agents {
-        let mut scores = Scores::new();
-        for &game in &games {
-            let mut of_game = Vec::new();
-            for it in of(scored, game, agent) {
-                session.progress().again(play.units);
-                let key = format!("{}-single", it.plan.name);
-                let returns = play.greedy(session, &key, &it.run)?;
-                let returns = returns.and_then(|it| mean(&it));
-                of_game.extend(returns.and_then(|it| normalised(game, it)));
-            }
-            if of_game.len() >= SEEDS_MIN {
-                scores.push(of_game);
-            }
-        }
-        lines.extend(iqm(&scores).map(|it| {
-            format!(
-                "Interquartile mean of `{agent}` over {} games: {it:.3} (greedy, an episode a level, normalised as by Cobbe et al. 2020).",
-                scores.len()
-            )
-        }));
-    }
-    let scores = |agent: &str| -> Scores {
-        let trained = |&game: &&str| {
-            of(scored, game, agent)
-                .filter_map(|it| it.training)
-                .collect()
-        };
-        games.iter().map(trained).collect()
-    };
-    if let [first, others @ ..] = &settings.agents[..] {
-        for agent in others {
-            lines.extend(improvement(&scores(agent), &scores(first)).map(|it| {
-                format!("Probability that `{agent}` trains better than `{first}`: {it:.3}.")
-            }));
-        }
-    }
-    Ok(lines)
+    })
 }
 
 /// What the page says.
-fn values(settings: &Settings, scored: &[Scored], over_games: &[String]) -> Value {
-    let games = games(scored).into_iter().map(|name| {
-        let agents = settings.agents.iter();
-        context! { name, paper => agents.map(|agent| paper(name, agent)).collect::<Vec<_>>() }
+fn values(settings: &Settings, scored: &[Scored]) -> Value {
+    let (agents, games) = (&settings.agents, games(scored));
+    let scores = |agent: &String, score: fn(&Scored) -> Option<f64>| -> Scores {
+        let of_game = |game: &&str| of(scored, game, agent).filter_map(score).collect();
+        games.iter().map(of_game).collect()
+    };
+    let iqms = agents.iter().filter_map(|agent| {
+        let mut scores = scores(agent, |it| it.single);
+        scores.retain(|of_game| of_game.len() >= SEEDS_MIN);
+        let score = format!("{:.3}", iqm(&scores)?);
+        Some(context! { agent, games => scores.len(), score })
+    });
+    let others = agents.iter().skip(1);
+    let others = others.filter(|_| has_seeds(settings, scored));
+    let improvements = others.filter_map(|agent| {
+        let [own, first] = [agent, &agents[0]].map(|agent| scores(agent, |it| it.training));
+        let chance = format!("{:.3}", improvement(&own, &first)?);
+        Some(context! { agent, chance })
+    });
+    let games = games.iter().map(|name| {
+        let paper = agents.iter().map(|agent| paper(name, agent));
+        context! { name, paper => paper.collect::<Vec<_>>() }
     });
     context! {
         settings,
-        agents => settings.agents,
+        agents,
         seeds => settings.seeds,
         runs => scored,
         games => games.collect::<Vec<_>>(),
+        iqms => iqms.collect::<Vec<_>>(),
+        improvements => improvements.collect::<Vec<_>>(),
         percent => percent(settings.frames as f64 / PAPER_FRAMES),
         errors => ERRORS,
-        over_games,
         returns_of => RETURNS_OF,
         episodes => CHECKPOINTS * settings.episodes,
         some_seeds => scored.iter().any(|it| it.plan.call.seed > 1),
