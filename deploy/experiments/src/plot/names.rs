@@ -1,11 +1,9 @@
 //! What a line is called: world and agent, the settings in which it differs from others of these, and its seeds.
 //! It groups nothing.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-use toml::{Table, Value};
-
-use super::runs::Run;
+use super::runs::{Run, Settings};
 
 /// Settings that a name tells at most; of more it tells how many.
 const TOLD_MAX: usize = 3;
@@ -18,10 +16,9 @@ pub(super) fn of(groups: &[Vec<&Run>]) -> Vec<String> {
         };
         let peers = groups.iter().map(|other| other[0]);
         let peers = peers.filter(|other| other.what.as_ref() == Some(what));
-        let peers = peers.filter_map(|other| other.settings.as_ref());
-        let peers: Vec<_> = peers.map(settings).collect();
+        let peers: Vec<_> = peers.filter_map(|other| other.settings.as_ref()).collect();
         let mut parts = vec![what.clone()];
-        parts.extend(differences(&settings(own), &peers));
+        parts.extend(differences(own, &peers));
         parts.push(seeds(runs));
         parts.join(", ")
     };
@@ -46,24 +43,9 @@ fn seeds(runs: &[&Run]) -> String {
     }
 }
 
-/// Every setting with its whole name.
-fn settings(table: &Table) -> BTreeMap<String, String> {
-    let mut all = BTreeMap::new();
-    for (key, value) in table {
-        if let Value::Table(inner) = value {
-            let inner = settings(inner).into_iter();
-            all.extend(inner.map(|(name, text)| (format!("{key}.{name}"), text)));
-        } else {
-            let text = value.as_str().map(str::to_owned);
-            all.insert(key.clone(), text.unwrap_or_else(|| value.to_string()));
-        }
-    }
-    all
-}
-
 /// The settings of `own` that are not the same in all of `peers`, which contain it, each as `name=value`.
-fn differences(own: &BTreeMap<String, String>, peers: &[BTreeMap<String, String>]) -> Vec<String> {
-    let keys = peers.iter().flat_map(BTreeMap::keys);
+fn differences(own: &Settings, peers: &[&Settings]) -> Vec<String> {
+    let keys = peers.iter().flat_map(|peer| peer.keys());
     let differs = |key: &&String| peers.iter().any(|peer| peer.get(*key) != own.get(*key));
     let keys: BTreeSet<&String> = keys.filter(differs).collect();
     let setting = |key: &&String| {
@@ -101,6 +83,7 @@ fn short<'a>(key: &'a str, keys: &BTreeSet<&String>) -> &'a str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plot::runs::flat;
 
     #[test]
     fn what_differs_is_told_by_its_shortest_name() {
@@ -117,8 +100,8 @@ mod tests {
             (deep, wide, "torso=impala, height=64, conv=unset"),
             (many, "", "a=1, b=1, c=1, and 2 more settings"),
         ] {
-            let [own, other] = [own, other].map(|text| settings(&text.parse().unwrap()));
-            let found = differences(&own, &[other, own.clone()]);
+            let [own, other] = [own, other].map(|text| flat(&text.parse().unwrap()));
+            let found = differences(&own, &[&other, &own]);
             assert_eq!(found.join(", "), expected);
         }
     }

@@ -1,7 +1,10 @@
 //! A run's folder as a plot needs it: the columns of `metrics.csv`, and the settings without the seed.
 //! It judges no value.
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use anyhow::Context;
 use driml_launch::run_folder::{RunFolder, Table};
@@ -15,6 +18,9 @@ const TOTAL_LOSS: &str = "total_loss";
 /// Columns of `metrics.csv` that hold words.
 const WORDS: [&str; 1] = ["waiting"];
 
+/// Settings as text, by their whole names.
+pub(crate) type Settings = BTreeMap<String, String>;
+
 /// The metrics of one run, and its settings.
 #[derive(Debug)]
 pub(crate) struct Run {
@@ -25,7 +31,7 @@ pub(crate) struct Run {
     pub(super) what: Option<String>,
     pub(super) seed: Option<i64>,
     /// The settings without seed and without what the machine decides; none if there are none.
-    pub(crate) settings: Option<toml::Table>,
+    pub(crate) settings: Option<Settings>,
     columns: Table,
     /// What its checkpoints earned when they were played; it has columns of `frames`, `updates` and `seconds` too.
     evaluations: Table,
@@ -45,12 +51,12 @@ impl Run {
             .into());
         }
         let (settings, seed) = settings(&folder.config()).unzip();
-        let run = settings.as_ref().and_then(|table| table.get("run"));
-        let word = |key: &str| run.and_then(|run| run.get(key)?.as_str());
-        let what = word("world").zip(word("agent"));
+        let word = |name: &str| settings.as_ref()?.get(name);
+        let what = word("run.world").zip(word("run.agent"));
+        let what = what.map(|(world, agent)| format!("{world} {agent}"));
         Ok(Self {
             name: folder_name(folder.path()),
-            what: what.map(|(world, agent)| format!("{world} {agent}")),
+            what,
             settings,
             seed: seed.flatten(),
             folder: folder.clone(),
@@ -140,25 +146,39 @@ pub(super) fn folder_name(folder: &Path) -> String {
 
 /// Settings without the seed and without what differs between machines alone, and the seed. A run without settings stands
 /// for itself.
-fn settings(path: &Path) -> Option<(toml::Table, Option<i64>)> {
-    let mut table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
+fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
+    let table: toml::Table = std::fs::read_to_string(path).ok()?.parse().ok()?;
+    table.get("run")?.as_table()?;
+    let mut all = flat(&table);
+    let seed = all.remove("run.seed").and_then(|seed| seed.parse().ok());
     // The machine decides most of how a run is launched, but what is learned depends on how many actors there are.
-    let local = table.remove("local");
-    let actors = local.and_then(|local| local.get("actors").cloned());
-    table.extend(actors.map(|actors| ("actors".to_owned(), actors)));
-    table.remove("transport");
-    let seed = table.get_mut("run")?.as_table_mut()?.remove("seed");
+    let actors = all.remove("local.actors");
+    all.retain(|name, _| !name.starts_with("local.") && !name.starts_with("transport."));
+    all.extend(actors.map(|actors| ("actors".to_owned(), actors)));
     // How often it is saved and played changes nothing that is learned.
-    for (part, key) in [
-        ("learner", "checkpoint_period_updates"),
-        ("learner", "checkpoints_kept"),
-        ("actor", "world_threads"),
-        ("replay", "capacity_transitions"),
-        ("replay", "compressed_bytes_max"),
+    for name in [
+        "learner.checkpoint_period_updates",
+        "learner.checkpoints_kept",
+        "actor.world_threads",
+        "replay.capacity_transitions",
+        "replay.compressed_bytes_max",
     ] {
-        if let Some(part) = table.get_mut(part).and_then(toml::Value::as_table_mut) {
-            part.remove(key);
+        all.remove(name);
+    }
+    Some((all, seed))
+}
+
+/// Every setting of a table.
+pub(super) fn flat(table: &toml::Table) -> Settings {
+    let mut all = Settings::new();
+    for (key, value) in table {
+        if let toml::Value::Table(inner) = value {
+            let inner = flat(inner).into_iter();
+            all.extend(inner.map(|(name, text)| (format!("{key}.{name}"), text)));
+        } else {
+            let text = value.as_str().map(str::to_owned);
+            all.insert(key.clone(), text.unwrap_or_else(|| value.to_string()));
         }
     }
-    Some((table, seed.and_then(|seed| seed.as_integer())))
+    all
 }

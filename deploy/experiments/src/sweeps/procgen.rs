@@ -133,8 +133,7 @@ fn write_data(session: &Session, scored: &[Scored]) -> anyhow::Result<()> {
         let settings = settings
             .with_context(|| format!("{} cannot be read", it.run.folder.config().display()))?;
         // Runs without a choice have the torso of Nature's DQN.
-        let torso = settings.get("model").and_then(|model| model.get("torso"));
-        let torso = torso.and_then(toml::Value::as_str).unwrap_or("nature");
+        let torso = settings.get("model.torso").map_or("nature", String::as_str);
         rows.push((
             (&point.game, &point.agent, torso),
             (it.plan.call.seed, summary.frames),
