@@ -176,36 +176,36 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     letters.take(NAME_LETTERS).collect()
 }
 
-/// What came out, a row a cell; the point of a run is its cell's number.
+/// What came out, a row a cell, with empty cells where there is no number; the point of a run is its cell's number.
 fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point == at);
         let runs: Vec<_> = here.map(|it| &it.run.summary).collect();
         let returns: Vec<f64> = runs.iter().filter_map(|it| it.mean_return).collect();
-        let (found, returns) = (interval(&returns), Spread::of(returns));
-        let ends = found.and_then(|it| it.ends).unzip();
+        let (low, high) = interval(&returns).and_then(|it| it.ends).unzip();
+        let returns = Spread::of(returns);
         let speed = Spread::of(runs.iter().map(|it| it.updates_per_second));
         let minutes = Spread::of(runs.iter().map(|it| it.wall_seconds / 60.0));
-        let mut row: Vec<_> = cell.iter().map(|it| it.1.clone()).collect();
-        row.push(runs.len().to_string());
-        row.extend([
-            number(returns.map(|it| it.mean), 3),
-            number(returns.filter(|it| it.count > 1).map(|it| it.sd), 3),
-            number(ends.0, 3),
-            number(ends.1, 3),
-            number(returns.map(|it| it.min), 3),
-            number(returns.map(|it| it.max), 3),
-            number(speed.map(|it| it.mean), 2),
-            number(minutes.map(|it| it.mean), 1),
-        ]);
-        row
+        let numbers = [
+            (returns.map(|it| it.mean), 3),
+            (returns.filter(|it| it.count > 1).map(|it| it.sd), 3),
+            (low, 3),
+            (high, 3),
+            (returns.map(|it| it.min), 3),
+            (returns.map(|it| it.max), 3),
+            (speed.map(|it| it.mean), 2),
+            (minutes.map(|it| it.mean), 1),
+        ];
+        let numbers = numbers.map(|(number, decimals)| {
+            number.map_or(String::new(), |it| format!("{it:.decimals$}"))
+        });
+        let values = cell.iter().map(|it| it.1.clone());
+        values
+            .chain([runs.len().to_string()])
+            .chain(numbers)
+            .collect()
     };
     cells.iter().enumerate().map(row).collect()
-}
-
-/// The cell of a number; empty where there is none.
-fn number(value: Option<f64>, decimals: usize) -> String {
-    value.map_or(String::new(), |value| format!("{value:.decimals$}"))
 }
 
 #[cfg(test)]

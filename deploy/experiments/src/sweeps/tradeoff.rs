@@ -166,12 +166,10 @@ impl Tradeoff<'_> {
         };
         let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
         for (of, is_chosen) in levels.iter().zip(&mut chosen).filter(|it| it.0.is_asked) {
-            let costs = [
-                self.cost(&runs, &of.base, &of.base)?,
-                self.cost(&runs, &of.point, &of.base)?,
-            ];
-            let seconds = costs[1].seconds;
+            let [base, level] = of.points().map(|it| self.cost(&runs, it, &of.base));
+            let costs = [base?, level?];
             *is_chosen = budget.takes(&costs);
+            let [_, Cost { seconds, .. }] = costs;
             asked.push(context! { name => of.name(), seconds, fits => *is_chosen });
         }
         let values = context! {
