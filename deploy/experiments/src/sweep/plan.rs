@@ -96,4 +96,3 @@ pub(crate) struct Made<P> {
     pub(crate) plan: PlannedRun,
     pub(crate) run: FinishedRun,
 }
-
