@@ -283,7 +283,7 @@ impl Tradeoff<'_> {
         for (of, is_chosen) in self.settings.levels.iter().zip(chosen) {
             if is_made(&of.point) && is_made(&of.base) && (!report_only || of.is_asked) {
                 levels.push(of.clone());
-            } else if !is_chosen {
+            } else if of.is_asked && !is_chosen {
                 left_out.push(of.name());
             }
         }

@@ -35,7 +35,7 @@ pub(super) struct Results {
     /// By the point's key.
     pub(super) points: BTreeMap<String, PointResult>,
     pub(super) random: Vec<f64>,
-    /// Levels that have no run.
+    /// Levels that are asked for and have no run.
     pub(super) left_out: Vec<String>,
     /// The calls that made it.
     pub(super) commands: Vec<String>,
