@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, fs, path::Path, time::Duration};
 
 use driml_protocol::tls::{self, Credentials, Role};
 
-use super::fact::Fact;
+use super::fact::{Fact, Found, State};
 
 /// A certificate that expires sooner is a note.
 const EXPIRES_SOON: Duration = Duration::from_secs(30 * 24 * 3600);
@@ -18,7 +18,7 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         Ok(entries) => entries,
         Err(e) => {
             let text = format!("{dir} cannot be read ({e}): `deploy/certs.sh {dir}` makes them");
-            return vec![Fact::missing("tls folder", text)];
+            return vec![Fact::new("tls folder", (State::Missing, text))];
         }
     };
     // By the certificate or the key alone, too: then the other one is missing.
@@ -30,17 +30,17 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
         name.to_str().map(str::to_owned)
     };
     let names: BTreeSet<_> = entries.flatten().filter_map(name).collect();
-    let mut facts = Vec::new();
-    let mut roles = Vec::new();
+    let (mut facts, mut roles) = (Vec::new(), Vec::new());
+    let mut note = |what: &str, found: Found| facts.push(Fact::new(what, found));
     for name in &names {
         match name.parse::<Role>() {
             Ok(role) => roles.push(role),
-            Err(e) => facts.push(Fact::note("tls other", format!("{dir}/{name}.*: {e}"))),
+            Err(e) => note("tls other", (State::Note, format!("{dir}/{name}.*: {e}"))),
         }
     }
     if roles.is_empty() {
         let text = format!("{dir} has none: `deploy/certs.sh {dir}` makes them");
-        facts.push(Fact::missing("tls folder", text));
+        note("tls folder", (State::Missing, text));
     }
     roles.sort_by_key(|role| match role {
         Role::ReplayServer => (0, 0),
@@ -52,21 +52,31 @@ pub(super) fn facts(folder: &Path) -> Vec<Fact> {
     for role in roles {
         let what = format!("tls {role}");
         match Credentials::examine(folder, role) {
-            Err(e) => facts.push(Fact::missing(&what, e.to_string())),
+            Err(e) => note(&what, (State::Missing, e.to_string())),
             Ok(it) => match (complaint(&it), role) {
-                (Some(text), _) => facts.push(Fact::note(&what, text)),
+                (Some(text), _) => note(&what, (State::Note, text)),
                 (None, Role::Actor(number)) => actors.push((number, it)),
                 (None, Role::ReplayServer) => {
                     let (until, names) = (good_until(&it), it.hosts.join(", "));
                     let text = format!("{until}, for {names}: connect to one of these names");
-                    facts.push(Fact::ok(&what, text));
+                    note(&what, (State::Ok, text));
                 }
-                (None, _) => facts.push(Fact::ok(&what, good_until(&it))),
+                (None, _) => note(&what, (State::Ok, good_until(&it))),
             },
         }
     }
-    facts.extend(all_well(&actors));
-    facts.extend(authority(folder));
+    if let Some(text) = all_well(&actors) {
+        note("tls actors", (State::Ok, text));
+    }
+    // Its certificate is checked with each process's.
+    let key = tls::authority_path(folder).with_extension("key");
+    if key.exists() {
+        let text = format!(
+            "{} is here, with which any certificate can be made: leave it on the machine on which it was made, and copy it to no other",
+            key.display()
+        );
+        note("tls authority", (State::Note, text));
+    }
     facts
 }
 
@@ -100,25 +110,12 @@ fn good_until(credentials: &Credentials) -> String {
 }
 
 /// The actors of which nothing is to be said each.
-fn all_well(actors: &[(u32, Credentials)]) -> Option<Fact> {
+fn all_well(actors: &[(u32, Credentials)]) -> Option<String> {
     let (first, last) = (actors.first()?.0, actors.last()?.0);
     let (_, soonest) = actors.iter().min_by_key(|(_, it)| it.expires_in())?;
     let until = good_until(soonest);
-    let text = match actors.len() {
+    Some(match actors.len() {
         1 => format!("{first}: {until}"),
         count => format!("{count} of them, from {first} to {last}: {until}"),
-    };
-    Some(Fact::ok("tls actors", text))
-}
-
-/// What is to be said of the authority: its certificate is checked with each process's.
-fn authority(folder: &Path) -> Option<Fact> {
-    let key = tls::authority_path(folder).with_extension("key");
-    key.exists().then(|| {
-        let text = format!(
-            "{} is here, with which any certificate can be made: leave it on the machine on which it was made, and copy it to no other",
-            key.display()
-        );
-        Fact::note("tls authority", text)
     })
 }

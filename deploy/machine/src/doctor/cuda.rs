@@ -4,7 +4,6 @@
 use super::fact::{Fact, State};
 use crate::error::{Usage, usage};
 
-const DEVICES: &str = "cuda";
 #[cfg(not(feature = "cuda"))]
 const TO_BUILD: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
      that has it, without a toolkit `deploy/cuda/build.sh`";
@@ -14,17 +13,12 @@ pub(super) fn facts() -> Vec<Fact> {
     match count() {
         Ok(count) => (0..count)
             .map(|ordinal| match describe(ordinal) {
-                Ok(text) => Fact::ok(&name(ordinal), text),
-                Err(why) => Fact::missing(&name(ordinal), why),
+                Ok(text) => Fact::new(name(ordinal), (State::Ok, text)),
+                Err(why) => Fact::new(name(ordinal), (State::Missing, why)),
             })
             .collect(),
-        Err(why) => vec![Fact::note(DEVICES, why)],
+        Err(why) => vec![Fact::new("cuda", (State::Note, why))],
     }
-}
-
-/// Whether `--device cuda` has something to compute on.
-pub(super) fn is_ready(facts: &[Fact]) -> bool {
-    facts.iter().any(|fact| fact.state == State::Ok)
 }
 
 /// Makes sure that there is a device with this number, and that this program was built for it; else says what to do.
@@ -35,10 +29,8 @@ pub(crate) fn check(ordinal: usize) -> Result<(), Usage> {
             "the driver finds {count} device(s), counted from cuda:0"
         )),
     });
-    match described {
-        Ok(_) => Ok(()),
-        Err(why) => Err(usage!("{} cannot be used: {why}", name(ordinal))),
-    }
+    let checked = described.map(drop);
+    checked.map_err(|why| usage!("{} cannot be used: {why}", name(ordinal)))
 }
 
 fn name(ordinal: usize) -> String {
@@ -129,8 +121,6 @@ mod tests {
         let said = check(0).unwrap_err().to_string();
         assert!(said.starts_with("cuda:0 cannot be used: this program"));
         assert!(said.contains("--features cuda"), "{said}");
-        let facts = facts();
-        assert_eq!(facts[0].state, State::Note);
-        assert!(!is_ready(&facts));
+        assert_eq!(facts()[0].state, State::Note);
     }
 }

@@ -3,42 +3,39 @@
 
 use procgen_sys::{Engine, ProcgenError};
 
-use super::fact::Fact;
-
-const WHAT: &str = "Procgen";
+use super::fact::{Found, State};
 
 /// Whether Procgen's engine is in the cache folder and loads.
-pub(super) fn fact() -> Fact {
+pub(super) fn found() -> Found {
     match Engine::locate() {
         Ok(engine) => {
             let library = engine.library().display();
             match engine.check_loads() {
-                Ok(()) => Fact::ok(WHAT, format!("the engine is {library} and loads")),
-                Err(why) => Fact::missing(WHAT, why.to_string()),
+                Ok(()) => (State::Ok, format!("the engine is {library} and loads")),
+                Err(why) => (State::Missing, why.to_string()),
             }
         }
         Err(ProcgenError::Missing { reason, .. }) => not_there(&reason, Engine::source()),
-        Err(why) => Fact::missing(WHAT, why.to_string()),
+        Err(why) => (State::Missing, why.to_string()),
     }
 }
 
-/// The fact where the engine is not there; `source` is where it would come from.
-fn not_there(reason: &str, source: Result<String, ProcgenError>) -> Fact {
+/// What is so where the engine is not there; `source` is where it would come from.
+fn not_there(reason: &str, source: Result<String, ProcgenError>) -> Found {
     match source {
-        Ok(source) => Fact::note(
-            WHAT,
-            format!(
+        Ok(source) => {
+            let text = format!(
                 "the engine: {reason}; `driml procgen install` gets it from {source}, and so does the first run that needs it"
-            ),
-        ),
-        Err(why) => Fact::missing(WHAT, why.to_string()),
+            );
+            (State::Note, text)
+        }
+        Err(why) => (State::Missing, why.to_string()),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::fact::State;
 
     #[test]
     fn an_engine_that_can_be_fetched_is_a_note_and_one_that_cannot_is_missing() {
@@ -47,8 +44,8 @@ mod tests {
             (Ok("`pip`".into()), State::Note, "`driml procgen install`"),
             (Err(no_pip), State::Missing, "python3-pip"),
         ] {
-            let fact = not_there("it is not installed", source);
-            assert!(fact.state == state && fact.text.contains(text), "{fact}");
+            let found = not_there("it is not installed", source);
+            assert!(found.0 == state && found.1.contains(text), "{found:?}");
         }
     }
 }

@@ -16,45 +16,31 @@ pub(super) enum State {
     Missing,
 }
 
+/// How something is, and what is so, with what to do if that should change.
+pub(super) type Found = (State, String);
+
 /// What was found out about one thing that a run needs.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Debug, Serialize)]
 pub(super) struct Fact {
     pub(super) state: State,
     /// What it is about, such as `cores`.
     pub(super) what: String,
-    /// What is so, and what to do if that should change.
-    pub(super) text: String,
+    text: String,
 }
 
 impl Fact {
-    pub(super) fn ok(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Ok, what, text)
-    }
-
-    pub(super) fn note(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Note, what, text)
-    }
-
-    pub(super) fn missing(what: &str, text: impl Into<String>) -> Self {
-        Self::new(State::Missing, what, text)
-    }
-
-    pub(super) fn new(state: State, what: &str, text: impl Into<String>) -> Self {
+    pub(super) fn new(what: impl Into<String>, (state, text): Found) -> Self {
         Self {
             state,
             what: what.into(),
-            text: text.into(),
+            text,
         }
     }
 }
 
 impl fmt::Display for Fact {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let state = match self.state {
-            State::Ok => "ok",
-            State::Note => "note",
-            State::Missing => "missing",
-        };
+        let state = format!("{:?}", self.state).to_lowercase();
         // One line a fact, whatever an error's text has.
         let text = self.text.split_whitespace().collect::<Vec<_>>().join(" ");
         write!(f, "{state:<8} {:<17} {text}", self.what)

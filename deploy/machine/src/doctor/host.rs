@@ -7,7 +7,7 @@ use driml_model::{Precision, describe_kernels};
 use driml_protocol::shared_memory::{self, lockable_bytes};
 use nix::sys::statvfs::statvfs;
 
-use super::fact::{Fact, State};
+use super::fact::{Fact, Found, State};
 use crate::{
     resources::{LEARNER_BYTES, Machine},
     units::gib,
@@ -28,23 +28,27 @@ const FRAME_BYTES: u64 = 64 * 64 * 3;
 /// All of them. `runs` is where run folders would be.
 pub(super) fn facts(runs: &Path) -> Vec<Fact> {
     let machine = Machine::this();
-    vec![
-        cores(&machine),
-        vectors(floats_at_once()),
-        kernels(),
-        memory(&machine),
-        shared_memory(shared_memory::free_bytes()),
-        locked_memory(lockable_bytes()),
-        disk(runs),
+    let [f32, bf16] = Precision::ALL.map(describe_kernels);
+    let kernels = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
+    [
+        ("cores", cores(&machine)),
+        ("vectors", vectors(floats_at_once())),
+        ("kernels", (State::Ok, kernels)),
+        ("memory", memory(&machine)),
+        ("shared memory", shared_memory(shared_memory::free_bytes())),
+        ("locked memory", locked_memory(lockable_bytes())),
+        ("disk", disk(runs)),
     ]
+    .map(|(what, found)| Fact::new(what, found))
+    .into()
 }
 
-fn cores(machine: &Machine) -> Fact {
+fn cores(machine: &Machine) -> Found {
     let (cores, actors) = (machine.cores, machine.actors());
     let text = format!("{cores}, all of them for the learner; --actors is {actors} unless given");
     match cores {
-        0 | 1 => Fact::note("cores", format!("{text}; all processes share it")),
-        _ => Fact::ok("cores", text),
+        0 | 1 => (State::Note, format!("{text}; all processes share it")),
+        _ => (State::Ok, text),
     }
 }
 
@@ -64,31 +68,26 @@ fn floats_at_once() -> Option<u32> {
     None
 }
 
-fn vectors(at_once: Option<u32>) -> Fact {
-    let what = "vectors";
+fn vectors(at_once: Option<u32>) -> Found {
     match at_once {
         None => {
             let arch = std::env::consts::ARCH;
             let text = format!("not x86-64 but {arch}: it was never measured there");
-            Fact::note(what, text)
+            (State::Note, text)
         }
-        Some(16) => Fact::ok(what, "AVX-512: 16 float32 at once"),
-        Some(8) => Fact::ok(what, "AVX2 and FMA: 8 float32 at once; there is no AVX-512"),
-        Some(_) => Fact::note(
-            what,
-            "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?",
+        Some(16) => (State::Ok, "AVX-512: 16 float32 at once".into()),
+        Some(8) => (
+            State::Ok,
+            "AVX2 and FMA: 8 float32 at once; there is no AVX-512".into(),
+        ),
+        Some(_) => (
+            State::Note,
+            "no AVX2 with FMA: matrix products are many times slower; does a virtual machine hide them?".into(),
         ),
     }
 }
 
-/// What the network's products run on, in either precision.
-fn kernels() -> Fact {
-    let [f32, bf16] = Precision::ALL.map(describe_kernels);
-    let text = format!("precision \"f32\": {f32}; \"bf16\": {bf16}");
-    Fact::ok("kernels", text)
-}
-
-fn memory(machine: &Machine) -> Fact {
+fn memory(machine: &Machine) -> Found {
     let (free, replay) = (machine.memory_bytes, machine.replay_bytes(LEARNER_BYTES));
     let text = format!(
         "{} free; a replay sized by the machine takes {}, {:.2} million of Procgen's frames",
@@ -96,25 +95,27 @@ fn memory(machine: &Machine) -> Fact {
         gib(replay),
         (replay / FRAME_BYTES) as f64 / 1e6
     );
-    let (state, more) = match free {
+    match free {
         ..MEMORY_MIN => {
-            let least = format!(": a run needs {} at least", gib(MEMORY_MIN));
-            (State::Missing, least)
+            let least = gib(MEMORY_MIN);
+            (
+                State::Missing,
+                format!("{text}: a run needs {least} at least"),
+            )
         }
-        MEMORY_MIN..MEMORY_ENOUGH => {
-            let packed = "; --set replay.compression=lz4 makes more fit";
-            (State::Note, packed.to_owned())
-        }
-        _ => (State::Ok, String::new()),
-    };
-    Fact::new(state, "memory", text + &more)
+        MEMORY_MIN..MEMORY_ENOUGH => (
+            State::Note,
+            text + "; --set replay.compression=lz4 makes more fit",
+        ),
+        _ => (State::Ok, text),
+    }
 }
 
-fn shared_memory(free: Result<u64, String>) -> Fact {
-    let (what, folder) = ("shared memory", shared_memory::FOLDER);
+fn shared_memory(free: Result<u64, String>) -> Found {
+    let folder = shared_memory::FOLDER;
     let why = match free {
         Ok(free) if free >= SHARED_MEMORY_ENOUGH => {
-            return Fact::ok(what, format!("{} free in {folder}", gib(free)));
+            return (State::Ok, format!("{} free in {folder}", gib(free)));
         }
         Ok(free) => format!(
             "{} MiB free in {folder}, a run takes up to {}: sockets serve instead, several times slower; a container needs --shm-size=1g",
@@ -123,51 +124,47 @@ fn shared_memory(free: Result<u64, String>) -> Fact {
         ),
         Err(why) => format!("{why}: sockets serve instead, several times slower"),
     };
-    Fact::note(what, why)
+    (State::Note, why)
 }
 
 /// `limit` is how many bytes of shared memory a process may lock, as it has to; none if there is no limit.
-fn locked_memory(limit: Option<u64>) -> Fact {
-    let what = "locked memory";
+fn locked_memory(limit: Option<u64>) -> Found {
     match limit {
-        None => Fact::ok(what, "no limit (`ulimit -l`)"),
+        None => (State::Ok, "no limit (`ulimit -l`)".into()),
         Some(limit) if limit >= SHARED_MEMORY_ENOUGH => {
-            Fact::ok(what, format!("{} MiB (`ulimit -l`)", limit >> 20))
+            (State::Ok, format!("{} MiB (`ulimit -l`)", limit >> 20))
         }
-        Some(limit) => Fact::note(
-            what,
-            format!(
+        Some(limit) => {
+            let text = format!(
                 "`ulimit -l` allows {} KiB, a run with one actor locks up to {} MiB of shared memory: sockets serve instead, several times slower; to raise it, add \
                  \"USER - memlock unlimited\" to /etc/security/limits.conf and log in again; a service needs LimitMEMLOCK=infinity, a \
                  container --ulimit memlock=-1",
                 limit >> 10,
                 SHARED_MEMORY_ENOUGH >> 20
-            ),
-        ),
+            );
+            (State::Note, text)
+        }
     }
 }
 
-fn disk(runs: &Path) -> Fact {
+fn disk(runs: &Path) -> Found {
     let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
     let there = runs.ancestors().find(|it| it.is_dir()).unwrap_or(&runs);
+    let elsewhere = "; --run-dir puts a run elsewhere";
+    let folder = there.display();
     match (free(there), tempfile::tempfile_in(there)) {
         (Ok(free), Ok(_)) => {
-            let text = format!("{} free in {}", gib(free), there.display());
-            let more = "; --run-dir puts a run elsewhere";
-            let state = match free {
-                0..DISK_MIN => State::Missing,
-                DISK_MIN..DISK_ENOUGH => State::Note,
-                _ => return Fact::ok("disk", text),
-            };
-            Fact::new(state, "disk", text + more)
+            let text = format!("{} free in {folder}", gib(free));
+            match free {
+                0..DISK_MIN => (State::Missing, text + elsewhere),
+                DISK_MIN..DISK_ENOUGH => (State::Note, text + elsewhere),
+                _ => (State::Ok, text),
+            }
         }
-        (Err(why), _) => Fact::missing("disk", why),
-        (_, Err(why)) => Fact::missing(
-            "disk",
-            format!(
-                "{} cannot be written to: {why}; --run-dir puts a run elsewhere",
-                there.display()
-            ),
+        (Err(why), _) => (State::Missing, why),
+        (_, Err(why)) => (
+            State::Missing,
+            format!("{folder} cannot be written to: {why}{elsewhere}"),
         ),
     }
 }
@@ -188,7 +185,7 @@ mod tests {
             memory_bytes,
             fast_bf16: false,
         };
-        for (fact, state) in [
+        for (found, state) in [
             (vectors(Some(16)), State::Ok),
             (vectors(Some(8)), State::Ok),
             (vectors(Some(1)), State::Note),
@@ -207,9 +204,9 @@ mod tests {
             (cores(&machine(1, 0)), State::Note),
             (cores(&machine(2, 0)), State::Ok),
         ] {
-            assert_eq!(fact.state, state, "{fact}");
+            assert_eq!(found.0, state, "{found:?}");
         }
-        let locked = locked_memory(Some(8 << 20)).text;
+        let (_, locked) = locked_memory(Some(8 << 20));
         assert!(locked.contains("`ulimit -l` allows 8192 KiB"), "{locked}");
         assert!(locked.contains(" locks up to 256 MiB"), "{locked}");
     }
@@ -217,9 +214,8 @@ mod tests {
     #[test]
     fn a_folder_that_is_not_there_yet_is_judged_by_the_one_above() {
         let folder = tempfile::tempdir().unwrap();
-        let fact = disk(&folder.path().join("runs/one"));
+        let (_, text) = disk(&folder.path().join("runs/one"));
         let there = folder.path().display().to_string();
-        assert!(fact.text.contains(&there), "{fact}");
-        assert!(!fact.text.contains("runs"), "{fact}");
+        assert!(text.contains(&there) && !text.contains("runs"), "{text}");
     }
 }

@@ -24,30 +24,42 @@ pub struct Report {
 /// Looks at this machine; runs would go to `run_dir`, with the certificates in `tls_dir`, if any.
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
-    cpu.push(engine::fact());
-    let cuda = cuda::facts();
-    let certificates = tls_dir.map_or_else(Vec::new, certificates::facts);
+    cpu.push(Fact::new("Procgen", engine::found()));
     Report {
         cpu,
-        cuda,
-        certificates,
+        cuda: cuda::facts(),
+        certificates: tls_dir.map_or_else(Vec::new, certificates::facts),
     }
 }
 
 impl Report {
     /// A line a fact, and what can be trained on.
     pub fn describe(&self) -> String {
-        describe(&self.all(), verdict(&self.cpu, &self.cuda))
+        let lines = self.all().map(|fact| format!("{fact}\n"));
+        let lines: String = lines.collect();
+        let lacks_nothing = self.cpu.iter().all(|fact| fact.state != State::Missing);
+        let verdict = match (lacks_nothing, self.is_ready_for_cuda()) {
+            (true, true) => "This machine can train on the CPU and with --device cuda.",
+            (true, false) => "This machine can train on the CPU, not with --device cuda.",
+            (false, _) => "This machine cannot train yet.",
+        };
+        format!("{lines}\n{verdict}\n")
     }
 
     /// The facts as JSON.
     pub fn json(&self) -> anyhow::Result<String> {
-        Ok(serde_json::to_string_pretty(&self.all())? + "\n")
+        let all: Vec<_> = self.all().collect();
+        Ok(serde_json::to_string_pretty(&all)? + "\n")
     }
 
-    fn all(&self) -> Vec<Fact> {
+    fn all(&self) -> impl Iterator<Item = &Fact> {
         let all = self.cpu.iter().chain(&self.cuda);
-        all.chain(&self.certificates).cloned().collect()
+        all.chain(&self.certificates)
+    }
+
+    /// Whether `--device cuda` has something to compute on.
+    fn is_ready_for_cuda(&self) -> bool {
+        self.cuda.iter().any(|fact| fact.state == State::Ok)
     }
 
     /// Fails where something is missing that training on the CPU needs, or a certificate is not good; with `cuda`, also what training
@@ -60,7 +72,7 @@ impl Report {
         ensure!(bad.is_empty(), "these certificates cannot be used: {bad}");
         let missing = lacking(&self.cuda, |state| state != State::Ok);
         ensure!(
-            !cuda || cuda::is_ready(&self.cuda),
+            !cuda || self.is_ready_for_cuda(),
             "--device cuda needs: {missing}"
         );
         Ok(())
@@ -74,49 +86,37 @@ fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
     names.join(", ")
 }
 
-fn describe(facts: &[Fact], verdict: &str) -> String {
-    let lines = facts.iter().map(|fact| format!("{fact}\n"));
-    format!("{}\n{verdict}\n", lines.collect::<String>())
-}
-
-fn verdict(cpu: &[Fact], cuda: &[Fact]) -> &'static str {
-    let cpu = cpu.iter().all(|fact| fact.state != State::Missing);
-    let cuda = cuda::is_ready(cuda);
-    match (cpu, cuda) {
-        (true, true) => "This machine can train on the CPU and with --device cuda.",
-        (true, false) => "This machine can train on the CPU, not with --device cuda.",
-        (false, _) => "This machine cannot train yet.",
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_verdict_follows_what_is_missing() {
-        let cpu = |state| vec![Fact::ok("cores", ""), Fact::new(state, "disk", "")];
-        let cuda = |state| {
-            vec![
-                Fact::missing("cuda:0", "not for this one"),
-                Fact::new(state, "cuda:1", ""),
-            ]
-        };
-        let says = |state, device| verdict(&cpu(state), &cuda(device));
-        assert!(says(State::Note, State::Ok).contains("CPU and with"));
-        assert!(says(State::Ok, State::Missing).contains("not with"));
-        assert!(verdict(&cpu(State::Ok), &[Fact::note("cuda", "none")]).contains("not with"));
-        assert!(says(State::Missing, State::Ok).contains("cannot"));
-    }
-
-    #[test]
-    fn every_fact_is_a_line_and_the_verdict_stands_apart() {
-        let broken = Fact::missing("Procgen", "not there:\n  do this");
-        let facts = [Fact::ok("cores", "2"), broken.clone()];
-        let text = describe(&facts, "Done.");
-        let lines = "ok       cores             2\nmissing  Procgen           not there: do this\n\nDone.\n";
-        assert_eq!(text, lines);
-        let json = serde_json::to_string(&broken).unwrap();
-        assert!(json.contains(r#""state":"missing""#), "{json}");
+    fn every_fact_is_a_line_and_the_verdict_follows_what_is_missing() {
+        let fact = |what: &str, state, text: &str| Fact::new(what, (state, text.into()));
+        for (disk, cuda, verdict) in [
+            (State::Note, State::Ok, "can train on the CPU and with"),
+            (State::Ok, State::Missing, "can train on the CPU, not with"),
+            (State::Ok, State::Note, "can train on the CPU, not with"),
+            (State::Missing, State::Ok, "cannot train yet"),
+        ] {
+            let (text, verdict) = (
+                "not there:\n  do this",
+                format!("\n\nThis machine {verdict}"),
+            );
+            let report = Report {
+                cpu: vec![fact("cores", State::Ok, "2"), fact("disk", disk, "")],
+                cuda: vec![fact("cuda:0", State::Missing, text), fact("1", cuda, "")],
+                certificates: Vec::new(),
+            };
+            let text = report.describe();
+            let lines = [
+                "ok       cores             2\n",
+                "missing  cuda:0            not there: do this\n",
+                &*verdict,
+            ];
+            assert!(lines.iter().all(|it| text.contains(it)), "{text}");
+            let json = report.json().unwrap();
+            assert!(json.contains(r#""state": "missing""#), "{json}");
+        }
     }
 }
