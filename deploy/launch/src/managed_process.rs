@@ -198,14 +198,15 @@ impl Drop for ManagedProcess {
 
 /// Waits for some processes to end, asking them first if `ask`; says which did not end well in time. None is left. A process that is
 /// asked before it listens for signals dies of the request, and has nothing to save.
-pub(crate) fn stop(
-    processes: &mut [ManagedProcess],
+pub(crate) fn stop<'a>(
+    processes: impl IntoIterator<Item = &'a mut ManagedProcess>,
     ask: bool,
     drain_max: Duration,
     abort: &impl Fn() -> bool,
 ) -> Vec<String> {
+    let mut processes: Vec<_> = processes.into_iter().collect();
     if ask {
-        processes.iter_mut().for_each(ManagedProcess::ask_to_stop);
+        processes.iter_mut().for_each(|it| it.ask_to_stop());
     }
     let deadline = Instant::now() + drain_max;
     let mut late = Vec::new();
@@ -242,8 +243,8 @@ mod tests {
             command.args(["-c", script]).stdin(Stdio::null());
             let log = ProcessLog::open("script", logs.path()).unwrap();
             let screen = Screen::default();
-            let process = ManagedProcess::spawn("script", command, log, &screen).unwrap();
-            stop(&mut [process], ask, Duration::from_secs(60), &|| false)
+            let mut process = ManagedProcess::spawn("script", command, log, &screen).unwrap();
+            stop([&mut process], ask, Duration::from_secs(60), &|| false)
         };
         assert_eq!(stopped("exec sleep 600", true), [] as [String; 0]);
         let killed = stopped("kill -TERM $$", false);

@@ -4,6 +4,8 @@
 
 mod processes;
 
+pub(crate) use processes::process_names;
+
 use std::{
     path::PathBuf,
     time::{Duration, Instant},
@@ -70,7 +72,6 @@ pub fn run(
     let shutdown = GracefulShutdown::on_repeated_signals(exit_with_parent);
     let shutdown = shutdown.context("listening for signals")?;
     open_files::check_run(config)?;
-    let servers = server_names(config.replay.shards);
     // Opening the recorder removes it.
     let before = resumed.and_then(|_| Summary::read(run_dir).ok());
     let restarts_before = before.map_or([0; 2], |it| {
@@ -78,13 +79,11 @@ pub fn run(
     });
     let evaluator = Evaluator::new(config, run_dir)?;
     let (names, events) = (process_names(config), config.local.tensorboard);
-    let mut recorder = RunRecorder::open(run_dir, config, names, resumed, events)?;
+    let mut recorder = RunRecorder::open(run_dir, config, names.clone(), resumed, events)?;
     let resume_point = resumed.unwrap_or_default();
     let rendezvous = Rendezvous::create()?;
-    let mut endpoints: Vec<_> = servers
-        .iter()
-        .map(|name| rendezvous.endpoint(name))
-        .collect();
+    let servers = names.iter().take(config.replay.shards as usize);
+    let mut endpoints: Vec<_> = servers.map(|name| rendezvous.endpoint(name)).collect();
     if let (Some(listen), None) = (&outside.listen, &outside.tls_dir) {
         endpoints[0].clone_from(listen);
     }
@@ -104,13 +103,13 @@ pub fn run(
         shared_memory,
         run_dir,
         resume_point,
-        servers,
         endpoints,
         outside,
         rendezvous,
         display,
         shutdown,
-        processes: Processes::default(),
+        names,
+        processes: Vec::new(),
         evaluator,
         server_restarts: 0,
         actor_restarts: 0,
@@ -167,62 +166,30 @@ struct Launch<'a> {
     shared_memory: bool,
     run_dir: &'a RunFolder,
     resume_point: ResumePoint,
-    /// Names of the replay servers, one a shard, and where each listens.
-    servers: Vec<String>,
+    /// Where each replay server listens, one a shard.
     endpoints: Vec<String>,
     outside: Outside,
     rendezvous: Rendezvous,
     display: Display,
     shutdown: GracefulShutdown,
-    processes: Processes,
+    /// Names of all processes, and those that are started: replay servers, learner, actors.
+    names: Vec<String>,
+    processes: Vec<ManagedProcess>,
     evaluator: Evaluator,
     server_restarts: u32,
     actor_restarts: u32,
     poller: Option<Poller>,
 }
 
-#[derive(Default)]
-struct Processes {
-    replay_servers: Vec<ManagedProcess>,
-    learner: Option<ManagedProcess>,
-    actors: Vec<ManagedProcess>,
-}
-
-impl Processes {
-    /// Replay servers, learner, actors, in the order of their names.
-    fn all(&mut self) -> impl Iterator<Item = &mut ManagedProcess> {
-        let first = self.replay_servers.iter_mut().chain(&mut self.learner);
-        first.chain(&mut self.actors)
-    }
-}
-
-/// The processes of a run that is started on one machine: replay servers, learner, actors.
-pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
-    let mut names = server_names(config.replay.shards);
-    names.push("learner".into());
-    names.extend((0..config.local.actors).map(|id| format!("actor-{id}")));
-    names
-}
-
-fn server_names(shards: u32) -> Vec<String> {
-    match shards {
-        1 => vec!["replay-server".into()],
-        _ => (0..shards).map(|i| format!("replay-server-{i}")).collect(),
-    }
-}
-
 impl Launch<'_> {
     fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
-        for shard in 0..self.servers.len() {
-            let server = self.start_server(shard)?;
-            self.processes.replay_servers.push(server);
-        }
+        self.start_up_to(self.endpoints.len())?;
         let hash = self.config.run.hash();
         let mut reached = Vec::new();
-        for (name, endpoint) in self.servers.iter().zip(&self.endpoints) {
-            let servers = &mut self.processes.replay_servers;
+        for (name, endpoint) in self.names.iter().zip(&self.endpoints) {
+            let servers = &mut self.processes;
             let mut check_alive = || servers.iter_mut().try_for_each(ManagedProcess::check_alive);
             if !wait_until_listening(endpoint, &self.shutdown.ending, &mut check_alive)? {
                 return Ok(Outcome::Interrupted);
@@ -239,11 +206,7 @@ impl Launch<'_> {
         poller.view = RunView::beginning(poller.view.plan, point.frames, point.updates);
         self.poller = Some(poller);
 
-        self.processes.learner = Some(self.start_learner()?);
-        for id in 0..self.config.local.actors {
-            let actor = self.start_actor(id)?;
-            self.processes.actors.push(actor);
-        }
+        self.start_up_to(self.names.len())?;
         self.watch(recorder)
     }
 
@@ -271,7 +234,7 @@ impl Launch<'_> {
                     bail!("the {name} has not answered for {silent}: {why}");
                 }
             }
-            let processes = self.processes.all();
+            let processes = self.processes.iter_mut();
             let rss: Vec<_> = processes.map(ManagedProcess::rss_mib).collect();
             if view.is_answered() {
                 let ask = |shard, since| poller.episodes(shard, since, true);
@@ -329,9 +292,11 @@ impl Launch<'_> {
             Err(_) => FAILED_DRAIN_MAX,
         };
         // When the run is finished, actors learn it from the replay server and exit.
-        let actors = stop(&mut self.processes.actors, !finished, actors_max, &abort);
+        let shards = self.endpoints.len();
+        let actors = self.processes.iter_mut().skip(shards + 1);
+        let actors = stop(actors, !finished, actors_max, &abort);
         self.wait_for_final_checkpoint(&abort);
-        let learner = self.processes.learner.as_mut_slice();
+        let learner = self.processes.iter_mut().skip(shards).take(1);
         let mut others = stop(learner, true, LEARNER_DRAIN_MAX, &abort);
         if let Some(poller) = &mut self.poller {
             if let Err(e) = poller.ask_replay() {
@@ -343,7 +308,7 @@ impl Launch<'_> {
             // Before its router goes away, so that it does not try to reach it again.
             poller.close();
         }
-        let servers = &mut self.processes.replay_servers;
+        let servers = self.processes.iter_mut().take(shards);
         others.extend(stop(servers, true, REPLAY_DRAIN_MAX, &abort));
         let is_complete = finished || self.is_complete();
         let result = match ran {
@@ -382,7 +347,8 @@ impl Launch<'_> {
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
     fn wait_for_final_checkpoint(&mut self, abort: &impl Fn() -> bool) {
-        let (Some(learner), Some(poller)) = (&mut self.processes.learner, &mut self.poller) else {
+        let learner = self.processes.get_mut(self.endpoints.len());
+        let (Some(learner), Some(poller)) = (learner, &mut self.poller) else {
             return;
         };
         if learner.end().is_some() {
@@ -422,7 +388,7 @@ impl Launch<'_> {
                 &mut poller.view
             }
         };
-        let logs = self.processes.all().filter_map(|it| it.log.missing());
+        let logs = self.processes.iter().filter_map(|it| it.log.missing());
         let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
         let mut summary = recorder.summarise(outcome, view);

@@ -1,15 +1,13 @@
 //! The launcher's processes: the words that start each, and those that are started again when they have died.
 //! When the first are started, and how all end, is in `mod`.
 
-use std::{
-    ffi::{OsStr, OsString},
-    process::ExitStatus,
-};
+use std::ffi::{OsStr, OsString};
 
 use anyhow::bail;
 use driml_protocol::session;
+use driml_settings::config::RunConfig;
 
-use super::{Launch, Outside};
+use super::Launch;
 use crate::managed_process::ManagedProcess;
 
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
@@ -19,77 +17,95 @@ const ACTOR_RESTARTS_MAX: u32 = 16;
 /// Threads of an actor and of the replay server for arithmetic: many processes share the cores.
 const PROCESS_THREADS: u32 = 1;
 
-fn call<'a>(
-    command: &'a str,
-    flags: impl IntoIterator<Item = (&'a str, &'a OsStr)>,
-) -> Vec<OsString> {
-    let flags = flags.into_iter();
-    let flags = flags.flat_map(|(flag, value)| [OsStr::new(flag), value]);
-    let words = command.split(' ').map(OsStr::new).chain(flags);
-    words.map(OsStr::to_owned).collect()
+/// What a process does: as the replay server of a shard, or the actor of an id.
+#[derive(Clone, Copy)]
+enum Part {
+    ReplayServer(usize),
+    Learner,
+    Actor(usize),
 }
 
-impl Outside {
-    /// Flags of the first replay server, beside where the processes meet.
-    fn flags(&self) -> Vec<OsString> {
-        let mut flags = Vec::new();
-        if let (Some(listen), Some(folder)) = (&self.listen, &self.tls_dir) {
-            flags.extend(["--listen".into(), listen.into()]);
-            flags.extend(["--tls-dir".into(), folder.into()]);
-        }
-        if self.allow_insecure {
-            flags.push("--allow-insecure".into());
-        }
-        flags
-    }
+/// The processes of a run that is started on one machine: replay servers, learner, actors.
+pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
+    let mut names: Vec<String> = match config.replay.shards {
+        1 => vec!["replay-server".into()],
+        shards => (0..shards).map(|i| format!("replay-server-{i}")).collect(),
+    };
+    names.push("learner".into());
+    names.extend((0..config.local.actors).map(|id| format!("actor-{id}")));
+    names
 }
 
 impl Launch<'_> {
-    fn start(&self, name: &str, args: &[OsString], threads: u32) -> anyhow::Result<ManagedProcess> {
+    /// What the process of this number does, by its place among the names.
+    fn part(&self, number: usize) -> Part {
+        match number.checked_sub(self.endpoints.len()) {
+            None => Part::ReplayServer(number),
+            Some(0) => Part::Learner,
+            Some(after) => Part::Actor(after - 1),
+        }
+    }
+
+    /// Starts the processes up to this number that are not started yet.
+    pub(super) fn start_up_to(&mut self, count: usize) -> anyhow::Result<()> {
+        for number in self.processes.len()..count {
+            let process = self.start(number)?;
+            self.processes.push(process);
+        }
+        Ok(())
+    }
+
+    fn start(&self, number: usize) -> anyhow::Result<ManagedProcess> {
+        let part = self.part(number);
+        let (command, threads) = match part {
+            Part::ReplayServer(_) => ("replay-server --keep-alive", PROCESS_THREADS),
+            Part::Learner => ("learner --keep-alive", self.config.local.learner_threads),
+            Part::Actor(_) => ("actor", PROCESS_THREADS),
+        };
+        let mut args: Vec<OsString> = command.split(' ').map(OsString::from).collect();
+        let mut flag = |name: &str, value: &dyn AsRef<OsStr>| {
+            args.extend([OsString::from(name), value.as_ref().to_owned()]);
+        };
+        let (local, endpoints) = (&self.config.local, &self.endpoints);
+        match part {
+            Part::ReplayServer(shard) => {
+                flag("--listen", &endpoints[shard]);
+                flag("--shard", &shard.to_string());
+                flag("--config", &self.run_dir.config());
+                if self.config.transport.shared_memory && !self.shared_memory {
+                    flag("--set", &"transport.shared_memory=false");
+                }
+                if local.durable {
+                    flag("--replay-dir", &self.run_dir.replay());
+                }
+                // The first is reached from outside the run, too.
+                let outside = &self.outside;
+                if shard == 0
+                    && let (Some(listen), Some(folder)) = (&outside.listen, &outside.tls_dir)
+                {
+                    flag("--listen", listen);
+                    flag("--tls-dir", folder);
+                }
+                if shard == 0 && outside.allow_insecure {
+                    args.push("--allow-insecure".into());
+                }
+            }
+            Part::Learner => {
+                flag("--run-dir", &self.run_dir.path());
+                flag("--device", &local.learner_device.to_string());
+                endpoints.iter().for_each(|it| flag("--connect", it));
+            }
+            Part::Actor(id) => {
+                flag("--connect", &endpoints[id % endpoints.len()]);
+                flag("--id", &id.to_string());
+                if self.config.world.name().foreign_code().is_some() {
+                    flag("--env", &self.config.run.world);
+                }
+            }
+        }
         let (logs, screen) = (self.run_dir.logs(), &self.display.screen);
-        ManagedProcess::start(name, args, threads, &logs, screen, Some(&self.rendezvous))
-    }
-
-    pub(super) fn start_learner(&self) -> anyhow::Result<ManagedProcess> {
-        let folder = self.run_dir.path().as_os_str();
-        let device = OsString::from(self.config.local.learner_device.to_string());
-        let endpoints = self.endpoints.iter().map(OsStr::new);
-        let connect = endpoints.map(|it| ("--connect", it));
-        let flags = [("--run-dir", folder), ("--device", &device)];
-        let args = call("learner --keep-alive", flags.into_iter().chain(connect));
-        self.start("learner", &args, self.config.local.learner_threads)
-    }
-
-    pub(super) fn start_actor(&self, id: u32) -> anyhow::Result<ManagedProcess> {
-        let number = OsString::from(id.to_string());
-        let endpoint = OsStr::new(&self.endpoints[id as usize % self.endpoints.len()]);
-        let mut flags = vec![("--connect", endpoint), ("--id", &number)];
-        if self.config.world.name().foreign_code().is_some() {
-            flags.push(("--env", OsStr::new(&self.config.run.world)));
-        }
-        let args = call("actor", flags);
-        self.start(&format!("actor-{id}"), &args, PROCESS_THREADS)
-    }
-
-    pub(super) fn start_server(&self, shard: usize) -> anyhow::Result<ManagedProcess> {
-        let (config, folder) = (self.run_dir.config(), self.run_dir.replay());
-        let number = OsString::from(shard.to_string());
-        let mut flags = vec![
-            ("--listen", OsStr::new(&self.endpoints[shard])),
-            ("--shard", &number),
-            ("--config", config.as_os_str()),
-        ];
-        if self.config.transport.shared_memory && !self.shared_memory {
-            flags.push(("--set", OsStr::new("transport.shared_memory=false")));
-        }
-        if self.config.local.durable {
-            flags.push(("--replay-dir", folder.as_os_str()));
-        }
-        let mut args = call("replay-server --keep-alive", flags);
-        if shard == 0 {
-            args.extend(self.outside.flags());
-        }
-        self.start(&self.servers[shard], &args, PROCESS_THREADS)
+        let (name, rendezvous) = (&self.names[number], Some(&self.rendezvous));
+        ManagedProcess::start(name, &args, threads, &logs, screen, rendezvous)
     }
 
     /// Whether an actor has exited though frames are missing, by an answer that is newer than its end.
@@ -97,7 +113,8 @@ impl Launch<'_> {
         let Some(poller) = &mut self.poller else {
             return false;
         };
-        let mut ends = self.processes.actors.iter_mut().map(ManagedProcess::end);
+        let actors = self.processes.iter_mut().skip(self.endpoints.len() + 1);
+        let mut ends = actors.map(ManagedProcess::end);
         if poller.view.replay.finished || !ends.any(|it| it.is_some()) {
             return false;
         }
@@ -111,52 +128,43 @@ impl Launch<'_> {
     /// One that has died is not restarted.
     pub(super) fn revive(&mut self) -> anyhow::Result<()> {
         let actors_are_needed = self.is_actor_missed();
-        for shard in 0..self.processes.replay_servers.len() {
-            let server = &mut self.processes.replay_servers[shard];
-            if !self.config.local.durable || self.server_restarts >= RESTARTS_MAX {
-                server.check_alive()?;
-            } else if server.end().is_some() {
-                let report = server.exit_report();
-                self.server_restarts += 1;
-                let how = format!(
-                    "{} is started again with what it has kept ({} of {RESTARTS_MAX} times in a run)",
-                    self.servers[shard], self.server_restarts
-                );
-                self.note_restart(&report, &how);
-                self.processes.replay_servers[shard] = self.start_server(shard)?;
-            }
-        }
-        let mut learner = self.processes.learner.iter_mut();
-        learner.try_for_each(ManagedProcess::check_alive)?;
-        for id in 0..self.processes.actors.len() {
-            let actor = &mut self.processes.actors[id];
-            let is_over = |status: ExitStatus| status.success() && !actors_are_needed;
-            if actor.end().is_none_or(is_over) {
+        for number in 0..self.processes.len() {
+            let part = self.part(number);
+            let process = &mut self.processes[number];
+            let Some(status) = process.end() else {
+                continue;
+            };
+            let is_actor = matches!(part, Part::Actor(_));
+            if is_actor && status.success() && !actors_are_needed {
                 continue;
             }
-            let report = actor.exit_report();
-            if !actor.may_be_started_again() || self.actor_restarts >= ACTOR_RESTARTS_MAX {
+            let (name, report) = (&self.names[number], process.exit_report());
+            let (restarts, max, with_what) = match part {
+                Part::ReplayServer(_) if self.config.local.durable => {
+                    let kept = " with what it has kept";
+                    (&mut self.server_restarts, RESTARTS_MAX, kept)
+                }
+                Part::Actor(_) if process.may_be_started_again() => {
+                    (&mut self.actor_restarts, ACTOR_RESTARTS_MAX, "")
+                }
+                _ => bail!("{report}"),
+            };
+            if *restarts >= max {
                 bail!("{report}");
             }
-            if !self.config.world.is_resumable() {
+            if is_actor && !self.config.world.is_resumable() {
                 bail!(
-                    "{report}\nactor-{id} is not started again: the ghosts of this run change as episodes pass, and a new process would \
+                    "{report}\n{name} is not started again: the ghosts of this run change as episodes pass, and a new process would \
                      count these from 0"
                 );
             }
-            self.actor_restarts += 1;
-            let how = format!(
-                "actor-{id} is started again ({} of {ACTOR_RESTARTS_MAX} times in a run)",
-                self.actor_restarts
-            );
-            self.note_restart(&report, &how);
-            self.processes.actors[id] = self.start_actor(id as u32)?;
+            *restarts += 1;
+            self.display.screen.line(&format!(
+                "{report}\n{name} is started again{with_what} ({restarts} of {max} times in a run)"
+            ));
+            session::sweep_shared_memory();
+            self.processes[number] = self.start(number)?;
         }
         Ok(())
-    }
-
-    fn note_restart(&self, report: &str, how: &str) {
-        self.display.screen.line(&format!("{report}\n{how}"));
-        session::sweep_shared_memory();
     }
 }
