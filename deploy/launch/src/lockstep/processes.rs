@@ -103,17 +103,16 @@ impl Lockstep {
     /// The components of a run that begins; its replay is kept in the run's folder if its checkpoints can be resumed.
     pub(super) fn begin(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let mut this = Self::in_memory(config)?;
-        if let Err(e) = this.actor_states() {
-            return match e {
-                ActError::World(e @ EnvError::NotSaved(_)) => {
-                    console::line(&format!("{e}: the run cannot be resumed, only repeated"));
-                    Ok(this)
-                }
-                e => Err(e.into()),
-            };
+        match this.actor_states() {
+            Ok(_) => {
+                this.replay = open(config, run_dir, None)?;
+                this.join_actors()?;
+            }
+            Err(ActError::World(e @ EnvError::NotSaved(_))) => {
+                console::line(&format!("{e}: the run cannot be resumed, only repeated"));
+            }
+            Err(e) => return Err(e.into()),
         }
-        this.replay = open(config, run_dir, None)?;
-        this.join_actors()?;
         Ok(this)
     }
 
