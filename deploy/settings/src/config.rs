@@ -97,12 +97,6 @@ pub struct RunConfig {
     pub notes: Vec<String>,
 }
 
-/// Reads every table as the part that uses it will.
-pub(crate) fn parts_read(table: &Table) -> Result<RunConfig, Usage> {
-    let read = Value::Table(table.clone()).try_into();
-    read.map_err(|e| usage!("in the settings: {}", describe(&e)))
-}
-
 impl RunConfig {
     /// Bytes of a version of the weights as the learner publishes it.
     pub fn weights_bytes(&self) -> driml_model::Result<usize> {
@@ -110,16 +104,23 @@ impl RunConfig {
         published.weights_bytes(self.learner.publish_dtype)
     }
 
-    pub(crate) fn from_table(table: &Table) -> Result<Self, Usage> {
-        let config = parts_read(table)?;
-        config.validate()?;
-        Ok(config)
+    /// Reads every table as the part that uses it will; what follows from others is there.
+    pub(crate) fn read(table: Table) -> Result<Self, Usage> {
+        let read = Value::Table(table).try_into();
+        read.map_err(|e| usage!("in the settings: {}", describe(&e)))
+    }
+
+    /// [`Self::read`] of a table in which what follows from others is first filled in.
+    pub(crate) fn derived(mut table: Table) -> Result<Self, Usage> {
+        derived::derive(&mut table)?;
+        Self::read(table)
     }
 
     /// Reads resolved settings, as in a run folder's `config.toml`.
     pub fn parse(name: &str, text: &str) -> Result<Self, Usage> {
-        let table = derived::read_file(name, text)?;
-        Self::from_table(&table).map_err(|e| usage!("{name}: {e}"))
+        let config = Self::read(derived::read_file(name, text)?);
+        let checked = config.and_then(Self::checked);
+        checked.map_err(|e| usage!("{name}: {e}"))
     }
 
     /// The settings as every process reads them, sorted by name.
@@ -137,8 +138,7 @@ impl RunConfig {
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
         let mut table = self.to_table();
         derived::keep_whole_frames(&mut table);
-        derived::derive(&mut table)?;
-        Self::from_table(&table)
+        Self::derived(table)?.checked()
     }
 
     /// The names of the run's actions; an action is a place in this list.
@@ -164,8 +164,8 @@ impl RunConfig {
         start.updates + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
-    /// Runs each component's checks of its own table, then those that span two tables.
-    fn validate(&self) -> Result<(), Usage> {
+    /// These settings, if they pass each component's checks of its own table, then those that span two tables.
+    pub(crate) fn checked(self) -> Result<Self, Usage> {
         fn said(e: impl std::fmt::Display) -> Usage {
             Usage(e.to_string())
         }
@@ -226,7 +226,7 @@ impl RunConfig {
             (false, true) => Err(usage!(
                 "learner.affinity.estimator keeps an affinity that run.horizon does not use: --set learner.affinity.estimator=none"
             )),
-            _ => Ok(()),
+            _ => Ok(self),
         }
     }
 

@@ -8,70 +8,8 @@ use driml_machine::{
 };
 use driml_protocol::RunSpec;
 use driml_replay_server::Compression;
-use toml::Table;
 
-use crate::{
-    config::{RunConfig, parts_read},
-    derived::{derive, put_number},
-};
-
-/// Makes the replay as small as the memory and says so, or refuses a size that was asked for and does not fit.
-pub(crate) fn fit(
-    table: &mut Table,
-    capacity_set: bool,
-    server_alone: bool,
-    machine: &Machine,
-) -> Result<Option<String>, Usage> {
-    let mut derived = table.clone();
-    derive(&mut derived)?;
-    let RunConfig {
-        run, replay, local, ..
-    } = parts_read(&derived)?;
-    let actors = resources::actors_bytes(local.actors, &run.world);
-    let (beside, parts) = match server_alone {
-        true => (0, u64::from(replay.shards)),
-        false => (actors + resources::LEARNER_BYTES, 1),
-    };
-    if machine.memory_bytes <= beside {
-        return Err(usage!(
-            "{} actors of {} take about {}, and {} are free: use fewer --actors, with more --envs each",
-            local.actors,
-            run.world,
-            gib(actors),
-            gib(machine.memory_bytes)
-        ));
-    }
-    let room = Room {
-        free: gib(machine.memory_bytes),
-        bytes: machine.replay_bytes(beside).saturating_mul(parts),
-        bytes_max: machine.replay_bytes_max(beside).saturating_mul(parts),
-    };
-    if replay.compression != Compression::None {
-        return fit_compressed(table, &run, &replay, &room);
-    }
-    let bytes_each = replay_bytes_each(&run) + sampling_bytes_each(&replay);
-    let (free, bytes, bytes_max) = (&room.free, room.bytes, room.bytes_max);
-    let asked = replay.capacity_transitions;
-    let capacity = bytes / bytes_each;
-    if capacity_set && asked > bytes_max / bytes_each {
-        return Err(usage!(
-            "replay.capacity_transitions = {asked} needs {}, and may take {}, as {free} are free: --set replay.capacity_transitions={capacity}",
-            gib(asked.saturating_mul(bytes_each)),
-            gib(bytes_max),
-        ));
-    }
-    if capacity_set || asked <= capacity {
-        return Ok(None);
-    }
-    put_number(table, "replay.capacity_transitions", capacity)?;
-    // A replay that holds the whole run anyway is as good as a larger one.
-    let frames = replay.transitions_max;
-    let is_smaller_than_the_run = frames.is_none_or(|frames| frames > capacity);
-    let note = format!(
-        "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
-    );
-    Ok(is_smaller_than_the_run.then_some(note))
-}
+use crate::config::RunConfig;
 
 /// Bytes for the replay, all shards together.
 struct Room {
@@ -83,20 +21,75 @@ struct Room {
     bytes_max: u64,
 }
 
+/// Makes the replay as small as the memory and notes it, or refuses a size that was asked for and does not fit.
+pub(crate) fn fit(
+    config: &mut RunConfig,
+    capacity_set: bool,
+    server_alone: bool,
+    machine: &Machine,
+) -> Result<(), Usage> {
+    let (world, actors) = (&config.run.world, config.local.actors);
+    let actors_bytes = resources::actors_bytes(actors, world);
+    let (beside, parts) = match server_alone {
+        true => (0, u64::from(config.replay.shards)),
+        false => (actors_bytes + resources::LEARNER_BYTES, 1),
+    };
+    let free = gib(machine.memory_bytes);
+    if machine.memory_bytes <= beside {
+        return Err(usage!(
+            "{actors} actors of {world} take about {}, and {free} are free: use fewer --actors, with more --envs each",
+            gib(actors_bytes)
+        ));
+    }
+    let room = Room {
+        free,
+        bytes: machine.replay_bytes(beside).saturating_mul(parts),
+        bytes_max: machine.replay_bytes_max(beside).saturating_mul(parts),
+    };
+    match config.replay.compression {
+        Compression::None => fit_plain(config, capacity_set, &room),
+        _ => fit_compressed(config, &room),
+    }
+}
+
+fn fit_plain(config: &mut RunConfig, capacity_set: bool, room: &Room) -> Result<(), Usage> {
+    let (replay, free) = (&mut config.replay, &room.free);
+    let bytes_each = replay_bytes_each(&config.run) + sampling_bytes_each(replay);
+    let asked = replay.capacity_transitions;
+    let capacity = room.bytes / bytes_each;
+    if capacity_set && asked > room.bytes_max / bytes_each {
+        return Err(usage!(
+            "replay.capacity_transitions = {asked} needs {}, and may take {}, as {free} are free: --set replay.capacity_transitions={capacity}",
+            gib(asked.saturating_mul(bytes_each)),
+            gib(room.bytes_max),
+        ));
+    }
+    if capacity_set || asked <= capacity {
+        return Ok(());
+    }
+    replay.capacity_transitions = capacity;
+    // A replay that holds the whole run anyway is as good as a larger one.
+    if replay
+        .transitions_max
+        .is_none_or(|frames| frames > capacity)
+    {
+        config.notes.push(format!(
+            "the replay holds the newest {capacity} transitions instead of {asked}: {free} of memory are free, and it takes half, or what actors and learner leave"
+        ));
+    }
+    Ok(())
+}
+
 /// Bounds the bytes of a compressed replay, as it is not known beforehand how well its frames compress.
 ///
 /// Half the free memory is taken, or what the settings allow; nothing is bounded where even frames that do not compress fit.
-fn fit_compressed(
-    table: &mut Table,
-    run: &RunSpec,
-    replay: &driml_replay_server::Config,
-    room: &Room,
-) -> Result<Option<String>, Usage> {
-    let free = &room.free;
+fn fit_compressed(config: &mut RunConfig, room: &Room) -> Result<(), Usage> {
+    let (replay, free) = (&mut config.replay, &room.free);
     let asked = replay.capacity_transitions;
     let fields_each = COMPRESSED_FIELDS_BYTES + sampling_bytes_each(replay);
     let fields = asked.saturating_mul(fields_each);
-    let frames = asked.saturating_mul(run.frame_bytes() as u64);
+    let frame_bytes = config.run.frame_bytes() as u64;
+    let frames = asked.saturating_mul(frame_bytes);
     let bytes = room.bytes.saturating_sub(fields);
     if fields > room.bytes / 2 {
         return Err(usage!(
@@ -111,16 +104,17 @@ fn fit_compressed(
             gib(max)
         )),
         None if frames > bytes => {
-            put_number(table, "replay.compressed_bytes_max", bytes)?;
-            let frames = replay.transitions_max.unwrap_or(u64::MAX);
-            let is_smaller_than_the_run = frames.saturating_mul(run.frame_bytes() as u64) > bytes;
-            let note = format!(
-                "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
-                gib(bytes)
-            );
-            Ok(is_smaller_than_the_run.then_some(note))
+            replay.compressed_bytes_max = Some(bytes);
+            let of_run = replay.transitions_max.unwrap_or(u64::MAX);
+            if of_run.saturating_mul(frame_bytes) > bytes {
+                config.notes.push(format!(
+                    "compressed frames may take {}, as {free} of memory are free; if they compress badly, the replay holds fewer than {asked} transitions",
+                    gib(bytes)
+                ));
+            }
+            Ok(())
         }
-        _ => Ok(None),
+        _ => Ok(()),
     }
 }
 

@@ -11,9 +11,8 @@ use driml_machine::{
 use toml::{Table, Value};
 
 use crate::{
-    config::{RunConfig, parts_read},
-    derived::{self, derive},
-    memory,
+    config::RunConfig,
+    derived, memory,
     overrides::Override,
     presets::{self, Agent, Preset},
 };
@@ -113,11 +112,9 @@ pub fn resolve(source: &Source, flags: &Flags, machine: &Machine) -> Result<RunC
         Source::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
         _ => e,
     };
-    let note =
-        memory::fit(&mut table, capacity_set, flags.server_alone, machine).map_err(of_file)?;
-    derive(&mut table)?;
-    let mut config = RunConfig::from_table(&table).map_err(of_file)?;
-    config.notes.extend(note);
+    let mut config = RunConfig::derived(table).map_err(of_file)?;
+    memory::fit(&mut config, capacity_set, flags.server_alone, machine).map_err(of_file)?;
+    config = config.checked().map_err(of_file)?;
     if let Source::Layers(preset, ..) = source {
         let price = preset.price.iter().copied();
         config.notes.extend(price.map(str::to_owned));
@@ -137,9 +134,9 @@ fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
         let new = one.apply(&mut tried)?;
         // A key that was not there may be an optional one. The type of its table decides.
         if new {
-            let mut derived = tried.clone();
-            derived::precision(&mut derived, false);
-            let read = derive(&mut derived).and_then(|()| parts_read(&derived));
+            let mut read = tried.clone();
+            derived::precision(&mut read, false);
+            let read = RunConfig::derived(read);
             let key = one.path.rsplit('.').next().unwrap_or_default();
             let unknown = format!("unknown field `{key}`");
             if read.is_err_and(|e| e.0.contains(&unknown)) {
