@@ -141,20 +141,29 @@ fn settings_that_cannot_work_are_answered_with_what_to_do() {
     expect_file!["../../tests/snapshots/refusals.txt"].assert_eq(&answers);
 }
 
-/// A row of the file is a preset, a world, an agent, what is set, and after a question mark the settings that stand below it.
+/// A row of the file is a preset, a world, an agent, what is set, and after a question mark the settings that stand below it, or the
+/// notes. `@bf16` is a machine that is fast in it, `@8` one with 8 GiB of memory.
 #[test]
 fn settings_follow_from_one_another() {
     let text = include_str!("../../tests/snapshots/resolved.txt");
     let answers = answered(text, |row| {
         let (row, asked) = row.split_once(" ? ").unwrap();
-        let words: Vec<_> = row.split(' ').collect();
+        let (at, words): (Vec<_>, Vec<_>) = row.split(' ').partition(|it| it.starts_with('@'));
+        let mut machine = MACHINE;
+        for at in at {
+            match at.trim_start_matches('@') {
+                "bf16" => machine.fast_bf16 = true,
+                gib => machine.memory_bytes = gib.parse::<u64>().unwrap() << 30,
+            }
+        }
         let [preset, world, agent] = [words[0], words[1], words[2]];
-        let config = of_names(preset, world, agent, &words[3..], &MACHINE).unwrap();
+        let config = of_names(preset, world, agent, &words[3..], &machine).unwrap();
         let text = config.to_toml();
         assert_eq!(RunConfig::parse("it", &text).unwrap().to_toml(), text);
         let table = config.to_table();
         let value = |path| match derived::find(&table, path) {
             Some(value) => format!("{path} = {value}"),
+            None if path == "notes" => format!("notes: {:?}", config.notes),
             None => format!("{path} is not set"),
         };
         asked.split(' ').map(value).collect::<Vec<_>>().join("\n")
@@ -171,40 +180,28 @@ fn settings_follow_from_one_another() {
 #[test]
 fn a_file_at_odds_with_itself_is_refused() {
     let text = with("mspacman", "c51", &[]).unwrap().to_toml();
-    let said = |text: String| of_file("x.toml", text, &[]).unwrap_err();
-    expect!["x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other"].assert_eq(&said(text.replace("num_actions = 5", "num_actions = 6")));
     let layers =
         format!("{text}\n[[model.loss_layers]]\nname = \"next\"\ninputs = 1\noutputs = 1\n");
-    expect![[r#"x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct the one or the other"#]].assert_eq(&said(layers));
-    expect![
-        "x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote"
-    ]
-    .assert_eq(&said(text.replace("[input]", "[inputs]")));
-    expect!["x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`"].assert_eq(&said(
+    let said = [
+        text.replace("num_actions = 5", "num_actions = 6"),
+        layers,
+        text.replace("[input]", "[inputs]"),
         text.replace("world = \"mspacman\"", "world = \"chain\""),
-    ));
-    expect![
-        "x.toml is not TOML: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`"
+        "= 3".into(),
+        String::new(),
+        text.replace("envs = 16", "envs = 16\ncolour = 1"),
     ]
-    .assert_eq(&said("= 3".into()));
-    expect!["x.toml: the settings lack run.world, a word: use a config.toml that driml wrote"]
-        .assert_eq(&said(String::new()));
-    expect!["x.toml: in the settings: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`"].assert_eq(&said(text.replace("envs = 16", "envs = 16\ncolour = 1")));
-}
-
-#[test]
-fn a_run_prints_what_its_preset_gives_up() {
-    let printed = |preset| {
-        let config = of_names(preset, "mspacman", "c51", &[], &MACHINE).unwrap();
-        config.notes.join("\n")
-    };
-    assert!(!printed("exact").contains("results/tradeoff"));
-    for (preset, price) in [("balanced", "6%"), ("fast", "15%")] {
-        let said = printed(preset);
-        let mut words = [price, "results/tradeoff"].into_iter();
-        assert!(words.all(|it| said.contains(it)), "{said}");
-        assert!(said.starts_with(preset), "{said}");
-    }
+    .map(|text| of_file("x.toml", text, &[]).unwrap_err() + "\n");
+    expect![[r#"
+        x.toml: run.num_actions = 6, but it follows from the world and actor.actions and is 5; correct the one or the other
+        x.toml: model.loss_layers = [{ inputs = 1, name = "next", outputs = 1 }], but it follows from learner.update and is not there; correct the one or the other
+        x.toml: the settings lack input.height, a whole number: use a config.toml that driml wrote
+        x.toml: in the settings' [world] table: unknown field `boost_steps`, expected one of `cells`, `height`, `width`, `step_limit`, `reward_left`, `reward_right`
+        x.toml is not TOML: unquoted keys cannot be empty, expected letters, numbers, `-`, `_`
+        x.toml: the settings lack run.world, a word: use a config.toml that driml wrote
+        x.toml: in the settings: unknown field `colour`, expected one of `envs`, `steps_per_chunk`, `round_transitions_max`, `chunks_in_flight_max`, `precision`, `actions`, `world_threads`, `epsilon_start`, `epsilon_end`, `epsilon_decay_frames`, `epsilon_ladder`, `ack_timeout_ms`, `unreachable_max_ms`, in `actor`
+    "#]]
+    .assert_eq(&said.concat());
 }
 
 #[test]
@@ -225,42 +222,6 @@ fn flags_come_before_set_and_both_before_the_machine() {
         "replay.transitions_max = 18446744073709551615: the largest number is 9223372036854775807"
     ]
     .assert_eq(&said.to_string());
-}
-
-#[test]
-fn an_automatic_precision_is_the_processors_fastest_and_f32_on_a_gpu() {
-    let of = |fast_bf16, set: &[&str]| {
-        let machine = Machine {
-            fast_bf16,
-            ..MACHINE
-        };
-        let config = of_names("tuned", "procgen:maze", "c51", set, &machine).unwrap();
-        [config.actor.precision, config.learner.precision].map(|it| it.to_string())
-    };
-    let cuda = "local.learner_device=cuda:0";
-    assert_eq!(of(true, &[]), ["bf16", "bf16"]);
-    assert_eq!(of(false, &[]), ["f32", "f32"]);
-    assert_eq!(of(true, &[cuda]), ["bf16", "f32"]);
-    assert_eq!(of(true, &["learner.precision=f32"]), ["bf16", "f32"]);
-    assert_eq!(of(false, &["actor.precision=bf16"]), ["bf16", "f32"]);
-}
-
-#[test]
-fn the_replay_fits_the_memory_and_says_so() {
-    let of = |world, gib: u64| {
-        let machine = Machine {
-            memory_bytes: gib << 30,
-            ..MACHINE
-        };
-        let source = source("paper", world, "driml-fix");
-        resolve(&source, &frames(50_000_000, &[]), &machine).unwrap()
-    };
-    let config = of("procgen:bigfish", 8);
-    expect!["the replay holds the newest 348617 transitions instead of 1000000: 8.0 GiB of memory are free, and it takes half, or what actors and learner leave"].assert_eq(&config.notes.join("\n"));
-    assert!(config.replay.capacity_transitions < 400_000);
-    let config = of("procgen:heist", 64);
-    let capacity = config.replay.capacity_transitions;
-    assert_eq!((capacity, config.notes.len()), (1_000_000, 0));
 }
 
 #[test]
@@ -286,14 +247,6 @@ fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
     let said = of(false, 4, 1, &[most]).unwrap_err();
     expect!["replay.capacity_transitions = 1400000 needs 14.1 GiB, and may take 13.8 GiB, as 16.0 GiB are free: --set replay.capacity_transitions=793014"].assert_eq(&said);
     assert_eq!(of(true, 4, 1, &[most]), Ok(1_400_000));
-}
-
-#[test]
-fn a_compressed_replay_says_what_its_frames_may_take() {
-    let lz4 = "replay.compression=lz4";
-    let million = "replay.transitions_max=1000000";
-    let config = with("procgen:bigfish", "c51", &[lz4, million]).unwrap();
-    expect!["compressed frames may take 7.9 GiB, as 16.0 GiB of memory are free; if they compress badly, the replay holds fewer than 1000000 transitions"].assert_eq(&config.notes.join("\n"));
 }
 
 /// The hash of the run's settings is that of every other rule: checkpoints stay valid.
