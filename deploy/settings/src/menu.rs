@@ -148,7 +148,6 @@ fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, Strin
     let everywhere = parts.next().unwrap_or_default();
     let mut note = |text: &str, how: &str| {
         for (path, comment) in comments(text) {
-            let path = path.strip_prefix("set.").unwrap_or(&path).to_owned();
             let source = format!("{comment} [{}{how}]", layer.name);
             sources.insert(path, source.trim_start().to_owned());
         }
@@ -162,7 +161,7 @@ fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, Strin
     }
 }
 
-/// The path of each setting in a preset file and the comment beside or above it.
+/// The path of each setting in a preset file, or in an `[[only]]` block of one, and the comment beside or above it.
 pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
     let mut found: Vec<(String, String)> = Vec::new();
     let (mut table, mut above) = (String::new(), String::new());
@@ -180,6 +179,7 @@ pub(crate) fn comments(text: &str) -> Vec<(String, String)> {
         } else if let Some((key, rest)) = bare.split_once(" = ") {
             let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '.';
             if key.chars().all(plain) {
+                let key = key.strip_prefix("set.").unwrap_or(key);
                 let beside = rest.split_once(" # ").map(|(_, comment)| comment.trim());
                 let comment = beside.map_or_else(|| above.clone(), str::to_owned);
                 found.push((format!("{table}{key}"), comment));

@@ -297,33 +297,13 @@ mod tests {
     }
 
     #[test]
-    fn a_preset_leaves_an_agent_what_it_is() {
-        let layers = |agent_name| {
-            let (world, agent) = (world("coinrun").unwrap(), agent(agent_name).unwrap());
-            layers(preset(TUNED).unwrap(), world, agent).unwrap()
-        };
-        for (name, epsilon) in [("rainbow", 0.0), ("c51", 1.0)] {
-            let start = layers(name)["actor"]["epsilon_start"].as_float();
-            assert_eq!(start, Some(epsilon), "{name}");
-        }
-    }
-
-    #[test]
-    fn every_only_block_names_worlds_that_exist() {
+    fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
         let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
         for layer in all_layers().values() {
-            for block in layer.read().1 {
-                for world in block.worlds {
-                    assert!(worlds.contains(&world), "{world} in {}", layer.name);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn every_layer_says_what_it_is_for() {
-        for layer in all_layers().values() {
             assert!(layer.text.starts_with("# "), "{}", layer.name);
+            for world in layer.read().1.iter().flat_map(|block| &block.worlds) {
+                assert!(worlds.contains(world), "{world} in {}", layer.name);
+            }
         }
     }
 
