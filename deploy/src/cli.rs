@@ -8,18 +8,8 @@ use driml_experiments::{
 };
 
 use crate::commands::{
-    actor::{self, ActorArgs},
-    completions::{self, CompletionsArgs, ManArgs},
-    doctor::{self, DoctorArgs},
-    evaluate::{self, EvaluateArgs},
-    inspect::{self, InspectArgs},
-    learner::{self, LearnerArgs},
-    parity::{self, ParityArgs},
-    presets::{self, PresetsArgs},
-    procgen::{self, ProcgenCommand},
-    replay_server::{self, ReplayServerArgs},
-    train::{self, TrainArgs},
-    watch::{self, StatusArgs, WatchArgs},
+    actor, completions, doctor, evaluate, inspect, learner, parity, presets, procgen,
+    replay_server, train, watch,
 };
 
 const EXAMPLES: &str = "\
@@ -45,23 +35,23 @@ pub(crate) struct Cli {
 pub(crate) enum Command {
     #[command(visible_alias = "local", after_help = EXAMPLES)]
     /// Train on this machine: start all processes, show progress, write a run folder
-    Train(TrainArgs),
+    Train(train::TrainArgs),
     /// Run one actor of a run whose replay server is at ENDPOINT
-    Actor(ActorArgs),
+    Actor(actor::ActorArgs),
     /// Run the replay server, to which the other processes connect and which has the settings
-    ReplayServer(ReplayServerArgs),
+    ReplayServer(replay_server::ReplayServerArgs),
     /// Run the learner of a run whose replay server is at ENDPOINT
-    Learner(LearnerArgs),
+    Learner(learner::LearnerArgs),
     /// Show a run's processes, which one waits, and how to unblock it
-    Status(StatusArgs),
+    Status(watch::StatusArgs),
     /// Monitor a run, local or remote, and record it in a folder
-    Watch(WatchArgs),
+    Watch(watch::WatchArgs),
     /// Play episodes with the weights of a run or a pretrained network, beside a random policy
-    Evaluate(EvaluateArgs),
+    Evaluate(evaluate::EvaluateArgs),
     /// Count the parameters, FLOPs and bytes of a configuration, without training
-    Inspect(InspectArgs),
+    Inspect(inspect::InspectArgs),
     /// Check the learner's arithmetic against float64 updates of another framework
-    Parity(ParityArgs),
+    Parity(parity::ParityArgs),
     /// Plot return, losses, k and speed of runs, or their action affinity
     Plot(PlotArgs),
     /// Train with every combination of settings and seeds; write a table and a plot
@@ -75,16 +65,16 @@ pub(crate) enum Command {
     /// Measure the speed of learner, policy, replay, worlds and whole runs, also beside PyTorch, Reverb and gym3
     Bench(BenchArgs),
     /// List worlds, agents and presets, or print every setting of a combination with its source
-    Presets(PresetsArgs),
+    Presets(presets::PresetsArgs),
     /// Check whether this machine can train on the CPU and on a GPU
-    Doctor(DoctorArgs),
+    Doctor(doctor::DoctorArgs),
     /// Install Procgen's engine
     #[command(subcommand)]
-    Procgen(ProcgenCommand),
+    Procgen(procgen::ProcgenCommand),
     /// Print a shell completion script
-    Completions(CompletionsArgs),
+    Completions(completions::CompletionsArgs),
     /// Write the manual pages
-    Man(ManArgs),
+    Man(completions::ManArgs),
 }
 
 impl Command {

@@ -59,29 +59,18 @@ pub fn describe(
     let left = (1.0 - done).max(0.0);
     let time = about(estimate(config, machine.cores).mul_f64(left));
     let (rows, ratio) = (config.learner.batch_size, replay.replay_ratio);
-    let mut text = String::new();
-    let mut fact = |name, fact: &str| text += &format!("{name:<INDENT$}{fact}\n");
     let (agent, world, seed) = (&run.agent, &run.world, run.seed);
-    fact(
-        "trains",
-        &format!("{agent} on {world}, seed {seed}, from {from}"),
-    );
-    fact(
-        "frames",
-        &format!("{frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})"),
-    );
-    fact("processes", &processes(config, lockstep));
-    fact(
-        "replay",
-        &format!("the newest {held} transitions, up to {bytes} of memory{disk}"),
-    );
-    fact("run folder", &run_dir.display().to_string());
-    fact(
-        "time",
-        &format!("{time} (coarse: from the network's arithmetic)"),
-    );
-    config.notes.iter().for_each(|note| fact("note", note));
-    text
+    let (processes, run_dir) = (processes(config, lockstep), run_dir.display());
+    let note = |note: &String| format!("{:INDENT$}{note}\n", "note");
+    let notes: String = config.notes.iter().map(note).collect();
+    format!(
+        "trains      {agent} on {world}, seed {seed}, from {from}\n\
+         frames      {frames} in all, with {updates} updates of {rows} rows (replay ratio {ratio})\n\
+         processes   {processes}\n\
+         replay      the newest {held} transitions, up to {bytes} of memory{disk}\n\
+         run folder  {run_dir}\n\
+         time        {time} (coarse: from the network's arithmetic)\n{notes}"
+    )
 }
 
 fn processes(config: &RunConfig, lockstep: bool) -> String {
