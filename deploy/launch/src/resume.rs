@@ -22,7 +22,7 @@ use driml_protocol::Sampling;
 use driml_replay_server::Since;
 use driml_settings::{
     config::RunConfig,
-    resolve::{Flags, Source, resolve},
+    flags::{Flags, Source},
 };
 
 use crate::{
@@ -183,7 +183,7 @@ pub fn find(folder: &RunFolder, flags: &Flags, machine: &Machine) -> anyhow::Res
     // First, as a run that is still ending holds memory.
     wait_until_free(folder)?;
     let before = RunConfig::parse(&name, &text)?;
-    let mut config = resolve(&Source::File(name, text), flags, machine)?;
+    let mut config = Source::File(name, text).resolve(flags, machine)?;
     let checkpoints = folder.checkpoints();
     let all = checkpoint::list(&checkpoints).context("looking for checkpoints")?;
     let (_, newest) = all.last().with_context(|| {

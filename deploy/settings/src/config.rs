@@ -1,5 +1,5 @@
 //! The resolved settings of a run: one TOML with a table for each part, checked as a whole.
-//! It fills in no number: `resolve` does.
+//! It fills in no number: `flags` does.
 
 use driml_envs::WorldConfig;
 use driml_learner::{DeviceName, EstimatorKind};

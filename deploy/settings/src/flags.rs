@@ -1,5 +1,5 @@
-//! The flags that choose a run's settings, and the settings that they resolve to.
-//! Every command that starts a run takes them.
+//! The flags that choose a run's settings, and how these come of presets or a file, flags and `--set`. Every command that starts a run
+//! takes them. No number is filled in here but those that follow from others and those that the machine decides.
 
 use std::path::PathBuf;
 
@@ -7,13 +7,16 @@ use clap::Args;
 use driml_envs::WorldName;
 use driml_machine::{
     error::{Usage, usage},
-    resources::Machine,
+    resources::{self, Machine},
+    whole_number,
 };
+use toml::{Table, Value};
 
 use crate::{
     config::RunConfig,
-    presets,
-    resolve::{self, Flags, Source},
+    derived, memory,
+    overrides::Override,
+    presets::{self, Agent, Preset},
 };
 
 /// World where none is given.
@@ -42,6 +45,32 @@ pub struct RunFlags {
     pub over: Flags,
 }
 
+/// Flags over the source; `--set` applies after the others.
+#[derive(Clone, Debug, Default, Args)]
+pub struct Flags {
+    /// Actor processes [default: by number of cores]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub actors: Option<u32>,
+    /// Replay servers, each with a share of the actors and memory [default: 1]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub replay_shards: Option<u32>,
+    /// Environments per actor [default: as the preset says]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub envs: Option<u32>,
+    /// Frames of the run; it is finished when they are stored and their updates are done
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = whole_number::within(1..=i64::MAX as u64))]
+    pub frames: Option<u64>,
+    /// Seed of the run
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = whole_number::within(0..=i64::MAX as u64))]
+    pub seed: Option<u64>,
+    /// One setting by its dotted path, such as learner.update.adam.lr=1e-4; may be given several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Whether one replay server starts on this machine, and the rest of the run is elsewhere or started before.
+    #[arg(skip)]
+    pub server_alone: bool,
+}
+
 /// The settings that the flags ask for, and where they come from.
 pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String), Usage> {
     let (source, from) = match &args.config {
@@ -60,7 +89,7 @@ pub fn resolve(args: &RunFlags, machine: &Machine) -> Result<(RunConfig, String)
             (source, format!("preset {}", preset.name))
         }
     };
-    Ok((resolve::resolve(&source, &args.over, machine)?, from))
+    Ok((source.resolve(&args.over, machine)?, from))
 }
 
 /// [`resolve`] of names and `--set`s, for code that has no command line.
@@ -83,3 +112,112 @@ pub fn of_names(
     };
     Ok(resolve(&flags, machine)?.0)
 }
+
+/// Where the settings come from before flags are applied.
+#[derive(Clone, Debug)]
+pub enum Source {
+    /// Layers: preset, world, agent.
+    Layers(&'static Preset, WorldName, &'static Agent),
+    /// A file that driml wrote: its name and text.
+    File(String, String),
+}
+
+impl Source {
+    /// Resolves the settings of a run: source, flags, `--set`, what the machine decides, what follows from the rest.
+    ///
+    /// # Errors
+    /// The first setting that is unknown, of the wrong type, out of range, or at odds with another.
+    pub fn resolve(&self, flags: &Flags, machine: &Machine) -> Result<RunConfig, Usage> {
+        let mut table = match self {
+            Self::Layers(preset, world, agent) => {
+                let mut table = presets::layers(preset, *world, agent)?;
+                // Everything else follows from these names.
+                derived::put(&mut table, "run.world", world.to_string().into());
+                derived::put(&mut table, "run.agent", agent.name.into());
+                derived::cut_frames(&mut table);
+                if let Some(command) = world.command() {
+                    // How long it is waited for is needed at once.
+                    for text in &flags.sets {
+                        let one = Override::parse(text)?;
+                        if one.path.starts_with("world.") {
+                            one.apply(&mut table)?;
+                        }
+                    }
+                    derived::declare(&mut table, command)?;
+                }
+                for (path, value) in [
+                    ("local.actors", Value::from(machine.actors())),
+                    ("local.learner_threads", machine.cores.into()),
+                    ("local.learner_device", "cpu".into()),
+                    ("actor.envs", resources::ENVS.into()),
+                    ("actor.world_threads", 0.into()),
+                ] {
+                    derived::put_missing(&mut table, path, value);
+                }
+                table
+            }
+            Self::File(name, text) => derived::read_file(name, text)?,
+        };
+        for (path, value) in [
+            ("local.actors", flags.actors.map(u64::from)),
+            ("actor.envs", flags.envs.map(u64::from)),
+            ("replay.transitions_max", flags.frames),
+            ("replay.shards", flags.replay_shards.map(u64::from)),
+            ("run.seed", flags.seed),
+        ] {
+            if let Some(value) = value {
+                derived::put_number(&mut table, path, value)?;
+            }
+        }
+        let sized_by_machine = matches!(self, Self::Layers(..));
+        let by_hand = set(&mut table, &flags.sets)?;
+        let is_set = |path: &str| by_hand.iter().any(|set| set == path);
+        if sized_by_machine || is_set("model.torso") {
+            derived::drop_other_torsos(&mut table, &by_hand)?;
+        }
+        let capacity_set = is_set("replay.capacity_transitions") || !sized_by_machine;
+        derived::precision(&mut table, machine.fast_bf16);
+        let of_file = |e| match self {
+            Self::File(name, _) if flags.sets.is_empty() => usage!("{name}: {e}"),
+            _ => e,
+        };
+        let mut config = RunConfig::derived(table).map_err(of_file)?;
+        memory::fit(&mut config, capacity_set, flags.server_alone, machine).map_err(of_file)?;
+        config = config.checked().map_err(of_file)?;
+        if let Self::Layers(preset, ..) = self {
+            let price = preset.price.iter().copied();
+            config.notes.extend(price.map(str::to_owned));
+        }
+        Ok(config)
+    }
+}
+
+/// Applies every `--set`; returns the paths that were set.
+fn set(table: &mut Table, sets: &[String]) -> Result<Vec<String>, Usage> {
+    let mut paths = Vec::with_capacity(sets.len());
+    for text in sets {
+        let one = Override::parse(text)?;
+        if let Some((known, how)) = derived::follows(&one.path) {
+            return Err(usage!("{known} cannot be set by hand: it {how}"));
+        }
+        let mut tried = table.clone();
+        let new = one.apply(&mut tried)?;
+        // A key that was not there may be an optional one. The type of its table decides.
+        if new {
+            let mut read = tried.clone();
+            derived::precision(&mut read, false);
+            let read = RunConfig::derived(read);
+            let key = one.path.rsplit('.').next().unwrap_or_default();
+            let unknown = format!("unknown field `{key}`");
+            if read.is_err_and(|e| e.0.contains(&unknown)) {
+                return Err(one.unknown(table));
+            }
+        }
+        *table = tried;
+        paths.push(one.path);
+    }
+    Ok(paths)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,8 +1,7 @@
 //! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
 //!
-//! Start with [`resolve::resolve`], which makes a [`config::RunConfig`] of a [`resolve::Source`] and [`resolve::Flags`]; the
-//! commands that start a run do so through [`flags::resolve`], and code by names. `presets/*.toml` has every number, each with its
-//! source.
+//! Start with [`flags::resolve`], which makes a [`config::RunConfig`] of what a command line says, or [`flags::of_names`], which does of
+//! names. `presets/*.toml` has every number, each with its source.
 //!
 //! ```
 //! use driml_machine::resources::Machine;
@@ -24,4 +23,3 @@ pub mod memory;
 pub mod menu;
 mod overrides;
 pub mod presets;
-pub mod resolve;

@@ -9,8 +9,8 @@ use toml::{Table, Value};
 
 use crate::{
     derived::{self, find},
+    flags::{Flags, Source},
     presets::{Agent, Layer, Only, PRESETS, Preset, agent, agents, layers, stack},
-    resolve::{Flags, Source, resolve},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -82,7 +82,7 @@ pub fn sourced(
         memory_bytes: u64::MAX,
         ..Machine::this()
     };
-    let table = resolve(&source, &Flags::default(), &machine)?.to_table();
+    let table = source.resolve(&Flags::default(), &machine)?.to_table();
     let mut sources = BTreeMap::new();
     for layer in stack(preset, world, agent) {
         note_sources(&layer, &world.with_own_library().to_string(), &mut sources);

@@ -5,8 +5,7 @@ use driml_launch::run_folder::{RunFolder, Summary};
 use driml_machine::{error::Usage, resources::Machine};
 use driml_settings::{
     config::RunConfig,
-    flags::{RunFlags, resolve},
-    resolve::Flags,
+    flags::{Flags, RunFlags, resolve},
 };
 
 /// The flags of `driml train` that make a run.

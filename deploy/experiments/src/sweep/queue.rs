@@ -23,7 +23,7 @@ use driml_machine::{
     resources::Machine,
 };
 use driml_protocol::lock_file;
-use driml_settings::resolve::Flags;
+use driml_settings::flags::Flags;
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,

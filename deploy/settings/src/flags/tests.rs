@@ -5,10 +5,7 @@ use driml_protocol::Sampling;
 use expect_test::{expect, expect_file};
 
 use super::*;
-use crate::{
-    flags::of_names,
-    presets::{AGENTS, PRESETS},
-};
+use crate::presets::{AGENTS, PRESETS};
 
 const MACHINE: Machine = Machine {
     cores: 2,
@@ -38,7 +35,8 @@ fn frames(frames: u64, set: &[&str]) -> Flags {
 
 fn of_file(name: &str, text: String, set: &[&str]) -> Result<RunConfig, String> {
     let file = Source::File(name.into(), text);
-    resolve(&file, &sets(set), &MACHINE).map_err(|e| e.to_string())
+    file.resolve(&sets(set), &MACHINE)
+        .map_err(|e| e.to_string())
 }
 
 fn with(world: &str, agent: &str, set: &[&str]) -> Result<RunConfig, String> {
@@ -52,7 +50,7 @@ fn every_preset_in_every_world_for_every_agent_resolves_and_reads_back() {
         for world in WorldName::all() {
             for agent in AGENTS {
                 let source = Source::Layers(preset, world, agent);
-                let config = match resolve(&source, &Flags::default(), &MACHINE) {
+                let config = match source.resolve(&Flags::default(), &MACHINE) {
                     Ok(config) => config,
                     Err(e) if e.0.contains("take --preset paper") => continue,
                     Err(e) => panic!("{} {world} {}: {e}", preset.name, agent.name),
@@ -212,12 +210,16 @@ fn flags_come_before_set_and_both_before_the_machine() {
         envs: Some(2),
         ..frames(7_000, &["run.seed=6"])
     };
-    let config = resolve(&source("paper", "chain", "c51"), &flags, &MACHINE).unwrap();
+    let config = source("paper", "chain", "c51")
+        .resolve(&flags, &MACHINE)
+        .unwrap();
     let (run, local) = (&config.run, &config.local);
     let found = (config.frames(), run.seed, local.actors, config.actor.envs);
     assert_eq!(found, (7_000, 6, 3, 2));
     let too_many = frames(u64::MAX, &[]);
-    let said = resolve(&source("paper", "chain", "c51"), &too_many, &MACHINE).unwrap_err();
+    let said = source("paper", "chain", "c51")
+        .resolve(&too_many, &MACHINE)
+        .unwrap_err();
     expect![
         "replay.transitions_max = 18446744073709551615: the largest number is 9223372036854775807"
     ]
@@ -233,7 +235,7 @@ fn a_replay_server_of_its_own_counts_nothing_that_runs_elsewhere() {
             server_alone,
             ..frames(50_000_000, set)
         };
-        let config = resolve(&source("paper", "procgen:heist", "c51"), &flags, &MACHINE);
+        let config = source("paper", "procgen:heist", "c51").resolve(&flags, &MACHINE);
         config
             .map(|it| it.replay.capacity_transitions)
             .map_err(|e| e.to_string())
