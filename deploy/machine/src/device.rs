@@ -1,10 +1,14 @@
-//! Which device a command computes on, and whether this program can compute there.
-//! It computes nothing.
+//! Which device a command computes on, and whether this program can compute there: on a GPU only if it was built with the feature
+//! `cuda`. It computes nothing.
 
 use clap::Args;
 use driml_model::DeviceName;
 
-use crate::{doctor::cuda, error::Usage};
+use crate::error::{Usage, usage};
+
+#[cfg(not(feature = "cuda"))]
+const TO_BUILD: &str = "this program was built without CUDA; with a CUDA toolkit `cargo build --release --features cuda` builds one \
+     that has it, without a toolkit `deploy/cuda/build.sh`";
 
 /// What the learner computes on.
 #[derive(Clone, Copy, Debug, Args)]
@@ -14,18 +18,119 @@ pub struct DeviceFlag {
     pub device: DeviceName,
 }
 
-/// Makes sure that this program can compute on `device`.
+/// Makes sure that there is this device, and that this program was built for it; else says what to do.
 pub fn ready_for(device: DeviceName) -> Result<(), Usage> {
-    match device {
-        DeviceName::Cpu => Ok(()),
-        DeviceName::Cuda(ordinal) => cuda::check(ordinal),
-    }
+    let DeviceName::Cuda(ordinal) = device else {
+        return Ok(());
+    };
+    let described = count().and_then(|count| match ordinal < count {
+        true => describe(ordinal),
+        false => Err(format!(
+            "the driver finds {count} device(s), counted from cuda:0"
+        )),
+    });
+    let checked = described.map(drop);
+    checked.map_err(|why| usage!("cuda:{ordinal} cannot be used: {why}"))
 }
 
 /// A GPU's name, compute capability and memory; none if the CPU computes.
 pub fn gpu(device: DeviceName) -> Option<String> {
     match device {
         DeviceName::Cpu => None,
-        DeviceName::Cuda(ordinal) => cuda::describe(ordinal).ok(),
+        DeviceName::Cuda(ordinal) => describe(ordinal).ok(),
+    }
+}
+
+/// Every GPU that the driver finds, by its name: what it is, or why this program cannot compute there. Else why there is none.
+pub(crate) fn gpus() -> Result<Vec<(String, Result<String, String>)>, String> {
+    let one = |ordinal| (format!("cuda:{ordinal}"), describe(ordinal));
+    count().map(|count| (0..count).map(one).collect())
+}
+
+/// How many devices the driver finds, at least one; else why there is none.
+#[cfg(not(feature = "cuda"))]
+fn count() -> Result<usize, String> {
+    Err(TO_BUILD.to_owned())
+}
+
+#[cfg(feature = "cuda")]
+fn count() -> Result<usize, String> {
+    use candle_core::cuda_backend::cudarc::driver::CudaContext;
+
+    match CudaContext::device_count() {
+        Ok(0) => Err("the driver finds no device; does CUDA_VISIBLE_DEVICES hide them?".to_owned()),
+        Ok(count) => Ok(count as usize),
+        Err(why) => Err(format!("asking the driver: {why}")),
+    }
+}
+
+/// A device's name, compute capability and memory; an error if it cannot be asked or this program was not built for it.
+#[cfg(not(feature = "cuda"))]
+fn describe(_ordinal: usize) -> Result<String, String> {
+    Err(TO_BUILD.to_owned())
+}
+
+#[cfg(feature = "cuda")]
+fn describe(ordinal: usize) -> Result<String, String> {
+    use candle_core::cuda_backend::cudarc::driver::{CudaContext, DriverError};
+
+    let ask = || -> Result<_, DriverError> {
+        let context = CudaContext::new(ordinal)?;
+        let (free, total) = context.mem_get_info()?;
+        let capability: (i32, i32) = context.compute_capability()?;
+        Ok((context.name()?, capability, free, total))
+    };
+    let (name, (major, minor), free, total) =
+        ask().map_err(|why| format!("asking for its properties: {why}"))?;
+    let [free, total] = [free, total].map(|bytes| crate::units::gib(bytes as u64));
+    let text = format!("{name}, compute capability {major}.{minor}, {total}, {free} free");
+    match option_env!("CUDA_COMPUTE_CAP").and_then(|it| it.parse().ok()) {
+        Some(built) if !runs_on(built, (major, minor)) => Err(format!(
+            "{text}; this program is for {built}: build it again with CUDA_COMPUTE_CAP={major}{minor}"
+        )),
+        _ => Ok(text),
+    }
+}
+
+/// Whether kernels that were compiled for the capability `built`, such as 90 for 9.0, run on one of `major.minor`.
+///
+/// Source: nvcc's rules. From 9.0 on candle's are compiled for the architecture's own instructions, which no other has;
+/// below, the driver compiles them for newer ones.
+#[cfg(any(test, feature = "cuda"))]
+fn runs_on(built: i32, (major, minor): (i32, i32)) -> bool {
+    let device = 10 * major + minor;
+    if built >= 90 {
+        device == built
+    } else {
+        device >= built
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kernels_run_where_nvcc_s_rules_say() {
+        for (built, device, runs) in [
+            (90, (9, 0), true),
+            (90, (8, 9), false),
+            (90, (10, 0), false),
+            (80, (8, 0), true),
+            (80, (8, 6), true),
+            (80, (9, 0), true),
+            (80, (7, 5), false),
+        ] {
+            assert_eq!(runs_on(built, device), runs, "{built} on {device:?}");
+        }
+    }
+
+    #[cfg(not(feature = "cuda"))]
+    #[test]
+    fn a_program_without_cuda_says_how_to_build_one_that_has_it() {
+        let said = ready_for(DeviceName::Cuda(0)).unwrap_err().to_string();
+        assert!(said.starts_with("cuda:0 cannot be used: this program"));
+        assert!(said.contains("--features cuda"), "{said}");
+        assert!(gpus().is_err());
     }
 }

@@ -2,7 +2,6 @@
 //! It changes nothing, fetches nothing and measures no speed.
 
 mod certificates;
-pub(crate) mod cuda;
 mod engine;
 mod fact;
 mod host;
@@ -12,6 +11,7 @@ use std::path::Path;
 use anyhow::ensure;
 
 use self::fact::{Fact, State};
+use crate::device;
 
 /// What was found out, for the CPU and for CUDA.
 #[derive(Debug)]
@@ -25,9 +25,20 @@ pub struct Report {
 pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
     cpu.push(Fact::new("Procgen", engine::found()));
+    // Training on the CPU needs none.
+    let cuda = match device::gpus() {
+        Ok(gpus) => gpus
+            .into_iter()
+            .map(|(name, found)| match found {
+                Ok(text) => Fact::new(name, (State::Ok, text)),
+                Err(why) => Fact::new(name, (State::Missing, why)),
+            })
+            .collect(),
+        Err(why) => vec![Fact::new("cuda", (State::Note, why))],
+    };
     Report {
         cpu,
-        cuda: cuda::facts(),
+        cuda,
         certificates: tls_dir.map_or_else(Vec::new, certificates::facts),
     }
 }
