@@ -1,9 +1,6 @@
 //! The menu of presets: TOML layers that lie in `presets/`, built into the program and laid over one another.
 //! It checks no value: `config` does, once everything is in place.
 
-#[cfg(test)]
-mod pinned;
-
 use std::sync::OnceLock;
 
 use driml_envs::WorldName;
@@ -276,42 +273,4 @@ fn merge(lower: &mut Table, upper: Table) {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::collections::BTreeSet;
-
-    use super::{pinned::all_layers, *};
-
-    #[test]
-    fn later_layers_win_key_by_key() {
-        let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
-        merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
-        let merged: Table = "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse().unwrap();
-        assert_eq!(lower, merged);
-    }
-
-    #[test]
-    fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
-        let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
-        let found = ["coinrun", "mspacman", "chain"].map(of);
-        assert_eq!(found, ["tuned", "paper", "paper"]);
-    }
-
-    #[test]
-    fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
-        let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
-        for layer in all_layers().values() {
-            assert!(layer.text.starts_with("# "), "{}", layer.name);
-            for world in layer.read().1.iter().flat_map(|block| &block.worlds) {
-                assert!(worlds.contains(world), "{world} in {}", layer.name);
-            }
-        }
-    }
-
-    #[test]
-    fn worlds_go_by_their_games_name_too() {
-        assert_eq!(world("bigfish").unwrap(), world("procgen:bigfish").unwrap());
-        assert!(world("mspacman").is_ok());
-        let said = world("bigfihs").unwrap_err().to_string();
-        assert!(said.contains("did you mean"), "{said}");
-    }
-}
+mod tests;

@@ -1,14 +1,15 @@
 //! The settings of every preset as a snapshot, `tests/snapshots/presets.txt`: a changed number shows in it (`UPDATE_EXPECT=1`
 //! rewrites it). Every number has its source beside it. `chain` and `smoke` are left out: their numbers are for tests.
-//! That later layers win is tested with `presets`, which games an `[[only]]` block names with `menu`.
+//! Which games an `[[only]]` block names is tested with `menu`.
 
-use std::{collections::BTreeMap, fmt::Write};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt::Write,
+};
 
-use driml_envs::WorldName;
 use expect_test::expect_file;
-use toml::{Table, Value};
 
-use super::{AGENTS, BASE, Layer, PRESETS, world_layer};
+use super::*;
 use crate::{derived::find, menu::comments, overrides::leaves};
 
 const LEFT_OUT: [&str; 2] = ["world/chain", "variant/smoke"];
@@ -26,7 +27,7 @@ const SOURCES: [&str; 8] = [
 ];
 
 /// Every layer, by its name.
-pub(super) fn all_layers() -> BTreeMap<&'static str, Layer> {
+fn all_layers() -> BTreeMap<&'static str, Layer> {
     let agents = AGENTS.iter().map(|agent| agent.layer);
     // A command is not a world's name; any one stands for all.
     let exec = "exec:true".parse().unwrap();
@@ -96,4 +97,38 @@ fn every_number_has_its_source_beside_it() {
             }
         }
     }
+}
+
+#[test]
+fn later_layers_win_key_by_key() {
+    let mut lower: Table = "[a]\nx = 1\ny = 2\n[b]\nz = [1, 2]".parse().unwrap();
+    merge(&mut lower, "[a]\ny = 3\n[b]\nz = [4]".parse().unwrap());
+    let merged: Table = "[a]\nx = 1\ny = 3\n[b]\nz = [4]".parse().unwrap();
+    assert_eq!(lower, merged);
+}
+
+#[test]
+fn a_run_without_a_preset_is_tuned_on_procgen_and_the_papers_elsewhere() {
+    let of = |name| preset_or_default(None, world(name).unwrap()).unwrap().name;
+    let found = ["coinrun", "mspacman", "chain"].map(of);
+    assert_eq!(found, ["tuned", "paper", "paper"]);
+}
+
+#[test]
+fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
+    let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
+    for layer in all_layers().values() {
+        assert!(layer.text.starts_with("# "), "{}", layer.name);
+        for world in layer.read().1.iter().flat_map(|block| &block.worlds) {
+            assert!(worlds.contains(world), "{world} in {}", layer.name);
+        }
+    }
+}
+
+#[test]
+fn worlds_go_by_their_games_name_too() {
+    assert_eq!(world("bigfish").unwrap(), world("procgen:bigfish").unwrap());
+    assert!(world("mspacman").is_ok());
+    let said = world("bigfihs").unwrap_err().to_string();
+    assert!(said.contains("did you mean"), "{said}");
 }
