@@ -79,7 +79,7 @@ pub fn run(
     });
     let evaluator = Evaluator::new(config, run_dir)?;
     let (names, events) = (process_names(config), config.local.tensorboard);
-    let mut recorder = RunRecorder::open(run_dir, config, names.clone(), resumed, events)?;
+    let recorder = RunRecorder::open(run_dir, config, names.clone(), resumed, events)?;
     let resume_point = resumed.unwrap_or_default();
     let rendezvous = Rendezvous::create()?;
     let servers = names.iter().take(config.replay.shards as usize);
@@ -114,14 +114,15 @@ pub fn run(
         server_restarts: 0,
         actor_restarts: 0,
         poller: None,
+        recorder,
     };
 
-    let ran = launch.start_and_watch(&mut recorder);
-    let ended = launch.end(ran, &mut recorder);
+    let ran = launch.start_and_watch();
+    let ended = launch.end(ran);
     session::sweep_shared_memory();
     launch.display.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
-    let (mut summary, written) = launch.conclude(&mut recorder, outcome, restarts_before);
+    let (mut summary, written) = launch.conclude(outcome, restarts_before);
     // An interrupted or failed run does not wait for it.
     if outcome == Outcome::Finished {
         let evaluator = &mut launch.evaluator;
@@ -179,10 +180,12 @@ struct Launch<'a> {
     server_restarts: u32,
     actor_restarts: u32,
     poller: Option<Poller>,
+    /// The last that goes: no other launcher writes to the folder before.
+    recorder: RunRecorder,
 }
 
 impl Launch<'_> {
-    fn start_and_watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
+    fn start_and_watch(&mut self) -> anyhow::Result<Outcome> {
         let logs = self.run_dir.logs();
         std::fs::create_dir_all(&logs).with_context(|| format!("making {}", logs.display()))?;
         self.start_up_to(self.endpoints.len())?;
@@ -207,11 +210,11 @@ impl Launch<'_> {
         self.poller = Some(poller);
 
         self.start_up_to(self.names.len())?;
-        self.watch(recorder)
+        self.watch()
     }
 
     /// Asks, shows and records once a second until the run is over.
-    fn watch(&mut self, recorder: &mut RunRecorder) -> anyhow::Result<Outcome> {
+    fn watch(&mut self) -> anyhow::Result<Outcome> {
         let (mut standstill, mut counts_before) = (Silence::default(), (0, 0));
         loop {
             if self.shutdown.ending.wait_timeout(POLL) {
@@ -238,11 +241,11 @@ impl Launch<'_> {
             let rss: Vec<_> = processes.map(ManagedProcess::rss_mib).collect();
             if view.is_answered() {
                 let ask = |shard, since| poller.episodes(shard, since, true);
-                let mut warnings = recorder.record_episodes(view, ask);
-                warnings.extend(recorder.record(&mut poller.view, &rss));
+                let mut warnings = self.recorder.record_episodes(view, ask);
+                warnings.extend(self.recorder.record(&mut poller.view, &rss));
                 self.display.screen.lines(warnings);
             }
-            recorder.complete(&mut poller.view);
+            self.recorder.complete(&mut poller.view);
             let view = &poller.view;
             self.display.show(view);
             self.evaluator.look(&self.display.screen);
@@ -269,11 +272,7 @@ impl Launch<'_> {
 
     /// Ends all processes: actors first, so that what they have is stored; the learner saves; the replay server is last, so
     /// that it can be asked for the final counts. A second interrupt ends everything at once. Gives how the run ended.
-    fn end(
-        &mut self,
-        ran: anyhow::Result<Outcome>,
-        recorder: &mut RunRecorder,
-    ) -> anyhow::Result<Outcome> {
+    fn end(&mut self, ran: anyhow::Result<Outcome>) -> anyhow::Result<Outcome> {
         let failed = ran.as_ref().err().map(|e| format!("{e:#}"));
         // The signal that interrupted this process may have reached the others first.
         let ran = match self.shutdown.ending.is_set() {
@@ -302,15 +301,19 @@ impl Launch<'_> {
             if let Err(e) = poller.ask_replay() {
                 tracing::debug!("the replay server's last answer: {e:#}");
             }
-            recorder.record_episodes(&poller.view, |shard, since| {
-                poller.episodes(shard, since, true)
-            });
+            let ask = |shard, since| poller.episodes(shard, since, true);
+            self.recorder.record_episodes(&poller.view, ask);
             // Before its router goes away, so that it does not try to reach it again.
             poller.close();
         }
         let servers = self.processes.iter_mut().take(shards);
         others.extend(stop(servers, true, REPLAY_DRAIN_MAX, &abort));
-        let is_complete = finished || self.is_complete();
+        // All transitions are in and learned from, and the result is saved, by the last answers.
+        let is_learned = |Poller { view, .. }: &Poller| {
+            let served = updates_served(self.config, view.replay.rows_sampled);
+            view.is_learned() && view.learner.updates >= served
+        };
+        let is_complete = finished || self.poller.as_ref().is_some_and(is_learned);
         let result = match ran {
             _ if is_complete => self.run_dir.check_whole().map(|()| Outcome::Finished),
             _ if abort() => Err(anyhow::anyhow!(
@@ -335,14 +338,6 @@ impl Launch<'_> {
                 .line(&format!("while stopping, {warning}"));
         }
         result
-    }
-
-    /// Whether all transitions are in and learned from, and the result saved, by the last answers.
-    fn is_complete(&self) -> bool {
-        self.poller.as_ref().is_some_and(|Poller { view, .. }| {
-            let served = updates_served(self.config, view.replay.rows_sampled);
-            view.is_learned() && view.learner.updates >= served
-        })
     }
 
     /// Tells the learner to stop and asks it how it is until it says that it has saved, or no longer answers.
@@ -375,7 +370,6 @@ impl Launch<'_> {
     /// Writes the last row and the summary, says what could not be written before, and whether the summary could.
     fn conclude(
         &mut self,
-        recorder: &mut RunRecorder,
         outcome: Outcome,
         [servers_before, actors_before]: [u32; 2],
     ) -> (Summary, anyhow::Result<()>) {
@@ -384,14 +378,14 @@ impl Launch<'_> {
         let view = match &mut self.poller {
             None => nothing,
             Some(poller) => {
-                recorder.record(&mut poller.view, &[]);
+                self.recorder.record(&mut poller.view, &[]);
                 &mut poller.view
             }
         };
         let logs = self.processes.iter().filter_map(|it| it.log.missing());
-        let missing = console::join_losses(recorder.missing().into_iter().chain(logs));
+        let missing = console::join_losses(self.recorder.missing().into_iter().chain(logs));
         missing.iter().for_each(|line| console::line(line));
-        let mut summary = recorder.summarise(outcome, view);
+        let mut summary = self.recorder.summarise(outcome, view);
         summary.replay_servers_restarted = servers_before + self.server_restarts;
         summary.actors_restarted = actors_before + self.actor_restarts;
         let written = summary.write(self.run_dir);
