@@ -11,41 +11,23 @@ use toml::{Table, Value};
 
 use crate::overrides::inline;
 
-const BY_ENV: &str = "is chosen by --env";
-const FROM_FRAME: &str = "follows from the world and what the torso reads";
-const FROM_ACTIONS: &str = "follows from the world and actor.actions";
+/// Settings that follow from others: their paths, and how.
+const FOLLOWS: &str = "\
+run.world world.kind world.game world.command world.library: is chosen by --env
+run.agent: is chosen by --agent
+run.frame_height run.frame_width: follows from the world and what the torso reads
+run.num_actions model.num_actions: follows from the world and actor.actions
+run.frame_channels input.frame: follows from the world
+model.height: follows from input.height and what the torso reads
+model.width: follows from input.width and what the torso reads
+model.input_channels: follows from the world and run.frame_stack
+model.dim model.loss_layers: follows from learner.update";
 
-const FROM_LOSS: &str = "follows from learner.update";
-const LOSS_LAYERS: &str = "model.loss_layers";
-
-const FOLLOWS: [(&str, &str); 17] = [
-    ("run.world", BY_ENV),
-    ("run.agent", "is chosen by --agent"),
-    ("run.frame_height", FROM_FRAME),
-    ("run.frame_width", FROM_FRAME),
-    ("run.frame_channels", "follows from the world"),
-    ("run.num_actions", FROM_ACTIONS),
-    ("world.kind", BY_ENV),
-    ("world.game", BY_ENV),
-    ("world.command", BY_ENV),
-    ("world.library", BY_ENV),
-    ("input.frame", "follows from the world"),
-    (
-        "model.height",
-        "follows from input.height and what the torso reads",
-    ),
-    (
-        "model.width",
-        "follows from input.width and what the torso reads",
-    ),
-    (
-        "model.input_channels",
-        "follows from the world and run.frame_stack",
-    ),
-    ("model.num_actions", FROM_ACTIONS),
-    ("model.dim", FROM_LOSS),
-    (LOSS_LAYERS, FROM_LOSS),
-];
+/// Each setting of [`FOLLOWS`] by its path, and how it follows.
+fn all_that_follows() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let lines = FOLLOWS.lines().filter_map(|line| line.split_once(": "));
+    lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
+}
 
 /// Where a whole frame's size is, if frames are cut.
 const FRAME: &str = "input.frame";
@@ -115,7 +97,7 @@ pub(crate) fn follows(path: &str) -> Option<(&'static str, &'static str)> {
         let rest = path.strip_prefix(known);
         rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     };
-    FOLLOWS.into_iter().find(|(known, _)| inside(known))
+    all_that_follows().find(|(known, _)| inside(known))
 }
 
 pub(crate) fn derive(table: &mut Table) -> Result<(), Usage> {
@@ -179,7 +161,7 @@ fn loss_layers(table: &mut Table, update: &LearnerSettings) -> Result<(), Usage>
         let layers = layers.collect::<Result<Vec<_>, _>>()?;
         match table.get_mut("model").and_then(Value::as_table_mut) {
             Some(model) if layers.is_empty() => _ = model.remove("loss_layers"),
-            _ => put(table, LOSS_LAYERS, layers.into()),
+            _ => put(table, "model.loss_layers", layers.into()),
         }
     }
     Ok(())
@@ -239,7 +221,7 @@ pub(crate) fn read_file(name: &str, text: &str) -> Result<Table, Usage> {
         .map_err(|e: toml::de::Error| usage!("{name} is not TOML: {}", e.message()))?;
     let mut right = read.clone();
     derive(&mut right).map_err(|e| usage!("{name}: {e}"))?;
-    for (path, how) in FOLLOWS {
+    for (path, how) in all_that_follows() {
         let is = find(&right, path);
         if let Some(was) = find(&read, path)
             && is != Some(was)
