@@ -18,10 +18,9 @@ const GENERATED: &str =
 
 /// A flag or argument as its command's list shows it.
 fn entry(arg: &Arg) -> String {
-    let values: Vec<_> = arg.get_value_names().unwrap_or_default().iter().collect();
     let takes_values = arg.get_action().takes_values();
-    let value = match values[..] {
-        [name] if takes_values => format!(" <{name}>"),
+    let value = match arg.get_value_names() {
+        Some([name]) if takes_values => format!(" <{name}>"),
         _ => String::new(),
     };
     let name = match arg.get_long() {

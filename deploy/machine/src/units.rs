@@ -50,25 +50,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_have_two_units_at_most() {
+    fn times_sizes_and_numbers_have_the_digits_that_matter() {
         let texts = [5, 65, 3_660, 90_000].map(|seconds| duration(Duration::from_secs(seconds)));
         assert_eq!(texts, ["5 s", "1 min 5 s", "1 h 1 min", "1 d 1 h"]);
-    }
-
-    #[test]
-    fn rough_times_have_one() {
         let texts = [3.2, 99.0, 100.0, 3_600.0, 9_000.0].map(rough_duration);
         assert_eq!(texts, ["3 s", "99 s", "2 min", "60 min", "2.5 h"]);
-    }
-
-    #[test]
-    fn numbers_have_the_digits_that_matter() {
         let texts = [0.0, 0.12345, 1.2345, 12.345, 123.45, 61_234.5].map(number);
         assert_eq!(texts, ["0.00", "0.123", "1.23", "12.3", "123", "61234"]);
-    }
-
-    #[test]
-    fn sizes_have_one_decimal() {
         assert_eq!(gib(3 << 29), "1.5 GiB");
     }
 

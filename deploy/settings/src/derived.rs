@@ -183,11 +183,7 @@ fn beta_updates(table: &mut Table) {
     if rule != Some("prioritised") || find(table, PATH).is_some() {
         return;
     }
-    let number = |path| {
-        let value = find(table, path)?;
-        let whole = value.as_integer().map(|whole| whole as f64);
-        value.as_float().or(whole)
-    };
+    let number = |path| optional::<f64>(table, path).ok().flatten();
     let updates = || {
         let transitions = number("replay.transitions_max")? - number("replay.warmup_transitions")?;
         let rows = transitions * number("replay.replay_ratio")?;
