@@ -136,9 +136,9 @@ impl RunConfig {
 
     /// The same settings with frames that are recorded and sent whole, as those of earlier versions: what is computed is the same.
     pub fn with_whole_frames(&self) -> Result<Self, Usage> {
-        let mut table = self.to_table();
-        derived::keep_whole_frames(&mut table);
-        Self::derived(table)?.checked()
+        let mut whole = self.clone();
+        whole.input.frame = None;
+        Self::derived(whole.to_table())?.checked()
     }
 
     /// The names of the run's actions; an action is a place in this list.

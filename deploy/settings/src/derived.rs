@@ -29,8 +29,9 @@ fn all_that_follows() -> impl Iterator<Item = (&'static str, &'static str)> {
     lines.flat_map(|(paths, how)| paths.split(' ').map(move |path| (path, how)))
 }
 
-/// Where a whole frame's size is, if frames are cut.
-const FRAME: &str = "input.frame";
+/// Where a whole frame's size is, if frames are cut to what the network reads. Settings of earlier versions do not have it: what they
+/// say of a run stays true of it.
+pub(crate) const FRAME: &str = "input.frame";
 
 /// Asks a world that runs in its own process what it is, and fills that in: shapes, actions, and the size at which its frames are seen.
 pub(crate) fn declare(table: &mut Table, command: &str) -> Result<(), Usage> {
@@ -60,17 +61,6 @@ pub(crate) fn precision(table: &mut Table, fast_bf16: bool) {
             let name = if fast { "bf16" } else { "f32" };
             put(table, path, Value::String(name.into()));
         }
-    }
-}
-
-/// Lets frames be cut to what the network reads. Settings of earlier versions do not: what they say of a run stays true of it.
-pub(crate) fn cut_frames(table: &mut Table) {
-    put(table, FRAME, Value::Table(Table::new()));
-}
-
-pub(crate) fn keep_whole_frames(table: &mut Table) {
-    if let Some(input) = table.get_mut("input").and_then(Value::as_table_mut) {
-        input.remove("frame");
     }
 }
 
@@ -257,14 +247,6 @@ pub(crate) fn put(table: &mut Table, path: &str, value: Value) {
             }
         }
     }
-}
-
-/// [`put`] of a whole number; TOML has none above `i64::MAX`.
-pub(crate) fn put_number(table: &mut Table, path: &str, number: u64) -> Result<(), Usage> {
-    let whole = i64::try_from(number)
-        .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
-    put(table, path, Value::Integer(whole));
-    Ok(())
 }
 
 /// Writes a value where there is none.

@@ -134,7 +134,7 @@ impl Source {
                 // Everything else follows from these names.
                 derived::put(&mut table, "run.world", world.to_string().into());
                 derived::put(&mut table, "run.agent", agent.name.into());
-                derived::cut_frames(&mut table);
+                derived::put(&mut table, derived::FRAME, Table::new().into());
                 if let Some(command) = world.command() {
                     // How long it is waited for is needed at once.
                     for text in &flags.sets {
@@ -165,8 +165,10 @@ impl Source {
             ("replay.shards", flags.replay_shards.map(u64::from)),
             ("run.seed", flags.seed),
         ] {
-            if let Some(value) = value {
-                derived::put_number(&mut table, path, value)?;
+            if let Some(number) = value {
+                let whole = i64::try_from(number)
+                    .map_err(|_| usage!("{path} = {number}: the largest number is {}", i64::MAX))?;
+                derived::put(&mut table, path, whole.into());
             }
         }
         let sized_by_machine = matches!(self, Self::Layers(..));

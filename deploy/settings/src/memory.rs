@@ -46,13 +46,9 @@ pub(crate) fn fit(
         bytes: machine.replay_bytes(beside).saturating_mul(parts),
         bytes_max: machine.replay_bytes_max(beside).saturating_mul(parts),
     };
-    match config.replay.compression {
-        Compression::None => fit_plain(config, capacity_set, &room),
-        _ => fit_compressed(config, &room),
+    if config.replay.compression != Compression::None {
+        return fit_compressed(config, &room);
     }
-}
-
-fn fit_plain(config: &mut RunConfig, capacity_set: bool, room: &Room) -> Result<(), Usage> {
     let (replay, free) = (&mut config.replay, &room.free);
     let bytes_each = replay_bytes_each(&config.run) + sampling_bytes_each(replay);
     let asked = replay.capacity_transitions;
