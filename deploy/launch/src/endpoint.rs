@@ -157,10 +157,14 @@ mod tests {
     fn endpoints_that_zenoh_cannot_open_are_refused() {
         let none = "not an endpoint";
         let quic = "with --tls-dir it is quic/host:1";
+        let socket = |bytes: usize| format!("unixsock-stream//{}", "x".repeat(bytes - 1));
+        let [short, long] = [107, 108].map(socket);
         for (endpoint, tls, said) in [
             ("tcp/127.0.0.1:7447", false, ""),
             ("tcp/[::1]:7447", false, ""),
             ("unixsock-stream//tmp/driml.sock", false, ""),
+            (&*short, false, ""),
+            (&*long, false, "at most 107 bytes, and this one has 108"),
             ("quic/host:1", true, ""),
             ("unixsock-stream//tmp/s", true, ""),
             ("", false, none),
@@ -188,14 +192,9 @@ mod tests {
         assert_eq!(listening("quic/[::]:1", true, false), Ok(()));
     }
 
+    /// As `check_endpoint` has it.
     #[test]
-    fn a_socket_s_path_is_short() {
-        let of_bytes = |bytes: usize| format!("unixsock-stream//{}", "x".repeat(bytes - 1));
-        assert!(check_endpoints(&[of_bytes(107)], false).is_ok());
-        let said = check_endpoints(&[of_bytes(108)], false).unwrap_err();
-        let why = "at most 107 bytes, and this one has 108";
-        assert!(said.to_string().contains(why), "{said}");
-        // As the system has it.
+    fn the_system_takes_a_socket_s_path_up_to_its_limit() {
         let folder = tempfile::tempdir_in("/tmp").unwrap();
         let path = folder.path().display().to_string();
         let path = |bytes: usize| format!("{path}/{}", "x".repeat(bytes - path.len() - 1));

@@ -29,8 +29,17 @@ pub(crate) struct InspectArgs {
 }
 
 pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
+    let machine = Machine::this();
     if args.worlds {
-        let inspections = in_every_world(&args.settings)?;
+        let of_world = |world: WorldName| {
+            let flags = RunFlags {
+                env: Some(world.to_string()),
+                ..args.settings.clone()
+            };
+            Inspection::of(&resolve(&flags, &machine)?.0)
+        };
+        let inspections: anyhow::Result<Vec<_>> = WorldName::all().map(of_world).collect();
+        let inspections = inspections?;
         return match args.json {
             true => print(&(serde_json::to_string_pretty(&inspections)? + "\n")),
             false => print(&describe_worlds(&inspections)),
@@ -38,23 +47,11 @@ pub(crate) fn run(args: &InspectArgs) -> anyhow::Result<()> {
     }
     let config = match &args.run {
         Some(folder) => config_of(&RunFolder::new(folder))?,
-        None => resolve(&args.settings, &Machine::this())?.0,
+        None => resolve(&args.settings, &machine)?.0,
     };
     let inspection = Inspection::of(&config)?;
     match args.json {
         true => print(&(serde_json::to_string_pretty(&inspection)? + "\n")),
         false => print(&inspection.describe()),
     }
-}
-
-fn in_every_world(settings: &RunFlags) -> anyhow::Result<Vec<Inspection>> {
-    let machine = Machine::this();
-    let of_world = |world: WorldName| {
-        let flags = RunFlags {
-            env: Some(world.to_string()),
-            ..settings.clone()
-        };
-        Inspection::of(&resolve(&flags, &machine)?.0)
-    };
-    WorldName::all().map(of_world).collect()
 }
