@@ -119,35 +119,58 @@ impl Lockstep {
     /// The components of the run in `run_dir`, as they were at its newest checkpoint.
     pub(super) fn resume(config: &RunConfig, run_dir: &RunFolder) -> anyhow::Result<Self> {
         let saved = SavedParts::read(run_dir)?;
-        let mut this = Self::in_memory(config)?;
         let compute = config.local.learner_device.open(config.learner.precision)?;
         let settings = LearnerConfig::from_toml(&config.to_toml())?;
-        this.learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
-        this.replay = open(config, run_dir, Some(saved.replay))?;
-        this.take(saved)
-            .context("resuming the actors from the checkpoint")?;
+        let learner = Learner::resume(settings, &compute, &run_dir.checkpoints())?;
+        let replay = open(config, run_dir, Some(saved.replay))?;
+        let (actors, turn) = (saved.actors, saved.turn);
+        let (found, count) = (actors.len(), config.local.actors as usize);
+        let resuming = "resuming the actors from the checkpoint";
+        if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
+            bail!("{resuming}: it holds {found} actors, and this run has {count}");
+        }
+        let mut this = Self::of(config, learner, replay, turn)?;
+        for (actor, state) in this.actors.iter_mut().zip(actors) {
+            actor.go_on_from(state).context(resuming)?;
+        }
         Ok(this)
     }
 
     /// The components of a run that begins and is not kept.
     pub(super) fn in_memory(config: &RunConfig) -> anyhow::Result<Self> {
-        let text = config.to_toml();
-        let settings = ActorSettings::from_toml(&text)?;
-        let learner_config = LearnerConfig::from_toml(&text)?;
-        let batch_size = learner_config.learner.batch_size;
-        let replay = Replay::new(&config.run, &config.replay, batch_size)?;
-        let device = config.local.learner_device;
-        let compute = device.open(learner_config.learner.precision)?;
-        let mut learner = Learner::new(learner_config, &compute)?;
+        let replay = Replay::new(&config.run, &config.replay, config.learner.batch_size)?;
+        let compute = config.local.learner_device.open(config.learner.precision)?;
+        let settings = LearnerConfig::from_toml(&config.to_toml())?;
+        let mut learner = Learner::new(settings, &compute)?;
         let Weights {
             header,
             safetensors,
         } = learner.next_weights()?;
-        let status = LearnerStatus {
-            weights_version: header.version,
-            weights_sha256: header.sha256_hex(),
-            ..LearnerStatus::default()
+        let turn = Turn {
+            next_actor: 0,
+            unwanted: vec![0; config.local.actors as usize],
+            status: LearnerStatus {
+                weights_version: header.version,
+                weights_sha256: header.sha256_hex(),
+                ..LearnerStatus::default()
+            },
+            acting: (header, safetensors),
+            published: 0,
         };
+        let mut this = Self::of(config, learner, replay, turn)?;
+        this.join_actors()?;
+        Ok(this)
+    }
+
+    /// These components, with actors that begin and act with the weights of this turn.
+    fn of(
+        config: &RunConfig,
+        learner: Learner,
+        replay: Replay,
+        turn: Turn,
+    ) -> anyhow::Result<Self> {
+        let settings = ActorSettings::from_toml(&config.to_toml())?;
+        let (header, safetensors) = &turn.acting;
         let actor = |actor| {
             let life = Incarnation {
                 actor,
@@ -156,27 +179,17 @@ impl Lockstep {
                 earlier_incarnations: 0,
             };
             let (settings, pool) = (settings.clone(), BufferPool::new(1));
-            Collector::new(settings, pool, life, header.version, &safetensors)
+            Collector::new(settings, pool, life, header.version, safetensors)
         };
-        let actors = (0..config.local.actors)
-            .map(actor)
-            .collect::<Result<Vec<_>, _>>()?;
-        let mut this = Self {
-            turn: Turn {
-                next_actor: 0,
-                unwanted: vec![0; actors.len()],
-                status,
-                acting: (header, safetensors),
-                published: 0,
-            },
-            actors,
+        let actors = (0..config.local.actors).map(actor);
+        Ok(Self {
+            actors: actors.collect::<Result<Vec<_>, _>>()?,
+            batch_size: config.learner.batch_size,
+            steps_per_chunk: config.actor.steps_per_chunk,
             replay,
             learner,
-            batch_size,
-            steps_per_chunk: settings.actor.steps_per_chunk,
-        };
-        this.join_actors()?;
-        Ok(this)
+            turn,
+        })
     }
 
     fn join_actors(&mut self) -> anyhow::Result<()> {
@@ -192,20 +205,6 @@ impl Lockstep {
 
     fn actor_states(&mut self) -> Result<Vec<CollectorState>, ActError> {
         self.actors.iter_mut().map(Collector::state).collect()
-    }
-
-    fn take(&mut self, SavedParts { actors, turn, .. }: SavedParts) -> anyhow::Result<()> {
-        let (found, count) = (actors.len(), self.actors.len());
-        if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
-            bail!("it holds {found} actors, and this run has {count}");
-        }
-        let (header, safetensors) = &turn.acting;
-        for (actor, state) in self.actors.iter_mut().zip(actors) {
-            actor.set_weights(header.version, safetensors)?;
-            actor.go_on_from(state)?;
-        }
-        self.turn = turn;
-        Ok(())
     }
 
     /// Writes a checkpoint into `folder`, from which the run continues exactly as now.
