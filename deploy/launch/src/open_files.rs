@@ -3,8 +3,9 @@
 //! Measured on runs of 1, 4 and 12 actors: a replay server has 40 and 4 for each actor (2 where none shares memory), the launcher 40 and 3
 //! for each process, the others 33.
 
-use driml_machine::{error::Usage, limits::check_open_files};
+use driml_machine::error::Usage;
 use driml_settings::config::RunConfig;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 /// Of each process, and some for what it opens for a moment.
 const BASE: u64 = 48;
@@ -14,6 +15,22 @@ const OF_LAUNCHER: u64 = 3;
 /// Of a replay server for so many actors: a socket and a segment of zenoh's for each, and what an actor sends in.
 fn of_server(actors: u64, shared_memory: bool) -> u64 {
     BASE + actors * if shared_memory { 4 } else { 2 }
+}
+
+/// Whether this process, or one that it starts, may have so many open files. What may be raised is.
+fn check(needed: u64, whose: &str) -> Result<(), String> {
+    let max = match getrlimit(Resource::RLIMIT_NOFILE) {
+        Ok((_, hard)) if setrlimit(Resource::RLIMIT_NOFILE, hard, hard).is_ok() => hard,
+        Ok((soft, _)) => soft,
+        Err(_) => u64::MAX,
+    };
+    if needed <= max {
+        return Ok(());
+    }
+    Err(format!(
+        "{whose} needs {needed} open files, and the system allows {max}: raise the limit (`ulimit -Hn`; a service needs \
+         LimitNOFILE={needed}, a container --ulimit nofile={needed}), or use fewer actors"
+    ))
 }
 
 /// Checks that the launcher and its replay servers may open as many files as the run's actors take.
@@ -27,7 +44,7 @@ pub(crate) fn check_run(config: &RunConfig) -> Result<(), Usage> {
         false => (of_launcher, "the launcher"),
     };
     let whose = format!("{whose} of a run with {actors} actors");
-    check_open_files(needed, &whose).map_err(Usage)
+    check(needed, &whose).map_err(Usage)
 }
 
 /// Warns if a replay server that is started by hand may not open as many files as the actors take that its settings know of.
@@ -35,7 +52,7 @@ pub fn warn_of_server(config: &RunConfig) {
     let actors = u64::from(config.local.actors);
     let needed = of_server(actors, config.transport.shared_memory);
     let whose = format!("a replay server for {actors} actors");
-    if let Err(why) = check_open_files(needed, &whose) {
+    if let Err(why) = check(needed, &whose) {
         tracing::warn!("{why}");
     }
 }

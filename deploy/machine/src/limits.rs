@@ -1,4 +1,4 @@
-//! What the system grants a process: how many open files, and what of all that it grants is nearly used up.
+//! What of all that the system grants a process is nearly used up.
 //! It ends nothing. A library's own words say what failed, and seldom of what there was too little.
 
 use std::fs;
@@ -6,7 +6,7 @@ use std::fs;
 use driml_protocol::shared_memory::{self, FOLDER, METADATA_BYTES};
 use nix::{
     errno::Errno,
-    sys::resource::{Resource, getrlimit, setrlimit},
+    sys::resource::{Resource, getrlimit},
 };
 
 use crate::{resources::Machine, units::kib};
@@ -15,29 +15,6 @@ use crate::{resources::Machine, units::kib};
 const FILES_SPARE: u64 = 8;
 const MAPS_SPARE: u64 = 64;
 const MEMORY_SPARE: u64 = 64 << 20;
-
-/// Open files that this process may have, once what may be raised is.
-fn open_files_max() -> u64 {
-    let Ok((soft, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else {
-        return u64::MAX;
-    };
-    match setrlimit(Resource::RLIMIT_NOFILE, hard, hard) {
-        Ok(()) => hard,
-        Err(_) => soft,
-    }
-}
-
-/// Whether this process, or one that it starts, may have so many open files.
-pub fn check_open_files(needed: u64, whose: &str) -> Result<(), String> {
-    let max = open_files_max();
-    if needed <= max {
-        return Ok(());
-    }
-    Err(format!(
-        "{whose} needs {needed} open files, and the system allows {max}: raise the limit (`ulimit -Hn`; a service needs \
-         LimitNOFILE={needed}, a container --ulimit nofile={needed}), or use fewer actors"
-    ))
-}
 
 /// What this process has nearly used up of what the system grants it, with how much there is and what to do.
 pub fn scarce() -> Vec<String> {
