@@ -50,10 +50,8 @@ fn actor_id(text: &str) -> Result<u32, String> {
 pub(crate) fn run(args: ActorArgs) -> anyhow::Result<()> {
     check_endpoints(&args.connect, args.tls.is_set())?;
     let credentials = args.tls.credentials(Role::Actor(args.id))?;
-    let world = match &args.env {
-        Some(name) => Some(presets::world(name).map_err(|e| usage!("--env: {e}"))?),
-        None => None,
-    };
+    let world = args.env.as_deref().map(presets::world).transpose();
+    let world = world.map_err(|e| usage!("--env: {e}"))?;
     let shutdown = join(&args.join, Shutdown::on_signals)?;
     let run = driml_actor::RunArgs {
         connect: args.connect,

@@ -13,12 +13,7 @@ use driml_launch::{
     run_folder::RunFolder,
 };
 use driml_learner::DeviceName;
-use driml_machine::{
-    device::ready_for,
-    error::{Usage, usage},
-    resources::Machine,
-    whole_number,
-};
+use driml_machine::{device::ready_for, error::usage, resources::Machine, whole_number};
 use driml_protocol::{RunSpec, session, tls::Role};
 use driml_settings::{
     config::RunConfig,
@@ -130,19 +125,7 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     // Errors in them are reported before anything is made.
     args.tls.credentials(Role::ReplayServer)?;
     ready_for(config.local.learner_device)?;
-    let (shards, actors) = (config.replay.shards, config.local.actors);
-    if shards > actors {
-        bail!(usage!(
-            "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
-        ));
-    }
-    check_ladder(&config)?;
-    if args.lockstep {
-        check_lockstep(&config)?;
-    } else if !config.local.durable {
-        let checked = config.replay.check_in_memory("--durable");
-        checked.map_err(|e| usage!("{e}"))?;
-    }
+    check(&config, args.lockstep)?;
     let run_dir = match args.resume {
         Some(folder) => RunFolder::new(folder),
         None => {
@@ -168,32 +151,40 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
 }
 
-/// Everything is in one process, and its replay is kept whole.
-fn check_lockstep(config: &RunConfig) -> Result<(), Usage> {
-    if config.replay.shards > 1 {
-        return Err(usage!(
+/// Whether this program can start the run: as processes, or in lockstep, which is one process and keeps its replay whole.
+fn check(config: &RunConfig, lockstep: bool) -> anyhow::Result<()> {
+    let (replay, actors) = (&config.replay, config.local.actors);
+    let shards = replay.shards;
+    if shards > actors {
+        bail!(usage!(
+            "{shards} replay shards for {actors} actors: a shard without actors would stay empty; add --actors {shards} or use fewer shards"
+        ));
+    }
+    // All actors are started here: the ladder of epsilons is theirs, no rung empty.
+    if let Some(ladder) = &config.actor.epsilon_ladder
+        && ladder.actors != actors
+    {
+        bail!(usage!(
+            "actor.epsilon_ladder is for {} actors, but {actors} are started: --set actor.epsilon_ladder.actors={actors}",
+            ladder.actors
+        ));
+    }
+    if lockstep && shards > 1 {
+        bail!(usage!(
             "--lockstep runs everything in one process, with one replay: leave --replay-shards out"
         ));
     }
-    match config.replay.disk_bytes_max {
-        Some(max) => Err(usage!(
+    if lockstep && let Some(max) = replay.disk_bytes_max {
+        bail!(usage!(
             "--lockstep keeps the whole replay in the run folder, so that the run can be resumed exactly, and cannot keep it within \
              replay.disk_bytes_max = {max}: leave that out, or lower replay.capacity_transitions"
-        )),
-        None => Ok(()),
+        ));
     }
-}
-
-/// Where this program starts all actors, the ladder of epsilons is theirs, no rung empty.
-fn check_ladder(config: &RunConfig) -> Result<(), Usage> {
-    let actors = config.local.actors;
-    match &config.actor.epsilon_ladder {
-        Some(ladder) if ladder.actors != actors => Err(usage!(
-            "actor.epsilon_ladder is for {} actors, but {actors} are started: --set actor.epsilon_ladder.actors={actors}",
-            ladder.actors
-        )),
-        _ => Ok(()),
+    if !lockstep && !config.local.durable {
+        let checked = replay.check_in_memory("--durable");
+        checked.map_err(|e| usage!("{e}"))?;
     }
+    Ok(())
 }
 
 fn default_run_dir(run: &RunSpec) -> PathBuf {

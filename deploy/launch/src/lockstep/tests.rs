@@ -128,16 +128,6 @@ fn refused(config: &RunConfig, run_dir: &RunFolder) -> String {
     format!("{error:#}")
 }
 
-#[test]
-fn a_checkpoint_of_one_rule_of_sampling_is_none_of_another() {
-    let uniform = config("chain", "c51", 800, &[]);
-    let prioritised = config("chain", "c51", 800, &[PRIORITISED]);
-    let (_folder, run_dir, _) = begun(&uniform, 9);
-    let why = refused(&prioritised, &run_dir);
-    let another = "replay.sampling is another rule than it was";
-    assert!(why.contains(another), "{why}");
-}
-
 /// Each resumption begins where the one before it saved.
 #[test]
 fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
@@ -155,7 +145,12 @@ fn a_run_that_is_interrupted_again_and_again_computes_the_same() {
 
 #[test]
 fn what_cannot_go_on_says_why() {
+    let prioritised = config("chain", "c51", 800, &[PRIORITISED]);
     let config = config("chain", "c51", 800, &[]);
+    let (_folder, run_dir, _) = begun(&config, 9);
+    let said = refused(&prioritised, &run_dir);
+    let why = "replay.sampling is another rule than it was";
+    assert!(said.contains(why), "{said}");
     // The newest segment begins with the mark, the one before it has the transitions.
     for (is_newest, why) in [
         (true, "is missing or damaged: the replay cannot go back"),
