@@ -10,6 +10,7 @@ use std::{
 
 use clap::{Arg, Command, CommandFactory, Parser};
 use expect_test::expect_file;
+use walkdir::WalkDir;
 
 use crate::cli::Cli;
 
@@ -165,20 +166,11 @@ fn calls(page: &str) -> impl Iterator<Item = &str> {
 
 #[test]
 fn every_command_in_the_pages_parses() {
-    let mut pages = vec![root().join("README.md")];
-    let mut folders = vec![root().join("deploy/docs/src")];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.extension().is_some_and(|it| it == "md") {
-                pages.push(path);
-            }
-        }
-    }
+    let files = WalkDir::new(root().join("deploy/docs/src")).into_iter();
+    let files = files.map(|entry| entry.unwrap().into_path());
+    let pages = files.filter(|path| path.extension().is_some_and(|it| it == "md"));
     let mut seen = 0;
-    for path in pages {
+    for path in pages.chain([root().join("README.md")]) {
         let text = fs::read_to_string(&path).unwrap();
         for call in calls(&text) {
             if let Err(e) = Cli::try_parse_from(words(call)) {

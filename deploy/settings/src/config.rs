@@ -52,24 +52,6 @@ pub struct EvaluationConfig {
     pub episodes: u32,
 }
 
-impl EvaluationConfig {
-    fn validate(&self, checkpoint_period_updates: u64) -> Result<(), Usage> {
-        let (every_updates, episodes) = (self.every_updates, self.episodes);
-        if every_updates == 0 || !every_updates.is_multiple_of(checkpoint_period_updates) {
-            return Err(usage!(
-                "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every \
-                 {checkpoint_period_updates} updates; take a multiple of that, or --set learner.checkpoint_period_updates"
-            ));
-        }
-        if !(1..=1_000_000).contains(&episodes) {
-            return Err(usage!(
-                "local.evaluation.episodes = {episodes}: an evaluation has 1 to 1,000,000 episodes"
-            ));
-        }
-        Ok(())
-    }
-}
-
 /// The resolved settings of a run. TOML is what they come from and travel as; between, there is this form alone.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -208,8 +190,20 @@ impl RunConfig {
                 "local.learner_threads = {threads}: a learner has 1 to 1024 threads"
             ));
         }
-        if let Some(evaluation) = &local.evaluation {
-            evaluation.validate(learner.checkpoint_period_updates)?;
+        if let Some(it) = local.evaluation {
+            let (every_updates, episodes) = (it.every_updates, it.episodes);
+            let period = learner.checkpoint_period_updates;
+            if every_updates == 0 || !every_updates.is_multiple_of(period) {
+                return Err(usage!(
+                    "local.evaluation.every_updates = {every_updates}: checkpoints are played, and there is one every {period} updates; \
+                     take a multiple of that, or --set learner.checkpoint_period_updates"
+                ));
+            }
+            if !(1..=1_000_000).contains(&episodes) {
+                return Err(usage!(
+                    "local.evaluation.episodes = {episodes}: an evaluation has 1 to 1,000,000 episodes"
+                ));
+            }
         }
         let device = local.learner_device.check(learner.precision);
         device.map_err(said)?;
