@@ -10,7 +10,7 @@ use toml::{Table, Value};
 use crate::{
     derived::{self, find},
     flags::{Flags, Source},
-    presets::{Agent, Layer, Only, PRESETS, Preset, agent, agents, layers, stack},
+    presets::{Agent, Layer, PRESETS, Preset, agent, agents, layers, stack},
 };
 
 /// Where a setting's source begins, if the setting leaves room.
@@ -144,19 +144,13 @@ fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: 
 
 /// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.
 fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
-    let mut parts = layer.text.split("[[only]]");
-    let everywhere = parts.next().unwrap_or_default();
-    let mut note = |text: &str, how: &str| {
-        for (path, comment) in comments(text) {
-            let source = format!("{comment} [{}{how}]", layer.name);
-            sources.insert(path, source.trim_start().to_owned());
-        }
-    };
-    note(everywhere, "");
-    for block in parts {
-        let read = toml::from_str::<Only>(block);
-        if read.is_ok_and(|only| only.is_for(world)) {
-            note(block, ", by world");
+    for (number, part) in layer.parts().iter().enumerate() {
+        if part.is_for(world) {
+            let by_world = if number == 0 { "" } else { ", by world" };
+            for (path, comment) in comments(&part.text) {
+                let source = format!("{comment} [{}{by_world}]", layer.name);
+                sources.insert(path, source.trim_start().to_owned());
+            }
         }
     }
 }

@@ -88,7 +88,7 @@ impl Override {
             at.push(name);
         }
         // The same key in another table is what is meant most often.
-        let paths = leaves(table);
+        let paths: Vec<_> = leaves(table).into_iter().map(|(path, _)| path).collect();
         let key = |path: &str| path.rsplit('.').next().map(str::to_owned);
         let elsewhere = paths.iter().filter(|path| key(path) == key(&self.path));
         let near = match elsewhere.min_by_key(|path| strsim::levenshtein(&self.path, path)) {
@@ -108,19 +108,19 @@ impl Override {
     }
 }
 
-/// The dotted paths of all values that are not tables.
-pub(crate) fn leaves(table: &Table) -> Vec<String> {
-    let mut paths = Vec::new();
+/// All values that are not tables, by their dotted paths.
+pub(crate) fn leaves(table: &Table) -> Vec<(String, &Value)> {
+    let mut found = Vec::new();
     for (key, value) in table {
         match value {
             Value::Table(inner) => {
                 let inner = leaves(inner).into_iter();
-                paths.extend(inner.map(|path| format!("{key}.{path}")));
+                found.extend(inner.map(|(path, value)| (format!("{key}.{path}"), value)));
             }
-            _ => paths.push(key.clone()),
+            _ => found.push((key.clone(), value)),
         }
     }
-    paths
+    found
 }
 
 fn type_name(value: &Value) -> &'static str {

@@ -213,10 +213,8 @@ pub(crate) fn layers(preset: &Preset, world: WorldName, agent: &Agent) -> Result
     let name = world.with_own_library().to_string();
     let mut table = Table::new();
     for layer in stack(preset, world, agent) {
-        let (everywhere, blocks) = layer.read();
-        merge(&mut table, everywhere);
-        for block in blocks.into_iter().filter(|it| it.is_for(&name)) {
-            merge(&mut table, block.set);
+        for part in layer.parts().into_iter().filter(|it| it.is_for(&name)) {
+            merge(&mut table, part.set);
         }
     }
     Ok(table)
@@ -228,35 +226,45 @@ pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Lay
     below.chain(preset.layer).chain([agent.layer]).collect()
 }
 
-/// An `[[only]]` block of a layer.
+/// What a layer sets everywhere, or an `[[only]]` block of it.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Only {
+pub(crate) struct Part {
+    /// None of what is set everywhere.
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
+    /// As it stands in the file, with its comments.
+    #[serde(skip)]
+    pub(crate) text: String,
 }
 
-impl Only {
+impl Part {
     pub(crate) fn is_for(&self, world: &str) -> bool {
-        self.worlds.iter().any(|name| name == world)
+        self.worlds.is_empty() || self.worlds.iter().any(|name| name == world)
     }
 }
 
 impl Layer {
-    /// What holds in every world, and the blocks that hold in some.
-    fn read(&self) -> (Table, Vec<Only>) {
+    /// What holds in every world, then the blocks that hold in some.
+    pub(crate) fn parts(&self) -> Vec<Part> {
         let bad = |e| -> ! {
             panic!(
                 "presets/{}.toml, or what a program has registered by that name, is not a layer of settings: {e}",
                 self.name
             )
         };
-        let mut everywhere: Table = self.text.parse().unwrap_or_else(|e| bad(e));
-        let blocks = everywhere
-            .remove("only")
-            .map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
-        (everywhere, blocks.unwrap_or_default())
+        let mut set: Table = self.text.parse().unwrap_or_else(|e| bad(e));
+        let blocks = set.remove("only");
+        let blocks: Option<Vec<Part>> =
+            blocks.map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
+        let (worlds, text) = (Vec::new(), String::new());
+        let mut parts = vec![Part { worlds, set, text }];
+        parts.extend(blocks.unwrap_or_default());
+        for (part, text) in parts.iter_mut().zip(self.text.split("[[only]]")) {
+            part.text = text.to_owned();
+        }
+        parts
     }
 }
 

@@ -10,7 +10,7 @@ use std::{
 use expect_test::expect_file;
 
 use super::*;
-use crate::{derived::find, menu::comments, overrides::leaves};
+use crate::{menu::comments, overrides::leaves};
 
 const LEFT_OUT: [&str; 2] = ["world/chain", "variant/smoke"];
 
@@ -37,18 +37,6 @@ fn all_layers() -> BTreeMap<&'static str, Layer> {
     all.map(|layer| (layer.name, layer)).collect()
 }
 
-/// What each part of a layer sets: what holds everywhere, then each `[[only]]` block.
-fn parts(layer: &Layer) -> Vec<BTreeMap<String, Value>> {
-    let (everywhere, blocks) = layer.read();
-    let tables = std::iter::once(everywhere).chain(blocks.into_iter().map(|it| it.set));
-    let part = |table: Table| {
-        let paths = leaves(&table).into_iter();
-        let setting = |path: String| find(&table, &path).cloned().map(|value| (path, value));
-        paths.filter_map(setting).collect()
-    };
-    tables.map(part).collect()
-}
-
 fn pinned() -> impl Iterator<Item = (&'static str, Layer)> {
     let all = all_layers().into_iter();
     all.filter(|(name, _)| !LEFT_OUT.contains(name))
@@ -58,12 +46,12 @@ fn pinned() -> impl Iterator<Item = (&'static str, Layer)> {
 fn a_changed_number_shows_in_the_snapshot() {
     let mut text = String::new();
     for (name, layer) in pinned() {
-        for (number, part) in parts(&layer).iter().enumerate() {
+        for (number, part) in layer.parts().iter().enumerate() {
             match number {
                 0 => writeln!(text, "[{name}]").unwrap(),
                 block => writeln!(text, "[{name}, only block {block}]").unwrap(),
             }
-            for (path, value) in part {
+            for (path, value) in leaves(&part.set) {
                 writeln!(text, "{path} = {value}").unwrap();
             }
         }
@@ -74,10 +62,9 @@ fn a_changed_number_shows_in_the_snapshot() {
 #[test]
 fn every_number_has_its_source_beside_it() {
     for (name, layer) in pinned() {
-        let texts = layer.text.split("[[only]]");
-        for (part, text) in parts(&layer).iter().zip(texts) {
-            let comments = comments(text);
-            for (path, value) in part {
+        for part in layer.parts() {
+            let comments = comments(&part.text);
+            for (path, value) in leaves(&part.set) {
                 // A table on one line has one comment.
                 let around = |known: &str| path == known || path.starts_with(&format!("{known}."));
                 let comment = comments.iter().find(|(known, _)| around(known));
@@ -119,7 +106,7 @@ fn every_layer_says_what_it_is_for_and_names_worlds_that_exist() {
     let worlds: BTreeSet<_> = WorldName::all().map(|world| world.to_string()).collect();
     for layer in all_layers().values() {
         assert!(layer.text.starts_with("# "), "{}", layer.name);
-        for world in layer.read().1.iter().flat_map(|block| &block.worlds) {
+        for world in layer.parts().iter().flat_map(|part| &part.worlds) {
             assert!(worlds.contains(world), "{world} in {}", layer.name);
         }
     }
