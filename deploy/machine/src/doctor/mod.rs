@@ -26,7 +26,7 @@ pub fn examine(run_dir: &Path, tls_dir: Option<&Path>) -> Report {
     let mut cpu = host::facts(run_dir);
     cpu.push(Fact::new("Procgen", engine::found()));
     // Training on the CPU needs none.
-    let cuda = match device::gpus() {
+    let cuda: Vec<_> = match device::gpus() {
         Ok(gpus) => gpus
             .into_iter()
             .map(|(name, found)| match found {
