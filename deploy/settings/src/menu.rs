@@ -144,13 +144,11 @@ fn source_of<'a>(path: &str, sources: &'a BTreeMap<String, String>, is_process: 
 
 /// Adds what a file says about each of its settings; a later file's word replaces an earlier one's.
 fn note_sources(layer: &Layer, world: &str, sources: &mut BTreeMap<String, String>) {
-    for (number, part) in layer.parts().iter().enumerate() {
-        if part.is_for(world) {
-            let by_world = if number == 0 { "" } else { ", by world" };
-            for (path, comment) in comments(&part.text) {
-                let source = format!("{comment} [{}{by_world}]", layer.name);
-                sources.insert(path, source.trim_start().to_owned());
-            }
+    for part in layer.parts().iter().filter(|it| it.is_for(world)) {
+        let how = if part.is_everywhere { "" } else { ", by world" };
+        for (path, comment) in comments(&part.text) {
+            let source = format!("{comment} [{}{how}]", layer.name);
+            sources.insert(path, source.trim_start().to_owned());
         }
     }
 }

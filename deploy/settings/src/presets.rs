@@ -230,7 +230,8 @@ pub(crate) fn stack(preset: &Preset, world: WorldName, agent: &Agent) -> Vec<Lay
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Part {
-    /// None of what is set everywhere.
+    #[serde(skip)]
+    pub(crate) is_everywhere: bool,
     worlds: Vec<String>,
     #[serde(default)]
     set: Table,
@@ -241,7 +242,7 @@ pub(crate) struct Part {
 
 impl Part {
     pub(crate) fn is_for(&self, world: &str) -> bool {
-        self.worlds.is_empty() || self.worlds.iter().any(|name| name == world)
+        self.is_everywhere || self.worlds.iter().any(|name| name == world)
     }
 }
 
@@ -258,8 +259,12 @@ impl Layer {
         let blocks = set.remove("only");
         let blocks: Option<Vec<Part>> =
             blocks.map(|blocks| blocks.try_into().unwrap_or_else(|e| bad(e)));
-        let (worlds, text) = (Vec::new(), String::new());
-        let mut parts = vec![Part { worlds, set, text }];
+        let mut parts = vec![Part {
+            is_everywhere: true,
+            worlds: Vec::new(),
+            set,
+            text: String::new(),
+        }];
         parts.extend(blocks.unwrap_or_default());
         for (part, text) in parts.iter_mut().zip(self.text.split("[[only]]")) {
             part.text = text.to_owned();
