@@ -1,6 +1,6 @@
 //! The settings of a run: presets in layers, flags over them, what the machine decides, and what follows from the rest.
 //!
-//! Start with [`flags::resolve`], which makes a [`config::RunConfig`] of what a command line says, or [`flags::of_names`], which does of
+//! Start with [`flags::resolve`], which makes a [`config::RunConfig`] of a command line, or [`flags::of_names`], which makes one of
 //! names. `presets/*.toml` has every number, each with its source.
 //!
 //! ```
