@@ -14,7 +14,6 @@ use std::time::{Duration, Instant};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
-use serde_json::Value;
 use tracing::Level;
 
 use crate::error::EnvError;
@@ -42,10 +41,14 @@ const WATCH: Duration = Duration::from_millis(500);
 /// How often it is looked whether it ended, once it should.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// How long an answer is waited for, and what a person sets to change that.
+/// What is being done with a process: for its errors, and for how long it is waited for.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Patience {
+pub(super) struct Exchange {
+    /// When it is, such as "in the middle of a step".
+    pub(super) doing: &'static str,
+    /// How long each answer is waited for.
     pub(super) limit: Duration,
+    /// What a person sets to change that.
     pub(super) setting: &'static str,
 }
 
@@ -54,6 +57,8 @@ pub(super) struct Patience {
 /// They are a process group of their own, which the guard leads: what the command starts ends with it, unless it leaves the group.
 pub(super) struct WorldProcess {
     command: String,
+    /// What is being done with it.
+    pub(super) exchange: Exchange,
     guard: Child,
     child: Child,
     /// None once it was told to end.
@@ -65,16 +70,8 @@ pub(super) struct WorldProcess {
 }
 
 impl WorldProcess {
-    /// Starts the command; what it writes to stderr is logged at `level`.
-    pub(super) fn start(command: &str, level: Level) -> Result<Self, EnvError> {
-        Self::try_start(command, level).map_err(|source| {
-            EnvError::Exec(format!(
-                "the world `{command}` cannot be used: starting it: {source}"
-            ))
-        })
-    }
-
-    fn try_start(command: &str, level: Level) -> io::Result<Self> {
+    /// Starts the command for a first exchange; what it writes to stderr is logged at `level`.
+    pub(super) fn start(command: &str, exchange: Exchange, level: Level) -> io::Result<Self> {
         let mut guard = Command::new(SHELL)
             .args(["-c", GUARD])
             .stdin(Stdio::piped())
@@ -110,6 +107,7 @@ impl WorldProcess {
         })?;
         Ok(Self {
             command: command.into(),
+            exchange,
             guard,
             child,
             to,
@@ -120,41 +118,20 @@ impl WorldProcess {
     }
 
     /// Says something to it. Whether it has ended is found out when its answer is read: what it said before that counts.
-    pub(super) fn say(&mut self, bytes: &[u8], doing: &'static str) -> Result<(), EnvError> {
-        let said = match &mut self.to {
-            Some(to) => to.write_all(bytes).and_then(|()| to.flush()),
-            None => Ok(()),
-        };
-        match said {
-            Ok(()) => Ok(()),
-            Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(()),
-            Err(source) => Err(self.system(doing, &source)),
+    pub(super) fn say(&mut self, text: &str) -> Result<(), EnvError> {
+        let to = self.to.as_mut();
+        match to.map_or(Ok(()), |to| to.write_all(text.as_bytes())) {
+            Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(self.system(&e)),
+            _ => Ok(()),
         }
     }
 
-    /// Says a line of JSON to it, after `before`.
-    pub(super) fn say_line(
-        &mut self,
-        before: &[u8],
-        message: &Value,
-        doing: &'static str,
-    ) -> Result<(), EnvError> {
-        let mut line = before.to_vec();
-        line.extend(message.to_string().bytes());
-        line.push(b'\n');
-        self.say(&line, doing)
-    }
-
-    pub(super) fn line(
-        &mut self,
-        patience: Patience,
-        doing: &'static str,
-    ) -> Result<Vec<u8>, EnvError> {
-        let deadline = Instant::now() + patience.limit;
+    pub(super) fn line(&mut self) -> Result<Vec<u8>, EnvError> {
+        let deadline = Instant::now() + self.exchange.limit;
         let mut line = Vec::new();
         loop {
             // A byte at a time: what follows the line does not belong to it.
-            match self.byte_until(deadline, patience, doing)? {
+            match self.byte_until(deadline)? {
                 b'\n' => return Ok(line),
                 _ if line.len() == LINE_MAX => return Ok(line),
                 byte => line.push(byte),
@@ -162,29 +139,28 @@ impl WorldProcess {
         }
     }
 
-    pub(super) fn byte(&mut self, patience: Patience, doing: &'static str) -> Result<u8, EnvError> {
-        self.byte_until(Instant::now() + patience.limit, patience, doing)
+    pub(super) fn byte(&mut self) -> Result<u8, EnvError> {
+        self.byte_until(Instant::now() + self.exchange.limit)
     }
 
-    fn byte_until(
-        &mut self,
-        deadline: Instant,
-        patience: Patience,
-        doing: &'static str,
-    ) -> Result<u8, EnvError> {
+    fn byte_until(&mut self, deadline: Instant) -> Result<u8, EnvError> {
         let mut byte = [0];
         match self.read_until(&mut byte, deadline) {
-            Ok(0) => Err(self.ended(doing)),
+            Ok(0) => Err(self.ended()),
             Ok(_) => Ok(byte[0]),
             Err(e) if e.kind() == ErrorKind::TimedOut => {
                 self.kill();
-                let Patience { limit, setting } = patience;
+                let Exchange {
+                    doing,
+                    limit,
+                    setting,
+                } = self.exchange;
                 Err(self.dead(&format!(
                     "has not answered for {} s {doing}, and was killed: if it needs longer, --set {setting}=N",
                     limit.as_secs_f64()
                 )))
             }
-            Err(source) => Err(self.system(doing, &source)),
+            Err(source) => Err(self.system(&source)),
         }
     }
 
@@ -205,8 +181,9 @@ impl WorldProcess {
     }
 
     /// What to say of a process that is not there any more.
-    fn ended(&mut self, doing: &'static str) -> EnvError {
+    fn ended(&mut self) -> EnvError {
         self.to = None;
+        let doing = self.exchange.doing;
         let how = match self.end_within(END_MAX) {
             Some(status) => format!("ended {doing} ({})", describe(status)),
             None => format!("closed its stdout {doing} without ending, and was killed"),
@@ -234,8 +211,11 @@ impl WorldProcess {
     }
 
     /// What to say of an error of the operating system.
-    pub(super) fn system(&self, doing: &str, source: &io::Error) -> EnvError {
-        self.fail(&format!("cannot be used: {doing}: {source}"))
+    pub(super) fn system(&self, source: &io::Error) -> EnvError {
+        self.fail(&format!(
+            "cannot be used: {}: {source}",
+            self.exchange.doing
+        ))
     }
 
     fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {

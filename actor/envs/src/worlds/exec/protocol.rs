@@ -1,4 +1,5 @@
-//! What an actor and a world's process say to each other, where it lies, and what can be wrong with it.
+//! The settings of a world that is a process, what an actor and the process say to each other, where it lies, and what can be wrong
+//! with it.
 //! Starting and ending the process is for `process`.
 //!
 //! The process is the command of `--env "exec:COMMAND"`, run by `sh`. Requests and answers:
@@ -45,11 +46,44 @@ use nix::sys::memfd::{MFdFlags, memfd_create};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::config::ExecConfig;
 use crate::environment::FrameShape;
 use crate::error::EnvError;
 use crate::saved;
 use crate::settings::WorldSettings;
+
+/// A command, and the world that it declared when the run was made. Each actor checks that its own process declares the same.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExecConfig {
+    /// What is started, by `sh`, in the folder in which the actor runs.
+    pub command: String,
+    /// Rows of a frame, as declared.
+    pub height: usize,
+    /// Columns of a frame, as declared.
+    pub width: usize,
+    /// Bytes a pixel, as declared: 1 is grey, 3 are colours.
+    pub channels: usize,
+    /// The names of the actions, as declared.
+    pub actions: Vec<String>,
+    /// How long the process may take to declare itself, for its first frames and to load a state, milliseconds; then it is killed.
+    pub start_timeout_ms: u64,
+    /// How long a step of all copies may take, and to save their state, milliseconds; then the process is killed.
+    pub step_timeout_ms: u64,
+}
+
+impl ExecConfig {
+    /// What it declares, in words.
+    pub(super) fn describe(&self) -> String {
+        format!(
+            "frames of {} x {} x {} and the {} actions {}",
+            self.height,
+            self.width,
+            self.channels,
+            self.actions.len(),
+            self.actions.join(", ")
+        )
+    }
+}
 
 /// The protocol's version. A process that speaks another is refused.
 pub(super) const VERSION: u64 = 1;

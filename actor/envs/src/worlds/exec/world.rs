@@ -3,19 +3,19 @@
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
+use std::time::Duration;
 
 use rand::Rng;
 use serde_json::json;
 use tracing::Level;
 
-use super::config::ExecConfig;
-use super::process::{Patience, WorldProcess};
+use super::process::{Exchange, WorldProcess};
 use super::protocol::{
-    Block, Declaration, SavedExec, VERSION, WORLD_STATE_BYTES_MAX, path, state_memory,
+    Block, Declaration, ExecConfig, SavedExec, VERSION, WORLD_STATE_BYTES_MAX, path, state_memory,
 };
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{RngUse, check_frames, check_num_envs, check_step, env_rng};
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::{Built, Variants, WorldSettings};
 
@@ -28,20 +28,20 @@ const CHANNELS_MAX: usize = 16;
 /// Most actions of a world: the wire numbers them with a byte.
 const ACTIONS_MAX: usize = 255;
 
-/// Bounds of a time limit, in milliseconds: a day at most.
-const LIMIT_MS: std::ops::RangeInclusive<u64> = 1..=86_400_000;
+/// Longest time limit, in milliseconds: a day.
+const LIMIT_MS_MAX: u64 = 86_400_000;
 
 /// Says that the actions lie in the block.
-const STEP: u8 = b's';
+const STEP: &str = "s";
 
 /// Says that the frames lie there, and after a step rewards and ends; that a state is written, or taken.
 const DONE: u8 = b'.';
 
 /// Asks for the state.
-const SAVE: u8 = b'S';
+const SAVE: &str = "S";
 
 /// Gives a state back.
-const LOAD: u8 = b'L';
+const LOAD: &str = "L";
 
 /// The error where no state can be saved, and why.
 const NOT_SAVED: u8 = b'-';
@@ -64,28 +64,26 @@ impl ExecWorld {
     pub fn new(config: &ExecConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
         config.validate()?;
         check_num_envs(num_envs)?;
-        let patience = config.start_patience();
-        let (mut process, declared) = introduce(config, seeds(seed, num_envs), Level::INFO)?;
+        let (mut process, declared) = introduce(config, &seeds(seed, num_envs), Level::INFO)?;
         let (copies, saves) = (declared.copies, declared.saves);
         let found = declared.over(config);
         if found != *config {
-            let other = format!(
+            return Err(process.fail(&format!(
                 "declares {}, but the run's settings say {}: start the run anew, or the command as it was",
                 found.describe(),
                 config.describe()
-            );
-            return Err(process.fail(&other));
+            )));
         }
         if copies != num_envs {
-            let other = format!(
+            return Err(process.fail(&format!(
                 "has {copies} copies where {num_envs} were asked for: it has to make as many as \"copies\" says"
-            );
-            return Err(process.fail(&other));
+            )));
         }
-        let block = Block::new(num_envs, config.frame_shape())
-            .map_err(|e| process.system("making the memory that it shares", &e))?;
-        let doing = "before its first frames";
-        process.say_line(b"", &block.opening(), doing)?;
+        process.exchange = config.starting("making the memory that it shares");
+        let block = Block::new(num_envs, config.frame_shape());
+        let block = block.map_err(|e| process.system(&e))?;
+        process.exchange = config.starting("before its first frames");
+        process.say(&format!("{}\n", block.opening()))?;
         let mut world = Self {
             process,
             block,
@@ -93,53 +91,53 @@ impl ExecWorld {
             num_envs,
             saves,
         };
-        world.hear_done(patience, doing)?;
+        world.hear_done()?;
         Ok(world)
     }
 
-    fn hear_done(&mut self, patience: Patience, doing: &'static str) -> Result<(), EnvError> {
-        match self.process.byte(patience, doing)? {
+    fn hear_done(&mut self) -> Result<(), EnvError> {
+        match self.process.byte()? {
             DONE => Ok(()),
-            byte => Err(self.other_byte(doing, byte)),
+            byte => Err(self.other_byte(byte)),
         }
     }
 
-    fn other_byte(&self, doing: &str, byte: u8) -> EnvError {
+    fn other_byte(&self, byte: u8) -> EnvError {
+        let doing = self.process.exchange.doing;
         self.process.fail(&format!(
             "answered {doing} with the byte {byte:#04x} and not with `.`: does it print to stdout? That belongs to the protocol"
         ))
     }
 
     /// Says that a state is to be saved or loaded, and where it lies.
-    fn say_state(&mut self, what: u8, memory: &File, doing: &'static str) -> Result<(), EnvError> {
+    fn say_state(&mut self, what: &str, memory: &File) -> Result<(), EnvError> {
         let place = json!({"state": path(memory), "bytes_max": WORLD_STATE_BYTES_MAX});
-        self.process.say_line(&[what], &place, doing)
+        self.process.say(&format!("{what}{place}\n"))
     }
 
     /// The process's own bytes for how its copies stand.
     fn save_process(&mut self) -> Result<Vec<u8>, EnvError> {
-        let doing = "in the middle of saving its state";
-        let patience = self.config.step_patience();
-        let memory = state_memory(&[]).map_err(|e| self.process.system(doing, &e))?;
-        self.say_state(SAVE, &memory, doing)?;
-        match self.process.byte(patience, doing)? {
+        self.process.exchange = self.config.stepping("in the middle of saving its state");
+        let memory = state_memory(&[]).map_err(|e| self.process.system(&e))?;
+        self.say_state(SAVE, &memory)?;
+        match self.process.byte()? {
             DONE => {}
             NOT_SAVED => {
-                let line = self.process.line(patience, doing)?;
-                let why = String::from_utf8_lossy(&line).trim().to_owned();
+                let line = self.process.line()?;
+                let why = String::from_utf8_lossy(&line);
                 // It lives on, and has said all there is to say.
-                let command = &self.config.command;
+                let (command, why) = (&self.config.command, why.trim());
                 let text = format!("the world `{command}` cannot save its state: {why}");
                 return Err(EnvError::NotSaved(text));
             }
-            byte => return Err(self.other_byte(doing, byte)),
+            byte => return Err(self.other_byte(byte)),
         }
-        let written = memory.metadata();
-        let written = written.map_err(|e| self.process.system(doing, &e))?;
+        let written = memory.metadata().map_err(|e| self.process.system(&e))?;
         let bytes = written.len();
         if bytes == 0 {
             return Err(self.process.fail(&format!(
-                "wrote no state: where it says `.` {doing}, the bytes have to lie in \"state\""
+                "wrote no state: where it says `.` {}, the bytes have to lie in \"state\"",
+                self.process.exchange.doing
             )));
         }
         if bytes > WORLD_STATE_BYTES_MAX {
@@ -149,7 +147,7 @@ impl ExecWorld {
         }
         let mut state = vec![0; bytes as usize];
         let read = memory.read_exact_at(&mut state, 0);
-        read.map_err(|e| self.process.system(doing, &e))?;
+        read.map_err(|e| self.process.system(&e))?;
         Ok(state)
     }
 }
@@ -157,16 +155,41 @@ impl ExecWorld {
 /// Starts a world's process, asks it for a copy for each of `seeds`, and reads its declaration. Its stderr is logged at `level`.
 fn introduce(
     config: &ExecConfig,
-    seeds: Vec<u32>,
+    seeds: &[u32],
     level: Level,
 ) -> Result<(WorldProcess, Declaration), EnvError> {
-    let mut process = WorldProcess::start(&config.command, level)?;
-    let doing = "before it declared itself";
+    let command = &config.command;
+    let exchange = config.starting("before it declared itself");
+    let process = WorldProcess::start(command, exchange, level);
+    let mut process = process.map_err(|e| {
+        let text = format!("the world `{command}` cannot be used: starting it: {e}");
+        EnvError::Exec(text)
+    })?;
     let request = json!({"driml_env": VERSION, "copies": seeds.len(), "seeds": seeds});
-    process.say_line(b"", &request, doing)?;
-    let line = process.line(config.start_patience(), doing)?;
+    process.say(&format!("{request}\n"))?;
+    let line = process.line()?;
     let declaration = Declaration::parse(&line).map_err(|why| process.fail(&why))?;
     Ok((process, declaration))
+}
+
+impl ExecConfig {
+    /// An exchange that belongs to a start: the process declares itself, makes its first frames or loads a state.
+    const fn starting(&self, doing: &'static str) -> Exchange {
+        Exchange {
+            doing,
+            limit: Duration::from_millis(self.start_timeout_ms),
+            setting: "world.start_timeout_ms",
+        }
+    }
+
+    /// One that a run waits for: a step of all copies, or their state.
+    const fn stepping(&self, doing: &'static str) -> Exchange {
+        Exchange {
+            doing,
+            limit: Duration::from_millis(self.step_timeout_ms),
+            setting: "world.step_timeout_ms",
+        }
+    }
 }
 
 /// Asks a command what world it is: starts it with one copy, reads its declaration, ends it.
@@ -187,7 +210,7 @@ pub fn declaration(
         start_timeout_ms,
         step_timeout_ms,
     };
-    let (process, declared) = introduce(&asked, vec![0], Level::DEBUG)?;
+    let (process, declared) = introduce(&asked, &[0], Level::DEBUG)?;
     drop(process);
     let config = declared.over(&asked);
     config.validate()?;
@@ -203,39 +226,32 @@ pub(super) fn seeds(seed: u64, copies: usize) -> Vec<u32> {
 
 impl WorldSettings for ExecConfig {
     fn validate(&self) -> Result<(), EnvError> {
-        let bad = |text: String| Err(EnvError::Config(text));
-        if self.command.trim().is_empty() {
-            return bad(
-                "exec: without a command; give one, as in --env \"exec:python3 world.py\"".into(),
-            );
-        }
-        let sides = [self.height, self.width];
-        if sides.iter().any(|side| !(1..=SIDE_MAX).contains(side))
-            || !(1..=CHANNELS_MAX).contains(&self.channels)
-        {
-            return bad(format!(
-                "the world `{}` declares frames of {} x {} x {}; 1 x 1 x 1 to {SIDE_MAX} x {SIDE_MAX} x {CHANNELS_MAX} bytes are possible, \
-                 rows first, channels last",
-                self.command, self.height, self.width, self.channels
-            ));
-        }
-        if !(1..=ACTIONS_MAX).contains(&self.actions.len()) {
-            return bad(format!(
-                "the world `{}` declares {} actions; 1 to {ACTIONS_MAX} are possible",
-                self.command,
-                self.actions.len()
-            ));
-        }
+        let command = &self.command;
+        let why = "exec: without a command; give one, as in --env \"exec:python3 world.py\"";
+        require(!command.trim().is_empty(), why)?;
+        let [height, width] = [self.height, self.width];
+        let is_possible = [height, width].iter().all(|it| (1..=SIDE_MAX).contains(it));
+        let why = format!(
+            "the world `{command}` declares frames of {height} x {width} x {}; 1 x 1 x 1 to {SIDE_MAX} x {SIDE_MAX} x {CHANNELS_MAX} \
+             bytes are possible, rows first, channels last",
+            self.channels
+        );
+        require(
+            is_possible && (1..=CHANNELS_MAX).contains(&self.channels),
+            why,
+        )?;
+        let actions = self.actions.len();
+        let why = format!(
+            "the world `{command}` declares {actions} actions; 1 to {ACTIONS_MAX} are possible"
+        );
+        require((1..=ACTIONS_MAX).contains(&actions), why)?;
         for (name, value) in [
             ("start_timeout_ms", self.start_timeout_ms),
             ("step_timeout_ms", self.step_timeout_ms),
         ] {
-            if !LIMIT_MS.contains(&value) {
-                return bad(format!(
-                    "world.{name} = {value}; 1 to {} milliseconds are possible",
-                    LIMIT_MS.end()
-                ));
-            }
+            let why =
+                format!("world.{name} = {value}; 1 to {LIMIT_MS_MAX} milliseconds are possible");
+            require((1..=LIMIT_MS_MAX).contains(&value), why)?;
         }
         Ok(())
     }
@@ -293,13 +309,13 @@ impl Environment for ExecWorld {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
         check_step(self.num_envs, self.num_actions(), actions, rewards, ends)?;
-        let doing = "in the middle of a step";
+        self.process.exchange = self.config.stepping("in the middle of a step");
         let written = self.block.write_actions(actions);
-        written.map_err(|e| self.process.system(doing, &e))?;
-        self.process.say(&[STEP], doing)?;
-        self.hear_done(self.config.step_patience(), doing)?;
+        written.map_err(|e| self.process.system(&e))?;
+        self.process.say(STEP)?;
+        self.hear_done()?;
         let numbers = self.block.read_results(rewards);
-        let numbers = numbers.map_err(|e| self.process.system(doing, &e))?;
+        let numbers = numbers.map_err(|e| self.process.system(&e))?;
         for (copy, (end, &number)) in ends.iter_mut().zip(numbers).enumerate() {
             *end = match number {
                 0 => StepEnd::Running,
@@ -341,12 +357,12 @@ impl Environment for ExecWorld {
         if !self.saves {
             return Err(EnvError::not_saved());
         }
-        let doing = "in the middle of loading its state";
-        let written = state_memory(&state)
-            .and_then(|memory| self.block.write_frames(&frames).map(|()| memory));
-        let memory = written.map_err(|e| self.process.system(doing, &e))?;
-        self.say_state(LOAD, &memory, doing)?;
         // It belongs to a start, and may take as long: a world may have to play an episode again.
-        self.hear_done(self.config.start_patience(), doing)
+        self.process.exchange = self.config.starting("in the middle of loading its state");
+        let memory = state_memory(&state)
+            .and_then(|memory| self.block.write_frames(&frames).map(|()| memory))
+            .map_err(|e| self.process.system(&e))?;
+        self.say_state(LOAD, &memory)?;
+        self.hear_done()
     }
 }
