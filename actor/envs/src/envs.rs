@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::environment::{Environment, FrameShape, StepEnd};
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::WorldSettings;
 
@@ -105,12 +105,8 @@ pub(crate) fn env_rng(seed: u64, env: usize, used_for: RngUse) -> ChaCha8Rng {
 }
 
 pub(crate) fn check_num_envs(num_envs: usize) -> Result<(), EnvError> {
-    if num_envs == 0 {
-        return Err(EnvError::Config(
-            "a world needs at least one environment, got num_envs = 0".into(),
-        ));
-    }
-    Ok(())
+    let why = "a world needs at least one environment, got num_envs = 0";
+    require(num_envs > 0, why)
 }
 
 /// Checks the arguments of `Environment::step`: `actions`, `rewards` and `ends` are [N], each action < `num_actions`.

@@ -23,6 +23,14 @@ pub enum EnvError {
     State(String),
 }
 
+/// An error of settings unless `holds`; `why` says which cannot work, and what would.
+pub(crate) fn require(holds: bool, why: impl Into<String>) -> Result<(), EnvError> {
+    match holds {
+        true => Ok(()),
+        false => Err(EnvError::Config(why.into())),
+    }
+}
+
 impl EnvError {
     /// The error of a world that can never say how it stands.
     pub(crate) fn not_saved() -> Self {

@@ -2,7 +2,7 @@
 //! It keeps no history beyond the stack, and it does not enlarge or convert pixels.
 
 use crate::environment::FrameShape;
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 
 /// Most frames in a stack; more are rejected.
@@ -25,11 +25,8 @@ impl FrameStack {
     /// # Errors
     /// A stack of 0 or above 64 frames.
     pub fn new(shape: FrameShape, stack: usize, num_envs: usize) -> Result<Self, EnvError> {
-        if !(1..=STACK_MAX).contains(&stack) {
-            return Err(EnvError::Config(format!(
-                "a frame stack holds 1 to {STACK_MAX} frames, got {stack}"
-            )));
-        }
+        let why = format!("a frame stack holds 1 to {STACK_MAX} frames, got {stack}");
+        require((1..=STACK_MAX).contains(&stack), why)?;
         Ok(Self {
             frame: shape,
             stack,

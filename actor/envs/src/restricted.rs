@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::check_frames;
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 
 /// Which of a world's actions an agent chooses among.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,17 +48,16 @@ impl RestrictedWorld {
         if shape == whole && has_all {
             return Ok(world);
         }
-        if actions.is_empty() || actions.iter().any(|&it| usize::from(it) >= count) {
-            return Err(EnvError::Config(format!(
-                "{actions:?} are not actions of a world that has {count}"
-            )));
-        }
-        if height.min(width) == 0 || height > whole.height || width > whole.width {
-            return Err(EnvError::Config(format!(
-                "frames of {height} x {width} cannot be cut from frames of {} x {}",
-                whole.height, whole.width
-            )));
-        }
+        let mut known = actions.iter().map(|&it| usize::from(it) < count);
+        let why = format!("{actions:?} are not actions of a world that has {count}");
+        require(!actions.is_empty() && known.all(|known| known), why)?;
+        let (rows, columns) = (whole.height, whole.width);
+        let why =
+            format!("frames of {height} x {width} cannot be cut from frames of {rows} x {columns}");
+        require(
+            (1..=rows).contains(&height) && (1..=columns).contains(&width),
+            why,
+        )?;
         let envs = world.num_envs();
         Ok(Box::new(Self {
             world,

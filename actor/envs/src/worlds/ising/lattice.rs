@@ -4,7 +4,7 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 
 /// Neighbours of one site: up, down, left, right.
@@ -70,18 +70,16 @@ impl IsingLattice {
     ) -> Result<Self, EnvError> {
         check_temperature(temperature)?;
         let side_min = if boundary == Boundary::Periodic { 3 } else { 1 };
-        if !(side_min..=SIDE_MAX).contains(&height) || !(side_min..=SIDE_MAX).contains(&width) {
-            return Err(EnvError::Config(format!(
-                "an Ising lattice with {boundary:?} boundary needs sides of {side_min} to {SIDE_MAX} sites, got {height} x {width}"
-            )));
-        }
-        if present.len() != height * width || !present.contains(&true) {
-            return Err(EnvError::Config(format!(
-                "the mask of a {height} x {width} Ising lattice needs {} entries and at least one site, got {} entries",
-                height * width,
-                present.len()
-            )));
-        }
+        let mut sides = [height, width].into_iter();
+        let why = format!(
+            "an Ising lattice with {boundary:?} boundary needs sides of {side_min} to {SIDE_MAX} sites, got {height} x {width}"
+        );
+        require(sides.all(|side| (side_min..=SIDE_MAX).contains(&side)), why)?;
+        let (all, given) = (height * width, present.len());
+        let why = format!(
+            "the mask of a {height} x {width} Ising lattice needs {all} entries and at least one site, got {given} entries"
+        );
+        require(given == all && present.contains(&true), why)?;
         let sites_of = |colour: usize| {
             (0..height * width)
                 .filter(move |i| present[*i] && (i / width + i % width) % 2 == colour)
@@ -186,13 +184,11 @@ const TEMPERATURE_MAX: f64 = 5.0;
 
 /// Rejects a temperature that is not above 0 and at most 5.
 pub(crate) fn check_temperature(temperature: f64) -> Result<(), EnvError> {
-    if temperature > 0.0 && temperature <= TEMPERATURE_MAX {
-        return Ok(());
-    }
-    Err(EnvError::Config(format!(
+    let why = format!(
         "an Ising temperature must be above 0 and at most {TEMPERATURE_MAX}, beyond which sweeps turn the whole lattice over; got \
          {temperature}"
-    )))
+    );
+    require(temperature > 0.0 && temperature <= TEMPERATURE_MAX, why)
 }
 
 fn accept_below(temperature: f64) -> [u64; 2 * NEIGHBOURS + 1] {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::lattice::{Boundary, IsingLattice, check_temperature};
 use crate::environment::{FrameShape, StepEnd};
 use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::{Built, WorldSettings};
 
@@ -95,21 +95,17 @@ impl IsingWorld {
 impl WorldSettings for IsingConfig {
     fn validate(&self) -> Result<(), EnvError> {
         check_temperature(self.temperature)?;
-        if self.patch_size < 3 || self.patch_size > self.lattice_size || self.lattice_size > 1024 {
-            return Err(EnvError::Config(format!(
-                "the Ising world needs 3 <= patch_size <= lattice_size <= 1024, got patch_size = {} and lattice_size = {}",
-                self.patch_size, self.lattice_size
-            )));
-        }
+        let (patch, lattice) = (self.patch_size, self.lattice_size);
+        let why = format!(
+            "the Ising world needs 3 <= patch_size <= lattice_size <= 1024, got patch_size = {patch} and lattice_size = {lattice}"
+        );
+        require((3..=lattice).contains(&patch) && lattice <= 1024, why)?;
         for (name, value) in [
             ("sweeps_per_step", self.sweeps_per_step),
             ("episode_steps", self.episode_steps),
         ] {
-            if value == 0 {
-                return Err(EnvError::Config(format!(
-                    "the Ising world's {name} must be at least 1, got 0"
-                )));
-            }
+            let why = format!("the Ising world's {name} must be at least 1, got 0");
+            require(value > 0, why)?;
         }
         Ok(())
     }

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::maze::GHOSTS;
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::worlds::ising::check_temperature;
 
 /// The settings of Ms. PacMan. Ghosts 0 to 3 are red, cyan, orange and green.
@@ -70,11 +70,10 @@ impl PacmanConfig {
             ("epsilon", self.epsilon),
             ("switch_probability", self.switch_probability),
         ] {
-            if !(0.0..=1.0).contains(&value) {
-                return Err(invalid(format!(
-                    "{name} is a probability and must be within 0 and 1, got {value}"
-                )));
-            }
+            let why = format!(
+                "mspacman: {name} is a probability and must be within 0 and 1, got {value}"
+            );
+            require((0.0..=1.0).contains(&value), why)?;
         }
         for (name, value) in [
             ("reward_pellet", self.reward_pellet),
@@ -83,24 +82,30 @@ impl PacmanConfig {
             ("reward_death", self.reward_death),
             ("reward_cleared", self.reward_cleared),
         ] {
-            if !value.is_finite() {
-                return Err(invalid(format!("{name} must be finite, got {value}")));
-            }
+            let why = format!("mspacman: {name} must be finite, got {value}");
+            require(value.is_finite(), why)?;
         }
-        if self.step_limit == 0 {
-            return Err(invalid("step_limit must be at least 1, got 0".into()));
-        }
+        let at_least_1 = |name: &str, value: u64| {
+            let why = format!("mspacman: {name} must be at least 1, got 0");
+            require(value > 0, why)
+        };
+        at_least_1("step_limit", self.step_limit.into())?;
         if let Some(ising) = &self.ising {
             check_temperature(ising.temperature)?;
-            if ising.sweeps_per_step == 0 {
-                return Err(invalid(
-                    "ising.sweeps_per_step must be at least 1, got 0".into(),
-                ));
-            }
+            at_least_1("ising.sweeps_per_step", ising.sweeps_per_step.into())?;
         }
-        self.lethal_schedule
-            .as_ref()
-            .map_or(Ok(()), LethalSchedule::validate)
+        let Some(schedule) = &self.lethal_schedule else {
+            return Ok(());
+        };
+        let period = schedule.episodes_per_task;
+        at_least_1("lethal_schedule.episodes_per_task", period)?;
+        for ghost in &schedule.order {
+            let why =
+                format!("mspacman: lethal_schedule.order names ghost {ghost}, but they are 0 to 3");
+            require(usize::from(*ghost) < GHOSTS, why)?;
+        }
+        let why = "mspacman: lethal_schedule.order must name at least one ghost";
+        require(!schedule.order.is_empty(), why)
     }
 
     /// Which ghosts are lethal in an environment's episode number `episode`, counted from 0; the schedule must be a valid one.
@@ -112,28 +117,4 @@ impl PacmanConfig {
         let lethal = usize::from(schedule.order[task as usize]);
         std::array::from_fn(|ghost| ghost == lethal)
     }
-}
-
-impl LethalSchedule {
-    fn validate(&self) -> Result<(), EnvError> {
-        if self.episodes_per_task == 0 {
-            return Err(invalid(
-                "lethal_schedule.episodes_per_task must be at least 1, got 0".into(),
-            ));
-        }
-        let mut ghosts = self.order.iter();
-        match ghosts.find(|&&ghost| usize::from(ghost) >= GHOSTS) {
-            Some(ghost) => Err(invalid(format!(
-                "lethal_schedule.order names ghost {ghost}, but they are 0 to 3"
-            ))),
-            None if self.order.is_empty() => Err(invalid(
-                "lethal_schedule.order must name at least one ghost".into(),
-            )),
-            None => Ok(()),
-        }
-    }
-}
-
-fn invalid(what: String) -> EnvError {
-    EnvError::Config(format!("mspacman: {what}"))
 }

@@ -39,7 +39,7 @@ use procgen_sys::{Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::{Built, Levels, Variants, WorldSettings};
 use config::whole_side;
@@ -180,14 +180,12 @@ impl LevelSet {
 impl WorldSettings for ProcgenConfig {
     /// Needs no engine.
     fn validate(&self) -> Result<(), EnvError> {
-        if !(SIDE_MIN..=whole_side()).contains(&self.frame_side) {
-            return Err(EnvError::Config(format!(
-                "frame_side = {}; the engine draws {} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
-                 `input.width` enlarge",
-                self.frame_side,
-                whole_side()
-            )));
-        }
+        let (side, whole) = (self.frame_side, whole_side());
+        let why = format!(
+            "frame_side = {side}; the engine draws {whole} pixels a side, and {SIDE_MIN} of them are the fewest; `input.height` and \
+             `input.width` enlarge"
+        );
+        require((SIDE_MIN..=whole).contains(&side), why)?;
         self.options(1, 0, 0).map(drop)
     }
 
@@ -234,9 +232,8 @@ impl WorldSettings for ProcgenConfig {
             Levels::Train => return Ok(changed),
             Levels::TrainSingle => {}
             Levels::Unseen if self.num_levels == 0 => {
-                return Err(EnvError::Config(
-                    "this run trained on all levels there are: none is unseen".into(),
-                ));
+                let why = "this run trained on all levels there are: none is unseen";
+                return Err(EnvError::Config(why.into()));
             }
             Levels::Unseen => {
                 changed.start_level += self.num_levels;
