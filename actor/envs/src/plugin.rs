@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use toml::{Table, Value};
+use toml::Table;
 
 use crate::settings::WorldSettings;
 
@@ -78,16 +78,17 @@ pub struct CustomWorld {
 }
 
 impl CustomWorld {
-    /// Reads the settings of a registered world; `None` if its `kind` is not registered.
-    pub(crate) fn read(table: &Table) -> Option<Result<Self, toml::de::Error>> {
-        let name = table.get("kind").and_then(Value::as_str)?;
-        let kind = custom().iter().find(|kind| kind.name == name)?;
-        let mut fields = table.clone();
-        fields.remove("kind");
+    /// Reads the settings of a registered world: its `fields`, and the `table` of them and its `kind`. `None` if that is not registered.
+    pub(crate) fn read(
+        kind: &str,
+        fields: Table,
+        table: Table,
+    ) -> Option<Result<Self, toml::de::Error>> {
+        let kind = custom().iter().find(|it| it.name == kind)?;
         let settings = (kind.read)(fields);
         Some(settings.map(|settings| Self {
             kind: kind.name,
-            table: table.clone(),
+            table,
             settings,
         }))
     }

@@ -10,11 +10,12 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
+use toml::Table;
 
-use crate::error::EnvError;
+use crate::error::{EnvError, require};
 use crate::plugin::{self, CustomWorld};
 use crate::restricted::ActionSet;
-use crate::settings::{Levels, Variants, WorldSettings, no_levels};
+use crate::settings::{Levels, Variants, WorldSettings};
 use crate::worlds::chain::ChainConfig;
 use crate::worlds::exec::ExecConfig;
 use crate::worlds::ising::IsingConfig;
@@ -34,22 +35,10 @@ macro_rules! worlds {
             Own(CustomWorld),
         }
 
-        /// Those of this crate.
-        #[derive(Deserialize)]
-        #[serde(tag = "kind")]
-        enum Ours {
-            $(#[serde(rename = $kind)] $World($Settings),)+
-        }
+        /// What a file calls each world of this crate.
+        const NAMES: &[&str] = &[$($kind),+];
 
-        impl From<Ours> for WorldConfig {
-            fn from(ours: Ours) -> Self {
-                match ours {
-                    $(Ours::$World(settings) => Self::$World(settings)),+
-                }
-            }
-        }
-
-        /// Every world of this crate: what a file calls it, and which variants of it are worlds of their own.
+        /// Every world of this crate: its name, and which variants of it are worlds of their own.
         const KINDS: &[(&str, fn() -> Variants)] = &[$(($kind, <$Settings>::variants)),+];
 
         impl WorldConfig {
@@ -60,15 +49,11 @@ macro_rules! worlds {
                 }
             }
 
-            /// The same world with other levels.
-            ///
-            /// # Errors
-            /// A world without levels, or without unseen ones; says what to ask for.
-            pub fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
-                match self {
-                    $(Self::$World(settings) => settings.with_levels(levels).map(Self::$World),)+
-                    Self::Own(_) if levels == Levels::Train => Ok(self.clone()),
-                    Self::Own(_) => Err(no_levels()),
+            /// Reads the settings of this crate's world `kind`; `None` if it has none of that name.
+            fn ours(kind: &str, fields: &Table) -> Option<Result<Self, toml::de::Error>> {
+                match kind {
+                    $($kind => Some(fields.clone().try_into().map(Self::$World)),)+
+                    _ => None,
                 }
             }
         }
@@ -96,18 +81,18 @@ const LIBENV_KIND: &str = "procgen";
 
 impl<'de> Deserialize<'de> for WorldConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let table = toml::Table::deserialize(deserializer)?;
-        let ours = table
-            .get("kind")
-            .and_then(toml::Value::as_str)
-            .is_some_and(|name| KINDS.iter().any(|(kind, _)| *kind == name));
-        if !ours && let Some(own) = CustomWorld::read(&table) {
-            return own.map(Self::Own).map_err(D::Error::custom);
+        let table = Table::deserialize(deserializer)?;
+        let mut fields = table.clone();
+        let kind = fields.remove("kind");
+        let kind = kind.ok_or_else(|| D::Error::missing_field("kind"))?;
+        let why = |e: toml::de::Error| D::Error::custom(e.message());
+        let kind: String = kind.try_into().map_err(why)?;
+        if let Some(ours) = Self::ours(&kind, &fields) {
+            return ours.map_err(why);
         }
-        let ours: Ours = table
-            .try_into()
-            .map_err(|e: toml::de::Error| D::Error::custom(e.message()))?;
-        Ok(ours.into())
+        let own = CustomWorld::read(&kind, fields, table);
+        let own = own.ok_or_else(|| D::Error::unknown_variant(&kind, NAMES))?;
+        own.map(Self::Own).map_err(D::Error::custom)
     }
 }
 
@@ -138,6 +123,21 @@ impl WorldConfig {
         actions
     }
 
+    /// The same world with other levels.
+    ///
+    /// # Errors
+    /// A world without levels, or without unseen ones; says what to ask for.
+    pub fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+        match self {
+            Self::Procgen(config) => config.with_levels(levels).map(Self::Procgen),
+            _ => {
+                let why = "this run's world has no levels: use --levels train";
+                require(levels == Levels::Train, why)?;
+                Ok(self.clone())
+            }
+        }
+    }
+
     /// The same world by the code that `name` has, where its own code is a person's: a command, or a library. A machine may have them
     /// elsewhere than the one on which the run was made.
     pub fn with_code_of(&self, name: WorldName) -> Result<Self, EnvError> {
@@ -151,14 +151,9 @@ impl WorldConfig {
             }
             _ => {}
         }
-        if changed.name() == name {
-            Ok(changed)
-        } else {
-            Err(EnvError::Config(format!(
-                "the run's world is {}, and not {name}",
-                self.name()
-            )))
-        }
+        let why = format!("the run's world is {}, and not {name}", self.name());
+        require(changed.name() == name, why)?;
+        Ok(changed)
     }
 }
 

@@ -20,8 +20,8 @@ pub type Built = Result<Box<dyn Environment>, EnvError>;
 
 /// The settings of one world.
 ///
-/// They are read from TOML, where unknown keys are errors, and have no defaults. A world without a seed, threads, levels or
-/// variants implements the first four methods only.
+/// They are read from TOML, where unknown keys are errors, and have no defaults. A world without variants implements the methods
+/// alone that have no body here.
 pub trait WorldSettings {
     /// # Errors
     /// Says which setting cannot work, and what would.
@@ -73,20 +73,6 @@ pub trait WorldSettings {
         true
     }
 
-    /// The same world with other levels.
-    ///
-    /// # Errors
-    /// A world without levels, or without unseen ones; says what to ask for.
-    fn with_levels(&self, levels: Levels) -> Result<Self, EnvError>
-    where
-        Self: Clone + Sized,
-    {
-        match levels {
-            Levels::Train => Ok(self.clone()),
-            _ => Err(no_levels()),
-        }
-    }
-
     /// Puts what the world needs onto this machine; `progress` is told what is being done, a line at a time.
     ///
     /// # Errors
@@ -94,11 +80,6 @@ pub trait WorldSettings {
     fn install(&self, _progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
         Ok(())
     }
-}
-
-/// What a world without levels says of others than those trained on.
-pub(crate) fn no_levels() -> EnvError {
-    EnvError::Config("this run's world has no levels: use --levels train".into())
 }
 
 /// Kinds of one world, each named on a command line as `world:variant`.

@@ -150,14 +150,10 @@ impl WorldProcess {
             Ok(_) => Ok(byte[0]),
             Err(e) if e.kind() == ErrorKind::TimedOut => {
                 self.kill();
-                let Exchange {
-                    doing,
-                    limit,
-                    setting,
-                } = self.exchange;
+                let (doing, setting) = (self.exchange.doing, self.exchange.setting);
+                let seconds = self.exchange.limit.as_secs_f64();
                 Err(self.dead(&format!(
-                    "has not answered for {} s {doing}, and was killed: if it needs longer, --set {setting}=N",
-                    limit.as_secs_f64()
+                    "has not answered for {seconds} s {doing}, and was killed: if it needs longer, --set {setting}=N"
                 )))
             }
             Err(source) => Err(self.system(&source)),

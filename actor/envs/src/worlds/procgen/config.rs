@@ -7,6 +7,10 @@ use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options};
 
 use super::shrink::Shrink;
 use crate::error::EnvError;
+use crate::settings::Levels;
+
+/// Levels to draw unseen ones from, right after those trained on.
+const UNSEEN_LEVELS: u32 = 100_000;
 
 /// Which levels of which game, and how they look.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -67,6 +71,25 @@ impl ProcgenConfig {
     pub(super) fn shrink(&self) -> Option<Shrink> {
         let changed = self.grey || self.frame_side < whole_side();
         changed.then(|| Shrink::new(self.frame_side as usize, self.grey))
+    }
+
+    /// The same game with other levels.
+    pub(crate) fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
+        let mut changed = self.clone();
+        match levels {
+            Levels::Train => return Ok(changed),
+            Levels::TrainSingle => {}
+            Levels::Unseen if self.num_levels == 0 => {
+                let why = "this run trained on all levels there are: none is unseen";
+                return Err(EnvError::Config(why.into()));
+            }
+            Levels::Unseen => {
+                changed.start_level += self.num_levels;
+                changed.num_levels = UNSEEN_LEVELS;
+            }
+        }
+        changed.use_sequential_levels = false;
+        Ok(changed)
     }
 
     /// The engine's settings, checked.

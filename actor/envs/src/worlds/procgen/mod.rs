@@ -41,15 +41,12 @@ use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
 use crate::error::{EnvError, require};
 use crate::saved;
-use crate::settings::{Built, Levels, Variants, WorldSettings};
+use crate::settings::{Built, Variants, WorldSettings};
 use config::whole_side;
 use shrink::Shrink;
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
-
-/// Levels to draw unseen ones from, right after those trained on.
-const UNSEEN_LEVELS: u32 = 100_000;
 
 /// The smallest side of a frame.
 const SIDE_MIN: u32 = 8;
@@ -224,24 +221,6 @@ impl WorldSettings for ProcgenConfig {
 
     fn visible_actions(&self) -> Vec<u8> {
         visible_actions(self.game).into()
-    }
-
-    fn with_levels(&self, levels: Levels) -> Result<Self, EnvError> {
-        let mut changed = self.clone();
-        match levels {
-            Levels::Train => return Ok(changed),
-            Levels::TrainSingle => {}
-            Levels::Unseen if self.num_levels == 0 => {
-                let why = "this run trained on all levels there are: none is unseen";
-                return Err(EnvError::Config(why.into()));
-            }
-            Levels::Unseen => {
-                changed.start_level += self.num_levels;
-                changed.num_levels = UNSEEN_LEVELS;
-            }
-        }
-        changed.use_sequential_levels = false;
-        Ok(changed)
     }
 
     fn install(&self, progress: &mut dyn FnMut(&str)) -> Result<(), EnvError> {
