@@ -1,6 +1,11 @@
 //! The actor's settings, and what it takes from the run's other tables.
 //! It fills in no number: presets do, with their sources.
 
+use std::{
+    fmt::Display,
+    ops::{Bound, RangeBounds},
+};
+
 use driml_envs::{EnvError, WorldName};
 use driml_protocol::{
     BufferPool, RunSpec, TRANSITION_BYTES,
@@ -200,71 +205,39 @@ impl Config {
 
     /// Checks every field's range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        for (key, value, most, why) in [
-            (
-                "actor.envs",
-                self.envs,
-                4096,
-                "an actor steps 1 to 4096 environments",
-            ),
-            (
-                "actor.steps_per_chunk",
-                self.steps_per_chunk,
-                4096,
-                "a chunk has 1 to 4096 steps",
-            ),
-            (
-                "actor.chunks_in_flight_max",
-                self.chunks_in_flight_max,
-                64,
-                "1 to 64 chunks may wait",
-            ),
-        ] {
-            check((1..=most).contains(&value), key, value, || why)?;
-        }
-        for (key, epsilon) in [
-            ("actor.epsilon_start", self.epsilon_start),
-            ("actor.epsilon_end", self.epsilon_end),
-        ] {
-            let why = "a probability lies between 0 and 1";
-            check((0.0..=1.0).contains(&epsilon), key, epsilon, || why)?;
-        }
+        let why = "an actor steps 1 to 4096 environments";
+        within("envs", self.envs, 1..=4096, why)?;
+        let why = "a chunk has 1 to 4096 steps";
+        within("steps_per_chunk", self.steps_per_chunk, 1..=4096, why)?;
+        let (key, why) = ("chunks_in_flight_max", "1 to 64 chunks may wait");
+        within(key, self.chunks_in_flight_max, 1..=64, why)?;
+        let why = "a probability lies between 0 and 1";
+        within("epsilon_start", self.epsilon_start, 0.0..=1.0, why)?;
+        within("epsilon_end", self.epsilon_end, 0.0..=1.0, why)?;
         if let Some(ladder) = &self.epsilon_ladder {
-            ladder.validate()?;
+            let why = "the first actor's probability lies between 0 and 1, without the two";
+            let open = (Bound::Excluded(0.0), Bound::Excluded(1.0));
+            within("epsilon_ladder.base", ladder.base, open, why)?;
+            let why = "epsilons fall from actor to actor, so it is a number of at least 0";
+            within("epsilon_ladder.alpha", ladder.alpha, 0.0..=f64::MAX, why)?;
+            let why = "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand";
+            within("epsilon_ladder.actors", ladder.actors, 2..=ACTORS_MAX, why)?;
         }
-        for (key, ms) in [
-            ("actor.ack_timeout_ms", self.ack_timeout_ms),
-            ("actor.unreachable_max_ms", self.unreachable_max_ms),
-        ] {
-            let why = "a wait lasts 100 ms to one day";
-            check((100..=86_400_000).contains(&ms), key, ms, || why)?;
-        }
-        Ok(())
+        let (why, waits) = ("a wait lasts 100 ms to one day", 100..=86_400_000);
+        within("ack_timeout_ms", self.ack_timeout_ms, waits.clone(), why)?;
+        within("unreachable_max_ms", self.unreachable_max_ms, waits, why)
     }
 }
 
-impl EpsilonLadder {
-    fn validate(&self) -> Result<(), ConfigError> {
-        let (base, alpha, actors) = (self.base, self.alpha, self.actors);
-        check(
-            base > 0.0 && base < 1.0,
-            "actor.epsilon_ladder.base",
-            base,
-            || "the first actor's probability lies between 0 and 1, without the two",
-        )?;
-        check(
-            alpha >= 0.0 && alpha.is_finite(),
-            "actor.epsilon_ladder.alpha",
-            alpha,
-            || "epsilons fall from actor to actor, so it is a number of at least 0",
-        )?;
-        check(
-            (2..=ACTORS_MAX).contains(&actors),
-            "actor.epsilon_ladder.actors",
-            actors,
-            || "a ladder is for 2 to 65536 actors: give --actors, or set it where actors are started by hand",
-        )
-    }
+/// Checks the range of the value of a key of the `[actor]` table.
+fn within<T: PartialOrd + Display>(
+    key: &str,
+    value: T,
+    range: impl RangeBounds<T>,
+    why: &str,
+) -> Result<(), ConfigError> {
+    let key = format!("actor.{key}");
+    check(range.contains(&value), &key, value, || why)
 }
 
 #[cfg(test)]

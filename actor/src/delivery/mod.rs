@@ -5,12 +5,12 @@ mod state;
 mod worker;
 
 use std::{
-    sync::{Arc, PoisonError, atomic::Ordering, mpsc},
+    sync::{Arc, PoisonError, mpsc},
     thread::JoinHandle,
     time::Duration,
 };
 
-use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown, lock};
+use driml_protocol::{BufferPool, Chunk, RunClient, Shutdown};
 
 use state::DeliveryState;
 use worker::DeliveryWorker;
@@ -39,11 +39,9 @@ impl Delivery {
         shutdown: Shutdown,
     ) -> std::io::Result<Self> {
         let state = Arc::new(DeliveryState::default());
-        state
-            .inserted_total
-            .store(inserted_total, Ordering::Relaxed);
+        state.progress().inserted_total = inserted_total;
         // Until a chunk was let in at once: many actors that start together must not run ahead of the learner together.
-        state.is_held.store(true, Ordering::Relaxed);
+        state.progress().is_held = true;
         let (queue, chunks) = mpsc::channel();
         let worker = DeliveryWorker::new(client, limits, pool, shutdown, state.clone());
         let thread = std::thread::Builder::new()
@@ -59,18 +57,18 @@ impl Delivery {
 
     /// Transitions that the run has stored, as of the last answer.
     pub fn inserted_total(&self) -> u64 {
-        self.state.inserted_total.load(Ordering::Relaxed)
+        self.state.progress().inserted_total
     }
 
     /// Actors that are connected to the run, as of the last answer; 0 before the first.
     pub fn actors(&self) -> u32 {
-        self.state.actors.load(Ordering::Relaxed)
+        self.state.progress().actors
     }
 
     /// How long the actor has time to wait for newer weights before it begins its next chunk: where the rate limiter makes its
     /// chunks wait, it loses nothing by acting with the newest.
     pub fn fresh_weights_max(&self) -> Duration {
-        match self.state.is_held() {
+        match self.state.progress().is_held {
             true => FRESH_WEIGHTS_MAX,
             false => Duration::ZERO,
         }
@@ -78,15 +76,15 @@ impl Delivery {
 
     /// The run has all the transitions it wants.
     pub fn is_finished(&self) -> bool {
-        self.state.finished.load(Ordering::Relaxed)
+        self.state.progress().finished
     }
 
     /// What the next chunk would wait for now; none if it would not.
     pub fn describe_wait(&self) -> Option<&'static str> {
-        let waiting = *lock(&self.state.waiting);
-        match self.state.is_held() {
-            true if waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
-            false if waiting >= self.limit => Some("waits for the replay server's answer"),
+        let progress = *self.state.progress();
+        match progress.is_held {
+            true if progress.waiting >= 1 => Some("waits until the rate limiter lets its chunk in"),
+            false if progress.waiting >= self.limit => Some("waits for the replay server's answer"),
             _ => None,
         }
     }
@@ -94,20 +92,20 @@ impl Delivery {
     /// Queues a chunk, waiting while too many are not acknowledged: one, where the rate limiter makes chunks wait. `false`: the
     /// thread has ended; [`Self::finish`] says why.
     pub fn send(&self, chunk: Chunk) -> bool {
-        let mut waiting = lock(&self.state.waiting);
+        let mut progress = self.state.progress();
         loop {
-            let limit = if self.state.is_held() { 1 } else { self.limit };
-            if *waiting < limit || self.thread.is_finished() {
+            let limit = if progress.is_held { 1 } else { self.limit };
+            if progress.waiting < limit || self.thread.is_finished() {
                 break;
             }
             // The time-out is for a thread that ended without a word.
-            (waiting, _) = self
+            let waited = self
                 .state
                 .settled
-                .wait_timeout(waiting, Duration::from_secs(1))
-                .unwrap_or_else(PoisonError::into_inner);
+                .wait_timeout(progress, Duration::from_secs(1));
+            (progress, _) = waited.unwrap_or_else(PoisonError::into_inner);
         }
-        *waiting += 1;
+        progress.waiting += 1;
         self.queue.send(chunk).is_ok()
     }
 

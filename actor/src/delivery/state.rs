@@ -2,10 +2,7 @@
 //! The chunks themselves go through a queue.
 
 use std::{
-    sync::{
-        Condvar, Mutex,
-        atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering},
-    },
+    sync::{Condvar, Mutex, MutexGuard},
     time::Duration,
 };
 
@@ -38,24 +35,26 @@ impl DeliveryLimits {
 /// What the sending side and the thread tell each other beside the chunks.
 #[derive(Debug, Default)]
 pub(super) struct DeliveryState {
-    pub(super) inserted_total: AtomicU64,
-    pub(super) actors: AtomicU32,
-    pub(super) finished: AtomicBool,
-    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
-    pub(super) is_held: AtomicBool,
-    /// Chunks that were sent and are not yet settled.
-    pub(super) waiting: Mutex<usize>,
+    progress: Mutex<Progress>,
+    /// Signalled when a chunk is settled.
     pub(super) settled: Condvar,
 }
 
-impl DeliveryState {
-    pub(super) fn settle(&self) {
-        *lock(&self.waiting) -= 1;
-        self.settled.notify_all();
-    }
+/// How far the delivery is, as of the last answer.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Progress {
+    pub(super) inserted_total: u64,
+    pub(super) actors: u32,
+    pub(super) finished: bool,
+    /// The rate limiter makes chunks wait: more than one at a time would only grow old.
+    pub(super) is_held: bool,
+    /// Chunks that were sent and are not yet settled.
+    pub(super) waiting: usize,
+}
 
-    pub(super) fn is_held(&self) -> bool {
-        self.is_held.load(Ordering::Relaxed)
+impl DeliveryState {
+    pub(super) fn progress(&self) -> MutexGuard<'_, Progress> {
+        lock(&self.progress)
     }
 }
 

@@ -4,7 +4,7 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, atomic::Ordering, mpsc},
+    sync::{Arc, mpsc},
     time::{Duration, Instant},
 };
 
@@ -37,17 +37,6 @@ struct Outgoing {
     asked: Option<PendingReply<InsertReply>>,
     /// The replay server has it and will store it: a poll is enough.
     is_kept: bool,
-}
-
-impl Outgoing {
-    const fn poll(&self) -> ChunkPoll {
-        ChunkPoll {
-            actor: self.header.actor,
-            incarnation: self.header.incarnation,
-            sequence: self.header.sequence,
-            leaving: self.header.leaving,
-        }
-    }
 }
 
 /// What became of the first chunk in line.
@@ -122,13 +111,14 @@ impl DeliveryWorker {
                 Ok(Outcome::Unwanted) => unwanted += transitions,
                 Err(e) => {
                     outcome = Err(e);
-                    self.state.finished.store(true, Ordering::Relaxed);
+                    self.state.progress().finished = true;
                 }
             }
             produced += transitions;
             last = Some((header.actor, header.incarnation));
             self.outgoing.pop_front();
-            self.state.settle();
+            self.state.progress().waiting -= 1;
+            self.state.settled.notify_all();
         }
         if let Some((actor, incarnation)) = last {
             self.leave(Leave {
@@ -194,10 +184,12 @@ impl DeliveryWorker {
                 actors,
                 waited,
             }) => {
-                self.note_inserted(inserted_total);
-                self.state.actors.store(actors, Ordering::Relaxed);
                 let was_held = self.held_since.take().is_some() || waited;
-                self.state.is_held.store(was_held, Ordering::Relaxed);
+                let mut progress = self.state.progress();
+                progress.inserted_total = inserted_total;
+                progress.actors = actors;
+                progress.is_held = was_held;
+                drop(progress);
                 self.window = match was_held {
                     true => 1,
                     false => (self.window + 1).min(self.limits.chunks_in_flight_max),
@@ -208,15 +200,16 @@ impl DeliveryWorker {
                 Ok(Outcome::Stored)
             }
             Ok(InsertReply::Finished { inserted_total }) => {
-                self.note_inserted(inserted_total);
-                self.state.finished.store(true, Ordering::Relaxed);
+                let mut progress = self.state.progress();
+                progress.inserted_total = inserted_total;
+                progress.finished = true;
                 Ok(Outcome::Unwanted)
             }
             Ok(InsertReply::Wait {
                 inserted_total,
                 kept,
             }) => {
-                self.note_inserted(inserted_total);
+                self.state.progress().inserted_total = inserted_total;
                 self.is_held(kept);
                 Ok(self.again())
             }
@@ -246,7 +239,11 @@ impl DeliveryWorker {
                 }
                 // What was not answered may not have arrived, whatever was said of it before.
                 self.outgoing.iter_mut().for_each(|it| it.is_kept = false);
-                self.leave_shared_memory();
+                // It may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
+                if self.outgoing[0].in_shared_memory {
+                    self.pool.avoid_shared_memory();
+                }
+                self.copy_out_of_shared_memory();
                 std::thread::sleep(RETRY_PAUSE);
                 Ok(self.again())
             }
@@ -271,7 +268,7 @@ impl DeliveryWorker {
     /// The rate limiter makes the first chunk wait; it is asked about again at once if the replay server keeps it.
     fn is_held(&mut self, kept: bool) {
         let since = *self.held_since.get_or_insert_with(Instant::now);
-        self.state.is_held.store(true, Ordering::Relaxed);
+        self.state.progress().is_held = true;
         self.outgoing[0].is_kept = kept;
         if !kept {
             self.pause();
@@ -294,24 +291,10 @@ impl DeliveryWorker {
         }
     }
 
-    fn note_inserted(&self, inserted_total: u64) {
-        self.state
-            .inserted_total
-            .store(inserted_total, Ordering::Relaxed);
-    }
-
     fn again(&mut self) -> Outcome {
         self.window = 1;
         self.outgoing.iter_mut().for_each(|it| it.asked = None);
         Outcome::Again
-    }
-
-    /// The replay server may be unable to read shared memory: what is at hand, and the next chunks, go through the socket.
-    fn leave_shared_memory(&mut self) {
-        if self.outgoing[0].in_shared_memory {
-            self.pool.avoid_shared_memory();
-        }
-        self.copy_out_of_shared_memory();
     }
 
     fn copy_out_of_shared_memory(&mut self) {
@@ -331,13 +314,18 @@ impl DeliveryWorker {
             if it.asked.is_some() {
                 continue;
             }
-            it.header.leaving |= leaving;
+            let header = &mut it.header;
+            header.leaving |= leaving;
             it.asked = Some(if it.is_kept {
-                let poll = self.client.seal(&it.poll())?;
-                self.client.send(poll, timeout)?
+                let poll = ChunkPoll {
+                    actor: header.actor,
+                    incarnation: header.incarnation,
+                    sequence: header.sequence,
+                    leaving: header.leaving,
+                };
+                self.client.send(self.client.seal(&poll)?, timeout)?
             } else {
-                let chunk = self.client.seal_with(&it.header, it.payload.clone())?;
-                let header = &it.header;
+                let chunk = self.client.seal_with(header, it.payload.clone())?;
                 tracing::debug!(
                     "chunk {} goes out: {} transitions by weights {}",
                     header.sequence,
