@@ -7,6 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use anyhow::anyhow;
 use driml_protocol::{
     Assembly, BufferPool, CodecError, LogLimiter, PIECE_BYTES, PendingReply, RunClient, Shutdown,
     Weights, WeightsReply, WeightsRequest, WeightsVersion, fail_point, session::SessionError,
@@ -24,30 +25,6 @@ const TICK: Duration = Duration::from_millis(200);
 const PAUSE: Duration = Duration::from_millis(200);
 /// How long the first weights may take before the wait is logged.
 const SILENT_MAX: Duration = Duration::from_secs(5);
-
-/// Why there are no weights, or no newer ones.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum WeightsError {
-    #[error(
-        "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
-    )]
-    NoneInTime {
-        wait_max: Duration,
-        /// Why the last pull failed, if it did.
-        source: Option<Box<Self>>,
-    },
-    /// An answer that did not come.
-    #[error(transparent)]
-    Session(#[from] SessionError),
-    /// A piece that is damaged or not the next one, or a whole that is not what its header says.
-    #[error(transparent)]
-    Damaged(#[from] CodecError),
-    /// A request that cannot be sent, pieces that are missing or of another version, or announcements that cannot be received.
-    #[error("{0}")]
-    Failed(String),
-    #[error(transparent)]
-    NoThread(#[from] std::io::Error),
-}
 
 /// The newest weights, taken at most once. They are pulled at most once for each time that they are asked for.
 #[derive(Clone, Debug)]
@@ -138,22 +115,31 @@ pub(crate) fn first(
     client: &RunClient,
     wait_max: Duration,
     shutdown: &Shutdown,
-) -> Result<Option<Weights>, WeightsError> {
+) -> anyhow::Result<Option<Weights>> {
     let mut started = Instant::now();
     let mut said = LogLimiter::default();
     loop {
         let pulled = pull(client, 0);
-        match pulled {
-            Err(WeightsError::Session(SessionError::Recovering(recovering))) => {
-                started = Instant::now();
-                if recovering.progress.is_slow() && said.due().is_some() {
-                    tracing::info!("waiting for weights for as long as it takes: {recovering}");
-                }
+        let error = pulled
+            .as_ref()
+            .err()
+            .and_then(|e| e.downcast_ref::<SessionError>());
+        if let Some(SessionError::Recovering(recovering)) = error {
+            started = Instant::now();
+            if recovering.progress.is_slow() && said.due().is_some() {
+                tracing::info!("waiting for weights for as long as it takes: {recovering}");
             }
+        }
+        match pulled {
             Ok(Some(weights)) => return Ok(Some(weights)),
             pulled if started.elapsed() > wait_max => {
-                let source = pulled.err().map(Box::new);
-                return Err(WeightsError::NoneInTime { wait_max, source });
+                let none = format!(
+                    "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
+                );
+                return Err(match pulled {
+                    Err(e) => e.context(none),
+                    Ok(_) => anyhow!(none),
+                });
             }
             Err(e) => tracing::debug!("no weights yet: {e}"),
             Ok(None) => {}
@@ -172,7 +158,7 @@ pub(crate) fn watch(
     client: RunClient,
     version: u64,
     shutdown: Shutdown,
-) -> Result<NewestWeights, WeightsError> {
+) -> anyhow::Result<NewestWeights> {
     let newest = NewestWeights::after(version);
     let slot = newest.clone();
     let on_announcement = move |announced: Result<WeightsVersion, CodecError>| match announced {
@@ -181,7 +167,7 @@ pub(crate) fn watch(
     };
     let announcements = client
         .subscribe(on_announcement)
-        .map_err(|e| WeightsError::Failed(format!("listening for new weights: {e}")))?;
+        .map_err(|e| anyhow!("listening for new weights: {e}"))?;
     let slot = newest.clone();
     let work = move || {
         // For as long as the thread lives.
@@ -216,7 +202,7 @@ pub(crate) fn watch(
 }
 
 /// The newest weights, piece by piece; none if they are not newer than `version`.
-fn pull(client: &RunClient, version: u64) -> Result<Option<Weights>, WeightsError> {
+fn pull(client: &RunClient, version: u64) -> anyhow::Result<Option<Weights>> {
     let pool = BufferPool::new(PIECES_IN_FLIGHT);
     let first = ask(client, WeightsRequest::NewerThan(version))?;
     let (reply, piece) = first.receive(&pool)?;
@@ -242,10 +228,7 @@ fn pull(client: &RunClient, version: u64) -> Result<Option<Weights>, WeightsErro
         {
             asked.push_back(ask(client, request)?);
         }
-        let failed = |what: &str| {
-            let version = weights.version;
-            WeightsError::Failed(format!("weights {version} {what}"))
-        };
+        let failed = |what: &str| anyhow!("weights {} {what}", weights.version);
         let next = asked.pop_front();
         let next = next.ok_or_else(|| failed("have no last piece"))?;
         let (reply, piece) = next.receive(&pool)?;
@@ -261,14 +244,9 @@ fn pull(client: &RunClient, version: u64) -> Result<Option<Weights>, WeightsErro
     Ok(Some(assembly.finish()?))
 }
 
-fn ask(
-    client: &RunClient,
-    request: WeightsRequest,
-) -> Result<PendingReply<WeightsReply>, WeightsError> {
-    let request = client.seal(&request)?;
-    client
-        .send(request, PIECE_TIMEOUT)
-        .map_err(|e| WeightsError::Failed(format!("asking for weights: {e}")))
+fn ask(client: &RunClient, request: WeightsRequest) -> anyhow::Result<PendingReply<WeightsReply>> {
+    let asked = client.send(client.seal(&request)?, PIECE_TIMEOUT);
+    asked.map_err(|e| anyhow!("asking for weights: {e}"))
 }
 
 #[cfg(test)]
