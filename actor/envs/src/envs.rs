@@ -1,6 +1,6 @@
 //! What every world of many environments shares: a generator for each environment, the check of a caller's step buffers, and how environments that are
 //! stepped one by one are a world.
-//! It holds no game rules and no state.
+//! It holds no game rules.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -11,46 +11,71 @@ use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::WorldSettings;
 
-/// A world whose environments are stepped one by one, each by itself.
-pub(crate) trait Envs: Send {
-    type Config: WorldSettings;
+/// One environment of a world in which each is stepped by itself.
+pub trait Env: Send + Sized {
+    /// What all environments of a world have in common.
+    type Config: WorldSettings + Clone + Send;
 
     /// All of an environment that does not follow from the settings.
     type Saved: Serialize + DeserializeOwned;
 
-    fn config(&self) -> &Self::Config;
+    /// Environment number `env` of a world with this seed, in its first frame; the settings are valid.
+    fn new(config: &Self::Config, seed: u64, env: usize) -> Result<Self, EnvError>;
 
-    fn count(&self) -> usize;
-
-    /// Writes the current frame [H, W, C] of an environment.
-    fn draw(&self, env: usize, frame: &mut [u8]);
+    /// Writes the current frame [H, W, C].
+    fn draw(&self, config: &Self::Config, frame: &mut [u8]);
 
     /// Takes an action, which the world has, and starts anew what it ended.
-    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd);
+    fn act(&mut self, config: &Self::Config, action: u8) -> (f32, StepEnd);
 
-    fn saved(&self, env: usize) -> Self::Saved;
+    /// What is saved of it.
+    fn saved(&self) -> Self::Saved;
 
-    fn restore(&mut self, env: usize, saved: Self::Saved) -> Result<(), EnvError>;
+    /// Takes what was saved of another one.
+    fn restore(&mut self, config: &Self::Config, saved: Self::Saved) -> Result<(), EnvError>;
 }
 
-impl<W: Envs> Environment for W {
+/// A world of environments that are stepped one by one.
+pub struct Envs<E: Env> {
+    config: E::Config,
+    pub(crate) envs: Vec<E>,
+}
+
+impl<E: Env> Envs<E> {
+    /// `num_envs` environments; environment i depends on (`seed`, i) and its actions only.
+    ///
+    /// # Errors
+    /// Settings that cannot work, or no environment.
+    pub fn new(config: &E::Config, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
+        config.validate()?;
+        check_num_envs(num_envs)?;
+        let envs = (0..num_envs).map(|env| E::new(config, seed, env));
+        Ok(Self {
+            envs: envs.collect::<Result<_, _>>()?,
+            config: config.clone(),
+        })
+    }
+}
+
+impl<E: Env> Environment for Envs<E> {
     fn frame_shape(&self) -> FrameShape {
-        self.config().frame_shape()
+        self.config.frame_shape()
     }
 
     fn num_actions(&self) -> usize {
-        self.config().action_names().len()
+        self.config.action_names().len()
     }
 
     fn num_envs(&self) -> usize {
-        self.count()
+        self.envs.len()
     }
 
     fn observe(&mut self, frames: &mut [u8]) {
         let shape = self.frame_shape();
-        check_frames(frames, self.count(), shape);
-        for (env, frame) in frames.chunks_exact_mut(shape.bytes()).enumerate() {
-            self.draw(env, frame);
+        check_frames(frames, self.num_envs(), shape);
+        let frames = frames.chunks_exact_mut(shape.bytes());
+        for (env, frame) in self.envs.iter().zip(frames) {
+            env.draw(&self.config, frame);
         }
     }
 
@@ -60,22 +85,22 @@ impl<W: Envs> Environment for W {
         rewards: &mut [f32],
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
-        check_step(self.count(), self.num_actions(), actions, rewards, ends)?;
-        for (env, &action) in actions.iter().enumerate() {
-            (rewards[env], ends[env]) = self.act(env, action);
+        check_step(self.num_envs(), self.num_actions(), actions, rewards, ends)?;
+        for (i, (env, &action)) in self.envs.iter_mut().zip(actions).enumerate() {
+            (rewards[i], ends[i]) = env.act(&self.config, action);
         }
         Ok(())
     }
 
     fn save(&mut self) -> Result<Vec<u8>, EnvError> {
-        let envs: Vec<_> = (0..self.count()).map(|env| self.saved(env)).collect();
+        let envs: Vec<_> = self.envs.iter().map(E::saved).collect();
         saved::encode(&envs)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        let envs = saved::decode(state, self.count())?;
-        let mut envs = envs.into_iter().enumerate();
-        envs.try_for_each(|(env, saved)| self.restore(env, saved))
+        let saved = saved::decode(state, self.num_envs())?;
+        let mut envs = self.envs.iter_mut().zip(saved);
+        envs.try_for_each(|(env, saved)| env.restore(&self.config, saved))
     }
 }
 

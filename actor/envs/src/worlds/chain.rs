@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Envs, check_num_envs};
+use crate::envs::{Env, Envs};
 use crate::error::EnvError;
 use crate::saved;
 use crate::settings::{Built, WorldSettings};
@@ -47,27 +47,27 @@ pub fn optimal_discounted_return(config: &ChainConfig, gamma: f64) -> f64 {
 
 /// N corridors. A frame is black but for the band of columns that belongs to the agent's cell, which is white.
 ///
-/// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows.
-pub struct ChainWorld {
-    config: ChainConfig,
-    cells: Vec<usize>,
-    episode_steps: Vec<u32>,
-}
+/// Actions: 0 no-op, 1 left, 2 right. Reaching an end is `Terminal`, also in the last step that the limit allows. The seed changes
+/// nothing: nothing is left to chance.
+pub type ChainWorld = Envs<Corridor>;
 
 impl ChainWorld {
     /// The actions, in their order.
     pub const ACTION_NAMES: [&str; 3] = ["no-op", "left", "right"];
+}
 
-    /// `num_envs` corridors. No seed: nothing in them is left to chance.
-    pub fn new(config: &ChainConfig, num_envs: usize) -> Result<Self, EnvError> {
-        config.validate()?;
-        check_num_envs(num_envs)?;
-        Ok(Self {
-            config: config.clone(),
-            cells: vec![START_CELL; num_envs],
-            episode_steps: vec![0; num_envs],
-        })
-    }
+/// Where the agent is in one corridor, and in which step of the episode. It is its own saved form.
+#[derive(Clone, Copy, Serialize, Deserialize)]
+pub struct Corridor {
+    cell: usize,
+    episode_step: u32,
+}
+
+impl Corridor {
+    const START: Self = Self {
+        cell: START_CELL,
+        episode_step: 0,
+    };
 }
 
 impl WorldSettings for ChainConfig {
@@ -100,61 +100,53 @@ impl WorldSettings for ChainConfig {
         ChainWorld::ACTION_NAMES.to_vec()
     }
 
-    fn build(&self, num_envs: usize, _seed: u64, _threads: usize) -> Built {
-        Ok(Box::new(ChainWorld::new(self, num_envs)?))
+    fn build(&self, num_envs: usize, seed: u64, _threads: usize) -> Built {
+        Ok(Box::new(ChainWorld::new(self, num_envs, seed)?))
     }
 }
 
-impl Envs for ChainWorld {
+impl Env for Corridor {
     type Config = ChainConfig;
+    type Saved = Self;
 
-    /// Cell, and steps of the episode.
-    type Saved = (usize, u32);
-
-    fn config(&self) -> &ChainConfig {
-        &self.config
+    fn new(_: &ChainConfig, _seed: u64, _env: usize) -> Result<Self, EnvError> {
+        Ok(Self::START)
     }
 
-    fn count(&self) -> usize {
-        self.cells.len()
-    }
-
-    fn draw(&self, env: usize, frame: &mut [u8]) {
-        let (cell, cells, width) = (self.cells[env], self.config.cells, self.config.width);
+    fn draw(&self, config: &ChainConfig, frame: &mut [u8]) {
+        let (cell, cells, width) = (self.cell, config.cells, config.width);
         frame.fill(0);
         for row in frame.chunks_exact_mut(width) {
             row[cell * width / cells..(cell + 1) * width / cells].fill(255);
         }
     }
 
-    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd) {
-        let (cell, steps) = (&mut self.cells[env], &mut self.episode_steps[env]);
+    fn act(&mut self, config: &ChainConfig, action: u8) -> (f32, StepEnd) {
         match action {
-            1 => *cell -= 1,
-            2 => *cell += 1,
+            1 => self.cell -= 1,
+            2 => self.cell += 1,
             _ => {}
         }
-        *steps += 1;
-        let (reward, end) = match *cell {
-            0 => (self.config.reward_left, StepEnd::Terminal),
-            it if it == self.config.cells - 1 => (self.config.reward_right, StepEnd::Terminal),
-            _ if *steps >= self.config.step_limit => (0.0, StepEnd::TimedOut),
+        self.episode_step += 1;
+        let (reward, end) = match self.cell {
+            0 => (config.reward_left, StepEnd::Terminal),
+            it if it == config.cells - 1 => (config.reward_right, StepEnd::Terminal),
+            _ if self.episode_step >= config.step_limit => (0.0, StepEnd::TimedOut),
             _ => (0.0, StepEnd::Running),
         };
         if end != StepEnd::Running {
-            (*cell, *steps) = (START_CELL, 0);
+            *self = Self::START;
         }
         (reward, end)
     }
 
-    fn saved(&self, env: usize) -> Self::Saved {
-        (self.cells[env], self.episode_steps[env])
+    fn saved(&self) -> Self {
+        *self
     }
 
-    fn restore(&mut self, env: usize, saved: Self::Saved) -> Result<(), EnvError> {
-        let inner = 1..self.config.cells - 1;
-        saved::check(inner.contains(&saved.0), "a cell")?;
-        (self.cells[env], self.episode_steps[env]) = saved;
+    fn restore(&mut self, config: &ChainConfig, saved: Self) -> Result<(), EnvError> {
+        saved::check((1..config.cells - 1).contains(&saved.cell), "a cell")?;
+        *self = saved;
         Ok(())
     }
 }
@@ -178,7 +170,7 @@ pub(crate) mod tests {
 
     /// Return and end of the first episode under a fixed action, with discount `gamma`.
     fn play(config: &ChainConfig, action: u8, gamma: f64) -> (f64, StepEnd) {
-        let mut world = ChainWorld::new(config, 1).unwrap();
+        let mut world = ChainWorld::new(config, 1, 0).unwrap();
         let (mut total, mut discount) = (0.0, 1.0);
         loop {
             let (rewards, ends) = step(&mut world, &[action]);
@@ -233,7 +225,7 @@ pub(crate) mod tests {
 
     #[test]
     fn each_cell_has_its_own_frame() {
-        let mut world = ChainWorld::new(&config(), 2).unwrap();
+        let mut world = ChainWorld::new(&config(), 2, 0).unwrap();
         let mut seen = std::collections::BTreeSet::new();
         for _ in 1..7 {
             assert!(seen.insert(frames(&mut world)[144..].to_vec()));
@@ -257,7 +249,7 @@ pub(crate) mod tests {
         for change in changes {
             let mut bad = config();
             change(&mut bad);
-            assert!(ChainWorld::new(&bad, 1).is_err(), "{bad:?}");
+            assert!(ChainWorld::new(&bad, 1, 0).is_err(), "{bad:?}");
         }
     }
 }

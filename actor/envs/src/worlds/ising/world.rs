@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::lattice::{Boundary, IsingLattice, check_temperature};
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
+use crate::envs::{Env, Envs, RngUse, env_rng};
 use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::{Built, WorldSettings};
@@ -35,19 +35,17 @@ pub struct IsingConfig {
 ///
 /// The patch's place is uniform in each episode: for 42 in 84 its centre, row and column, is uniform on 21..=63.
 /// Source: the paper's appendix on the Ising model, with the place held for an episode as its main text has it.
-pub struct IsingWorld {
-    config: IsingConfig,
-    envs: Vec<Field>,
-}
+pub type IsingWorld = Envs<Field>;
 
-struct Field {
+/// One field, and the lattice that is its patch.
+pub struct Field {
     now: Now,
     patch: IsingLattice,
 }
 
 /// All of a [`Field`] that does not follow from the settings, but for the patch's spins.
 #[derive(Clone, Serialize, Deserialize)]
-pub(crate) struct Now {
+pub struct Now {
     rng: ChaCha8Rng,
     /// Row and column of the patch's first site.
     origin: (usize, usize),
@@ -58,33 +56,6 @@ pub(crate) struct Now {
 impl IsingWorld {
     /// The only action.
     pub const ACTION_NAMES: [&str; 1] = ["no-op"];
-
-    /// `num_envs` fields; environment i depends on (`seed`, i) only.
-    pub fn new(config: &IsingConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
-        config.validate()?;
-        check_num_envs(num_envs)?;
-        let field = |env| {
-            let mut rng = env_rng(seed, env, RngUse::Game);
-            let side = config.patch_size;
-            let patch =
-                IsingLattice::random(side, side, config.temperature, config.boundary, &mut rng)?;
-            let frame = vec![0; config.frame_shape().bytes()];
-            let now = Now {
-                rng,
-                origin: (0, 0),
-                frame,
-                episode_step: 0,
-            };
-            let mut field = Field { now, patch };
-            field.reset(config);
-            Ok(field)
-        };
-        let envs = (0..num_envs).map(field).collect::<Result<_, EnvError>>()?;
-        Ok(Self {
-            config: config.clone(),
-            envs,
-        })
-    }
 
     /// Row and column of the first site of environment `env`'s patch in the current episode; `None` if `env` is out of range.
     pub fn patch_origin(&self, env: usize) -> Option<(usize, usize)> {
@@ -124,42 +95,57 @@ impl WorldSettings for IsingConfig {
     }
 }
 
-impl Envs for IsingWorld {
+impl Env for Field {
     type Config = IsingConfig;
 
     /// With the patch's spins.
     type Saved = (Now, Vec<i8>);
 
-    fn config(&self) -> &IsingConfig {
-        &self.config
+    fn new(config: &IsingConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
+        let mut rng = env_rng(seed, env, RngUse::Game);
+        let (side, temperature, boundary) =
+            (config.patch_size, config.temperature, config.boundary);
+        let patch = IsingLattice::random(side, side, temperature, boundary, &mut rng)?;
+        let now = Now {
+            rng,
+            origin: (0, 0),
+            frame: vec![0; config.frame_shape().bytes()],
+            episode_step: 0,
+        };
+        let mut field = Self { now, patch };
+        field.reset(config);
+        Ok(field)
     }
 
-    fn count(&self) -> usize {
-        self.envs.len()
+    fn draw(&self, _: &IsingConfig, frame: &mut [u8]) {
+        frame.copy_from_slice(&self.now.frame);
     }
 
-    fn draw(&self, env: usize, frame: &mut [u8]) {
-        frame.copy_from_slice(&self.envs[env].now.frame);
+    fn act(&mut self, config: &IsingConfig, _: u8) -> (f32, StepEnd) {
+        self.now.episode_step += 1;
+        if self.now.episode_step >= config.episode_steps {
+            self.reset(config);
+            return (0.0, StepEnd::TimedOut);
+        }
+        for _ in 0..config.sweeps_per_step {
+            self.patch.sweep(&mut self.now.rng);
+        }
+        self.paint(config);
+        (0.0, StepEnd::Running)
     }
 
-    fn act(&mut self, env: usize, _: u8) -> (f32, StepEnd) {
-        (0.0, self.envs[env].step(&self.config))
+    fn saved(&self) -> Self::Saved {
+        (self.now.clone(), self.patch.spins().to_vec())
     }
 
-    fn saved(&self, env: usize) -> Self::Saved {
-        let Field { now, patch } = &self.envs[env];
-        (now.clone(), patch.spins().to_vec())
-    }
-
-    fn restore(&mut self, env: usize, (now, spins): Self::Saved) -> Result<(), EnvError> {
+    fn restore(&mut self, config: &IsingConfig, (now, spins): Self::Saved) -> Result<(), EnvError> {
         let (row, col) = now.origin;
-        let origin_max = self.config.lattice_size - self.config.patch_size;
+        let origin_max = config.lattice_size - config.patch_size;
         saved::check(row.max(col) <= origin_max, "the patch's place")?;
-        let frame_bytes = self.config.frame_shape().bytes();
+        let frame_bytes = config.frame_shape().bytes();
         saved::check(now.frame.len() == frame_bytes, "a frame")?;
-        let field = &mut self.envs[env];
-        field.patch.set_spins(&spins)?;
-        field.now = now;
+        self.patch.set_spins(&spins)?;
+        self.now = now;
         Ok(())
     }
 }
@@ -173,23 +159,11 @@ impl Field {
         );
         self.patch.randomise(&mut self.now.rng);
         self.now.episode_step = 0;
-        self.draw(config);
+        self.paint(config);
     }
 
-    fn step(&mut self, config: &IsingConfig) -> StepEnd {
-        self.now.episode_step += 1;
-        if self.now.episode_step >= config.episode_steps {
-            self.reset(config);
-            return StepEnd::TimedOut;
-        }
-        for _ in 0..config.sweeps_per_step {
-            self.patch.sweep(&mut self.now.rng);
-        }
-        self.draw(config);
-        StepEnd::Running
-    }
-
-    fn draw(&mut self, config: &IsingConfig) {
+    /// Draws the noise afresh, and the patch over it.
+    fn paint(&mut self, config: &IsingConfig) {
         for pixels in self.now.frame.chunks_mut(64) {
             let bits: u64 = self.now.rng.random();
             for (bit, pixel) in pixels.iter_mut().enumerate() {

@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 use super::{
     config::PacmanConfig,
     ghost::Ghost,
-    maze::{DIRECTIONS, GHOSTS, Item, Maze, Place},
+    maze::{DIRECTIONS, GHOSTS, Item, MAZE, Place},
     render,
 };
 use crate::{environment::StepEnd, error::EnvError, saved::check};
 
 /// It is its own saved form: what never changes, the maze and the settings, is not in it.
 #[derive(Clone, Serialize, Deserialize)]
-pub(crate) struct Game {
+pub struct Game {
     pub(super) rng: ChaCha8Rng,
     pub(super) agent: Place,
     pub(super) ghosts: [Ghost; GHOSTS],
@@ -32,30 +32,24 @@ pub(crate) struct Game {
 
 impl Game {
     /// The start of an episode, after so many others.
-    pub(super) fn start(
-        config: &PacmanConfig,
-        maze: &Maze,
-        fresh: &[u8],
-        rng: ChaCha8Rng,
-        episodes: u64,
-    ) -> Self {
+    pub(super) fn start(config: &PacmanConfig, rng: ChaCha8Rng, episodes: u64) -> Self {
         Self {
             rng,
-            agent: maze.agent_start,
-            ghosts: maze.ghost_starts.map(Ghost::at),
+            agent: MAZE.agent_start,
+            ghosts: MAZE.ghost_starts.map(Ghost::at),
             lethal: config.lethal_in(episodes),
             boost_left: 0,
-            items: maze.items.clone(),
-            pellets_left: maze.pellets,
+            items: MAZE.items.clone(),
+            pellets_left: MAZE.pellets,
             episode_step: 0,
             episodes,
-            background: fresh.to_vec(),
+            background: render::background(),
         }
     }
 
-    /// An error where no game in this maze is so.
-    pub(super) fn check(&self, maze: &Maze) -> Result<(), EnvError> {
-        let places = maze.items.len();
+    /// An error where no game is so.
+    pub(super) fn check(&self) -> Result<(), EnvError> {
+        let places = MAZE.items.len();
         let is_place = |place: Place| usize::from(place) < places;
         check(is_place(self.agent), "the agent's place")?;
         for ghost in self.ghosts {
@@ -69,25 +63,20 @@ impl Game {
     }
 
     /// One step of one game; it does not reset. Returns what was earned and what ended.
-    pub(super) fn step(
-        &mut self,
-        config: &PacmanConfig,
-        maze: &Maze,
-        action: u8,
-    ) -> (f32, StepEnd) {
+    pub(super) fn step(&mut self, config: &PacmanConfig, action: u8) -> (f32, StepEnd) {
         let (agent_before, boosted_before) = (self.agent, self.boost_left > 0);
         self.episode_step += 1;
         self.boost_left = self.boost_left.saturating_sub(1);
         if action > 0 {
-            self.agent = maze.next(self.agent, action - 1);
+            self.agent = MAZE.next(self.agent, action - 1);
         }
         let item = std::mem::replace(&mut self.items[usize::from(self.agent)], Item::Nothing);
-        let mut reward = self.eat(config, maze, item);
+        let mut reward = self.eat(config, item);
         let boosted = boosted_before || item == Item::Boost;
 
         let ghosts_before = self.ghosts.map(|ghost| ghost.place);
         for ghost in &mut self.ghosts {
-            ghost.step(config, maze, agent_before, boosted_before, &mut self.rng);
+            ghost.step(config, agent_before, boosted_before, &mut self.rng);
         }
         if self.pellets_left == 0 {
             return (reward + config.reward_cleared, StepEnd::Terminal);
@@ -99,7 +88,7 @@ impl Game {
                 continue;
             }
             if boosted {
-                self.ghosts[index] = Ghost::at(maze.ghost_starts[index]);
+                self.ghosts[index] = Ghost::at(MAZE.ghost_starts[index]);
                 if self.lethal[index] {
                     reward += config.reward_ghost;
                 }
@@ -113,9 +102,9 @@ impl Game {
         }
     }
 
-    fn eat(&mut self, config: &PacmanConfig, maze: &Maze, item: Item) -> f32 {
+    fn eat(&mut self, config: &PacmanConfig, item: Item) -> f32 {
         if item != Item::Nothing {
-            let pixel = maze.pixel(self.agent);
+            let pixel = MAZE.pixel(self.agent);
             render::paint(&mut self.background, pixel, render::FLOOR);
         }
         match item {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     config::PacmanConfig,
-    maze::{DIRECTIONS, Direction, Maze, Place},
+    maze::{DIRECTIONS, Direction, MAZE, Place},
 };
 
 /// What a ghost is at. Which one the situation asks for: `wanted`.
@@ -42,33 +42,32 @@ impl Ghost {
     pub(crate) fn step(
         &mut self,
         config: &PacmanConfig,
-        maze: &Maze,
         agent: Place,
         boosted: bool,
         rng: &mut impl Rng,
     ) {
-        let wanted = wanted(maze.in_sight(self.place, agent), boosted);
+        let wanted = wanted(MAZE.in_sight(self.place, agent), boosted);
         if wanted != self.mode && rng.random::<f64>() < config.switch_probability {
             self.mode = wanted;
         }
         let direction = if rng.random::<f64>() < config.epsilon {
-            Some(draw(maze.open(self.place), rng))
+            Some(draw(MAZE.open(self.place), rng))
         } else {
             match self.mode {
-                Mode::Wander => Some(self.wander(maze, rng)),
+                Mode::Wander => Some(self.wander(rng)),
                 Mode::Follow if self.place == agent => None,
-                Mode::Follow => self.best(maze, |place| -i32::from(maze.distance(place, agent))),
-                Mode::Avoid => self.best(maze, |place| maze.distance(place, agent).into()),
+                Mode::Follow => self.best(|place| -i32::from(MAZE.distance(place, agent))),
+                Mode::Avoid => self.best(|place| MAZE.distance(place, agent).into()),
             }
         };
         if let Some(direction) = direction {
-            self.place = maze.next(self.place, direction);
+            self.place = MAZE.next(self.place, direction);
             self.heading = Some(direction);
         }
     }
 
-    fn wander(&self, maze: &Maze, rng: &mut impl Rng) -> Direction {
-        let open = maze.open(self.place);
+    fn wander(&self, rng: &mut impl Rng) -> Direction {
+        let open = MAZE.open(self.place);
         let onward = self
             .heading
             .map_or(open, |heading| open & !(1 << (heading ^ 1)));
@@ -76,11 +75,11 @@ impl Ghost {
     }
 
     /// The open direction of the highest score, the first of equals in the order up, down, left, right.
-    fn best(&self, maze: &Maze, score: impl Fn(Place) -> i32) -> Option<Direction> {
+    fn best(&self, score: impl Fn(Place) -> i32) -> Option<Direction> {
         (0..DIRECTIONS as Direction)
             .rev()
-            .filter(|d| maze.open(self.place) >> d & 1 == 1)
-            .max_by_key(|&d| score(maze.next(self.place, d)))
+            .filter(|d| MAZE.open(self.place) >> d & 1 == 1)
+            .max_by_key(|&d| score(MAZE.next(self.place, d)))
     }
 }
 
@@ -120,51 +119,47 @@ mod tests {
 
     #[test]
     fn followers_close_in_and_avoiders_do_not() {
-        let maze = Maze::new();
         let (mut rng, certain) = (ChaCha8Rng::seed_from_u64(1), chance(0.0, 1.0));
-        let places = maze.items.len() as u16;
-        for place in 0..places {
-            for agent in (0..places).filter(|&agent| agent != place && maze.in_sight(place, agent))
-            {
+        for place in MAZE.places() {
+            let is_seen = |agent: &Place| *agent != place && MAZE.in_sight(place, *agent);
+            for agent in MAZE.places().filter(is_seen) {
                 let (mut follower, mut avoider) = (Ghost::at(place), Ghost::at(place));
-                follower.step(&certain, &maze, agent, false, &mut rng);
-                avoider.step(&certain, &maze, agent, true, &mut rng);
+                follower.step(&certain, agent, false, &mut rng);
+                avoider.step(&certain, agent, true, &mut rng);
                 assert_eq!((follower.mode, avoider.mode), (Mode::Follow, Mode::Avoid));
-                let closer = maze.distance(place, agent) - 1;
-                assert_eq!(maze.distance(follower.place, agent), closer);
-                let furthest = (0..4).map(|d| maze.next(place, d)).filter(|&p| p != place);
-                let furthest = furthest.map(|p| maze.distance(p, agent)).max().unwrap();
-                assert_eq!(maze.distance(avoider.place, agent), furthest);
+                let closer = MAZE.distance(place, agent) - 1;
+                assert_eq!(MAZE.distance(follower.place, agent), closer);
+                let furthest = (0..4).map(|d| MAZE.next(place, d)).filter(|&p| p != place);
+                let furthest = furthest.map(|p| MAZE.distance(p, agent)).max().unwrap();
+                assert_eq!(MAZE.distance(avoider.place, agent), furthest);
             }
         }
     }
 
     #[test]
     fn a_follower_that_lost_sight_continues_until_it_changes_over() {
-        let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         let mut ghost = Ghost {
             mode: Mode::Follow,
-            ..Ghost::at(maze.ghost_starts[2])
+            ..Ghost::at(MAZE.ghost_starts[2])
         };
         let agent = 0;
-        assert!(!maze.in_sight(ghost.place, agent));
-        for _ in 0..maze.distance(ghost.place, agent) {
-            ghost.step(&chance(0.0, 0.0), &maze, agent, false, &mut rng);
+        assert!(!MAZE.in_sight(ghost.place, agent));
+        for _ in 0..MAZE.distance(ghost.place, agent) {
+            ghost.step(&chance(0.0, 0.0), agent, false, &mut rng);
         }
         assert_eq!((ghost.place, ghost.mode), (agent, Mode::Follow));
     }
 
     #[test]
     fn modes_change_over_with_the_given_probability() {
-        let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let start = Ghost::at(maze.agent_start);
+        let start = Ghost::at(MAZE.agent_start);
         let (trials, p) = (20_000, 0.3);
         let changed = (0..trials)
             .filter(|_| {
                 let mut ghost = start;
-                ghost.step(&chance(0.0, p), &maze, start.place, false, &mut rng);
+                ghost.step(&chance(0.0, p), start.place, false, &mut rng);
                 ghost.mode == Mode::Follow
             })
             .count() as f64;
@@ -176,11 +171,8 @@ mod tests {
     /// At epsilon 1 every open direction is equally likely, even back, whatever the mode.
     #[test]
     fn random_moves_are_uniform() {
-        let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let crossing = (0..maze.items.len() as u16)
-            .find(|&p| maze.open(p) == 0b1111)
-            .unwrap();
+        let crossing = MAZE.places().find(|&p| MAZE.open(p) == 0b1111).unwrap();
         let mut counts = [0i32; 4];
         for _ in 0..40_000 {
             let mut ghost = Ghost {
@@ -188,7 +180,7 @@ mod tests {
                 heading: Some(1),
                 ..Ghost::at(crossing)
             };
-            ghost.step(&chance(1.0, 0.0), &maze, 0, false, &mut rng);
+            ghost.step(&chance(1.0, 0.0), 0, false, &mut rng);
             counts[usize::from(ghost.heading.unwrap())] += 1;
         }
         let squares = counts.map(|count| f64::from(count - 10_000).powi(2));
@@ -199,20 +191,19 @@ mod tests {
 
     #[test]
     fn wanderers_turn_back_only_in_dead_ends() {
-        let maze = Maze::new();
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let mut ghost = Ghost::at(maze.ghost_starts[1]);
+        let mut ghost = Ghost::at(MAZE.ghost_starts[1]);
         let mut visited = std::collections::BTreeSet::new();
         for _ in 0..20_000 {
             let before = ghost;
-            ghost.step(&chance(0.0, 0.0), &maze, before.place, false, &mut rng);
+            ghost.step(&chance(0.0, 0.0), before.place, false, &mut rng);
             visited.insert(ghost.place);
             let back = before
                 .heading
                 .is_some_and(|heading| ghost.heading == Some(heading ^ 1));
-            assert!(!back || maze.open(before.place).count_ones() == 1);
+            assert!(!back || MAZE.open(before.place).count_ones() == 1);
         }
         // A wanderer gets everywhere.
-        assert_eq!(visited.len(), maze.items.len());
+        assert_eq!(visited.len(), MAZE.items.len());
     }
 }

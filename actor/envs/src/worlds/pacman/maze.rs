@@ -1,6 +1,8 @@
 //! The maze of Ms. PacMan: where walls, food and starts are, what sees what, and how far it is.
 //! It knows nothing of what moves in it. The layout was drawn for this project; it is not the arcade's.
 
+use std::sync::LazyLock;
+
 use serde::{Deserialize, Serialize};
 
 /// Rows of the maze, one pixel each.
@@ -37,6 +39,9 @@ const LAYOUT: [&[u8; WIDTH]; HEIGHT] = [
     b"###################",
 ];
 
+/// The one maze that there is.
+pub(crate) static MAZE: LazyLock<Maze> = LazyLock::new(Maze::new);
+
 /// A way out of a cell; `direction ^ 1` is its opposite.
 pub(crate) type Direction = u8;
 
@@ -71,7 +76,7 @@ pub(crate) struct Maze {
 }
 
 impl Maze {
-    pub(crate) fn new() -> Self {
+    fn new() -> Self {
         let cell = |pixel: usize| LAYOUT[pixel / WIDTH][pixel % WIDTH];
         let pixels: Vec<u16> = (0..(HEIGHT * WIDTH) as u16)
             .filter(|&p| cell(p.into()) != b'#')
@@ -119,6 +124,11 @@ impl Maze {
             next,
             pixels,
         }
+    }
+
+    /// The open cells.
+    pub(crate) fn places(&self) -> std::ops::Range<Place> {
+        0..self.pixels.len() as Place
     }
 
     /// The pixel of an open cell, row * 19 + column.
@@ -192,17 +202,23 @@ fn distances_from(from: usize, next: &[[Place; DIRECTIONS]]) -> Vec<u8> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    /// The open cell in this row and column.
+    pub(crate) fn at(row: usize, column: usize) -> Place {
+        let pixel = row * WIDTH + column;
+        MAZE.places().find(|&p| MAZE.pixel(p) == pixel).unwrap()
+    }
 
     #[test]
     fn every_open_cell_is_reachable_and_the_food_is_counted() {
-        let maze = Maze::new();
-        let places = maze.items.len();
-        assert!((0..places as u16).all(|place| maze.distance(maze.agent_start, place) < u8::MAX));
-        let boosts = maze.items.iter().filter(|&&item| item == Item::Boost);
-        assert_eq!((places, maze.pellets, boosts.count()), (196, 187, 4));
-        assert_eq!(maze.walls().iter().filter(|&&wall| !wall).count(), places);
+        let places = MAZE.items.len();
+        let reached = |place| MAZE.distance(MAZE.agent_start, place) < u8::MAX;
+        assert!(MAZE.places().all(reached));
+        let boosts = MAZE.items.iter().filter(|&&item| item == Item::Boost);
+        assert_eq!((places, MAZE.pellets, boosts.count()), (196, 187, 4));
+        assert_eq!(MAZE.walls().iter().filter(|&&wall| !wall).count(), places);
     }
 
     #[test]
@@ -217,17 +233,16 @@ mod tests {
 
     #[test]
     fn only_the_house_has_dead_ends_and_only_the_tunnel_leaves_the_rim() {
-        let maze = Maze::new();
-        let house = maze.ghost_starts;
-        for place in 0..maze.items.len() as u16 {
-            let a = maze.pixel(place);
-            let is_dead_end = maze.open(place).count_ones() < 2;
+        let house = MAZE.ghost_starts;
+        for place in MAZE.places() {
+            let a = MAZE.pixel(place);
+            let is_dead_end = MAZE.open(place).count_ones() < 2;
             assert!(!is_dead_end || house.contains(&place), "pixel {a}");
             for direction in 0..4 {
-                let there = maze.next(place, direction);
-                let is_undone = maze.next(there, direction ^ 1) == place;
+                let there = MAZE.next(place, direction);
+                let is_undone = MAZE.next(there, direction ^ 1) == place;
                 assert!(there == place || is_undone, "pixel {a}");
-                let b = maze.pixel(there);
+                let b = MAZE.pixel(there);
                 let (row, is_in_row) = (a / WIDTH, a / WIDTH == b / WIDTH);
                 let is_in_line = is_in_row || a % WIDTH == b % WIDTH;
                 assert!(a.abs_diff(b) <= WIDTH && is_in_line, "pixel {a}");
@@ -239,18 +254,12 @@ mod tests {
 
     #[test]
     fn sight_is_a_straight_line_without_walls() {
-        let maze = Maze::new();
-        let at = |row: usize, column: usize| {
-            (0..maze.items.len() as u16)
-                .find(|&p| maze.pixel(p) == row * WIDTH + column)
-                .unwrap()
-        };
-        assert!(maze.in_sight(at(19, 1), at(19, 17)));
-        assert!(maze.in_sight(at(1, 5), at(11, 5)));
-        assert!(!maze.in_sight(at(1, 5), at(1, 7)), "a wall between");
-        assert!(!maze.in_sight(at(1, 1), at(3, 3)), "neither row nor column");
-        assert!(!maze.in_sight(at(9, 0), at(9, 18)), "through the tunnel");
-        assert_eq!(maze.distance(at(9, 0), at(9, 18)), 1);
-        assert_eq!(maze.distance(at(19, 1), at(19, 17)), 16);
+        assert!(MAZE.in_sight(at(19, 1), at(19, 17)));
+        assert!(MAZE.in_sight(at(1, 5), at(11, 5)));
+        assert!(!MAZE.in_sight(at(1, 5), at(1, 7)), "a wall between");
+        assert!(!MAZE.in_sight(at(1, 1), at(3, 3)), "neither row nor column");
+        assert!(!MAZE.in_sight(at(9, 0), at(9, 18)), "through the tunnel");
+        assert_eq!(MAZE.distance(at(9, 0), at(9, 18)), 1);
+        assert_eq!(MAZE.distance(at(19, 1), at(19, 17)), 16);
     }
 }

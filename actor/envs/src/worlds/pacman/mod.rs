@@ -22,11 +22,11 @@ pub(crate) mod tests;
 
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};
 use game::Game;
-use maze::{HEIGHT, Maze, WIDTH};
+use maze::{HEIGHT, MAZE, WIDTH};
 use rand_chacha::ChaCha8Rng;
 
 use crate::environment::{FrameShape, StepEnd};
-use crate::envs::{Envs, RngUse, check_num_envs, env_rng};
+use crate::envs::{Env, Envs, RngUse, env_rng};
 use crate::error::EnvError;
 use crate::saved::check;
 use crate::settings::{Built, WorldSettings};
@@ -35,15 +35,13 @@ use crate::worlds::ising::{Boundary, IsingLattice};
 /// N games of Ms. PacMan. Frames [21, 19, 3] RGB, one pixel a cell; actions 0 no-op, 1 up, 2 down, 3 left, 4 right.
 ///
 /// A move into a wall is a no-op. The no-op is a separate action so that an agent can wait for a ghost to pass.
-pub struct PacmanWorld {
-    config: PacmanConfig,
-    maze: Maze,
-    /// The frame at the start of an episode, without what moves.
-    fresh: Vec<u8>,
-    envs: Vec<Game>,
-    /// The spins in the walls of each game, where walls flicker. Their generators are their own, so that the ghosts do the same with
-    /// and without them.
-    walls: Vec<(IsingLattice, ChaCha8Rng)>,
+pub type PacmanWorld = Envs<Board>;
+
+/// One game, and what its walls show.
+pub struct Board {
+    game: Game,
+    /// The spins in the walls, where walls flicker. Their generator is their own, so that the ghosts do the same with and without them.
+    walls: Option<(IsingLattice, ChaCha8Rng)>,
 }
 
 impl WorldSettings for PacmanConfig {
@@ -73,70 +71,45 @@ impl WorldSettings for PacmanConfig {
 impl PacmanWorld {
     /// The actions, in their order.
     pub const ACTION_NAMES: [&str; 5] = ["no-op", "up", "down", "left", "right"];
-
-    /// `num_envs` games; environment i depends on (`seed`, i) and its actions only.
-    pub fn new(config: &PacmanConfig, num_envs: usize, seed: u64) -> Result<Self, EnvError> {
-        config.validate()?;
-        check_num_envs(num_envs)?;
-        let maze = Maze::new();
-        let mut fresh = vec![0; render::FRAME_BYTES];
-        render::background(&maze, &mut fresh);
-        let start = |env| Game::start(config, &maze, &fresh, env_rng(seed, env, RngUse::Game), 0);
-        let mut walls = Vec::new();
-        if let Some(overlay) = &config.ising {
-            let (sites, temperature) = (maze.walls(), overlay.temperature);
-            for env in 0..num_envs {
-                let mut rng = env_rng(seed, env, RngUse::Overlay);
-                let free = Boundary::Free;
-                let mut lattice =
-                    IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng)?;
-                lattice.randomise(&mut rng);
-                walls.push((lattice, rng));
-            }
-        }
-        Ok(Self {
-            config: config.clone(),
-            envs: (0..num_envs).map(start).collect(),
-            maze,
-            fresh,
-            walls,
-        })
-    }
 }
 
-impl Envs for PacmanWorld {
+impl Env for Board {
     type Config = PacmanConfig;
 
     /// A game; and the spins in its walls with their generator, where walls flicker.
     type Saved = (Game, Option<(Vec<i8>, ChaCha8Rng)>);
 
-    fn config(&self) -> &PacmanConfig {
-        &self.config
+    fn new(config: &PacmanConfig, seed: u64, env: usize) -> Result<Self, EnvError> {
+        let mut walls = None;
+        if let Some(overlay) = &config.ising {
+            let (sites, temperature, free) = (MAZE.walls(), overlay.temperature, Boundary::Free);
+            let mut rng = env_rng(seed, env, RngUse::Overlay);
+            let mut lattice =
+                IsingLattice::masked(HEIGHT, WIDTH, &sites, temperature, free, &mut rng)?;
+            lattice.randomise(&mut rng);
+            walls = Some((lattice, rng));
+        }
+        let game = Game::start(config, env_rng(seed, env, RngUse::Game), 0);
+        Ok(Self { game, walls })
     }
 
-    fn count(&self) -> usize {
-        self.envs.len()
-    }
-
-    fn draw(&self, env: usize, frame: &mut [u8]) {
-        let game = &self.envs[env];
+    fn draw(&self, _: &PacmanConfig, frame: &mut [u8]) {
+        let game = &self.game;
         frame.copy_from_slice(&game.background);
-        if let Some((lattice, _)) = self.walls.get(env) {
+        if let Some((lattice, _)) = &self.walls {
             render::overlay(lattice.spins(), frame);
         }
         let ghosts = game.ghosts.map(|ghost| ghost.place);
-        render::actors(&self.maze, ghosts, game.agent, game.boost_left > 0, frame);
+        render::actors(ghosts, game.agent, game.boost_left > 0, frame);
     }
 
-    fn act(&mut self, env: usize, action: u8) -> (f32, StepEnd) {
-        let game = &mut self.envs[env];
-        let (reward, end) = game.step(&self.config, &self.maze, action);
+    fn act(&mut self, config: &PacmanConfig, action: u8) -> (f32, StepEnd) {
+        let game = &mut self.game;
+        let (reward, end) = game.step(config, action);
         if end != StepEnd::Running {
-            let (rng, episodes) = (game.rng.clone(), game.episodes + 1);
-            *game = Game::start(&self.config, &self.maze, &self.fresh, rng, episodes);
+            *game = Game::start(config, game.rng.clone(), game.episodes + 1);
         }
-        if let (Some((lattice, rng)), Some(overlay)) = (self.walls.get_mut(env), &self.config.ising)
-        {
+        if let (Some((lattice, rng)), Some(overlay)) = (&mut self.walls, &config.ising) {
             match end {
                 StepEnd::Running => (0..overlay.sweeps_per_step).for_each(|_| lattice.sweep(rng)),
                 _ => lattice.randomise(rng),
@@ -145,15 +118,15 @@ impl Envs for PacmanWorld {
         (reward, end)
     }
 
-    fn saved(&self, env: usize) -> Self::Saved {
-        let walls = self.walls.get(env);
+    fn saved(&self) -> Self::Saved {
+        let walls = self.walls.as_ref();
         let walls = walls.map(|(lattice, rng)| (lattice.spins().to_vec(), rng.clone()));
-        (self.envs[env].clone(), walls)
+        (self.game.clone(), walls)
     }
 
-    fn restore(&mut self, env: usize, (game, walls): Self::Saved) -> Result<(), EnvError> {
-        game.check(&self.maze)?;
-        match (self.walls.get_mut(env), walls) {
+    fn restore(&mut self, _: &PacmanConfig, (game, walls): Self::Saved) -> Result<(), EnvError> {
+        game.check()?;
+        match (&mut self.walls, walls) {
             (Some((lattice, own)), Some((spins, rng))) => {
                 lattice.set_spins(&spins)?;
                 *own = rng;
@@ -161,7 +134,7 @@ impl Envs for PacmanWorld {
             (None, None) => {}
             _ => check(false, "the walls' flicker")?,
         }
-        self.envs[env] = game;
+        self.game = game;
         Ok(())
     }
 }

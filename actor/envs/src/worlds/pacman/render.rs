@@ -1,7 +1,7 @@
 //! How Ms. PacMan looks: one pixel a cell, [21, 19, 3] RGB.
 //! It does not enlarge frames; what a frame cannot show (a ghost's mode, the boost's remaining steps) stays hidden.
 
-use super::maze::{GHOSTS, HEIGHT, Item, Maze, Place, WIDTH};
+use super::maze::{GHOSTS, HEIGHT, Item, MAZE, Place, WIDTH};
 
 /// Bytes a pixel.
 pub(crate) const CHANNELS: usize = 3;
@@ -21,19 +21,18 @@ pub(crate) const GHOST: [Colour; GHOSTS] = [[255, 0, 0], [0, 255, 255], [255, 12
 /// A wall whose Ising spin is +1; one with spin -1 is unchanged.
 pub(crate) const FUCHSIA: Colour = [255, 0, 255];
 
-/// Paints walls, floor and all the food into `frame` [21, 19, 3].
-pub(crate) fn background(maze: &Maze, frame: &mut [u8]) {
-    for (pixel, wall) in maze.walls().into_iter().enumerate() {
-        paint(frame, pixel, if wall { WALL } else { FLOOR });
-    }
-    for (place, item) in maze.items.iter().enumerate() {
+/// A frame [21, 19, 3] of walls, floor and all the food.
+pub(crate) fn background() -> Vec<u8> {
+    let mut frame = WALL.repeat(HEIGHT * WIDTH);
+    for (place, item) in MAZE.places().zip(&MAZE.items) {
         let colour = match item {
             Item::Nothing => FLOOR,
             Item::Pellet => PELLET,
             Item::Boost => BOOST,
         };
-        paint(frame, maze.pixel(place as Place), colour);
+        paint(&mut frame, MAZE.pixel(place), colour);
     }
+    frame
 }
 
 /// Paints the walls by their spins [21 * 19]: fuchsia +1, wall -1; 0 (open cells) is left alone.
@@ -48,21 +47,12 @@ pub(crate) fn overlay(spins: &[i8], frame: &mut [u8]) {
 }
 
 /// Paints what moves: the ghosts, the first on top, and the agent over them.
-pub(crate) fn actors(
-    maze: &Maze,
-    ghosts: [Place; GHOSTS],
-    agent: Place,
-    boosted: bool,
-    frame: &mut [u8],
-) {
+pub(crate) fn actors(ghosts: [Place; GHOSTS], agent: Place, boosted: bool, frame: &mut [u8]) {
     for (place, colour) in ghosts.into_iter().zip(GHOST).rev() {
-        paint(frame, maze.pixel(place), colour);
+        paint(frame, MAZE.pixel(place), colour);
     }
-    paint(
-        frame,
-        maze.pixel(agent),
-        if boosted { AGENT_BOOSTED } else { AGENT },
-    );
+    let colour = if boosted { AGENT_BOOSTED } else { AGENT };
+    paint(frame, MAZE.pixel(agent), colour);
 }
 
 pub(crate) fn paint(frame: &mut [u8], pixel: usize, colour: Colour) {
@@ -85,11 +75,9 @@ mod tests {
 
     #[test]
     fn the_agent_is_over_the_ghosts_and_the_first_ghost_over_the_rest() {
-        let maze = Maze::new();
-        let mut frame = vec![0; FRAME_BYTES];
-        background(&maze, &mut frame);
-        actors(&maze, [5, 5, 7, 7], 7, false, &mut frame);
-        let at = |place| frame[maze.pixel(place) * CHANNELS..][..CHANNELS].to_vec();
+        let mut frame = background();
+        actors([5, 5, 7, 7], 7, false, &mut frame);
+        let at = |place| frame[MAZE.pixel(place) * CHANNELS..][..CHANNELS].to_vec();
         assert_eq!((at(5), at(7)), (GHOST[0].to_vec(), AGENT.to_vec()));
     }
 }

@@ -63,12 +63,10 @@ fn a_game_continues_where_it_was_saved() {
 
 #[test]
 fn a_state_that_no_game_has_is_refused() {
-    let maze = Maze::new();
-    let fine = || PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
     let refuse = |what: &str, change: fn(&mut Game)| {
-        let mut wrong = fine();
-        change(&mut wrong);
-        fails(wrong.check(&maze), &[what]);
+        let mut wrong = PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
+        change(&mut wrong.game);
+        fails(wrong.game.check(), &[what]);
     };
     refuse("the agent's place", |game| game.agent = 10_000);
     refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));

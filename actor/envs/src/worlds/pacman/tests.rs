@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::ghost::{Ghost, Mode};
-use super::maze::{Item, Place, WIDTH};
+use super::maze::{Item, tests::at};
 use super::*;
 use crate::playing::{self, frames, play};
 
@@ -32,13 +32,6 @@ fn harmless() -> PacmanConfig {
     }
 }
 
-fn at(world: &PacmanWorld, row: usize, column: usize) -> Place {
-    let places = world.maze.items.len() as u16;
-    (0..places)
-        .find(|&p| world.maze.pixel(p) == row * WIDTH + column)
-        .unwrap()
-}
-
 fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
     let (rewards, ends) = playing::step(world, &[action]);
     (rewards[0], ends[0])
@@ -53,12 +46,8 @@ fn duel(config: &PacmanConfig, apart: usize) -> PacmanWorld {
         ..config.clone()
     };
     let mut world = PacmanWorld::new(&steady, 1, 0).unwrap();
-    let (agent, hunter, far) = (
-        at(&world, 19, 9),
-        at(&world, 19, 9 + apart),
-        at(&world, 1, 1),
-    );
-    let game = &mut world.envs[0];
+    let (agent, hunter, far) = (at(19, 9), at(19, 9 + apart), at(1, 1));
+    let game = &mut world.envs[0].game;
     game.agent = agent;
     game.ghosts = [hunter, far, far, far].map(Ghost::at);
     game.ghosts[0].mode = Mode::Follow;
@@ -79,25 +68,26 @@ fn the_first_frame_shows_everything() {
 #[test]
 fn a_wall_stops_the_agent_and_a_no_op_keeps_it() {
     let mut world = duel(&harmless(), 3);
-    let before = world.envs[0].agent;
+    let before = world.envs[0].game.agent;
     for action in [0, 2] {
         step(&mut world, action);
-        assert_eq!(world.envs[0].agent, before);
+        assert_eq!(world.envs[0].game.agent, before);
     }
     step(&mut world, 3);
-    assert_eq!(world.envs[0].agent, at(&world, 19, 8));
+    assert_eq!(world.envs[0].game.agent, at(19, 8));
 }
 
 #[test]
 fn food_is_eaten_once() {
     let mut world = duel(&harmless(), 3);
     assert_eq!(step(&mut world, 3).0, 1.0);
-    assert_eq!(world.envs[0].pellets_left, 186);
+    assert_eq!(world.envs[0].game.pellets_left, 186);
     // The pellet on which the agent was put.
     assert_eq!(step(&mut world, 4).0, 1.0);
     assert_eq!(step(&mut world, 3).0, 0.0);
-    let pixel = world.maze.pixel(at(&world, 19, 9));
-    assert_eq!(world.envs[0].background[pixel * 3..][..3], render::FLOOR);
+    let pixel = MAZE.pixel(at(19, 9));
+    let found = &world.envs[0].game.background[pixel * 3..][..3];
+    assert_eq!(found, render::FLOOR);
 }
 
 #[test]
@@ -124,7 +114,7 @@ fn the_game_starts_again_after_an_end() {
     assert_ne!(frames(&mut world), start);
     assert_eq!(step(&mut world, 0).1, StepEnd::Terminal);
     assert_eq!(frames(&mut world), start);
-    let game = &world.envs[0];
+    let game = &world.envs[0].game;
     assert_eq!((game.pellets_left, game.episode_step), (187, 0));
 }
 
@@ -133,7 +123,7 @@ fn contact_with_a_harmless_ghost_is_nothing() {
     let lethal = [false, true, true, true];
     let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
     assert_eq!(step(&mut world, 0), (1.0, StepEnd::Running));
-    assert_eq!(world.envs[0].ghosts[0].place, world.envs[0].agent);
+    assert_eq!(world.envs[0].game.ghosts[0].place, world.envs[0].game.agent);
     // It stays, and still does nothing.
     assert_eq!(step(&mut world, 0), (0.0, StepEnd::Running));
 }
@@ -142,33 +132,35 @@ fn contact_with_a_harmless_ghost_is_nothing() {
 fn a_boosted_agent_destroys_ghosts_and_only_lethal_ones_pay() {
     for (lethal, reward) in [([true; 4], 1.0 + 20.0), ([false, true, true, true], 1.0)] {
         let mut world = duel(&PacmanConfig { lethal, ..config() }, 1);
-        world.envs[0].boost_left = 5;
+        world.envs[0].game.boost_left = 5;
         assert_eq!(step(&mut world, 0), (reward, StepEnd::Running));
         // Back at its start, wandering.
-        let home = Ghost::at(world.maze.ghost_starts[0]);
-        assert_eq!(world.envs[0].ghosts[0], home);
+        let home = Ghost::at(MAZE.ghost_starts[0]);
+        assert_eq!(world.envs[0].game.ghosts[0], home);
     }
 }
 
 #[test]
 fn a_boost_protects_in_its_own_step_and_the_next_ten() {
     let mut world = duel(&config(), 1);
-    let (boost, beside) = (at(&world, 1, 1), at(&world, 1, 2));
-    let away = at(&world, 19, 9);
-    world.envs[0].agent = beside;
-    world.envs[0].ghosts = [boost, away, away, away].map(Ghost::at);
-    world.envs[0].ghosts[0].mode = Mode::Follow;
+    let (boost, beside) = (at(1, 1), at(1, 2));
+    let away = at(19, 9);
+    let game = &mut world.envs[0].game;
+    game.agent = beside;
+    game.ghosts = [boost, away, away, away].map(Ghost::at);
+    game.ghosts[0].mode = Mode::Follow;
     // In the step in which it is taken.
     assert_eq!(step(&mut world, 3), (5.0 + 20.0, StepEnd::Running));
-    let pixel = world.maze.pixel(boost) * 3;
+    let pixel = MAZE.pixel(boost) * 3;
     for after in 1..=11 {
         let (colour, expected) = match after {
             11 => (render::AGENT, (-100.0, StepEnd::Terminal)),
             _ => (render::AGENT_BOOSTED, (20.0, StepEnd::Running)),
         };
         assert_eq!(frames(&mut world)[pixel..][..3], colour, "{after}");
-        world.envs[0].ghosts[0] = Ghost::at(beside);
-        world.envs[0].ghosts[0].mode = Mode::Follow;
+        let ghost = &mut world.envs[0].game.ghosts[0];
+        *ghost = Ghost::at(beside);
+        ghost.mode = Mode::Follow;
         assert_eq!(step(&mut world, 0), expected, "{after}");
     }
 }
@@ -176,10 +168,10 @@ fn a_boost_protects_in_its_own_step_and_the_next_ten() {
 #[test]
 fn the_last_pellet_ends_the_episode_before_any_contact() {
     let mut world = duel(&config(), 1);
-    world.envs[0].items.fill(Item::Nothing);
-    let last = at(&world, 19, 10);
-    world.envs[0].items[usize::from(last)] = Item::Pellet;
-    world.envs[0].pellets_left = 1;
+    let game = &mut world.envs[0].game;
+    game.items.fill(Item::Nothing);
+    game.items[usize::from(at(19, 10))] = Item::Pellet;
+    game.pellets_left = 1;
     assert_eq!(step(&mut world, 4), (1.0 + 1000.0, StepEnd::Terminal));
 }
 
@@ -192,15 +184,16 @@ fn a_whole_game_can_be_cleared() {
     let mut world = PacmanWorld::new(&config, 1, 5).unwrap();
     let mut total = 0.0;
     for steps in 1.. {
-        let game = &world.envs[0];
-        let target = (0..game.items.len() as u16)
+        let game = &world.envs[0].game;
+        let target = MAZE
+            .places()
             .filter(|&p| game.items[usize::from(p)] != Item::Nothing)
-            .min_by_key(|&p| world.maze.distance(game.agent, p))
+            .min_by_key(|&p| MAZE.distance(game.agent, p))
             .unwrap();
         let action = (1..5)
             .find(|&a| {
-                let there = world.maze.next(game.agent, a - 1);
-                world.maze.distance(there, target) < world.maze.distance(game.agent, target)
+                let there = MAZE.next(game.agent, a - 1);
+                MAZE.distance(there, target) < MAZE.distance(game.agent, target)
             })
             .unwrap();
         let (reward, end) = step(&mut world, action);
@@ -245,7 +238,8 @@ fn the_lethal_ghost_changes_by_the_schedule() {
     };
     let mut world = PacmanWorld::new(&config, 1, 7).unwrap();
     for ghost in [0, 0, 2, 2, 3, 3, 0, 0] {
-        assert_eq!(world.envs[0].lethal, std::array::from_fn(|g| g == ghost));
+        let lethal = std::array::from_fn(|g| g == ghost);
+        assert_eq!(world.envs[0].game.lethal, lethal);
         assert_eq!(step(&mut world, 0).1, StepEnd::TimedOut);
     }
 }
