@@ -174,8 +174,8 @@ impl VecGame {
                 "action {action} for environment {env} of {game}; 0 to 14 exist"
             ));
         }
-        // SAFETY: `act` below is the only call during which the engine reads the actions.
-        unsafe { self.actions.as_mut_slice() }.copy_from_slice(actions);
+        // `act` below is the only call during which the engine reads the actions.
+        self.actions.write(actions);
         let started = Instant::now();
         // SAFETY: the handle is open, the buffers are set, and no reference into them is alive thanks to `&mut self`.
         unsafe { (self.api.act)(self.handle) };
@@ -226,16 +226,10 @@ impl VecGame {
             )));
         }
         let len = i32::try_from(state.bytes.len()).expect("the engine gave its length as an i32");
+        let bytes = state.bytes.as_ptr().cast_mut().cast();
         // SAFETY: the handle is open, its buffers are set, `index` is one of its environments, and the bytes are what the
         // engine wrote for this game. It only reads them; the pointer is `*mut` for want of `const` in its header.
-        unsafe {
-            (self.api.set_state)(
-                self.handle,
-                index,
-                state.bytes.as_ptr().cast_mut().cast(),
-                len,
-            )
-        };
+        unsafe { (self.api.set_state)(self.handle, index, bytes, len) };
         Ok(())
     }
 
@@ -252,20 +246,17 @@ impl VecGame {
     /// The buffers above are right only for exactly these tensors.
     fn check_types(&self) -> Result<(), ProcgenError> {
         let side = FRAME_SIDE as i32;
+        let frame = ffi::describe("rgb", DTYPE_UINT8, &[side, side, 3]);
+        let number = |name, dtype| ffi::describe(name, dtype, &[]);
+        let infos = [
+            number("prev_level_seed", DTYPE_INT32),
+            number("prev_level_complete", DTYPE_UINT8),
+            number("level_seed", DTYPE_INT32),
+        ];
         for (space, expected) in [
-            (
-                ffi::SPACE_OBSERVATION,
-                &[("rgb", DTYPE_UINT8, &[side, side, 3][..])][..],
-            ),
-            (ffi::SPACE_ACTION, &[("action", DTYPE_INT32, &[])]),
-            (
-                ffi::SPACE_INFO,
-                &[
-                    ("prev_level_seed", DTYPE_INT32, &[]),
-                    ("prev_level_complete", DTYPE_UINT8, &[]),
-                    ("level_seed", DTYPE_INT32, &[]),
-                ],
-            ),
+            (ffi::SPACE_OBSERVATION, &[frame][..]),
+            (ffi::SPACE_ACTION, &[number("action", DTYPE_INT32)]),
+            (ffi::SPACE_INFO, &infos),
         ] {
             let null = std::ptr::null_mut();
             // SAFETY: the handle is open; with a null pointer the engine only counts.
@@ -274,9 +265,6 @@ impl VecGame {
             // SAFETY: the engine writes as many types as it just counted, and there is room for them.
             unsafe { (self.api.get_tensortypes)(self.handle, space, types.as_mut_ptr()) };
             let found: Vec<_> = types.iter().map(LibenvTensortype::describe).collect();
-            let expected = expected.iter();
-            let expected = expected.map(|(name, dtype, shape)| ffi::describe(name, *dtype, shape));
-            let expected: Vec<_> = expected.collect();
             if found != expected {
                 let (found, expected) = (found.join(", "), expected.join(", "));
                 return Err(ProcgenError::Unexpected(format!(
