@@ -173,7 +173,7 @@ impl Collector {
 mod tests {
     use driml_envs::{ChainConfig, WorldConfig};
     use driml_model::{Compute, ConvLayer, InputSize, ModelConfig, Parameters};
-    use driml_protocol::{Horizon, TimeoutRule, config::TransportConfig};
+    use driml_protocol::config::TransportConfig;
 
     use super::*;
     use crate::config::{Config, EpsilonLadder, tests::CONFIG};
@@ -192,17 +192,11 @@ mod tests {
         ActorSettings {
             spec: RunSpec {
                 world: "chain".into(),
-                agent: "c51".into(),
                 seed: 5,
                 frame_height: 12,
                 frame_width: 12,
-                frame_channels: 1,
-                frame_stack: 1,
                 num_actions: 3,
-                n_step: 1,
-                gamma: 0.9,
-                horizon: Horizon::None {},
-                timeout: TimeoutRule::Terminal,
+                ..RunSpec::smallest()
             },
             world: WorldConfig::Chain(ChainConfig {
                 cells: 8,

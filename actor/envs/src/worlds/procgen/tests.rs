@@ -132,25 +132,23 @@ fn smaller_and_grey_frames_are_the_engines_own_made_so() {
 fn wrong_settings_are_refused_without_an_engine() {
     let maze = || config(Game::Maze);
     maze().validate().unwrap();
-    type Change = fn(&mut ProcgenConfig);
-    let refused: [(Change, &str); 7] = [
-        (
-            |it| it.distribution_mode = DistributionMode::Extreme,
-            "maze has no distribution",
-        ),
-        (|it| it.num_levels = u32::MAX, "num_levels = 4294967295"),
-        (|it| it.start_level = i32::MAX as u32, "past the last level"),
-        (|it| (it.num_levels, it.start_level) = (0, 3), "no effect"),
-        (|it| it.frame_side = 0, "frame_side = 0"),
-        (|it| it.frame_side = 7, "frame_side = 7"),
-        (|it| it.frame_side = 65, "frame_side = 65"),
-    ];
-    for (change, text) in refused {
+    let refused = |change: fn(&mut ProcgenConfig), text: &str| {
         let mut config = maze();
         change(&mut config);
         fails(config.validate(), &[text]);
         fails(ProcgenWorld::new(&config, 1, 1, 0), &[text]);
-    }
+    };
+    let extreme = "maze has no distribution mode \"extreme\"";
+    refused(
+        |it| it.distribution_mode = DistributionMode::Extreme,
+        extreme,
+    );
+    refused(|it| it.num_levels = u32::MAX, "num_levels = 4294967295");
+    refused(|it| it.start_level = i32::MAX as u32, "past the last level");
+    refused(|it| (it.num_levels, it.start_level) = (0, 3), "no effect");
+    refused(|it| it.frame_side = 0, "frame_side = 0");
+    refused(|it| it.frame_side = 7, "frame_side = 7");
+    refused(|it| it.frame_side = 65, "frame_side = 65");
     for (num_envs, threads, text) in [(0, 0, "0 environments"), (1, 1000, "1000 threads")] {
         fails(ProcgenWorld::new(&maze(), num_envs, 1, threads), &[text]);
     }

@@ -11,35 +11,20 @@ use procgen_sys::{Game, NUM_ACTIONS};
 /// It could also be coarser: in leaper 0 and 2 do what 1 does, and 6 and 8 what 7 does; in starpilot 11 to 14 do what 9
 /// does. In caveflyer, dodgeball, fruitbot and ninja the effect of action 9 shows only after the next frame.
 pub fn visible_actions(game: Game) -> [u8; NUM_ACTIONS] {
-    let mut table: [u8; NUM_ACTIONS] = std::array::from_fn(|action| action as u8);
-    let mut amounts_to =
-        |raw: &[usize], visible: u8| raw.iter().for_each(|&action| table[action] = visible);
-    match game {
+    let [left, still, right]: [&[usize]; 3] = match game {
         Game::Bigfish | Game::Chaser | Game::Coinrun | Game::Heist | Game::Leaper => {
-            amounts_to(&[9, 10, 11, 12, 13, 14], 4);
+            [&[], &[9, 10, 11, 12, 13, 14], &[]]
         }
-        Game::Bossfight | Game::Caveflyer | Game::Dodgeball => amounts_to(&[10, 11, 12, 13, 14], 4),
-        Game::Climber | Game::Jumper => {
-            amounts_to(&[0], 1);
-            amounts_to(&[3, 9, 10, 11, 12, 13, 14], 4);
-            amounts_to(&[6], 7);
-        }
-        Game::Fruitbot | Game::Plunder => {
-            amounts_to(&[0, 2], 1);
-            amounts_to(&[3, 5, 10, 11, 12, 13, 14], 4);
-            amounts_to(&[6, 8], 7);
-        }
-        Game::Maze | Game::Miner => {
-            amounts_to(&[0, 2], 1);
-            amounts_to(&[6, 8], 7);
-            amounts_to(&[9, 10, 11, 12, 13, 14], 4);
-        }
-        Game::Ninja => {
-            amounts_to(&[0], 1);
-            amounts_to(&[3, 13, 14], 4);
-            amounts_to(&[6], 7);
-        }
-        Game::Starpilot => {}
+        Game::Bossfight | Game::Caveflyer | Game::Dodgeball => [&[], &[10, 11, 12, 13, 14], &[]],
+        Game::Climber | Game::Jumper => [&[0], &[3, 9, 10, 11, 12, 13, 14], &[6]],
+        Game::Fruitbot | Game::Plunder => [&[0, 2], &[3, 5, 10, 11, 12, 13, 14], &[6, 8]],
+        Game::Maze | Game::Miner => [&[0, 2], &[9, 10, 11, 12, 13, 14], &[6, 8]],
+        Game::Ninja => [&[0], &[3, 13, 14], &[6]],
+        Game::Starpilot => [&[], &[], &[]],
+    };
+    let mut table: [u8; NUM_ACTIONS] = std::array::from_fn(|action| action as u8);
+    for (raw, visible) in [(left, 1), (still, 4), (right, 7)] {
+        raw.iter().for_each(|&action| table[action] = visible);
     }
     table
 }
