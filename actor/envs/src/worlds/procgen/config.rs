@@ -5,7 +5,6 @@ use std::path::Path;
 
 use procgen_sys::{DistributionMode, Engine, FRAME_SIDE, Game, Options};
 
-use super::shrink::Shrink;
 use crate::error::EnvError;
 use crate::settings::Levels;
 
@@ -65,12 +64,6 @@ impl ProcgenConfig {
             None => Engine::install(progress),
         };
         Ok(engine?)
-    }
-
-    /// What makes the engine's frames smaller or grey; none where they are wanted as they are.
-    pub(super) fn shrink(&self) -> Option<Shrink> {
-        let changed = self.grey || self.frame_side < whole_side();
-        changed.then(|| Shrink::new(self.frame_side as usize, self.grey))
     }
 
     /// The same game with other levels.

@@ -1,7 +1,6 @@
 //! Tests of which levels are played one after the other. They fetch the engine once and are skipped with `DRIML_OFFLINE=1`.
 //! Frames, rewards and ends are in `tests`.
 
-use procgen_sys::{FRAME_BYTES, Game};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 

@@ -35,7 +35,7 @@ mod shrink;
 pub(crate) mod tests;
 mod visible_actions;
 
-use procgen_sys::{Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
+use procgen_sys::{FRAME_BYTES, Game, NUM_ACTIONS, ProcgenError, RESET, State, VecGame};
 
 use crate::environment::{Environment, FrameShape, StepEnd};
 use crate::envs::{check_frames, check_step};
@@ -43,7 +43,7 @@ use crate::error::{EnvError, require};
 use crate::saved;
 use crate::settings::{Built, Variants, WorldSettings};
 use config::whole_side;
-use shrink::Shrink;
+use shrink::{RGB, Shrink};
 
 pub use config::ProcgenConfig;
 pub use visible_actions::visible_actions;
@@ -62,8 +62,6 @@ pub struct ProcgenWorld {
     steps_taken: Vec<u32>,
     /// Steps after which the engine ends an episode.
     time_limit_steps: u32,
-    /// The engine's actions of the step in progress [N].
-    actions: Vec<i32>,
     /// What keeps sequential levels in their set; `None` where the engine does so itself.
     levels: Option<LevelSet>,
     /// The shape of a frame as it leaves this world.
@@ -128,14 +126,14 @@ impl ProcgenWorld {
         } else {
             None
         };
+        let shape = config.frame_shape();
         Ok(ProcgenWorld {
             game: VecGame::new(&engine, &options)?,
             steps_taken: vec![0; num_envs],
             time_limit_steps: config.game.time_limit_steps(config.distribution_mode),
-            actions: vec![0; num_envs],
             levels,
-            shape: config.frame_shape(),
-            shrink: config.shrink(),
+            shape,
+            shrink: (shape.bytes() < FRAME_BYTES).then(|| Shrink::new(shape)),
         })
     }
 
@@ -187,7 +185,8 @@ impl WorldSettings for ProcgenConfig {
     }
 
     fn frame_shape(&self) -> FrameShape {
-        Shrink::shape(self.frame_side as usize, self.grey)
+        let side = self.frame_side as usize;
+        FrameShape::new(side, side, if self.grey { 1 } else { RGB })
     }
 
     /// Source: the `tps` of Procgen's own `interactive.py`.
@@ -257,10 +256,8 @@ impl Environment for ProcgenWorld {
         ends: &mut [StepEnd],
     ) -> Result<(), EnvError> {
         check_step(self.num_envs(), NUM_ACTIONS, actions, rewards, ends)?;
-        for (to, from) in self.actions.iter_mut().zip(actions) {
-            *to = i32::from(*from);
-        }
-        self.game.act(&self.actions)?;
+        let actions: Vec<_> = actions.iter().copied().map(i32::from).collect();
+        self.game.act(&actions)?;
         rewards.copy_from_slice(self.game.rewards());
         for (env, end) in ends.iter_mut().enumerate() {
             self.steps_taken[env] += 1;

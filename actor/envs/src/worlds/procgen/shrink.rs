@@ -6,7 +6,7 @@ use procgen_sys::{FRAME_BYTES, FRAME_SIDE};
 use crate::environment::FrameShape;
 
 /// Bytes of the engine's pixel.
-const RGB: usize = 3;
+pub(super) const RGB: usize = 3;
 /// Thousandths of red, green and blue in grey. Source: ITU-R BT.601, luma.
 const LUMA: [u32; RGB] = [299, 587, 114];
 const LUMA_SUM: u32 = 1000;
@@ -16,15 +16,15 @@ const LUMA_SUM: u32 = 1000;
 /// A pixel is the mean over the area that it covers, pixels at its edges counted in proportion, rounded to the nearest number, halves
 /// up; its grey is the luma of that mean before rounding. All of it is exact in 32 bits.
 pub(super) struct Shrink {
-    side: usize,
-    grey: bool,
+    shape: FrameShape,
     /// For each pixel along a side the first of the engine's that it covers, and how much of each, in `1 / side` of one.
     covers: Vec<(usize, Vec<u32>)>,
 }
 
 impl Shrink {
-    /// To a side of 1 to 64 pixels.
-    pub(super) fn new(side: usize, grey: bool) -> Self {
+    /// To frames of this shape: a side of 1 to 64 pixels, and 3 bytes a pixel, or 1 where they are grey.
+    pub(super) fn new(shape: FrameShape) -> Self {
+        let side = shape.height;
         assert!((1..=FRAME_SIDE).contains(&side), "a side of {side} pixels");
         // In units of 1 / side of the engine's pixels, ours is FRAME_SIDE wide and the engine's is side wide.
         let covers = (0..side).map(|at| {
@@ -38,27 +38,20 @@ impl Shrink {
         });
         Self {
             covers: covers.collect(),
-            side,
-            grey,
+            shape,
         }
-    }
-
-    pub(super) const fn shape(side: usize, grey: bool) -> FrameShape {
-        FrameShape::new(side, side, if grey { 1 } else { RGB })
     }
 
     /// Writes `frames` [N, 64, 64, 3] to `out` [N, side, side, 3 or 1].
     pub(super) fn apply(&self, frames: &[u8], out: &mut [u8]) {
-        let bytes = Self::shape(self.side, self.grey).bytes();
         let frames = frames.chunks_exact(FRAME_BYTES);
-        for (frame, out) in frames.zip(out.chunks_exact_mut(bytes)) {
+        for (frame, out) in frames.zip(out.chunks_exact_mut(self.shape.bytes())) {
             self.one(frame, out);
         }
     }
 
     fn one(&self, frame: &[u8], out: &mut [u8]) {
-        let channels = if self.grey { 1 } else { RGB };
-        let mut pixels = out.chunks_exact_mut(channels);
+        let mut pixels = out.chunks_exact_mut(self.shape.channels);
         for (top, rows) in &self.covers {
             for (left, cols) in &self.covers {
                 // At most 255 * 64 * 64.
@@ -73,7 +66,7 @@ impl Shrink {
                 }
                 let pixel = pixels.next().expect("side x side pixels");
                 let area = (FRAME_SIDE * FRAME_SIDE) as u32;
-                if self.grey {
+                if self.shape.channels == 1 {
                     let luma: u32 = sums.iter().zip(LUMA).map(|(sum, share)| sum * share).sum();
                     pixel[0] = rounded(luma, area * LUMA_SUM);
                 } else {
@@ -99,8 +92,9 @@ mod tests {
     use super::*;
 
     fn shrunk(side: usize, grey: bool, frame: &[u8]) -> Vec<u8> {
-        let mut out = vec![0; frame.len() / FRAME_BYTES * Shrink::shape(side, grey).bytes()];
-        Shrink::new(side, grey).apply(frame, &mut out);
+        let shape = FrameShape::new(side, side, if grey { 1 } else { RGB });
+        let mut out = vec![0; frame.len() / FRAME_BYTES * shape.bytes()];
+        Shrink::new(shape).apply(frame, &mut out);
         out
     }
 
