@@ -233,7 +233,7 @@ impl WorldName {
     /// What distinguishes worlds of its kind.
     fn variants(self) -> Variants {
         let known = KINDS.iter().find(|(kind, _)| *kind == self.kind);
-        known.map_or(Variants::NONE, |(_, variants)| variants())
+        known.map(|(_, variants)| variants()).unwrap_or_default()
     }
 
     /// The world's code outside this program: a command, or a library by its path.

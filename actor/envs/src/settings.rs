@@ -47,7 +47,7 @@ pub trait WorldSettings {
     where
         Self: Sized,
     {
-        Variants::NONE
+        Variants::default()
     }
 
     /// Which of [`variants`](Self::variants) this is.
@@ -82,8 +82,8 @@ pub trait WorldSettings {
     }
 }
 
-/// Kinds of one world, each named on a command line as `world:variant`.
-#[derive(Clone, Copy, Debug)]
+/// Kinds of one world, each named on a command line as `world:variant`; the default is that there is one world alone.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Variants {
     /// The setting that says which; its capitals stand for the variant in help texts.
     pub key: &'static str,
@@ -91,13 +91,4 @@ pub struct Variants {
     pub names: &'static [&'static str],
     /// Whether every other name is one too, such as a command.
     pub is_open: bool,
-}
-
-impl Variants {
-    /// The world is only one.
-    pub const NONE: Self = Self {
-        key: "",
-        names: &[],
-        is_open: false,
-    };
 }

@@ -198,24 +198,15 @@ fn configs() -> [WorldConfig; 4] {
 }
 
 #[test]
-fn shapes_and_actions_are_those_of_the_built_world() {
-    for config in configs() {
-        let mut world = config.build(3, 1, 0).unwrap();
-        assert_eq!(
-            (world.frame_shape(), world.num_actions()),
-            (config.frame_shape(), config.num_actions())
-        );
-        assert_eq!(world.num_envs(), 3);
-        world.observe(&mut vec![0; 3 * config.frame_shape().bytes()]);
-    }
-}
-
-#[test]
-fn no_environments_wrong_buffers_and_wrong_actions_are_errors() {
+fn a_built_world_is_as_its_settings_say_and_rejects_wrong_buffers_and_actions() {
     let with_engine = procgen::tests::engine().map(|_| procgen(0, 500));
     for config in configs().into_iter().chain(with_engine) {
         assert!(config.build(0, 1, 0).is_err());
         let mut world = config.build(2, 1, 0).unwrap();
+        assert_eq!(world.num_envs(), 2);
+        assert_eq!(world.frame_shape(), config.frame_shape());
+        assert_eq!(world.num_actions(), config.num_actions());
+        frames(&mut *world);
         let (mut rewards, mut ends) = ([0.0; 2], [Default::default(); 2]);
         let few = "actions has 1 entries, but the world has 2 environments";
         fails(world.step(&[0], &mut rewards, &mut ends), &[few]);
