@@ -15,6 +15,8 @@ use driml_protocol::{
 };
 use serde::{Deserialize, Serialize};
 
+use crate::error::ActError;
+
 /// Most actors on a ladder of epsilons; settings beyond it are refused.
 const ACTORS_MAX: u32 = 65_536;
 
@@ -96,7 +98,7 @@ struct Planned {
 
 impl ActorSettings {
     /// Reads the tables from a run's resolved settings.
-    pub fn from_toml(text: &str) -> Result<Self, SettingsError> {
+    pub fn from_toml(text: &str) -> Result<Self, ActError> {
         let settings = Settings::parse(text)?;
         let this = Self {
             spec: settings.table("run")?,
@@ -179,17 +181,6 @@ impl ActorSettings {
             BufferPool::new(count)
         }
     }
-}
-
-/// Why a run's settings are of no use to an actor.
-#[derive(Debug, thiserror::Error)]
-pub enum SettingsError {
-    /// A table is missing or does not fit, or a value cannot work.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// The network cannot exist.
-    #[error(transparent)]
-    Model(#[from] driml_model::ModelError),
 }
 
 impl Config {

@@ -2,11 +2,15 @@
 
 use driml_envs::EnvError;
 use driml_model::ModelError;
+use driml_protocol::config::ConfigError;
 
 /// A world, a policy or settings that do not go together, or the failure of one of them.
 #[derive(Debug, thiserror::Error)]
 pub enum ActError {
-    /// The network refuses its weights or its input, or fails.
+    /// A table of the settings is missing or does not fit, or a value cannot work.
+    #[error(transparent)]
+    Settings(#[from] ConfigError),
+    /// The network cannot exist, refuses its weights or its input, or fails.
     #[error(transparent)]
     Network(#[from] ModelError),
     /// The world cannot be stepped.

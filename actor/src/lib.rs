@@ -45,7 +45,7 @@ mod weights;
 
 pub use acting::{Acting, ActingState, Step};
 pub use collect::{Collector, CollectorState, Incarnation};
-pub use config::{ActorSettings, Config, EpsilonLadder, SettingsError};
+pub use config::{ActorSettings, Config, EpsilonLadder};
 pub use delivery::{Delivery, DeliveryError, DeliveryLimits};
 pub use error::ActError;
 pub use evaluate::{Evaluation, Watch, episode_returns};
