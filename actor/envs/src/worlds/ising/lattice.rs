@@ -114,14 +114,12 @@ impl IsingLattice {
     /// # Errors
     /// Spins that are not -1 or +1 exactly where there is a site, and 0 elsewhere.
     pub fn set_spins(&mut self, spins: &[i8]) -> Result<(), EnvError> {
-        let all = self.height * self.width;
-        let there = spins.iter().filter(|spin| spin.abs() == 1).count();
-        let fits = spins.len() == all
-            && there == self.sites.len()
-            && spins.iter().all(|spin| spin.abs() <= 1)
-            && self.sites.iter().all(|&site| spins[site as usize] != 0);
+        let own = &mut self.spins[..self.height * self.width];
+        // 1 where there is a site, else 0.
+        let site = |spin: &i8| spin.unsigned_abs();
+        let fits = spins.iter().map(site).eq(own.iter().map(site));
         saved::check(fits, "a lattice")?;
-        self.spins[..all].copy_from_slice(spins);
+        own.copy_from_slice(spins);
         Ok(())
     }
 
