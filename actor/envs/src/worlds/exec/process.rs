@@ -208,10 +208,8 @@ impl WorldProcess {
 
     /// What to say of an error of the operating system.
     pub(super) fn system(&self, source: &io::Error) -> EnvError {
-        self.fail(&format!(
-            "cannot be used: {}: {source}",
-            self.exchange.doing
-        ))
+        let doing = self.exchange.doing;
+        self.fail(&format!("cannot be used: {doing}: {source}"))
     }
 
     fn end_within(&mut self, limit: Duration) -> Option<ExitStatus> {

@@ -16,8 +16,6 @@ mod ghost;
 mod maze;
 mod render;
 #[cfg(test)]
-mod state_tests;
-#[cfg(test)]
 pub(crate) mod tests;
 
 pub use config::{IsingOverlay, LethalSchedule, PacmanConfig};

@@ -1,4 +1,4 @@
-//! The rules of Ms. PacMan, checked on games put into chosen situations.
+//! The rules of Ms. PacMan, checked on games put into chosen situations; which settings and saved states are rejected.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -6,7 +6,9 @@ use rand_chacha::ChaCha8Rng;
 use super::ghost::{Ghost, Mode};
 use super::maze::{Item, tests::at};
 use super::*;
-use crate::playing::{self, frames, play};
+use crate::environment::Environment;
+use crate::playing::{self, fails, frames, play};
+use crate::saved::tests::continues;
 
 pub(crate) fn config() -> PacmanConfig {
     PacmanConfig {
@@ -30,6 +32,20 @@ fn harmless() -> PacmanConfig {
         lethal: [false; 4],
         ..config()
     }
+}
+
+fn schedule(episodes_per_task: u64, order: &[u8]) -> Option<LethalSchedule> {
+    Some(LethalSchedule {
+        episodes_per_task,
+        order: order.to_vec(),
+    })
+}
+
+fn overlay(temperature: f64, sweeps_per_step: u32) -> Option<IsingOverlay> {
+    Some(IsingOverlay {
+        temperature,
+        sweeps_per_step,
+    })
 }
 
 fn step(world: &mut PacmanWorld, action: u8) -> (f32, StepEnd) {
@@ -227,13 +243,9 @@ fn episodes_are_cut_off_at_the_step_limit() {
 
 #[test]
 fn the_lethal_ghost_changes_by_the_schedule() {
-    let schedule = LethalSchedule {
-        episodes_per_task: 2,
-        order: vec![0, 2, 3],
-    };
     let config = PacmanConfig {
         step_limit: 1,
-        lethal_schedule: Some(schedule),
+        lethal_schedule: schedule(2, &[0, 2, 3]),
         ..config()
     };
     let mut world = PacmanWorld::new(&config, 1, 7).unwrap();
@@ -246,10 +258,6 @@ fn the_lethal_ghost_changes_by_the_schedule() {
 
 #[test]
 fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
-    let overlay = IsingOverlay {
-        temperature: 0.4,
-        sweeps_per_step: 1,
-    };
     let seen = |ising| {
         let config = PacmanConfig {
             ising,
@@ -260,7 +268,7 @@ fn the_overlay_changes_walls_only_and_starts_afresh_in_each_episode() {
         play(&mut world, 400, &mut ChaCha8Rng::seed_from_u64(2))
     };
     let (mut starts, mut is_start) = (vec![], true);
-    let both = seen(Some(overlay)).into_iter().zip(seen(None));
+    let both = seen(overlay(0.4, 1)).into_iter().zip(seen(None));
     for ((a, rewards, ends), (b, bare_rewards, _)) in both {
         assert_eq!(rewards, bare_rewards);
         let mut fuchsia = 0;
@@ -320,4 +328,57 @@ fn a_uniform_policy_earns_its_reference_return() {
         println!("lethal {lethal:?}: {mean:.3} +- {error:.3}, {length:.1} env steps an episode");
         assert!((mean - reference).abs() < 5.0 * error);
     }
+}
+
+#[test]
+fn unusable_settings_are_errors() {
+    let changes: [fn(&mut PacmanConfig); 10] = [
+        |it| it.epsilon = 1.1,
+        |it| it.epsilon = f64::NAN,
+        |it| it.switch_probability = -0.1,
+        |it| it.step_limit = 0,
+        |it| it.reward_ghost = f32::INFINITY,
+        |it| it.lethal_schedule = schedule(0, &[0]),
+        |it| it.lethal_schedule = schedule(1, &[]),
+        |it| it.lethal_schedule = schedule(1, &[4]),
+        |it| it.ising = overlay(0.0, 1),
+        |it| it.ising = overlay(0.4, 0),
+    ];
+    for change in changes {
+        let mut bad = config();
+        change(&mut bad);
+        let error = fails(PacmanWorld::new(&bad, 1, 0), &[]);
+        let words = ["must", "0 to 3"];
+        assert!(words.iter().any(|it| error.contains(it)), "{error}");
+    }
+}
+
+#[test]
+fn a_game_continues_where_it_was_saved() {
+    let schedule = schedule(1, &[0, 1, 2, 3]);
+    for (ising, lethal_schedule) in [(None, None), (overlay(2.0, 1), schedule)] {
+        let config = PacmanConfig {
+            ising,
+            lethal_schedule,
+            step_limit: 40,
+            ..config()
+        };
+        let make =
+            || -> Box<dyn Environment> { Box::new(PacmanWorld::new(&config, 3, 5).unwrap()) };
+        assert!(continues("Ms. PacMan", 100, make) > 3);
+    }
+}
+
+#[test]
+fn a_state_that_no_game_has_is_refused() {
+    let refuse = |what: &str, change: fn(&mut Game)| {
+        let mut wrong = PacmanWorld::new(&config(), 1, 5).unwrap().envs.remove(0);
+        change(&mut wrong.game);
+        fails(wrong.game.check(), &[what]);
+    };
+    refuse("the agent's place", |game| game.agent = 10_000);
+    refuse("a ghost's place", |game| game.ghosts[2].heading = Some(4));
+    refuse("the food", |game| game.pellets_left += 1);
+    refuse("the food", |game| game.items.clear());
+    refuse("a frame", |game| game.background.clear());
 }

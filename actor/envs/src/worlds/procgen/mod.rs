@@ -28,8 +28,6 @@
 //! lies in the set (sets of more than 997 levels, or all levels), the engine's own choice stays.
 
 mod config;
-#[cfg(test)]
-mod level_tests;
 mod shrink;
 #[cfg(test)]
 pub(crate) mod tests;
