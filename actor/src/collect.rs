@@ -70,7 +70,7 @@ impl Collector {
     /// An actor beyond the ladder of epsilons, a world that cannot be made or does not fit the run spec, weights that do not fit
     /// the model.
     pub fn new(
-        settings: ActorSettings,
+        settings: &ActorSettings,
         pool: BufferPool,
         incarnation: Incarnation,
         weights_version: u64,
@@ -242,7 +242,7 @@ mod tests {
         let rng = &mut ChaCha8Rng::seed_from_u64(1);
         let weights = Parameters::init(&settings.model, rng, &Compute::CPU.device).unwrap();
         let weights = weights.to_safetensors(|_| true).unwrap();
-        Collector::new(settings, BufferPool::new(1), incarnation, 1, &weights)
+        Collector::new(&settings, BufferPool::new(1), incarnation, 1, &weights)
     }
 
     /// The actions of a life's first chunk.

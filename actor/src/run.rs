@@ -109,12 +109,9 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let Some(run_info) = join::run_info(client.session(), client.keys(), shutdown)? else {
         return Ok(());
     };
-    let limits = DeliveryLimits::of(&settings.actor);
-    let (actor, config) = (args.actor, settings.actor.clone());
-    let actors_planned = settings.actors_planned;
     let pool = settings.chunk_memory();
     let mut collector = Collector::new(
-        settings,
+        &settings,
         pool.clone(),
         Incarnation {
             actor: join.actor,
@@ -129,14 +126,15 @@ pub fn run(args: RunArgs, shutdown: &Shutdown) -> anyhow::Result<()> {
     let delivery = Delivery::start(
         client.clone(),
         run_info.inserted_total,
-        limits,
+        DeliveryLimits::of(&settings.actor),
         pool,
         shutdown.clone(),
     )?;
+    let (actor, config) = (args.actor, &settings.actor);
     let envs = config.envs;
     tracing::info!("actor {actor} steps {envs} environments, run {spec_hash:016x}");
     // At the start not all are connected yet.
-    let chunk_steps = |actors: u32| config.chunk_steps(actors.max(actors_planned));
+    let chunk_steps = |actors: u32| config.chunk_steps(actors.max(settings.actors_planned));
     let played = play(
         &mut collector,
         chunk_steps,

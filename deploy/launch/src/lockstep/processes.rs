@@ -178,8 +178,8 @@ impl Lockstep {
                 after_updates: 0,
                 earlier_incarnations: 0,
             };
-            let (settings, pool) = (settings.clone(), BufferPool::new(1));
-            Collector::new(settings, pool, life, header.version, safetensors)
+            let pool = BufferPool::new(1);
+            Collector::new(&settings, pool, life, header.version, safetensors)
         };
         let actors = (0..config.local.actors).map(actor);
         Ok(Self {
