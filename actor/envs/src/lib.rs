@@ -19,8 +19,9 @@
 //! [`RestrictedWorld`] is one with fewer actions and smaller frames.
 //!
 //! To add a world in another language, write a program that speaks the protocol of [`ExecWorld`]. To add one in Rust without a
-//! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`], and the world itself,
-//! which implements [`Environment`] (or `Env`, for one of its environments, if they are stepped one by one); then give it a line in `registry.rs`.
+//! change here, [`register`] it. To add one here, write a file in `worlds/` with its settings, which implement [`WorldSettings`],
+//! and the world itself, which implements [`Environment`] (or `Env`, for one of its environments, if they are stepped one by one);
+//! then give it a line in `registry.rs`.
 //!
 //! ```
 //! use driml_envs::{ChainConfig, FrameStack, StepEnd, WorldConfig};
