@@ -13,6 +13,9 @@ use crate::error::ProcgenError;
 use crate::library;
 use crate::wheel::{self, LIBRARY_SHA256, WHEEL_NAME, WHEEL_SHA256};
 
+/// The Python whose pip fetches and unpacks the engine.
+const PYTHON: &str = "python3";
+
 /// How long to wait for another process that installs; then this one does it too.
 const WAIT_MAX: Duration = Duration::from_secs(120);
 
@@ -41,7 +44,8 @@ impl Engine {
     /// No pip, no network, a wrong hash, a full disk, `DRIML_OFFLINE=1`, or a machine that cannot run it.
     pub fn install(progress: &mut dyn FnMut(&str)) -> Result<Engine, ProcgenError> {
         let cache = Cache::from_env()?;
-        Engine::install_in(&cache, LIBRARY_SHA256, progress, wheel::unpack)
+        let unpack = |to: &Path, provided: Option<&Path>| wheel::unpack(PYTHON, to, provided);
+        Engine::install_in(&cache, LIBRARY_SHA256, progress, unpack)
     }
 
     /// From where [`Engine::install`] would take the engine, for a person. Nothing is fetched or looked at more closely.
@@ -51,7 +55,7 @@ impl Engine {
     pub fn source() -> Result<String, ProcgenError> {
         let cache = Cache::from_env()?;
         let provided = cache.provided("it is not installed")?;
-        wheel::check_pip()?;
+        wheel::pip(PYTHON, &["--version"])?;
         Ok(provided.map_or_else(
             || "the package index with `python3 -m pip`".to_owned(),
             |wheel| wheel.display().to_string(),

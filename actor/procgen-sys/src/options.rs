@@ -81,65 +81,48 @@ impl Options {
     }
 }
 
-/// The settings in the engine's layout, with the memory they point to.
-pub(crate) struct RawOptions {
-    items: Vec<LibenvOption>,
-    /// Each item's value: held for the items that point into them, and staying where it is when this is moved.
-    _values: Vec<Vec<u8>>,
-}
-
-impl RawOptions {
-    /// Lays out checked settings. `resource_root` is the folder of the pictures, with a slash at its end.
-    pub(crate) fn new(options: &Options, resource_root: &str) -> RawOptions {
-        let text = |value: &str| (DTYPE_UINT8, value.len(), value.as_bytes().to_vec());
-        let int = |value: i32| (DTYPE_INT32, 1, value.to_ne_bytes().to_vec());
-        let flag = |value: bool| (DTYPE_UINT8, 1, vec![u8::from(value)]);
-        let i32 = |number: usize| i32::try_from(number).expect("validated to be small");
-        let table = [
-            ("env_name", text(options.game.name())),
-            ("resource_root", text(resource_root)),
-            ("num_levels", int(options.num_levels)),
-            ("start_level", int(options.start_level)),
-            ("num_actions", int(i32(NUM_ACTIONS))),
-            ("rand_seed", int(options.rand_seed)),
-            ("num_threads", int(i32(options.num_threads))),
-            ("debug_mode", int(0)),
-            ("distribution_mode", int(options.distribution_mode as i32)),
-            ("render_human", flag(false)),
-            ("use_generated_assets", flag(false)),
-            ("use_monochrome_assets", flag(false)),
-            ("use_sequential_levels", flag(options.use_sequential_levels)),
-            ("paint_vel_info", flag(options.paint_vel_info)),
-            ("use_backgrounds", flag(options.use_backgrounds)),
-            ("center_agent", flag(options.center_agent)),
-            ("restrict_themes", flag(options.restrict_themes)),
-        ];
-        let (items, values) = table
-            .map(|(name, (dtype, count, mut value))| {
-                let item = LibenvOption {
-                    name: ffi::name(name),
-                    dtype,
-                    count: i32(count),
-                    data: value.as_mut_ptr().cast::<c_void>(),
-                };
-                (item, value)
-            })
-            .into_iter()
-            .unzip();
-        RawOptions {
-            items,
-            _values: values,
-        }
-    }
-
-    /// The struct that `libenv_make` takes by value; it points into `self`, which must outlive the call.
-    pub(crate) fn as_libenv(&mut self) -> LibenvOptions {
-        let count = i32::try_from(self.items.len()).expect("there are 17 options");
-        LibenvOptions {
-            items: self.items.as_mut_ptr(),
-            count,
-        }
-    }
+/// Hands checked settings to `make` in the engine's layout, which is there until that returns. `resource_root` is the folder of the
+/// pictures, with a slash at its end.
+pub(crate) fn lay_out<T>(
+    options: &Options,
+    resource_root: &str,
+    make: impl FnOnce(LibenvOptions) -> T,
+) -> T {
+    let text = |value: &str| (DTYPE_UINT8, value.len(), value.as_bytes().to_vec());
+    let int = |value: i32| (DTYPE_INT32, 1, value.to_ne_bytes().to_vec());
+    let flag = |value: bool| (DTYPE_UINT8, 1, vec![u8::from(value)]);
+    let i32 = |number: usize| i32::try_from(number).expect("validated to be small");
+    let mut table = [
+        ("env_name", text(options.game.name())),
+        ("resource_root", text(resource_root)),
+        ("num_levels", int(options.num_levels)),
+        ("start_level", int(options.start_level)),
+        ("num_actions", int(i32(NUM_ACTIONS))),
+        ("rand_seed", int(options.rand_seed)),
+        ("num_threads", int(i32(options.num_threads))),
+        ("debug_mode", int(0)),
+        ("distribution_mode", int(options.distribution_mode as i32)),
+        ("render_human", flag(false)),
+        ("use_generated_assets", flag(false)),
+        ("use_monochrome_assets", flag(false)),
+        ("use_sequential_levels", flag(options.use_sequential_levels)),
+        ("paint_vel_info", flag(options.paint_vel_info)),
+        ("use_backgrounds", flag(options.use_backgrounds)),
+        ("center_agent", flag(options.center_agent)),
+        ("restrict_themes", flag(options.restrict_themes)),
+    ];
+    let mut items = table
+        .each_mut()
+        .map(|(name, (dtype, count, value))| LibenvOption {
+            name: ffi::name(name),
+            dtype: *dtype,
+            count: i32(*count),
+            data: value.as_mut_ptr().cast::<c_void>(),
+        });
+    make(LibenvOptions {
+        items: items.as_mut_ptr(),
+        count: i32(items.len()),
+    })
 }
 
 #[cfg(test)]
@@ -186,12 +169,20 @@ mod tests {
 
     #[test]
     fn values_lie_where_the_items_point() {
-        let mut raw = RawOptions::new(&OPTIONS, "/somewhere/");
-        assert_eq!(raw.as_libenv().count, 17);
-        for (item, value) in raw.items.iter().zip(&raw._values) {
-            assert_eq!(item.data.cast_const().cast::<u8>(), value.as_ptr());
-        }
-        assert_eq!(raw._values[0], b"coinrun");
-        assert_eq!(raw._values[2], 500_i32.to_ne_bytes());
+        let values = lay_out(&OPTIONS, "/somewhere/", |raw| {
+            // SAFETY: so many items are there, and until this returns.
+            let items = unsafe { std::slice::from_raw_parts(raw.items, raw.count as usize) };
+            // SAFETY: none of these has a value of fewer bytes.
+            let bytes = |item: usize, len| unsafe {
+                std::slice::from_raw_parts(items[item].data.cast::<u8>(), len).to_vec()
+            };
+            assert_eq!(items.len(), 17);
+            [bytes(0, 7), bytes(1, 11), bytes(2, 4)]
+        });
+        let levels = 500_i32.to_ne_bytes().to_vec();
+        assert_eq!(
+            values,
+            [b"coinrun".to_vec(), b"/somewhere/".to_vec(), levels]
+        );
     }
 }

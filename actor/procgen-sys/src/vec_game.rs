@@ -12,7 +12,7 @@ use crate::game::Game;
 use crate::install::Engine;
 use crate::library::{self, Api};
 use crate::nap::Nap;
-use crate::options::{NUM_ACTIONS, Options, RawOptions};
+use crate::options::{self, NUM_ACTIONS, Options};
 use crate::pinned::Pinned;
 
 /// Rows and columns of a frame.
@@ -89,13 +89,13 @@ impl VecGame {
         };
         let n = options.num_envs;
         let num_envs = i32::try_from(n).expect("validated to be small");
-        let mut raw = RawOptions::new(options, &resource_root);
-        // SAFETY: the settings were validated, are laid out as the engine reads them, and live until after the call.
-        let handle = unsafe { (api.make)(num_envs, raw.as_libenv()) };
+        let handle = options::lay_out(options, &resource_root, |raw| {
+            // SAFETY: the settings were validated, are laid out as the engine reads them, and live until after the call.
+            unsafe { (api.make)(num_envs, raw) }
+        });
         if handle.is_null() {
             return Err(ProcgenError::Unexpected("it made no game".to_owned()));
         }
-        drop(raw);
         let game = VecGame {
             api,
             handle,

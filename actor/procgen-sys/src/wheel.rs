@@ -46,11 +46,7 @@ pub(crate) fn command_for_people() -> String {
 
 /// Unpacks the engine, its pictures and its licence into the new folder `to`: `libenv.so`, `assets/`, `LICENSE`. pip does it, and
 /// checks the wheel's hash: of the one in the folder `provided`, else of the index's.
-pub(crate) fn unpack(to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
-    unpack_with("python3", to, provided)
-}
-
-fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
+pub(crate) fn unpack(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), ProcgenError> {
     let [all, pins] = ["wheel", "txt"].map(|extension| to.with_extension(extension));
     let text = format!("procgen==0.10.7 --hash=sha256:{WHEEL_SHA256}\n");
     fs::write(&pins, text).map_err(ProcgenError::io("writing", &pins))?;
@@ -82,11 +78,8 @@ fn unpack_with(python: &str, to: &Path, provided: Option<&Path>) -> Result<(), P
     )))
 }
 
-pub(crate) fn check_pip() -> Result<(), ProcgenError> {
-    pip("python3", &["--version"]).map(drop)
-}
-
-fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
+/// What pip says to these arguments; an error where there is none.
+pub(crate) fn pip(python: &str, arguments: &[&str]) -> Result<Output, ProcgenError> {
     // Other users can change nothing of what it writes, whatever the umask says.
     let mut command = Command::new("sh");
     command.args(["-c", "umask 022; exec \"$@\"", "sh", python, "-m", "pip"]);
@@ -141,7 +134,7 @@ mod tests {
         let script = format!("#!/bin/sh\ncd \"${{0%/*}}\"\n{script}\n");
         fs::write(&python, script).unwrap();
         fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
-        unpack_with(python.to_str().unwrap(), &folder.join("fresh"), provided)
+        unpack(python.to_str().unwrap(), &folder.join("fresh"), provided)
     }
 
     /// One test, as a script cannot be started while a process that another test starts has it open.
@@ -188,7 +181,7 @@ mod tests {
             }
         }
         let to = folder.path().join("fresh");
-        let error = unpack_with("/nowhere/python3", &to, None).unwrap_err();
+        let error = unpack("/nowhere/python3", &to, None).unwrap_err();
         assert!(error.to_string().contains("is not installed"), "{error}");
     }
 }
