@@ -99,16 +99,14 @@ fn assert_samples_law(height: usize, width: usize, temperature: f64, boundary: B
 }
 
 #[test]
-fn sweeps_sample_the_boltzmann_law_3x3_periodic() {
-    for temperature in [2.0, 4.0, 5.0] {
-        assert_samples_law(3, 3, temperature, Boundary::Periodic);
-    }
-}
-
-#[test]
-fn sweeps_sample_the_boltzmann_law_3x4_free() {
-    for temperature in [2.0, 2.5, 5.0] {
-        assert_samples_law(3, 4, temperature, Boundary::Free);
+fn sweeps_sample_the_boltzmann_law() {
+    for (width, boundary, temperatures) in [
+        (3, Boundary::Periodic, [2.0, 4.0, 5.0]),
+        (4, Boundary::Free, [2.0, 2.5, 5.0]),
+    ] {
+        for temperature in temperatures {
+            assert_samples_law(3, width, temperature, boundary);
+        }
     }
 }
 
