@@ -12,16 +12,16 @@ use crate::error::ProcgenError;
 
 /// The cache folder and whether fetching is allowed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Cache {
+pub(crate) struct Cache {
     /// The folder under which each version of the engine has its own.
-    pub folder: PathBuf,
+    pub(crate) folder: PathBuf,
     /// Whether nothing may be fetched (`DRIML_OFFLINE=1`).
-    pub offline: bool,
+    pub(crate) offline: bool,
 }
 
 impl Cache {
     /// As this process's environment says.
-    pub fn from_env() -> Result<Cache, ProcgenError> {
+    pub(crate) fn from_env() -> Result<Cache, ProcgenError> {
         Cache::from_variables(|name| std::env::var_os(name))
     }
 

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// What every error about the engine ends with: a world that works without it.
-pub const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no engine)";
+pub(crate) const WITHOUT_ENGINE: &str = "(`--env mspacman` is the world that needs no engine)";
 
 /// Why the engine is not there, could not be put there, made or driven.
 #[derive(Debug, thiserror::Error)]

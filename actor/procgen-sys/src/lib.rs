@@ -52,8 +52,7 @@ mod pinned;
 mod vec_game;
 mod wheel;
 
-pub use cache::Cache;
-pub use error::{ProcgenError, WITHOUT_ENGINE};
+pub use error::ProcgenError;
 pub use game::{DistributionMode, Game};
 pub use install::Engine;
 pub use options::{NUM_ACTIONS, NUM_ENVS_MAX, NUM_THREADS_MAX, Options};
