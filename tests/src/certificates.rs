@@ -27,6 +27,10 @@ impl Certificates {
         run(Command::new(script)
             .arg(&folder)
             .args(args.split_whitespace()));
+        Self::at(folder)
+    }
+
+    pub(crate) const fn at(folder: PathBuf) -> Self {
         Self { folder }
     }
 

@@ -1,7 +1,7 @@
 //! A client of a run over zenoh, as any process is one: asks, and sends whatever a test wants.
 //! It takes no part in the run and keeps nothing.
 
-use std::time::Duration;
+use std::{net::UdpSocket, time::Duration};
 
 use driml_protocol::{
     ActorJoin, Chunk, ChunkHeader, InsertReply, Keyed, Keys, LearnerJoin, LearnerStatus,
@@ -9,13 +9,14 @@ use driml_protocol::{
     config::Settings,
     join,
     session::{self, Endpoints, SessionError},
+    tls::Credentials,
 };
 use zenoh::{Session, Wait, qos::Priority};
 
 use crate::waiting::wait_for;
 
 /// The prefix of a run's keys unless a process is told otherwise.
-const NAMESPACE: &str = "driml";
+pub(crate) const NAMESPACE: &str = "driml";
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
 /// An open session and what the replay server said of its run.
@@ -45,6 +46,12 @@ pub fn listen(endpoint: &str) -> Session {
     .unwrap()
 }
 
+/// An unused endpoint of this machine for QUIC.
+pub fn quic_endpoint() -> String {
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    format!("quic/{}", socket.local_addr().unwrap())
+}
+
 /// How a learner joins that has learned nothing yet.
 pub fn new_learner(learner: u64) -> LearnerJoin {
     LearnerJoin {
@@ -62,9 +69,15 @@ pub fn check_nothing_lost(replay: &ReplayStatus) {
 }
 
 impl Client {
-    /// A client over a session that a test has opened in its own way.
-    pub fn over(session: Session) -> Self {
+    /// A client of the run at an endpoint, once its replay server answers.
+    pub(crate) fn join(endpoint: &str, credentials: Option<&Credentials>) -> Self {
+        let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
         let keys = Keys::new(NAMESPACE).unwrap();
+        let bytes_max = session::MESSAGE_BYTES_MAX;
+        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
+        let session = wait_for(&format!("a process that listens on {endpoint}"), || {
+            session::open_as(&endpoints, &keys, credentials, bytes_max).ok()
+        });
         let run_info = join::run_info(&session, &keys, &Shutdown::default())
             .unwrap()
             .expect("this client is not told to stop");
@@ -78,16 +91,6 @@ impl Client {
             spec,
             config_toml: run_info.config_toml,
         }
-    }
-
-    /// A client of the run at an endpoint, once its replay server answers.
-    pub fn join(endpoint: &str) -> Self {
-        let endpoints = Endpoints::to(vec![endpoint.to_owned()]);
-        // One try waits for seconds by itself; on a busy machine a process may need longer to listen.
-        let session = wait_for(&format!("a process that listens on {endpoint}"), || {
-            session::open(&endpoints).ok()
-        });
-        Self::over(session)
     }
 
     /// Sends bytes and gives the bytes of the answer.
@@ -155,6 +158,11 @@ impl Client {
     pub fn wait_for_updates(&self, updates: u64) -> LearnerStatus {
         let what = format!("more than {updates} updates");
         self.wait_for_learner(&what, |learner| learner.updates > updates)
+    }
+
+    /// Waits until the learner has made its last update, and gives its status.
+    pub fn wait_for_the_last_update(&self) -> LearnerStatus {
+        self.wait_for_learner("the learner's last update", |learner| learner.finished)
     }
 
     /// The replay server's status, of which [`check_nothing_lost`] holds.

@@ -20,7 +20,7 @@ mod system;
 mod waiting;
 
 pub use certificates::{Certificates, EXPIRED, FUTURE};
-pub use client::{Client, check_nothing_lost, connect, listen, new_learner};
+pub use client::{Client, check_nothing_lost, connect, listen, new_learner, quic_endpoint};
 pub use network::Network;
 pub use process::{Ended, Process, check_has};
 pub use run_folder::{EpisodeRow, Outcome, RunFolder, Summary, Table, updates_of};

@@ -8,16 +8,21 @@ use std::{
     sync::atomic::{AtomicU32, AtomicU64, Ordering},
 };
 
-use driml_protocol::fail_point;
+use driml_protocol::{
+    Keys, RunClient, RunSpec, fail_point,
+    tls::{Credentials, Role},
+};
 use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
 };
 
 use crate::{
-    client::Client,
+    certificates::Certificates,
+    client::{Client, NAMESPACE, connect, quic_endpoint},
     process::{Ended, Process},
     run_folder::{Outcome, RunFolder, Summary},
+    skipped::succeeds,
     waiting::{wait_for, wait_until},
 };
 
@@ -30,6 +35,10 @@ pub struct TestSystem {
     program: String,
     folder: tempfile::TempDir,
     mark: String,
+    /// Where its processes meet: a unix socket unless a test asks for another, so that no port can be taken.
+    endpoint: String,
+    /// The flag of processes that talk over TLS.
+    tls: &'static str,
     /// After how many updates learners that are started wait; none do after [`NEVER`].
     held_at: AtomicU64,
 }
@@ -58,13 +67,36 @@ impl TestSystem {
             .prefix("driml-test-")
             .tempdir()
             .unwrap();
-        let program = program.into();
         Self {
-            program,
+            program: program.into(),
+            endpoint: format!("unixsock-stream/{}/s", folder.path().display()),
             folder,
             mark: format!("{}-{count}", std::process::id()),
+            tls: "",
             held_at: AtomicU64::new(NEVER),
         }
+    }
+
+    /// This system, whose processes meet at another endpoint.
+    pub fn at(mut self, endpoint: String) -> Self {
+        self.endpoint = endpoint;
+        self
+    }
+
+    /// This system, whose processes talk over TLS with certificates in its folder `tls`, of three actors; none where there is no
+    /// openssl, and then the test is skipped by name.
+    pub fn over_tls(mut self) -> Option<Self> {
+        if !succeeds(Command::new("openssl").arg("version")) {
+            return None;
+        }
+        Certificates::make(self.path("tls"), "--actors 3");
+        self.tls = " --tls-dir tls";
+        Some(self.at(quic_endpoint()))
+    }
+
+    /// The certificates of a system over TLS.
+    pub fn certificates(&self) -> Certificates {
+        Certificates::at(self.path("tls"))
     }
 
     /// Learners that are started from now on stand still after so many updates, until [`Self::let_go`]: their run is not over before a
@@ -110,9 +142,9 @@ impl TestSystem {
         summary
     }
 
-    /// The endpoint at which this system's processes meet: a unix socket, so that no port can be taken.
-    pub fn endpoint(&self) -> String {
-        self.socket("s")
+    /// The endpoint at which this system's processes meet.
+    pub fn endpoint(&self) -> &str {
+        &self.endpoint
     }
 
     /// The endpoint of a unix socket in the system's folder.
@@ -122,7 +154,17 @@ impl TestSystem {
 
     /// The call of a run in the folder `run` whose processes meet at this system's endpoint.
     pub fn local(&self, flags: &str) -> String {
-        format!("local {flags} --listen {} --run-dir run", self.endpoint())
+        self.listening(&format!("local {flags} --run-dir run"))
+    }
+
+    /// The call of a command that listens at this system's endpoint.
+    pub fn listening(&self, command: &str) -> String {
+        format!("{command} --listen {}{}", self.endpoint, self.tls)
+    }
+
+    /// The call of a command that connects to this system's replay server.
+    pub fn connected(&self, command: &str) -> String {
+        format!("{command} --connect {}{}", self.endpoint, self.tls)
     }
 
     /// Starts the program in the system's folder, with these arguments as in a shell: quotes are around those that have blanks.
@@ -202,31 +244,44 @@ impl TestSystem {
     /// The call of a replay server on this system's endpoint, with the settings that `flags` ask for. When the run is over it stays to be
     /// asked, as the learner does.
     pub fn replay_server(&self, flags: &str) -> String {
-        let endpoint = self.endpoint();
-        format!("replay-server --keep-alive --listen {endpoint} {flags}")
+        self.listening(&format!("replay-server --keep-alive {flags}"))
     }
 
-    /// Starts such a replay server.
+    /// Starts such a replay server; over TLS it listens then.
     pub fn start_replay_server(&self, flags: &str) -> Process {
-        self.start_process(&self.replay_server(flags))
+        let mut server = self.start_process(&self.replay_server(flags));
+        if !self.tls.is_empty() {
+            server.wait_for_stderr("replay server listens");
+        }
+        server
     }
 
     /// Starts a learner whose checkpoints go into the run folder `run_dir`.
     pub fn start_learner(&self, run_dir: &str) -> Process {
-        self.start_process(&format!(
-            "learner --keep-alive --connect {} --run-dir {run_dir}",
-            self.endpoint()
-        ))
+        self.start_process(&self.connected(&format!("learner --keep-alive --run-dir {run_dir}")))
     }
 
     /// Starts an actor.
     pub fn start_actor(&self, id: u32) -> Process {
-        self.start_process(&format!("actor --connect {} --id {id}", self.endpoint()))
+        self.start_process(&self.connected(&format!("actor --id {id}")))
     }
 
-    /// A client of the run at this system's endpoint, once its replay server answers.
+    /// A client of the run at this system's endpoint, once its replay server answers; over TLS, one that only looks.
     pub fn connect(&self) -> Client {
-        Client::join(&self.endpoint())
+        self.connect_as(Role::Observer)
+    }
+
+    /// The same, over TLS with the certificate of `role`.
+    pub fn connect_as(&self, role: Role) -> Client {
+        let read = || Credentials::read(&self.path("tls"), role).unwrap();
+        let credentials = (!self.tls.is_empty()).then(read);
+        Client::join(&self.endpoint, credentials.as_ref())
+    }
+
+    /// A process's connection to the run with this spec, without any question to its replay server.
+    pub fn run_client(&self, spec: &RunSpec) -> RunClient {
+        let keys = Keys::new(NAMESPACE).unwrap();
+        RunClient::new(connect(&self.endpoint), keys, spec.hash())
     }
 
     /// Every process of this system that still runs, children of ended ones included.

@@ -4,28 +4,34 @@
 use std::fs;
 
 use driml_protocol::Waiting;
-use driml_tests::check_nothing_lost;
+use driml_tests::{Process, TestSystem, check_nothing_lost};
+use nix::sys::signal::Signal::{SIGHUP, SIGINT, SIGTERM};
 
-use crate::{LONG, SHORT, system};
+use crate::{
+    LONG, SHORT,
+    closed_terminal::skipped_under_nohup,
+    leftovers::{check_gone, shared_memory},
+    system,
+};
 
-#[test]
-fn processes_find_each_other_and_end_in_order() {
-    let system = system();
+/// A run by hand: its processes find each other, and end in order.
+fn finds_each_other_and_ends_in_order(system: &TestSystem) {
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
-    let learner = system.start_learner("run");
-    let first = system.start_actor(0);
-    let second = system.start_actor(7);
     let client = system.connect();
-
+    let learner = system.start_learner("run");
     // Actors learn from the replay server that the run is complete, and exit.
-    first.wait_ok().expect_said("actor 0 leaves");
-    second.wait_ok().expect_said("actor 7 leaves");
-    let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
+    for (id, actor) in [0, 2].map(|id| (id, system.start_actor(id))) {
+        actor.wait_ok().expect_said(&format!("actor {id} leaves: "));
+    }
+    let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     assert_eq!(replay.waiting, Waiting::Finished);
+    // No process asked for more than its role allows.
     assert_eq!((status.updates, replay.messages_refused), (540, 0));
     let counts = (replay.transitions_inserted, replay.rows_sampled);
     assert_eq!(counts, (1280, 8640));
+    let affinity = replay.affinity_version;
+    assert!(affinity > 0, "the learner's affinity arrived");
     let run = system.run_folder("run");
     assert_eq!(run.checkpoint_sha256(), status.weights_sha256);
 
@@ -37,6 +43,18 @@ fn processes_find_each_other_and_end_in_order() {
         .stop_ok()
         .expect_said("stops with 1280 transitions stored");
     assert_eq!(system.survivors(), []);
+}
+
+#[test]
+fn processes_find_each_other_and_end_in_order() {
+    finds_each_other_and_ends_in_order(&system());
+}
+
+#[test]
+fn so_they_do_over_tls() {
+    if let Some(system) = system().over_tls() {
+        finds_each_other_and_ends_in_order(&system);
+    }
 }
 
 #[test]
@@ -65,39 +83,48 @@ fn processes_end_by_themselves_when_the_run_is_over() {
     }
 }
 
+/// By any signal that a shell, a service manager or a closed ssh session sends.
 #[test]
-fn processes_that_are_told_to_stop_lose_nothing() {
-    let system = system();
-    let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
-    let mut learner = system.start_learner("run");
-    let mut actors = [system.start_actor(0), system.start_actor(1)];
-    for actor in &mut actors {
-        actor.wait_for_stderr("steps 4 environments");
+fn processes_that_are_told_to_stop_lose_and_leave_nothing() {
+    for signal in [SIGTERM, SIGINT, SIGHUP] {
+        if signal == SIGHUP && skipped_under_nohup() {
+            continue;
+        }
+        let system = system();
+        let mut server = system.start_replay_server(&format!("--agent c51 {LONG}"));
+        let mut learner = system.start_learner("run");
+        let mut actors = [0, 1].map(|id| system.start_actor(id));
+        for actor in &mut actors {
+            actor.wait_for_stderr("steps 4 environments");
+        }
+        let client = system.connect();
+        client.wait_for_updates(100);
+        client.wait_for_replay("both actors", |replay| replay.actors == 2);
+        let segments = shared_memory(&system);
+        let ends = |process: Process, says: &str| {
+            process.signal(signal);
+            process.wait_ok().expect_said(says)
+        };
+        for (id, actor) in (0..).zip(actors) {
+            ends(actor, &format!("actor {id} leaves: "));
+        }
+        let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
+        check_nothing_lost(&replay);
+        assert!(
+            learner.is_running() && server.is_running(),
+            "they do not depend on actors"
+        );
+        // The learner uses up what the replay ratio allows, then waits; told to stop, it saves.
+        client.wait_for_replay("a waiting learner", |replay| {
+            replay.waiting == Waiting::LearnerWaitsForActors
+        });
+        ends(learner, "saved run/checkpoints/checkpoint-").expect_said("finished after ");
+        assert!(!system.run_folder("run").checkpoints().is_empty());
+        // A client may hold what it has seen.
+        drop(client);
+        ends(server, "replay server stops");
+        check_gone(&segments);
     }
-    let client = system.connect();
-    client.wait_for_updates(100);
-    client.wait_for_replay("both actors", |replay| replay.actors == 2);
-
-    for actor in actors {
-        actor.stop_ok().expect_said("leaves: ");
-    }
-    let replay = client.wait_for_replay("the actors' absence", |replay| replay.actors == 0);
-    check_nothing_lost(&replay);
-    assert!(
-        learner.is_running() && server.is_running(),
-        "they do not depend on actors"
-    );
-
-    // The learner uses up what the replay ratio allows, then waits; told to stop, it saves.
-    client.wait_for_replay("a waiting learner", |replay| {
-        replay.waiting == Waiting::LearnerWaitsForActors
-    });
-    learner
-        .stop_ok()
-        .expect_said("saved run/checkpoints/checkpoint-");
-    assert!(!system.run_folder("run").checkpoints().is_empty());
-    drop(client);
-    server.interrupt().expect_code(0);
 }
 
 #[test]
@@ -120,7 +147,7 @@ fn an_actor_killed_and_started_again_continues() {
     system.let_go();
     let again = system.start_actor(3);
     again.wait_ok();
-    client.wait_for_learner("the learner's last update", |learner| learner.finished);
+    client.wait_for_the_last_update();
     // A killed actor sends no `Leave`: what it had and did not deliver was never announced, and is in no count.
     let replay = client.check_nothing_lost();
     assert!(replay.transitions_inserted >= 4_008 && replay.finished);

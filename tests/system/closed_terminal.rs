@@ -1,5 +1,5 @@
 //! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
-//! And one that is stopped, and resumes. What Ctrl-C does is in `resume` and `failures`.
+//! And one that is stopped, and resumes. What Ctrl-C does is in `resume` and `failures`, what a hangup does to single processes in `by_hand`.
 
 use std::{
     fs::{File, OpenOptions},
@@ -132,7 +132,7 @@ fn a_closed_pipe_saves_a_run_in_lockstep() {
 }
 
 /// Under `nohup` all processes of a test ignore hangups. It does not ask the program, which may be wrong.
-fn skipped_under_nohup() -> bool {
+pub(crate) fn skipped_under_nohup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
     let mask = u64::from_str_radix(mask.unwrap().trim(), 16).unwrap();
@@ -141,27 +141,6 @@ fn skipped_under_nohup() -> bool {
         driml_tests::skip("hangups are ignored here");
     }
     is_ignored
-}
-
-/// A closed ssh session.
-#[test]
-fn a_hangup_ends_processes_in_order() {
-    if skipped_under_nohup() {
-        return;
-    }
-    let system = system();
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let (learner, actor) = (system.start_learner("run"), system.start_actor(0));
-    system.connect().wait_for_updates(100);
-    for (role, says) in [
-        (actor, "actor 0 leaves"),
-        (learner, "finished after"),
-        (server, "replay server stops"),
-    ] {
-        role.signal(Signal::SIGHUP);
-        role.wait_ok().expect_said(says);
-    }
-    assert!(!system.run_folder("run").checkpoints().is_empty());
 }
 
 #[test]

@@ -4,10 +4,10 @@
 use std::time::{Duration, Instant};
 
 use driml_actor::DeliveryLimits;
-use driml_protocol::{ChunkHeader, Keys, RunClient, Shutdown};
-use driml_tests::{Outcome, connect, wait_until};
+use driml_protocol::Shutdown;
+use driml_tests::{Outcome, wait_until};
 
-use crate::{LONG, chain, synthetic::SyntheticActor, system};
+use crate::{LONG, chain, synthetic::SyntheticActor, system, tiny_replay};
 
 /// The learner is so slow, by a replay ratio of 64, that every actor waits nearly all of the time.
 #[test]
@@ -61,17 +61,8 @@ fn an_actor_waits_for_as_long_as_it_must() {
     };
     let synthetic = |actor| {
         client.join_as_actor(actor, 1);
-        let session = connect(&system.endpoint());
-        let run = RunClient::new(session, Keys::new("driml").unwrap(), client.spec.hash());
-        let first = ChunkHeader {
-            actor,
-            incarnation: 1,
-            streams: 4,
-            steps: 8,
-            frame_bytes: client.spec.frame_bytes() as u32,
-            ..ChunkHeader::default()
-        };
-        SyntheticActor::start(run, first, limits, &stop)
+        let first = tiny_replay::header(&client.spec, actor, 4, 8);
+        SyntheticActor::start(system.run_client(&client.spec), first, limits, &stop)
     };
     let actors: Vec<_> = (0..16).map(synthetic).collect();
     let produced: u64 = std::thread::scope(|scope| {

@@ -59,10 +59,9 @@ fn with_full_disk(
     let Some(_disk) = Disk::mount(system.path("disk"), 3_000) else {
         return;
     };
-    let mut process = system.start(&format!(
-        "local --agent c51 {LONG} --set learner.checkpoint_period_updates={checkpoint_period} --listen {} --run-dir disk/run",
-        system.endpoint()
-    ));
+    let period = format!("--set learner.checkpoint_period_updates={checkpoint_period}");
+    let run = format!("local --agent c51 {LONG} {period} --run-dir disk/run");
+    let mut process = system.start(&system.listening(&run));
     system.connect().wait_for_updates(100);
     let filler = system.path("disk/filler");
     fill(&filler);
@@ -166,7 +165,7 @@ fn a_full_disk_makes_all_processes_wait_until_there_is_room() {
     fill(&filler);
     server.wait_for_stderr("cannot be written: No space left on device (os error 28); nothing more is stored until it can");
     let stopped = client.replay().unwrap();
-    let ask = format!("status --connect {}", system.endpoint());
+    let ask = system.connected("status");
     let words = [
         "replay on disk: ",
         "REFUSED for",

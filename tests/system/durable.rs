@@ -3,7 +3,9 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{Outcome, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until};
+use driml_tests::{
+    Outcome, Process, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
+};
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -101,20 +103,18 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     system.hold_at(1_000);
     let server = system.start_replay_server(&flags);
     let learner = system.start_learner("run");
-    let actors = [system.start_actor(0), system.start_actor(1)];
+    let actors = || [0, 1].map(|id| system.start_actor(id));
+    let first = actors();
     let client = system.connect();
     client.wait_for_updates(500);
     server.kill();
-    let [first, second] = actors;
-    first.kill();
-    second.kill();
+    first.into_iter().for_each(Process::kill);
     system.let_go();
     let server = system.start_replay_server(&flags);
-    let actors = [system.start_actor(0), system.start_actor(1)];
-    for actor in actors {
+    for actor in actors() {
         actor.wait_ok();
     }
-    let status = client.wait_for_learner("the learner's last update", |learner| learner.finished);
+    let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     assert_eq!(status.updates, planned(replay.transitions_inserted));
     learner.stop_ok();
@@ -204,7 +204,6 @@ fn a_resumed_run_continues_with_its_replay() {
 #[test]
 fn a_run_whose_launcher_was_killed_continues() {
     let system = system();
-    let listen = format!("--listen {}", system.endpoint());
     let process = launched_with(&system, "--durable --agent c51", 1_000);
     let client = system.connect();
     let actor = system.find_process("actor");
@@ -213,9 +212,8 @@ fn a_run_whose_launcher_was_killed_continues() {
     drop(client);
     process.kill();
     // Which of them is the last to end depends on how busy the machine is.
-    system
-        .run_ok(&format!("local --resume run --frames {frames} {listen}"))
-        .expect_said(": waiting");
+    let resume = system.listening(&format!("local --resume run --frames {frames}"));
+    system.run_ok(&resume).expect_said(": waiting");
     actor.signal(Signal::SIGKILL);
     system.run_folder("run").check_finished();
 }

@@ -6,7 +6,11 @@ use std::{fs, process::Command};
 use driml_tests::{Ended, Outcome, Process, wait_until};
 use nix::sys::signal::Signal;
 
-use crate::{LONG, SHORT, chain, launched, system};
+use crate::{
+    LONG, PROCESSES, SHORT, chain, launched,
+    leftovers::{check_gone, shared_memory},
+    system,
+};
 
 #[test]
 fn a_second_interrupt_ends_at_once() {
@@ -60,17 +64,29 @@ fn a_run_whose_folder_is_gone_says_what_is_lost() {
 }
 
 #[test]
-fn a_dead_learner_or_replay_server_ends_the_run() {
-    for role in ["learner", "replay-server"] {
+fn dead_processes_end_the_run_and_leave_no_shared_memory() {
+    for (dead, says) in [
+        (
+            &["learner"][..],
+            "error: learner was killed by signal 9 SIGKILL (log: ",
+        ),
+        (
+            &["replay-server"],
+            "error: replay-server was killed by signal 9 SIGKILL (log: ",
+        ),
+        (&PROCESSES, " was killed by signal 9 SIGKILL (log: "),
+    ] {
         let system = system();
         let process = launched(&system, 100);
-        system.find_process(role).signal(Signal::SIGKILL);
+        let segments = shared_memory(&system);
+        let dead = dead.iter().map(|role| system.find_process(role));
+        let dead: Vec<_> = dead.collect();
+        dead.iter().for_each(|it| it.signal(Signal::SIGKILL));
         process
-            .fails(&format!(
-                "error: {role} was killed by signal 9 SIGKILL (log: "
-            ))
+            .fails(says)
             .expect_said("`driml train --resume run` resumes it");
         system.check_over(Outcome::Failed);
+        check_gone(&segments);
     }
 }
 
@@ -152,8 +168,9 @@ fn a_process_whose_launcher_died_before_it_looked_ends() {
     let mut launcher = Command::new("true").spawn().unwrap();
     launcher.wait().unwrap();
     let system = system();
-    let listen = format!("replay-server --listen {} {SHORT}", system.endpoint());
+    let parent = launcher.id();
+    let server = format!("replay-server {SHORT} --exit-with-parent {parent}");
     system
-        .run_ok(&format!("{listen} --exit-with-parent {}", launcher.id()))
+        .run_ok(&system.listening(&server))
         .expect_said("replay server stops");
 }

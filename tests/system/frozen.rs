@@ -31,7 +31,7 @@ fn complete_but_for_an_actor(system: &TestSystem) -> Process {
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     system.find_process("actor").signal(Signal::SIGSTOP);
     system.let_go();
-    client.wait_for_learner("the last update", |learner| learner.finished);
+    client.wait_for_the_last_update();
     process
 }
 
@@ -55,14 +55,12 @@ fn an_interrupt_of_a_complete_run_leaves_it_finished() {
 
 fn a_replay_server_ends_without_its_actor() {
     let system = system();
-    let listen = system.endpoint();
-    let server = system.start_process(&format!(
-        "replay-server --listen {listen} --agent c51 {SHORT}"
-    ));
+    let server = format!("replay-server --agent c51 {SHORT}");
+    let server = system.start_process(&system.listening(&server));
     let mut frozen = system.start_actor(1);
     frozen.wait_for_stderr("waiting for the learner's first weights");
     frozen.signal(Signal::SIGSTOP);
-    let learner = system.start_process(&format!("learner --connect {listen} --run-dir run"));
+    let learner = system.start_process(&system.connected("learner --run-dir run"));
     system.start_actor(0).wait_ok();
     learner.wait_ok();
     server.wait_ok().expect_said("the run is over, and ");

@@ -1,12 +1,12 @@
 //! What a run leaves outside its folder, in the temporary folder and in shared memory: nothing, however it ended; or until the
 //! next run starts, if all its processes were killed. A killed launcher's learner saves what it has learned.
+//! Shared memory of single processes that end is looked for in `by_hand` and `failures`, too.
 
 use std::{fs, path::PathBuf};
 
-use driml_tests::{Process, Survivor, TestSystem};
-use nix::sys::signal::Signal;
+use driml_tests::{Process, TestSystem};
 
-use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, launched, system};
+use crate::{LONG, PROCESSES, SHORT, disk_full::NEVER, system};
 
 /// A run whose temporary folder is `tmp` in the system's.
 fn local(system: &TestSystem, flags: &str) -> String {
@@ -14,15 +14,15 @@ fn local(system: &TestSystem, flags: &str) -> String {
     format!("env TMPDIR={} DRIML local {flags}", folder.display())
 }
 
-/// A run of [`local`] that has learned something and saved nothing, and its processes.
-fn started(system: &TestSystem) -> (Process, [Survivor; 3]) {
+/// A run of [`local`] that has learned something and saved nothing, and the shared memory of its processes.
+fn started(system: &TestSystem) -> (Process, Vec<PathBuf>) {
     fs::create_dir(system.path("tmp")).unwrap();
     let never = format!("--set learner.checkpoint_period_updates={NEVER}");
     let flags = format!("--agent driml-ada {LONG} {never} --run-dir run");
     let process = system.start(&local(system, &flags));
-    let run = system.run_folder("run");
-    run.wait_for_updates(100);
-    (process, PROCESSES.map(|role| system.find_process(role)))
+    system.run_folder("run").wait_for_updates(100);
+    assert_eq!(temporary(system).len(), 1);
+    (process, shared_memory(system))
 }
 
 fn temporary(system: &TestSystem) -> Vec<PathBuf> {
@@ -33,9 +33,7 @@ fn temporary(system: &TestSystem) -> Vec<PathBuf> {
 #[test]
 fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     let system = system();
-    let (process, processes) = started(&system);
-    let segments = all_shared_memory_of(&processes);
-    assert_eq!(temporary(&system).len(), 1);
+    let (process, segments) = started(&system);
     process.kill();
     system.wait_until_all_have_ended();
     assert!(system.run_folder("run").saved_updates() > 100);
@@ -46,8 +44,7 @@ fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
 #[test]
 fn the_next_run_sweeps_what_killed_processes_left() {
     let system = system();
-    let (process, processes) = started(&system);
-    let segments = all_shared_memory_of(&processes);
+    let (process, segments) = started(&system);
     system.kill_all();
     process.wait();
     system.wait_until_all_have_ended();
@@ -58,39 +55,12 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     check_gone(&segments);
 }
 
-#[test]
-fn processes_started_by_hand_leave_no_shared_memory() {
-    let system = system();
-    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
-    let learner = system.start_learner("run");
-    let actor = system.start_actor(0);
-    let client = system.connect();
-    client.wait_for_updates(100);
-    let segments = all_shared_memory_of(&PROCESSES.map(|role| system.find_process(role)));
-    // A client may hold what it has seen.
-    drop(client);
-    for process in [actor, learner, server] {
-        process.stop_ok();
-    }
-    check_gone(&segments);
-}
-
-#[test]
-fn shared_memory_of_killed_processes_is_removed() {
-    let system = system();
-    let process = launched(&system, 100);
-    let processes = PROCESSES.map(|role| system.find_process(role));
-    let segments = all_shared_memory_of(&processes);
-    processes.iter().for_each(|it| it.signal(Signal::SIGKILL));
-    process.wait().expect_code(1);
-    check_gone(&segments);
-}
-
-/// The shared memory that the processes have open.
-fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
+/// The shared memory that the processes of a run have open.
+pub(crate) fn shared_memory(system: &TestSystem) -> Vec<PathBuf> {
     let mut files = Vec::new();
-    for process in processes {
-        let maps = fs::read_to_string(format!("/proc/{}/maps", process.pid)).unwrap();
+    for role in PROCESSES {
+        let process = system.find_process(role).pid;
+        let maps = fs::read_to_string(format!("/proc/{process}/maps")).unwrap();
         let paths = maps
             .lines()
             .filter_map(|line| line.split_whitespace().nth(5));
@@ -101,7 +71,7 @@ fn all_shared_memory_of(processes: &[Survivor]) -> Vec<PathBuf> {
     files
 }
 
-fn check_gone(files: &[PathBuf]) {
+pub(crate) fn check_gone(files: &[PathBuf]) {
     let left: Vec<&PathBuf> = files.iter().filter(|file| file.exists()).collect();
     assert!(left.is_empty(), "{left:?}");
 }

@@ -3,7 +3,8 @@
 
 use std::collections::BTreeSet;
 
-use driml_tests::{Client, Outcome, Summary, wait_until};
+use driml_tests::{Outcome, Summary, TestSystem, wait_until};
+use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, chain, listener, system};
 
@@ -52,17 +53,18 @@ fn c51_leaves_a_whole_run_folder() {
 
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
-    let system = system();
+    let system = system().at(listener().0);
     // The run is not over before its second actor has started.
     system.hold_at(500);
     let longer = chain(2_560);
-    let (endpoint, _) = listener();
-    let flags = format!("{longer} --actors 2 --listen {endpoint} --run-dir run");
     // All three actions amount to one, so the learner's A is 1 everywhere and k goes as far as it may. Without the learner the
     // replay server's A is 1/3 everywhere: then the mean of k is at most 1 + 1/3 + .. + 1/81.
     let alphabet = "--set learner.affinity.alphabet=visible --set learner.affinity.visible=[0,0,0]";
-    let process = system.start(&format!("local --agent driml-ada {alphabet} {flags}"));
-    Client::join(&endpoint).wait_for_replay("both actors", |replay| replay.actors == 2);
+    let flags = format!("--agent driml-ada {alphabet} {longer} --actors 2");
+    let process = system.start(&system.local(&flags));
+    system
+        .connect()
+        .wait_for_replay("both actors", |replay| replay.actors == 2);
     system.let_go();
     process.wait_ok();
     let run = system.run_folder("run");
@@ -82,25 +84,45 @@ fn driml_ada_with_two_actors_over_tcp() {
     assert!(affinity > Some(0), "it reached the replay server");
 }
 
-/// `driml local --listen` lets actors of other machines play, in the same run folder.
+/// `driml local --listen` lets actors of other machines play in the same run, and other processes watch it.
+fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
+    let run = system.start(&system.local(&format!("--agent c51 {LONG}")));
+    let mut outside = system.start_actor(2);
+    outside.wait_for_stderr("actor 2 steps 4 environments");
+    let client = system.connect();
+    client.wait_for_replay("both actors", |replay| replay.actors_acting == 2);
+    // Who only looks gets all that is recorded, episodes too.
+    let mut watched = system.start(&system.connected("watch --run-dir seen"));
+    let both = BTreeSet::from([0, 2]);
+    let has_both = |folder| {
+        let episodes = system.run_folder(folder).episodes();
+        let actors: BTreeSet<_> = episodes.iter().map(|it| it.actor).collect();
+        actors == both
+    };
+    wait_until("episodes of both actors", || {
+        has_both("run") && has_both("seen")
+    });
+    watched.signal(Signal::SIGINT);
+    watched.wait_for_stderr("the run continues without being watched");
+    watched.wait().expect_code(130);
+    outside.stop_ok().expect_said("actor 2 leaves: ");
+    drop(client);
+    run.interrupt().expect_code(130);
+    system.run_folder("run").check(Outcome::Interrupted);
+    assert!(has_both("run"));
+}
+
 #[test]
 fn an_actor_from_elsewhere_plays_in_a_launched_run() {
-    let system = system();
-    let (endpoint, _) = listener();
-    let run = system.start(&format!(
-        "local --agent c51 {LONG} --listen {endpoint} --run-dir run"
-    ));
-    // All processes of the run meet at this replay server.
-    system.find_process("learner");
-    let mut outside = system.start_process(&format!("actor --connect {endpoint} --id 5"));
-    outside.wait_for_stderr("actor 5 steps 4 environments");
-    let folder = system.run_folder("run");
-    let actors = || -> BTreeSet<_> { folder.episodes().iter().map(|it| it.actor).collect() };
-    wait_until("an episode that it played", || actors().contains(&5));
-    outside.stop_ok().expect_said("actor 5 leaves");
-    run.interrupt().expect_code(130);
-    folder.check(Outcome::Interrupted);
-    assert_eq!(actors(), BTreeSet::from([0, 5]));
+    plays_with_an_actor_from_elsewhere(&system().at(listener().0));
+}
+
+/// The processes of the run meet at a unix socket.
+#[test]
+fn an_actor_from_elsewhere_plays_over_tls() {
+    if let Some(system) = system().over_tls() {
+        plays_with_an_actor_from_elsewhere(&system);
+    }
 }
 
 #[test]

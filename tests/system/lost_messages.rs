@@ -206,7 +206,7 @@ fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Serv
             let run = endpoint.client(&spec());
             scope.spawn(move || {
                 let stop = Shutdown::default();
-                let first = tiny_replay::chunk(&spec(), actor, 0, STEPS).header;
+                let first = tiny_replay::header(&spec(), actor, 1, STEPS);
                 let mut synthetic = SyntheticActor::start(run, first, limits, &stop);
                 if leaving {
                     stop.set();

@@ -4,9 +4,9 @@
 use std::{collections::BTreeSet, time::Duration};
 
 use driml_actor::DeliveryLimits;
-use driml_protocol::{ChunkHeader, Keys, RunClient, RunSpec, Shutdown, config::Settings};
+use driml_protocol::{ChunkHeader, RunClient, RunSpec, Shutdown, config::Settings};
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, TestSystem, check_nothing_lost, connect};
+use driml_tests::{Process, TestSystem, check_nothing_lost};
 
 use crate::{
     synthetic::{SyntheticActor, SyntheticLearner},
@@ -31,22 +31,15 @@ const DRAWN: u64 = 64;
 pub(crate) const KILLS: u64 = 6;
 
 /// Delivers all of one actor's chunks; each transition is one episode whose return is its number.
-fn deliver(run: RunClient, actor: u32, frame_bytes: u32) {
+fn deliver(run: RunClient, first: ChunkHeader) {
     let limits = DeliveryLimits {
         chunks_in_flight_max: 4,
         ack_timeout: Duration::from_secs(2),
         unreachable_max: Duration::from_secs(60),
     };
-    let first = ChunkHeader {
-        actor,
-        incarnation: 1,
-        streams: STREAMS,
-        steps: STEPS,
-        frame_bytes,
-        ..ChunkHeader::default()
-    };
+    let number = u64::from(first.actor) * OF_AN_ACTOR;
     let mut synthetic = SyntheticActor::start(run, first, limits, &Shutdown::default());
-    (0..CHUNKS).for_each(|_| synthetic.send(u64::from(actor) * OF_AN_ACTOR));
+    (0..CHUNKS).for_each(|_| synthetic.send(number));
     synthetic.finish();
 }
 
@@ -89,15 +82,12 @@ pub(crate) fn kill_after_rows(moments: impl IntoIterator<Item = u64>) {
         client.join_as_actor(actor, 1);
     }
     client.join_as_learner(7);
-    let (spec_hash, frame_bytes) = (client.spec.hash(), client.spec.frame_bytes() as u32);
-    let run = || {
-        let session = connect(&system.endpoint());
-        RunClient::new(session, Keys::new("driml").unwrap(), spec_hash)
-    };
+    let run = || system.run_client(&client.spec);
     let batches = std::thread::scope(|scope| {
         for actor in 0..ACTORS {
+            let first = tiny_replay::header(&client.spec, actor, STREAMS, STEPS);
             let run = run();
-            scope.spawn(move || deliver(run, actor, frame_bytes));
+            scope.spawn(move || deliver(run, first));
         }
         let mut learner = SyntheticLearner::start(&[run()], 7, ROWS, 1);
         let learning = scope.spawn(move || {

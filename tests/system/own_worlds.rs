@@ -145,10 +145,7 @@ fn an_actor_starts_no_command_that_was_not_named_on_its_machine() {
         .start_actor(0)
         .fails("an actor starts none because a replay server says so")
         .expect_said("--env \"exec:exec python3 ");
-    let actor = |flags: &str| {
-        let endpoint = system.endpoint();
-        system.start_process(&format!("actor --connect {endpoint} {flags}"))
-    };
+    let actor = |flags: &str| system.start_process(&system.connected(&format!("actor {flags}")));
     actor("--env chain").fails("and not chain");
     // The same world by another command, as another machine may have it; it will hang.
     let hanging = actor(&format!("--id 1 --env '{}'", numbered("hang 50")));

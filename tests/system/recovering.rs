@@ -1,18 +1,20 @@
 //! A replay server that has a long log to read back: all processes learn the progress, wait, and continue; nothing is lost or doubled.
 //! The log is real, and its server gets little of the processor, as on a slow machine: nothing in the program waits for these tests.
 
-use std::{fs, path::Path, time::Duration};
+use std::{fs, path::Path};
 
 use driml_protocol::{
-    ActorJoin, BatchRequest, Chunk, ChunkHeader, End, InsertReply, Keys, ReplayStatus, RequestId,
-    RunClient, RunInfo, RunSpec, WeightsHeader, WeightsUpload, config::Settings,
-    session::SessionError,
+    Chunk, ChunkHeader, End, InsertReply, ReplayStatus, RunInfo, RunSpec, WeightsUpload,
+    config::Settings,
 };
 use driml_replay_server::{Config, PersistArgs, Replay};
-use driml_tests::{Process, SlowMachine, TestSystem, check_has, connect, new_learner, wait_for};
+use driml_tests::{Client, Process, SlowMachine, TestSystem, check_has, new_learner, wait_for};
 use serde_json::Value;
 
-use crate::{system, tiny_replay, tls::TlsSystem};
+use crate::{
+    refusals::{Row, actor_join, batch_request, send, upload},
+    system, tiny_replay,
+};
 
 /// Transitions in a log, one record each: in one that is read for longer than the limit for an absent server, and in the others.
 const LONG: u64 = 1_000_000;
@@ -58,7 +60,7 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
     };
     let (mut replay, _) = Replay::open(&args, &spec, &config, 16).unwrap();
     tiny_replay::join(&mut replay, 9);
-    let mut header = header_of(9, spec.frame_bytes());
+    let mut header = tiny_replay::header(&spec, 9, 1, 1);
     for sequence in 0..kept {
         (header.sequence, header.first_transition) = (sequence, sequence);
         let mut chunk = Chunk::zeroed(header);
@@ -67,18 +69,6 @@ fn keep(kept: u64, folder: &Path, config_toml: &str) -> RunSpec {
         assert!(matches!(reply, InsertReply::Stored { .. }), "{reply:?}");
     }
     spec
-}
-
-/// The first chunk of an actor, of one transition.
-fn header_of(actor: u32, frame_bytes: usize) -> ChunkHeader {
-    ChunkHeader {
-        actor,
-        incarnation: 1,
-        streams: 1,
-        steps: 1,
-        frame_bytes: frame_bytes as u32,
-        ..ChunkHeader::default()
-    }
 }
 
 /// Makes a log of so many transitions in the folder `replay`; gives its run, and what a replay server is called with to read it.
@@ -109,8 +99,7 @@ fn start_stopped(system: &TestSystem, flags: &str) -> Process {
 
 /// How far the server is, as `driml status --json` has it; none once it has read all.
 fn recovering(system: &TestSystem) -> Option<Value> {
-    let status = format!("status --connect {} --json", system.endpoint());
-    let answer = system.run_ok(&status).json();
+    let answer = system.run_ok(&system.connected("status --json")).json();
     let recovering = answer["servers"][0]["recovering"].clone();
     if recovering.is_null() {
         return None;
@@ -121,48 +110,26 @@ fn recovering(system: &TestSystem) -> Option<Value> {
 
 /// Whatever is asked is put off.
 fn check_put_off(system: &TestSystem, spec: &RunSpec) {
-    let session = connect(&system.endpoint());
-    let run = RunClient::new(session, Keys::new("driml").unwrap(), spec.hash());
-    let answer_max = Duration::from_secs(10);
-    let chunk = Chunk::zeroed(header_of(5, spec.frame_bytes()));
-    let (header, payload) = (chunk.header, chunk.into_payload().freeze());
-    let actor = ActorJoin {
-        actor: 5,
-        incarnation: 1,
+    let run = system.run_client(spec);
+    let client = Client {
+        session: run.session().clone(),
+        keys: run.keys().clone(),
+        spec: spec.clone(),
+        config_toml: String::new(),
     };
-    let learner = new_learner(99);
-    let request = BatchRequest {
-        learner: 99,
-        id: RequestId::first(1),
-        rows: 16,
-        ..BatchRequest::default()
-    };
-    let upload = WeightsUpload {
-        learner: 99,
-        weights: WeightsHeader::new(1, 0, b"weights"),
-    };
-    let sealed = |payload: &[u8]| run.seal_with(&upload, payload.to_vec().into()).unwrap();
-    let asked = [
-        ("a chunk", {
-            let chunk = run.seal_with(&header, payload).unwrap();
-            run.send(chunk, answer_max).unwrap().wait().map(drop)
-        }),
-        ("weights", {
-            let upload = run.send(sealed(b"weights"), answer_max).unwrap();
-            upload.wait().map(drop)
-        }),
-        ("a batch", run.ask(&request, answer_max).map(drop)),
-        ("an actor", run.ask(&actor, answer_max).map(drop)),
-        ("a learner", run.ask(&learner, answer_max).map(drop)),
-        ("settings", run.fetch::<RunInfo>(answer_max).map(drop)),
-        ("a status", run.fetch::<ReplayStatus>(answer_max).map(drop)),
+    let told = "the replay server reads its replay back from disk, ";
+    let chunk = client.seal(&Chunk::zeroed(tiny_replay::header(spec, 5, 1, 1)));
+    let weights = upload(spec.hash(), 99, 1, b"weights");
+    let rows = [
+        Row::new(client.keys.of_actor::<ChunkHeader>(5), chunk, told),
+        Row::new(client.keys.of::<WeightsUpload>(), weights, told),
+        Row::of(&client, &batch_request(99, 16), told),
+        Row::of(&client, &actor_join(5, 1), told),
+        Row::of(&client, &new_learner(99), told),
+        Row::new(client.keys.of::<RunInfo>(), [], told),
+        Row::new(client.keys.of::<ReplayStatus>(), [], told),
     ];
-    for (what, asked) in asked {
-        assert!(
-            matches!(asked, Err(SessionError::Recovering(_))),
-            "{what}: {asked:?}"
-        );
-    }
+    send(&client, rows);
 }
 
 /// Processes that were there when the server died, and others that come while it reads, longer than the limit for an absent server.
@@ -180,9 +147,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let slow = slow_down(&mut server);
     let first = recovering(&system).expect("it has a long log");
     check_put_off(&system, &spec);
-    let endpoint = system.endpoint();
-    let status = format!("status --connect {endpoint}");
-    let said = system.run_ok(&status).stdout;
+    let said = system.run_ok(&system.connected("status")).stdout;
     let words = [
         "chain, c51: frames ?/",
         "replay-server  reads its replay back",
@@ -190,9 +155,9 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
         "no action needed",
     ];
     check_has(&said, &words);
-    let look = format!("watch --once --connect {endpoint}");
+    let look = system.connected("watch --once");
     system.fails(&look, "reads its replay back from disk");
-    let mut watched = system.start(&format!("watch --connect {endpoint} --run-dir seen"));
+    let mut watched = system.start(&system.connected("watch --run-dir seen"));
     watched.wait_for_stderr(": reads its replay back from disk, ");
     actors.push(system.start_actor(1));
     actors[1].wait_for_stderr(WAITING);
@@ -211,7 +176,7 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
         actor.wait_ok();
     }
     let client = system.connect();
-    let status = client.wait_for_learner("the learner's last update", |it| it.finished);
+    let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     assert_eq!(
         (status.updates, replay.rows_sampled),
@@ -285,22 +250,19 @@ fn a_resumed_run_shows_how_far_its_server_is() {
 /// Each role receives it in place of the answer.
 #[test]
 fn roles_are_told_too() {
-    let Some(tls) = TlsSystem::new() else { return };
-    let (_, serve) = keep_for(&tls.system, SHORTER);
-    let mut server = tls.start_server(&serve);
+    let Some(system) = system().over_tls() else {
+        return;
+    };
+    let (_, serve) = keep_for(&system, SHORTER);
+    let mut server = system.start_replay_server(&serve);
     let slow = slow_down(&mut server);
-    let mut processes = [
-        tls.start("actor --id 0", "tls"),
-        tls.start("learner --keep-alive --run-dir run", "tls"),
-    ];
-    for role in &mut processes {
+    let [mut actor, mut learner] = [system.start_actor(0), system.start_learner("run")];
+    for role in [&mut actor, &mut learner] {
         role.wait_for_stderr(WAITING);
     }
-    let status = format!("status --connect {} --tls-dir tls", tls.endpoint);
-    let said = tls.system.run_ok(&status).stdout;
+    let said = system.run_ok(&system.connected("status")).stdout;
     assert!(said.contains("reads its replay back"), "{said}");
     drop(slow);
-    let [actor, learner] = processes;
     actor.wait_ok();
     learner.stop_ok();
     server.stop_ok();

@@ -7,8 +7,7 @@ use nix::sys::signal::Signal;
 use crate::{LONG, SHORT, system};
 
 fn status(system: &TestSystem) -> String {
-    let call = format!("status --connect {}", system.endpoint());
-    system.run_ok(&call).stdout
+    system.run_ok(&system.connected("status")).stdout
 }
 
 /// Asks until the answer holds all of `words`.
@@ -57,9 +56,7 @@ fn missing_processes_are_named_with_what_to_do() {
     let words = ["learner        GONE for", "from its newest checkpoint"];
     wait_for_status(&system, &words);
 
-    let answer = system
-        .run_ok(&format!("status --connect {endpoint} --json"))
-        .json();
+    let answer = system.run_ok(&system.connected("status --json")).json();
     let processes = &answer["servers"][0]["processes"]["processes"];
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);
@@ -68,7 +65,7 @@ fn missing_processes_are_named_with_what_to_do() {
 
     // A suspended server is reported within seconds, too.
     server.signal(Signal::SIGSTOP);
-    let ended = system.run(&format!("status --connect {endpoint}"));
+    let ended = system.run(&system.connected("status"));
     server.signal(Signal::SIGCONT);
     ended.expect_error("endpoint");
 }

@@ -44,7 +44,7 @@ fn killed_learners_cost_no_update_of_the_plan() {
         forgotten = replay.rows_unlearned;
     }
     system.let_go();
-    let learned = client.wait_for_learner("the last update", |it| it.finished);
+    let learned = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
     let planned = (replay.transitions_inserted - 200) * 8 / 16;
     assert_eq!(learned.updates, planned, "{replay:#?}");
@@ -127,10 +127,7 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     let system = system();
     let (server, learner, client) = between_checkpoints(&system, "");
     learner.kill();
-    let stranger = |flags: &str| {
-        let connect = system.endpoint();
-        format!("learner --connect {connect} --run-dir elsewhere {flags}")
-    };
+    let stranger = |flags: &str| system.connected(&format!("learner --run-dir elsewhere {flags}"));
     let why = "and the learner has no checkpoint of it: start the learner with the --run-dir that holds its checkpoints";
     system.fails(&stranger(""), why);
     let before = client.replay().unwrap();
@@ -145,8 +142,7 @@ fn a_learner_without_the_runs_checkpoint_is_rejected_and_may_restart() {
     drop(client);
 
     let server = system.start_replay_server(&format!("--agent c51 {SHORT}"));
-    let connect = system.endpoint();
-    let learner = system.start(&format!("learner --connect {connect} --run-dir short"));
+    let learner = system.start(&system.connected("learner --run-dir short"));
     let actor = system.start_actor(0);
     let client = system.connect();
     let replay = client.wait_for_replay("the run's end", |replay| replay.learner_finished);

@@ -39,18 +39,24 @@ pub(crate) fn join(replay: &mut Replay, actor: u32) {
     replay.join_actor(join).unwrap();
 }
 
-/// An actor's chunk of `steps` steps of one environment, all zeroes; the ones before it were as long.
-pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Chunk {
-    Chunk::zeroed(ChunkHeader {
+/// The first chunk of an actor of any run.
+pub(crate) fn header(spec: &RunSpec, actor: u32, streams: u32, steps: u32) -> ChunkHeader {
+    ChunkHeader {
         actor,
         incarnation: INCARNATION,
-        sequence,
-        first_transition: sequence * u64::from(steps),
-        weights_version: 1,
-        streams: 1,
+        streams,
         steps,
         frame_bytes: spec.frame_bytes() as u32,
         ..ChunkHeader::default()
+    }
+}
+
+/// An actor's chunk of `steps` steps of one environment, all zeroes; the ones before it were as long.
+pub(crate) fn chunk(spec: &RunSpec, actor: u32, sequence: u64, steps: u32) -> Chunk {
+    Chunk::zeroed(ChunkHeader {
+        sequence,
+        first_transition: sequence * u64::from(steps),
+        ..header(spec, actor, 1, steps)
     })
 }
 

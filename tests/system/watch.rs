@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use driml_launch::metrics::COLUMNS;
 use driml_tests::{
-    Process, TestSystem,
     python::{python_with, run},
     wait_for, wait_until,
 };
@@ -13,27 +12,20 @@ use nix::sys::signal::Signal;
 
 use crate::{LONG, SHORT, launched, system};
 
-/// Starts to watch the run at this system's endpoint.
-fn watch(system: &TestSystem, flags: &str) -> Process {
-    system.start(&format!("watch --connect {} {flags}", system.endpoint()))
-}
-
 #[test]
 fn a_run_of_processes_by_hand_leaves_the_folder_of_a_launched_one() {
     let system = system();
-    let endpoint = system.endpoint();
     let flags = "--agent driml-ada --actors 2";
-    let server = system.start_process(&format!(
-        "replay-server --listen {endpoint} {flags} {SHORT}"
-    ));
+    let server = format!("replay-server {flags} {SHORT}");
+    let server = system.start_process(&system.listening(&server));
     let client = system.connect();
-    let watch = watch(&system, "--run-dir run --tensorboard");
+    let watch = system.start(&system.connected("watch --run-dir run --tensorboard"));
     wait_until("the folder", || system.path("run/metrics.csv").exists());
     // They begin together, with the first weights: one that came late would play hardly an episode.
     let actors = [system.start_actor(0), system.start_actor(1)];
     client.wait_for_replay("both actors", |replay| replay.actors == 2);
     // Into the same folder, which is then as good as a launched run's.
-    let learner = system.start_process(&format!("learner --connect {endpoint} --run-dir run"));
+    let learner = system.start_process(&system.connected("learner --run-dir run"));
     watch
         .wait_ok()
         .expect_printed("finished: 1280 frames and 540 updates");
@@ -101,7 +93,7 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
     let flags = format!("--replay-dir replay --agent c51 {LONG}");
     let server = system.start_replay_server(&flags);
     let client = system.connect();
-    let mut watched = watch(&system, "--run-dir seen");
+    let mut watched = system.start(&system.connected("watch --run-dir seen"));
     watched.wait_for_stderr("no learner has joined yet; no actor has joined yet");
     let learner = system.start_learner("run");
     let _actor = system.start_actor(0);
@@ -123,44 +115,28 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
 }
 
 /// The fields of `--once --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
-const FIELDS: [&str; 15] = [
-    "actors_planned",
-    "agent",
-    "finished",
-    "frames_planned",
-    "learner",
-    "replay",
-    "replay_ratio_planned",
-    "run_spec",
-    "seed",
-    "servers",
-    "to_go_on",
-    "updates_planned",
-    "waits",
-    "well",
-    "world",
-];
+const FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers to_go_on \
+    updates_planned waits well world";
 
 #[test]
 fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     let system = system();
-    let endpoint = system.endpoint();
     let server = system.start_replay_server(&format!("--agent driml-ada {SHORT}"));
     let client = system.connect();
-    let look = format!("watch --connect {endpoint} --once");
+    let look = system.connected("watch --once");
     // A process is missing.
     let ended = system.run(&look).expect_code(1);
     ended
         .expect_said("error: the run needs attention: no learner has joined: start `driml learner");
     let _processes = [system.start_learner("run"), system.start_actor(0)];
-    client.wait_for_learner("the end", |it| it.finished);
+    client.wait_for_the_last_update();
 
     let ended = system.run_ok(&format!("{look} --json --prometheus run.prom"));
     let said = ended.json();
     let names = said.as_object().unwrap().keys().map(String::as_str);
     let names: BTreeSet<_> = names.collect();
     let metrics = COLUMNS.iter().map(|it| it.name);
-    let fields: BTreeSet<_> = metrics.chain(FIELDS).collect();
+    let fields: BTreeSet<_> = metrics.chain(FIELDS.split(' ')).collect();
     assert_eq!(names, fields);
     assert_eq!(said["frames"], 1280);
     assert_eq!(said["updates"], 540);
@@ -180,7 +156,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
         (&*labels["world"], &*labels["agent"], &*labels["seed"]),
         ("chain", "driml-ada", "1")
     );
-    assert_eq!(labels["endpoint"], endpoint);
+    assert_eq!(labels["endpoint"], system.endpoint());
     assert_eq!(of("driml_updates_total").2, 540.0);
     // JSON's reader may be off by a last place.
     let (found, said) = (of("driml_mean_return").2, &said["mean_return"]);

@@ -13,10 +13,13 @@ use std::time::Duration;
 use driml_protocol::{
     Ack, ActorJoin, AffinityUpdate, BatchReply, BatchRequest, ChunkHeader, InsertReply, JoinReply,
     Keyed, Leave, Message, PROTOCOL_VERSION, RequestId, WeightsHeader, WeightsReply, WeightsUpload,
-    codec, session,
+    codec,
+    session::{self, SessionError},
 };
 use driml_tests::{Client, check_nothing_lost};
 use zenoh::qos::Priority;
+
+use crate::tiny_replay;
 
 /// What comes of a message to whose sender nothing is promised.
 const SILENCE: &str = "no answer";
@@ -26,14 +29,18 @@ const NO_ANSWER: Duration = Duration::from_millis(700);
 const ANSWER_MAX: Duration = Duration::from_secs(20);
 
 /// A message, and words of the answer to it.
-struct Row {
+pub(crate) struct Row {
     key: String,
     bytes: Vec<u8>,
     expected: &'static str,
 }
 
 impl Row {
-    fn new(key: impl Into<String>, bytes: impl Into<Vec<u8>>, expected: &'static str) -> Self {
+    pub(crate) fn new(
+        key: impl Into<String>,
+        bytes: impl Into<Vec<u8>>,
+        expected: &'static str,
+    ) -> Self {
         Self {
             key: key.into(),
             bytes: bytes.into(),
@@ -42,7 +49,7 @@ impl Row {
     }
 
     /// A well-formed message of the client's run, at the key where such messages go.
-    fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
+    pub(crate) fn of<M: Keyed>(client: &Client, message: &M, expected: &'static str) -> Self {
         let actor = message.actor().unwrap_or_default();
         let key = client.keys.of_actor::<M>(actor);
         Self::new(key, sealed(client, message), expected)
@@ -57,11 +64,11 @@ const fn leave(actor: u32, incarnation: u64, produced: u64) -> Leave {
     }
 }
 
-const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
+pub(crate) const fn actor_join(actor: u32, incarnation: u64) -> ActorJoin {
     ActorJoin { actor, incarnation }
 }
 
-fn batch_request(learner: u64, rows: u32) -> BatchRequest {
+pub(crate) fn batch_request(learner: u64, rows: u32) -> BatchRequest {
     BatchRequest {
         learner,
         id: RequestId::first(7),
@@ -81,7 +88,7 @@ fn affinity(learner: u64, version: u64, num_actions: u32) -> AffinityUpdate {
 }
 
 /// A learner's weights of this version, as it hands them over.
-fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec<u8> {
+pub(crate) fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec<u8> {
     let weights = WeightsHeader::new(version, version, safetensors);
     let upload = WeightsUpload { learner, weights };
     codec::encode(spec_hash, &upload, safetensors).unwrap()
@@ -90,13 +97,9 @@ fn upload(spec_hash: u64, learner: u64, version: u64, safetensors: &[u8]) -> Vec
 /// The first chunk of an actor: one stream of two steps.
 fn chunk_header(client: &Client, actor: u32, incarnation: u64) -> ChunkHeader {
     ChunkHeader {
-        actor,
         incarnation,
         weights_version: 1,
-        streams: 1,
-        steps: 2,
-        frame_bytes: client.spec.frame_bytes() as u32,
-        ..ChunkHeader::default()
+        ..tiny_replay::header(&client.spec, actor, 1, 2)
     }
 }
 
@@ -111,7 +114,7 @@ fn newer(mut bytes: Vec<u8>) -> Vec<u8> {
 }
 
 /// Sends each row's message and checks the answer.
-fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
+pub(crate) fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
     for (i, row) in rows.into_iter().enumerate() {
         let Row {
             key,
@@ -125,6 +128,7 @@ fn send(client: &Client, rows: impl IntoIterator<Item = Row>) {
         let bytes = bytes.into();
         let said = match session::ask(&client.session, &key, bytes, Priority::Data, wait_max) {
             Ok(answer) => describe(&answer.to_bytes()),
+            Err(e @ SessionError::Recovering(_)) => e.to_string(),
             Err(_) => SILENCE.to_owned(),
         };
         assert!(

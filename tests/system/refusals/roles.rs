@@ -10,18 +10,18 @@ use driml_protocol::{
     ActorJoin, Alive, Chunk, ChunkHeader, ChunkPoll, LearnerStatus, Leave, ReplayStatus, RunInfo,
     WeightsRequest, WeightsUpload, WeightsVersion, session, tls::Role,
 };
-use driml_tests::{Client, Process, at_once, new_learner, wait_until};
+use driml_tests::{Client, Process, TestSystem, at_once, new_learner, wait_until};
 use zenoh::{Wait, query::Query, sample::Locality};
 
 use super::{
     Row, SILENCE, actor_join, affinity, batch_request, chunk_header, continues, leave, sealed,
     send, upload,
 };
-use crate::{LONG, tls::TlsSystem};
+use crate::{LONG, system};
 
 /// A run over TLS, and who watches it.
 struct Guarded {
-    tls: TlsSystem,
+    system: TestSystem,
     observer: Client,
     _server: Process,
     _processes: [Process; 2],
@@ -29,16 +29,13 @@ struct Guarded {
 
 impl Guarded {
     fn new() -> Option<Self> {
-        let tls = TlsSystem::new()?;
-        let server = tls.start_server(&format!("--agent driml-ada {LONG}"));
-        let processes = [
-            tls.start("learner --keep-alive --run-dir run", "tls"),
-            tls.start("actor --id 0", "tls"),
-        ];
-        let observer = tls.client(Role::Observer);
+        let system = system().over_tls()?;
+        let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+        let processes = [system.start_learner("run"), system.start_actor(0)];
+        let observer = system.connect();
         observer.wait_for_updates(10);
         Some(Self {
-            tls,
+            system,
             observer,
             _server: server,
             _processes: processes,
@@ -58,7 +55,7 @@ fn send_at_once(client: &Client, rows: impl IntoIterator<Item = Row>) {
 #[test]
 fn an_actor_asks_for_nothing_but_its_own() {
     let Some(run) = Guarded::new() else { return };
-    let one = &run.tls.client(Role::Actor(1));
+    let one = &run.system.connect_as(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
     let leave = leave(other, incarnation, 0);
@@ -110,7 +107,7 @@ fn an_actor_asks_for_nothing_but_its_own() {
 #[test]
 fn an_actor_declares_nothing_but_its_own() {
     let Some(run) = Guarded::new() else { return };
-    let one = run.tls.client(Role::Actor(1));
+    let one = run.system.connect_as(Role::Actor(1));
     let keys = &one.keys;
     let asked = Arc::<AtomicUsize>::default();
     let mut declared = Vec::new();
@@ -153,7 +150,7 @@ fn an_actor_declares_nothing_but_its_own() {
         .unwrap();
 
     // A process that joins now gets the right answer.
-    let mut two = run.tls.start("actor --id 2", "tls");
+    let mut two = run.system.start_actor(2);
     two.wait_for_stderr("actor 2 steps");
     run.observer
         .wait_for_replay("both", |replay| replay.actors == 2);
@@ -173,7 +170,7 @@ fn an_actor_declares_nothing_but_its_own() {
 #[test]
 fn an_observer_only_looks() {
     let Some(run) = Guarded::new() else { return };
-    let observer = &run.tls.client(Role::Observer);
+    let observer = &run.system.connect_as(Role::Observer);
     assert!(observer.replay().is_some() && observer.learner().is_some());
     let keys = &observer.keys;
     send_at_once(

@@ -102,7 +102,7 @@ fn only_the_learner_s_whole_and_sound_weights_are_acted_with() {
 #[test]
 fn processes_of_another_protocol_version_do_not_join() {
     let system = system();
-    let server = listen(&system.endpoint());
+    let server = listen(system.endpoint());
     let run_info = RunInfo {
         has_learner: true,
         shard: (0, 1),

@@ -56,8 +56,7 @@ fn a_closed_port_differs_from_an_unknown_host() {
     }
     let started = Instant::now();
     refused(&system, &format!("status --connect {endpoint}"), 0);
-    let socket = system.endpoint();
-    refused(&system, &format!("watch --connect {socket}"), 0)
+    refused(&system, &system.connected("watch"), 0)
         .expect_said("there is no such socket. Start the replay server first");
     system.run("status").expect_code(64);
     assert!(started.elapsed() < Duration::from_secs(10));
