@@ -53,15 +53,24 @@ impl Lied {
         continues(&self.client);
         let log = self.system.read("run/logs/replay-server.log");
         let lines = log.lines().filter(|line| line.contains("refused")).count();
-        assert!((1..30).contains(&lines), "{lines} lines: {log}");
+        assert!((1..60).contains(&lines), "{lines} lines: {log}");
         drop(self.client);
         self.run.stop().expect_code(130);
     }
 }
 
 #[test]
-fn of_each_kind_of_message() {
+fn lies_are_counted_and_change_nothing() {
     let lied = Lied::new("");
+    // First, as memory that was held once hides what is held later.
+    of_half_a_gigabyte(&lied);
+    of_each_kind_of_message(&lied);
+    of_processes_whose_number_can_be_read(&lied);
+    of_4096_strangers(&lied);
+    lied.continues();
+}
+
+fn of_each_kind_of_message(lied: &Lied) {
     let (client, keys) = (&lied.client, &lied.client.keys);
     let joins = [0, 1 << 60, u64::MAX].map(|rows_sampled| {
         let mut join = new_learner(LEARNER);
@@ -153,7 +162,6 @@ fn of_each_kind_of_message() {
         (piece(1, u64::MAX), "Gone"),
     ];
     lied.sends(requests.map(|(it, said)| Row::of(client, &it, said)), 0);
-    lied.continues();
 }
 
 /// The priority of a transition, by a learner that is not the run's.
@@ -171,7 +179,7 @@ fn priority(transition: u64, priority: f32) -> PriorityUpdate {
 
 /// Without certificates every client may offer to answer in the replay server's place.
 #[test]
-fn of_who_answers() {
+fn lies_of_who_answers_are_not_believed() {
     let lied = Lied::new("");
     let liar = lied.system.connect();
     let asked = Arc::<AtomicUsize>::default();
@@ -193,9 +201,7 @@ fn of_who_answers() {
 }
 
 /// More than a run may have; then one that belongs to the run.
-#[test]
-fn of_4096_strangers() {
-    let lied = Lied::new("");
+fn of_4096_strangers(lied: &Lied) {
     let client = &lied.client;
     let tokens: Vec<_> = (0..300)
         .map(|number| client.run().declare_alive(Alive::learner(number)).unwrap())
@@ -215,12 +221,11 @@ fn of_4096_strangers() {
     // Those who were forgotten, and who say what they will.
     let leave = leave(STRANGER, LIFE, 1 << 60);
     lied.sends([Row::of(client, &leave, "Ack")], 1);
-    lied.continues();
 }
 
 /// Of a run that draws by them.
 #[test]
-fn of_priorities() {
+fn lies_of_priorities_change_nothing() {
     let lied = Lied::new(PRIORITISED);
     let client = &lied.client;
     let row = |lie: &PriorityUpdate| Row::of(client, lie, SILENCE);
@@ -239,34 +244,28 @@ fn of_priorities() {
 }
 
 /// 512 MB of zeros are never held; what is too long by less is refused and counted before it is copied.
-#[test]
-fn of_half_a_gigabyte() {
-    let lied = Lied::new("");
+fn of_half_a_gigabyte(lied: &Lied) {
     let client = &lied.client;
     let server = lied.system.find_process("replay-server");
     let peak_mib = || server.status("VmHWM") / 1024;
     let (keys, peak_before) = (&client.keys, peak_mib());
-    let long: [String; 4] = [
-        keys.of_actor::<ChunkHeader>(0),
+    let zeros = |key: String, bytes| Row::new(key, vec![0; bytes], SILENCE);
+    let long = [
         keys.of::<WeightsUpload>(),
         keys.of_actor::<Leave>(0),
         keys.of::<ReplayStatus>(),
     ];
-    let rows = long[1..].iter();
-    lied.sends(rows.map(|key| Row::new(key, vec![0; 600_000], SILENCE)), 3);
-    send(client, [Row::new(&long[0], vec![0; 1 << 29], SILENCE)]);
+    lied.sends(long.map(|key| zeros(key, 600_000)), 3);
+    send(client, [zeros(keys.of_actor::<ChunkHeader>(0), 1 << 29)]);
     let peak = peak_mib();
     assert!(
         peak < peak_before + 100,
         "{peak_before} MiB before, then {peak}"
     );
-    lied.continues();
 }
 
 /// What a liar would need is not to be seen: the numbers by which the replay server knows its learner and its actors.
-#[test]
-fn of_processes_whose_number_can_be_read() {
-    let lied = Lied::new("");
+fn of_processes_whose_number_can_be_read(lied: &Lied) {
     let client = &lied.client;
     let tokens = client
         .session
@@ -289,5 +288,4 @@ fn of_processes_whose_number_can_be_read() {
     }
     assert_eq!(rows.len(), 2, "the actor and the learner");
     lied.sends(rows, 2);
-    lied.continues();
 }

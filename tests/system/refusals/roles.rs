@@ -53,8 +53,16 @@ fn send_at_once(client: &Client, rows: impl IntoIterator<Item = Row>) {
 }
 
 #[test]
-fn an_actor_asks_for_nothing_but_its_own() {
-    let Some(run) = Guarded::new() else { return };
+fn a_role_does_nothing_but_its_own() {
+    if let Some(run) = Guarded::new() {
+        an_actor_asks_for_nothing_but_its_own(&run);
+        an_actor_declares_nothing_but_its_own(&run);
+        an_observer_only_looks(&run);
+        continues(&run.observer);
+    }
+}
+
+fn an_actor_asks_for_nothing_but_its_own(run: &Guarded) {
     let one = &run.system.connect_as(Role::Actor(1));
     let (keys, hash) = (&one.keys, one.spec.hash());
     let (other, incarnation) = (0, 9);
@@ -100,13 +108,10 @@ fn an_actor_asks_for_nothing_but_its_own() {
         ],
     );
     wait_until("four refusals", || run.refused() >= before + 4);
-    continues(&run.observer);
 }
 
 /// It can neither answer in the place of others, nor publish or receive what is not for it, nor count as another process.
-#[test]
-fn an_actor_declares_nothing_but_its_own() {
-    let Some(run) = Guarded::new() else { return };
+fn an_actor_declares_nothing_but_its_own(run: &Guarded) {
     let one = run.system.connect_as(Role::Actor(1));
     let keys = &one.keys;
     let asked = Arc::<AtomicUsize>::default();
@@ -167,9 +172,7 @@ fn an_actor_declares_nothing_but_its_own() {
     drop((declared, everything, tokens));
 }
 
-#[test]
-fn an_observer_only_looks() {
-    let Some(run) = Guarded::new() else { return };
+fn an_observer_only_looks(run: &Guarded) {
     let observer = &run.system.connect_as(Role::Observer);
     assert!(observer.replay().is_some() && observer.learner().is_some());
     let keys = &observer.keys;
@@ -182,5 +185,4 @@ fn an_observer_only_looks() {
             Row::new(keys.of_actor::<ChunkHeader>(1), [0; 100], SILENCE),
         ],
     );
-    continues(&run.observer);
 }
