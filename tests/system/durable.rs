@@ -1,10 +1,10 @@
-//! A replay that is kept on disk, and replay servers that are killed: every transition once, every update of the plan, nothing said
-//! twice. What comes back of a log, whole or damaged, is tested beside the code; here are real processes and real disks.
+//! A replay that is kept on disk, and processes that are killed and started again: every transition once, every update of the plan, nothing
+//! said twice. What comes back of a log, whole or damaged, is tested beside the code; here are real processes and real disks.
 
 use std::collections::BTreeSet;
 
 use driml_tests::{
-    Outcome, Process, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
+    Ended, Outcome, Process, Survivor, TestSystem, check_has, check_nothing_lost, note, wait_until,
 };
 use nix::sys::signal::Signal;
 use rand::{Rng, SeedableRng};
@@ -17,19 +17,60 @@ use crate::{
     system,
 };
 
-/// Kills a replay server of a launched run, and waits for its successor, or the end of the run.
-fn kill_server(system: &TestSystem) {
-    let dead = system.find_process("replay-server");
-    let servers = |of: &[Survivor]| {
-        let all = of.iter().filter(|it| it.args.first() == dead.args.first());
+/// Ends a process of a launched run, and waits for its successor, or the end of the run.
+fn end_one(system: &TestSystem, role: &str, signal: Signal) {
+    let dead = system.find_process(role);
+    let of_its_role = |all: &[Survivor]| {
+        let all = all.iter().filter(|it| it.args.first() == dead.args.first());
         all.count()
     };
-    let before = servers(&system.survivors());
-    dead.signal(Signal::SIGKILL);
-    wait_until("another server, or the end", || {
+    let before = of_its_role(&system.survivors());
+    dead.signal(signal);
+    wait_until("another one, or the end", || {
         let left = system.survivors();
-        left.is_empty() || !left.contains(&dead) && servers(&left) == before
+        left.is_empty() || !left.contains(&dead) && of_its_role(&left) == before
     });
+}
+
+/// A process of a launched run that ends, once so many updates are learned.
+type End = (u64, &'static str, Signal);
+
+const fn killed_server(updates: u64) -> End {
+    (updates, "replay-server", Signal::SIGKILL)
+}
+
+/// Runs so many frames with two actors, of which processes end and are started again: every transition is there once, and every update
+/// of the plan is made. The learner is held at `hold_at` updates until all have ended.
+fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (TestSystem, Ended) {
+    let system = system();
+    system.hold_at(hold_at);
+    let process = system.start(&format!(
+        "local {flags} {} --actors 2 --run-dir run",
+        chain(frames)
+    ));
+    let run = system.run_folder("run");
+    for (updates, role, signal) in ends {
+        run.wait_for_updates(*updates);
+        end_one(&system, role, *signal);
+    }
+    system.let_go();
+    let ended = process.wait_ok();
+    let summary = system.check_over(Outcome::Finished);
+    let said = format!("{summary:#?}");
+    let replay = &summary.replay;
+    check_nothing_lost(replay);
+    let updates = planned(replay.transitions_inserted);
+    assert_eq!(summary.updates, updates, "{said}");
+    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
+    let servers = ends.iter().filter(|it| it.1 == "replay-server").count() as u32;
+    let restarted = (summary.replay_servers_restarted, summary.actors_restarted);
+    assert_eq!(restarted, (servers, ends.len() as u32 - servers), "{said}");
+    (system, ended)
+}
+
+/// Updates that the settings of `SHORT` and `LONG` plan for so many frames.
+const fn planned(frames: u64) -> u64 {
+    (frames - WARMUP) * 8 / ROWS as u64
 }
 
 /// A server of numbered transitions, and servers of two shards in a launched run, killed at moments that follow from the seed.
@@ -46,36 +87,63 @@ fn fifty_seeds_of_random_kills_lose_and_double_nothing() {
     }
 }
 
-/// Updates that the settings of `SHORT` and `LONG` plan for so many frames.
-const fn planned(frames: u64) -> u64 {
-    (frames - WARMUP) * 8 / ROWS as u64
-}
-
 /// Its rows are drawn by priority: transitions come back with the highest one each, and losses of rows that were drawn before are not
 /// mistaken for those of others.
 #[test]
 fn a_launched_run_starts_its_dead_replay_server_again() {
-    let system = system();
-    let longer = chain(8_000);
-    system.hold_at(3_500);
-    let flags = format!("--durable --agent driml-ada {longer} --actors 2 {PRIORITISED}");
-    let process = system.start(&system.local(&flags));
-    let run = system.run_folder("run");
-    for updates in [500, 1_500, 2_500] {
-        run.wait_for_updates(updates);
-        kill_server(&system);
-    }
-    system.let_go();
-    process
-        .wait_ok()
+    let flags = format!("--durable --agent driml-ada {PRIORITISED}");
+    let kills = [500, 1_500, 2_500].map(killed_server);
+    let (system, ended) = ends_as_planned(8_000, &flags, 3_500, &kills);
+    ended
         .expect_said("replay-server was killed by signal 9 SIGKILL")
         .expect_said("replay-server is started again with what it has kept (3 of 8 times in a run)")
         .expect_printed("of disk, in the run folder");
-    assert_eq!(run.check_finished().replay_servers_restarted, 3);
+    let run = system.run_folder("run");
+    run.check_finished();
     let log = run.log("replay-server");
     check_has(&log, &["priorities are those of the last checkpoint"]);
     assert!(said::<3>(&log, SET)[0] > 0, "{log}");
-    assert_eq!(system.survivors(), []);
+}
+
+/// What the dead one had not delivered is gone with it, and in no count; all else is as planned.
+#[test]
+fn a_dead_actor_is_started_again() {
+    // Held there, it has room for 1,400 transitions and the slack, and the limiter is closed.
+    let ends = [
+        (150, "actor", Signal::SIGKILL),
+        (400, "actor", Signal::SIGTERM),
+    ];
+    let (system, ended) = ends_as_planned(2_560, "--agent c51", 600, &ends);
+    ended
+        .expect_said("was killed by signal 9 SIGKILL (log: ")
+        .expect_said("is started again (1 of 16 times in a run)")
+        .expect_said("is started again (2 of 16 times in a run)");
+    let run = system.run_folder("run");
+    run.check_finished();
+    system.run_ok("local --resume run --frames 3000");
+    let summary = run.summary();
+    assert_eq!(summary.actors_restarted, 2, "of the whole run");
+}
+
+/// Updates at which the learner of two shards is held until all kills are done.
+const SHARDS_HOLD: u64 = 2_000;
+
+#[test]
+fn shards_come_back_each_by_itself() {
+    kill_shards_after_updates([500, 1_500]);
+}
+
+fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
+    let kills: Vec<_> = moments.into_iter().map(killed_server).collect();
+    let flags = "--durable --agent c51 --replay-shards 2";
+    let (system, ended) = ends_as_planned(6_400, flags, SHARDS_HOLD, &kills);
+    ended.expect_said(&format!(
+        "is started again with what it has kept ({} of 8",
+        kills.len()
+    ));
+    for log in ["shard-0/log.toml", "shard-1/log.toml"] {
+        assert!(system.path("run/replay").join(log).exists());
+    }
 }
 
 #[test]
@@ -83,7 +151,7 @@ fn a_launched_run_gives_a_replay_server_up_that_dies_again_and_again() {
     let system = system();
     let process = launched_with(&system, "--durable --agent c51", 100);
     for _ in 0..=8 {
-        kill_server(&system);
+        end_one(&system, "replay-server", Signal::SIGKILL);
     }
     process.fails("(8 of 8 times in a run)");
     system.check_over(Outcome::Failed);
@@ -122,44 +190,6 @@ fn processes_by_hand_go_on_when_the_server_is_started_again() {
     server
         .stop_ok()
         .expect_said("continues with the replay in replay");
-}
-
-/// Updates at which the learner of two shards is held until all kills are done.
-const SHARDS_HOLD: u64 = 2_000;
-
-#[test]
-fn shards_come_back_each_by_itself() {
-    kill_shards_after_updates([500, 1_500]);
-}
-
-fn kill_shards_after_updates(moments: impl IntoIterator<Item = u64>) {
-    let system = system();
-    let longer = chain(6_400);
-    system.hold_at(SHARDS_HOLD);
-    let process = system.start(&format!(
-        "local --durable --agent c51 {longer} --actors 2 --replay-shards 2 --run-dir run"
-    ));
-    let run = system.run_folder("run");
-    let mut kills = 0;
-    for updates in moments {
-        run.wait_for_updates(updates);
-        kill_server(&system);
-        kills += 1;
-    }
-    system.let_go();
-    process.wait_ok().expect_said(&format!(
-        "is started again with what it has kept ({kills} of 8"
-    ));
-    let summary = run.summary();
-    let said = format!("{summary:#?}");
-    let replay = &summary.replay;
-    check_nothing_lost(replay);
-    let updates = planned(replay.transitions_inserted);
-    assert_eq!(summary.updates, updates, "{said}");
-    assert_eq!(replay.rows_sampled, updates * u64::from(ROWS), "{said}");
-    for log in ["replay/shard-0/log.toml", "replay/shard-1/log.toml"] {
-        assert!(run.path().join(log).exists());
-    }
 }
 
 #[test]

@@ -7,7 +7,7 @@ use driml_tests::{Ended, Outcome, Process, wait_until};
 use nix::sys::signal::Signal;
 
 use crate::{
-    LONG, PROCESSES, SHORT, chain, launched,
+    LONG, PROCESSES, SHORT, launched,
     leftovers::{check_gone, shared_memory},
     system,
 };
@@ -88,37 +88,6 @@ fn dead_processes_end_the_run_and_leave_no_shared_memory() {
         system.check_over(Outcome::Failed);
         check_gone(&segments);
     }
-}
-
-/// What the dead one had not delivered is gone with it, and in no count; all else is as planned.
-#[test]
-fn a_dead_actor_is_started_again() {
-    let system = system();
-    // Held there, it has room for 1,400 transitions and the slack, and the limiter is closed.
-    system.hold_at(600);
-    let flags = format!("--agent c51 {} --actors 2", chain(2_560));
-    let mut process = system.start(&system.local(&flags));
-    let client = system.connect();
-    for (restarts, signal) in [(1, Signal::SIGKILL), (2, Signal::SIGTERM)] {
-        client.wait_for_replay("both actors", |replay| replay.actors == 2);
-        client.wait_for_transitions(restarts * 500);
-        system.find_process("actor").signal(signal);
-        process.wait_for_stderr(&format!(
-            "is started again ({restarts} of 16 times in a run)"
-        ));
-    }
-    system.let_go();
-    drop(client);
-    process
-        .wait_ok()
-        .expect_said("was killed by signal 9 SIGKILL (log: ");
-    let summary = system.run_folder("run").check_finished();
-    assert_eq!(summary.actors_restarted, 2);
-    assert_eq!(system.survivors(), []);
-
-    system.run_ok("local --resume run --frames 3000");
-    let summary = system.run_folder("run").summary();
-    assert_eq!(summary.actors_restarted, 2, "of the whole run");
 }
 
 /// Its successor would count the episodes anew, and have other ghosts than the run is to have.
