@@ -185,27 +185,20 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
     }
 }
 
-/// The arrows from whose ends arrows lead back to their beginnings.
+/// The arrows of circles, and between circles. All others are removed, round by round: no arrow leads to their beginning, or from their end.
 fn circles<'a>(arrows: &BTreeMap<&'a Path, BTreeSet<&'a Path>>) -> Vec<(&'a Path, &'a Path)> {
     let all = arrows
         .iter()
         .flat_map(|(from, named)| named.iter().map(|to| (*from, *to)));
-    all.filter(|(from, to)| leads_to(arrows, to, from))
-        .collect()
-}
-
-fn leads_to(arrows: &BTreeMap<&Path, BTreeSet<&Path>>, from: &Path, to: &Path) -> bool {
-    let mut seen = BTreeSet::new();
-    let mut next = vec![from];
-    while let Some(file) = next.pop() {
-        if file == to {
-            return true;
-        }
-        if seen.insert(file) {
-            next.extend(arrows.get(file).into_iter().flatten());
+    let mut left: Vec<_> = all.collect();
+    loop {
+        let (from, to): (BTreeSet<_>, BTreeSet<_>) = left.iter().copied().unzip();
+        let before = left.len();
+        left.retain(|arrow| to.contains(arrow.0) && from.contains(arrow.1));
+        if left.len() == before {
+            return left;
         }
     }
-    false
 }
 
 #[test]

@@ -16,9 +16,16 @@ fn with_run(flags: &str) -> TestSystem {
     system
 }
 
+/// All with one run, which the last of them damages.
 #[test]
-fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
+fn a_run_is_evaluated() {
     let system = with_run("");
+    the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(&system);
+    an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(&system);
+    damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(&system);
+}
+
+fn the_agent_is_printed_beside_a_random_policy_for_people_and_for_programs(system: &TestSystem) {
     let flags = "evaluate run --episodes 7 --seed 2";
     let said = system.run_ok(flags).stdout;
     let lines: Vec<_> = said.lines().collect();
@@ -78,12 +85,9 @@ fn it_prints_the_agent_beside_a_random_policy_for_people_and_for_programs() {
     );
 }
 
-/// Of a run that averages its weights.
-const AVERAGED: &str = "--set learner.update.average_tau=0.01";
-
 #[test]
-fn it_plays_averaged_weights_where_a_run_has_them() {
-    let system = with_run(AVERAGED);
+fn averaged_weights_are_played_where_a_run_has_them_and_without_their_run() {
+    let system = with_run("--set learner.update.average_tau=0.01");
     system.run_ok("evaluate run --keep --episodes 2");
     for (flags, weights) in [
         ("", "averaged"),
@@ -98,11 +102,7 @@ fn it_plays_averaged_weights_where_a_run_has_them() {
         assert_eq!(told["averaged"], weights == "averaged", "{flags}");
     }
     system.refuses("evaluate run --checkpoint average", "leave it out");
-}
 
-#[test]
-fn an_exported_network_is_played_without_its_run() {
-    let system = with_run(AVERAGED);
     system
         .run_ok("evaluate run --export net.safetensors")
         .expect_printed("averaged weights after 540 updates as f16");
@@ -221,9 +221,7 @@ fn an_evaluation_in_lockstep_neither_holds_up_a_run_nor_ends_it() {
 }
 
 /// A checkpoint is compared with the best over as many episodes as that was played for, or more.
-#[test]
-fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it() {
-    let system = with_run("");
+fn an_evaluation_is_kept_by_hand_and_fewer_episodes_do_not_displace_it(system: &TestSystem) {
     system.refuses(
         "evaluate run --checkpoint best",
         "run has no best checkpoint",
@@ -314,9 +312,9 @@ fn a_folder_that_is_no_run_s() {
 }
 
 /// That every file's damage is found is the learner's own test. Films that cannot be are refused before anything is played.
-#[test]
-fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named() {
-    let system = with_run("");
+fn damaged_checkpoints_those_of_another_run_and_films_that_cannot_be_are_named(
+    system: &TestSystem,
+) {
     system.refuses_each(
         "
         evaluate run --record play.mp4 => use one that ends in .gif
