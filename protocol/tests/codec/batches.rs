@@ -38,10 +38,8 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     let mut back = received(&bytes);
     assert_eq!(back, prioritised);
     assert_eq!(back.probabilities().unwrap(), [0.5, 1.0, 1e-30]);
-    assert_eq!(
-        (back.actions(), back.ks()),
-        (&[0, 1, 2][..], &[2, 0, 255][..])
-    );
+    assert_eq!(back.actions(), [0, 1, 2]);
+    assert_eq!(back.ks(), [2, 0, 255]);
     let update = back.priority_update(5, 9, &[1.0, 2.0, 3.0]).unwrap();
     let part = |origin, transitions: &[u64], priorities: &[f32]| PriorityPart {
         origin,
@@ -64,10 +62,8 @@ fn rows_drawn_by_priority_say_which_they_are_and_how_likely_they_were() {
     let parts = [back, second];
     let whole = Batch::merged_header(&parts).unwrap();
     let merged = Batch::merge(&parts, Buffer::zeroed(whole.payload_bytes()));
-    assert_eq!(
-        merged.probabilities().unwrap(),
-        [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875]
-    );
+    let scaled = [0.125, 0.25, 2.5e-31, 0.375, 0.1875, 0.1875];
+    assert_eq!(merged.probabilities().unwrap(), scaled);
     let found = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0];
     let update = merged.priority_update(5, 9, &found).unwrap();
     let expected = [
@@ -91,11 +87,9 @@ fn stacks_come_back_as_whole_states() {
         let back = received(&bytes);
         assert_eq!(back, sent);
         assert_eq!(back.probabilities().is_some(), origin.is_some());
-        assert_eq!(
-            back.states_t()[..],
-            [50, 50, 50, 50, 50, 51, 50, 51, 51, 52, 51, 52],
-            "a pixel's oldest channels come first"
-        );
+        // A pixel's oldest channels come first.
+        let states_t = [50, 50, 50, 50, 50, 51, 50, 51, 51, 52, 51, 52];
+        assert_eq!(back.states_t()[..], states_t);
         assert_eq!(back.states_k()[..], [50, 51, 50, 51, 53, 54, 53, 54]);
         assert_eq!(back.states_n()[..], [54, 54, 54, 54]);
         assert_eq!(back.ks(), [2, 0, 255]);
@@ -119,10 +113,8 @@ fn parts_of_stacks_are_merged() {
     };
     let parts_planes = parts.each_ref().map(planes);
     for (at, plane) in planes(&merged).into_iter().enumerate() {
-        assert_eq!(
-            plane,
-            parts_planes.each_ref().map(|it| &it[at][..]).concat()
-        );
+        let of_parts = parts_planes.each_ref().map(|it| &it[at][..]);
+        assert_eq!(plane, of_parts.concat());
     }
     let (header, payload) = merged.into_payload();
     assert!(Batch::from_payload(header, payload).is_ok());
@@ -148,11 +140,11 @@ fn stacks_that_cannot_be_are_refused() {
         let mut wrong = stacked_batch(None);
         wrong.states_mut().set_stack(5, &[0, number]);
         let (header, payload) = wrong.into_payload();
-        let said = said(header, payload);
-        assert!(
-            said.contains(&format!("a state of frame {number}, of 5 that travel")),
-            "{said}"
+        let (said, why) = (
+            said(header, payload),
+            format!("a state of frame {number}, of 5"),
         );
+        assert!(said.contains(&format!("{why} that travel")), "{said}");
     }
     let (header, payload) = stacked_batch(None).into_payload();
     let changes: [fn(&mut StackedFrames); 10] = [
@@ -274,10 +266,8 @@ fn parts_are_merged_row_by_row() {
     assert_eq!((whole.counts.inserted, whole.held), (30, 15));
     assert_eq!((whole.rows, whole.states_k, whole.states_n), (8, 12, 4));
     assert_eq!(merged, expected);
-    assert_eq!(
-        merged.states_n()[..],
-        [[20; 3], [22; 3], [24; 3], [26; 3]].concat()
-    );
+    let states_n: Vec<u8> = [20, 22, 24, 26].map(|byte| [byte; 3]).concat();
+    assert_eq!(merged.states_n()[..], states_n);
 
     let other = BatchHeader {
         state_bytes: 4,

@@ -16,27 +16,18 @@ use crate::samples::{SPEC, batch, chunk, samples, sealed_chunk, weights};
 #[test]
 fn chunk_batch_and_weights_hold_what_was_written() {
     let back = chunk();
-    assert_eq!(
-        (back.actions()[4], back.reward(4), back.end(3)),
-        (4, -2.0, End::Terminal)
-    );
+    assert_eq!((back.actions()[4], back.reward(4)), (4, -2.0));
+    assert_eq!(back.end(3), End::Terminal);
     assert_eq!(back.frames()[5 * 5..], [6; 5]);
 
     let back = batch();
-    assert_eq!(
-        back.states_t()[..],
-        [10, 10, 10, 10, 11, 11, 11, 11, 12, 12, 12, 12]
-    );
+    assert_eq!(back.states_t()[..], [[10; 4], [11; 4], [12; 4]].concat());
     assert_eq!(back.states_n()[..], [22; 4], "no state that a row lacks");
-    assert_eq!(back.states_k()[..], [30, 30, 30, 30, 32, 32, 32, 32]);
-    assert_eq!(
-        (back.actions(), back.next_actions()),
-        (&[0, 1, 2][..], &[4, NO_ACTION, 6][..])
-    );
-    assert_eq!(
-        (back.positive_valid(), back.ks()),
-        (&[1, 0, 1][..], &[2, 0, 255][..])
-    );
+    assert_eq!(back.states_k()[..], [[30; 4], [32; 4]].concat());
+    assert_eq!(back.actions(), [0, 1, 2]);
+    assert_eq!(back.next_actions(), [4, NO_ACTION, 6]);
+    assert_eq!(back.positive_valid(), [1, 0, 1]);
+    assert_eq!(back.ks(), [2, 0, 255]);
     assert_eq!(back.n_step_returns(), [0.5, 1.5, 2.5]);
     assert_eq!(back.bootstrap_discounts(), [0.0, 0.0, 0.5]);
 
@@ -70,11 +61,8 @@ fn pieces_are_received_as_the_whole_is() {
         let mut damaged = bytes.clone();
         damaged[flipped] ^= 1;
         let (first, second) = damaged.split_at(flipped / 2);
-        let refused = receive(first, second, bytes.len());
-        assert_eq!(
-            refused.unwrap_err(),
-            Chunk::decode(&damaged, SPEC).unwrap_err()
-        );
+        let refused = receive(first, second, bytes.len()).unwrap_err();
+        assert_eq!(refused, Chunk::decode(&damaged, SPEC).unwrap_err());
     }
 }
 
@@ -82,10 +70,8 @@ fn pieces_are_received_as_the_whole_is() {
 fn every_kind_has_a_sample_that_is_read() {
     let samples = samples();
     for kind in 1..=Kind::Recovering as u16 {
-        assert!(
-            samples.iter().any(|sample| sample.kind == kind),
-            "kind {kind}"
-        );
+        let has_it = samples.iter().any(|sample| sample.kind == kind);
+        assert!(has_it, "kind {kind}");
     }
     for sample in &samples {
         assert_eq!((sample.read)(&sample.bytes), Ok(()), "{}", sample.name);
