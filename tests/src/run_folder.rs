@@ -118,23 +118,17 @@ impl RunFolder {
     #[track_caller]
     fn check_episodes(&self, summary: &Summary) {
         let rows = self.episodes();
-        assert!(
-            rows.is_sorted_by(|a, b| a.frames <= b.frames && a.episode < b.episode),
-            "{rows:?}"
-        );
-        assert!(
-            rows.iter().all(|it| it.frames <= summary.frames),
-            "{rows:?}"
-        );
+        let is_sorted = rows.is_sorted_by(|a, b| a.frames <= b.frames && a.episode < b.episode);
+        let is_past = rows.iter().all(|it| it.frames <= summary.frames);
+        assert!(is_sorted && is_past, "{rows:?}");
         assert_eq!(summary.mean_return_of, summary.episodes.min(100));
         let newest = &rows[rows.len() - summary.mean_return_of as usize..];
         let returns = newest.iter().filter_map(|it| it.episode_return);
         let sum: f64 = returns.sum();
         let mean = (!newest.is_empty()).then(|| sum / newest.len() as f64);
-        match (mean, summary.mean_return) {
-            (Some(want), Some(have)) => assert!((want - have).abs() < 1e-9, "{want} {have}"),
-            (want, have) => assert_eq!(want, have),
-        }
+        assert_eq!(mean.is_some(), summary.mean_return.is_some());
+        let off = mean.unwrap_or_default() - summary.mean_return.unwrap_or_default();
+        assert!(off.abs() < 1e-9, "{mean:?} {:?}", summary.mean_return);
         let last = rows.last().map_or(0, |row| row.episode);
         assert_eq!(last, summary.episodes, "episodes have their numbers");
         assert_eq!(rows.len() as u64, summary.episodes, "each has a row");
@@ -153,10 +147,8 @@ impl RunFolder {
             .filter(|path| !path.ends_with(".lock"))
             .collect();
         paths.sort();
-        assert!(
-            paths.iter().all(|path| path.extension().is_none()),
-            "left from an unfinished save: {paths:?}"
-        );
+        let is_whole = paths.iter().all(|path| path.extension().is_none());
+        assert!(is_whole, "left from an unfinished save: {paths:?}");
         paths
     }
 
@@ -201,31 +193,23 @@ impl RunFolder {
         // A server that was killed has forgotten the k of what it served since its last snapshot.
         let may_lack = summary.resumed_after_updates > 0 || summary.replay_servers_restarted > 0;
         assert!(known == served || may_lack && known < served, "{said}");
-        assert!(
-            summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0,
-            "{said}"
-        );
+        let is_timed = summary.wall_seconds > 0.0 && summary.frames_per_second > 0.0;
+        assert!(is_timed, "{said}");
 
         self.check_episodes(&summary);
         for name in ["metrics.csv", "episodes.csv"] {
             assert!(self.text(name).ends_with('\n'), "{name} has whole rows");
         }
-
         for (column, count) in [("frames", summary.frames), ("updates", summary.updates)] {
             let last = self.column(column).pop().expect("there is a row");
             assert_eq!(last, count.to_string(), "{column}");
         }
 
-        assert_eq!(
-            self.checkpoint_sha256(),
-            summary.weights_sha256,
-            "of the newest checkpoint and of the last weights"
-        );
+        // The newest checkpoint has the last weights.
+        assert_eq!(self.checkpoint_sha256(), summary.weights_sha256);
         let kept = self.checkpoints().len();
-        assert!(
-            (1..=self.setting("learner.checkpoints_kept") as usize).contains(&kept),
-            "{kept} checkpoints"
-        );
+        let allowed = 1..=self.setting("learner.checkpoints_kept") as usize;
+        assert!(allowed.contains(&kept), "{kept} checkpoints");
         summary
     }
 
@@ -234,33 +218,28 @@ impl RunFolder {
     pub fn check_finished(&self) -> Summary {
         let summary = self.check(Outcome::Finished);
         let said = format!("{summary:#?}");
-        let rows = self.setting("learner.batch_size") as u64;
-        let (warmup, ratio) = (
-            self.setting("replay.warmup_transitions") as u64,
-            self.setting("replay.replay_ratio"),
-        );
-        assert!(
-            summary.frames >= self.setting("replay.transitions_max") as u64,
-            "{said}"
-        );
-        assert_eq!(
-            summary.replay.rows_sampled,
-            summary.updates * rows,
-            "{said}"
-        );
+        let [rows, warmup, planned, period] = [
+            "learner.batch_size",
+            "replay.warmup_transitions",
+            "replay.transitions_max",
+            "learner.publish_period_updates",
+        ]
+        .map(|name| self.setting(name) as u64);
+        assert!(summary.frames >= planned, "{said}");
+        let learned = summary.updates * rows;
+        assert_eq!(summary.replay.rows_sampled, learned, "{said}");
+        let ratio = self.setting("replay.replay_ratio");
         let allowed = ratio * (summary.frames - warmup) as f64 / rows as f64;
         assert_eq!(summary.updates, allowed as u64, "{said}");
-        let publications = summary.updates / self.setting("learner.publish_period_updates") as u64;
         // One set of weights before the first update, one for what came after the last publication; a resumed run skips the
         // versions that may have been published since its checkpoint.
+        let publications = summary.updates / period;
         let most = match summary.resumed_after_updates {
             0 => publications + 2,
             _ => u64::MAX,
         };
-        assert!(
-            (publications + 1..=most).contains(&summary.weights_version),
-            "{said}"
-        );
+        let allowed = publications + 1..=most;
+        assert!(allowed.contains(&summary.weights_version), "{said}");
         summary
     }
 }
