@@ -277,10 +277,8 @@ fn killed_and_resumed() {
         .run_ok(call)
         .expect_said("mspacman-c51-seed1 resumes from its checkpoint");
     let summary = run.summary();
-    assert!(
-        summary.outcome == Outcome::Finished && summary.resumed_after_updates > 0,
-        "{summary:#?}"
-    );
+    assert_eq!(summary.outcome, Outcome::Finished, "{summary:#?}");
+    assert!(summary.resumed_after_updates > 0, "{summary:#?}");
     let page = system.read("x/README.md");
     assert!(page.contains("* 1 of 1 runs are finished"), "{page}");
 }

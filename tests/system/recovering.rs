@@ -178,10 +178,8 @@ fn all_processes_wait_for_a_server_that_reads_its_replay_back() {
     let client = system.connect();
     let status = client.wait_for_the_last_update();
     let replay = client.check_nothing_lost();
-    assert_eq!(
-        (status.updates, replay.rows_sampled),
-        (updates(LONG), 16 * updates(LONG))
-    );
+    assert_eq!(status.updates, updates(LONG));
+    assert_eq!(replay.rows_sampled, 16 * updates(LONG));
     assert_eq!(replay.transitions_inserted, frames(LONG));
     assert_eq!(replay.actors_acting, 3, "9, 0 and 1, and never 5");
     watched.wait_ok();

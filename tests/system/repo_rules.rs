@@ -308,11 +308,8 @@ fn every_package_takes_the_workspace_s_lints_and_versions() {
     for (name, folder, _) in arrows() {
         let manifest = toml(Path::new(folder).join("Cargo.toml"));
         assert_eq!(manifest["package"]["name"].as_str(), Some(name), "{folder}");
-        assert_eq!(
-            manifest["lints"]["workspace"].as_bool(),
-            Some(true),
-            "{folder}"
-        );
+        let lints = manifest["lints"]["workspace"].as_bool();
+        assert_eq!(lints, Some(true), "{folder}");
         for kind in ["dependencies", "dev-dependencies", "build-dependencies"] {
             let Some(table) = manifest.get(kind).and_then(toml::Value::as_table) else {
                 continue;

@@ -157,11 +157,8 @@ fn resume_once(seed: u64) {
         false => (frames - WARMUP) * change.ratio / change.rows,
     };
     if ended.stdout.contains("nothing is left to do") {
-        assert!(
-            planned(change.frames) <= before.updates,
-            "{about}: {before:?}\n{}",
-            ended.stdout
-        );
+        let is_done = planned(change.frames) <= before.updates;
+        assert!(is_done, "{about}: {before:?}\n{}", ended.stdout);
         return;
     }
     let after = run.summary();
@@ -169,10 +166,8 @@ fn resume_once(seed: u64) {
     assert_eq!(after.outcome, Outcome::Finished, "{said}");
     let replay = &after.replay;
     check_nothing_lost(replay);
-    assert!(
-        is_fresh || after.frames >= change.frames.max(before.frames),
-        "{said}"
-    );
+    let frames_min = change.frames.max(before.frames);
+    assert!(is_fresh || after.frames >= frames_min, "{said}");
     assert_eq!(after.updates, planned(after.frames), "{said}");
     let learned = (after.updates - before.updates) * change.rows;
     let rows = before.rows * u64::from(!is_fresh) + learned;
@@ -185,10 +180,8 @@ fn resume_once(seed: u64) {
             // The log holds what came after the checkpoint, too.
             (false, _) => assert!(counted >= before.frames + delivered, "{said}"),
         }
-        assert!(
-            store.is_empty() || replay.transitions_refilled == 0,
-            "{said}"
-        );
+        let is_refilled = replay.transitions_refilled > 0;
+        assert!(store.is_empty() || !is_refilled, "{said}");
     }
     let episodes = run.episodes();
     let is_sorted = episodes.is_sorted_by_key(|row| (row.episode, row.frames));

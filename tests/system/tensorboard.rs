@@ -83,10 +83,8 @@ fn tensorboard_reads_what_a_run_recorded_and_continues_recording() {
         let all = first["histograms"][tag].as_array().unwrap();
         all.iter().map(|it| it[1].as_f64().unwrap() as u64).sum()
     };
-    assert_eq!(
-        counted("k/served"),
-        summary.replay.k_histogram.iter().sum::<u64>()
-    );
+    let served: u64 = summary.replay.k_histogram.iter().sum();
+    assert_eq!(counted("k/served"), served);
     assert_eq!(counted("actions/stored"), summary.frames);
     let picture = first["images"]["affinity/A"]
         .as_array()
