@@ -8,112 +8,65 @@ use std::{
 };
 
 use proc_macro2::{Delimiter, TokenStream, TokenTree};
+use walkdir::WalkDir;
 
-/// A module's path from the crate's root, which is empty itself.
+/// A module's path from the crate's root, which is empty itself; a path in code from there ends in an item's name or in a module's.
 type ModulePath = Vec<String>;
 
-/// The files of one crate, and which names which.
-struct Crate {
-    /// Of each module, its file. Modules within a file are in it too.
-    files: BTreeMap<ModulePath, PathBuf>,
-    /// Of each file, what its code names: a path from the crate's root, which ends in an item's name or in a module's.
-    named: BTreeMap<PathBuf, BTreeSet<ModulePath>>,
+/// A file, and another that its code names.
+type Arrow = (PathBuf, PathBuf);
+
+/// The module that a file is, by its path from the crate's sources.
+fn module_of(file: &Path) -> ModulePath {
+    let names = file.with_extension("");
+    let names = names.iter().map(|name| name.to_str().unwrap().to_owned());
+    let mut module: ModulePath = names.collect();
+    module.pop_if(|name| ["lib", "main", "mod"].contains(&name.as_str()));
+    module
 }
 
-impl Crate {
-    /// Reads the crate whose sources lie in `folder`.
-    fn read(folder: &Path) -> Self {
-        let mut read = Self {
-            files: BTreeMap::new(),
-            named: BTreeMap::new(),
-        };
-        for root in ["lib.rs", "main.rs"].map(|name| folder.join(name)) {
-            if root.exists() {
-                read.read_file(&root, &[], folder);
-            }
+/// Which files of the crate whose sources lie in `folder` name which others. A module is a file, but for modules of tests.
+fn arrows(folder: &Path) -> BTreeSet<Arrow> {
+    let mut files = BTreeMap::<ModulePath, PathBuf>::new();
+    for entry in WalkDir::new(folder).sort_by_file_name() {
+        let file = entry.unwrap().into_path();
+        if file.extension().is_some_and(|it| it == "rs") {
+            // That a program's root is its library's too changes nothing.
+            let module = module_of(file.strip_prefix(folder).unwrap());
+            files.entry(module).or_insert(file);
         }
-        read
     }
-
-    /// Reads a module's file; files of its children lie in `folder`.
-    fn read_file(&mut self, file: &Path, module: &[String], folder: &Path) {
-        let text = fs::read_to_string(file).unwrap();
-        let tokens = text.parse::<TokenStream>();
+    let mut arrows = BTreeSet::new();
+    for (module, file) in &files {
+        let tokens = fs::read_to_string(file).unwrap().parse::<TokenStream>();
         let tokens = tokens.unwrap_or_else(|e| panic!("{}: {e}", file.display()));
-        self.read_module(tokens, file, module, folder);
-    }
-
-    fn read_module(&mut self, tokens: TokenStream, file: &Path, module: &[String], folder: &Path) {
-        // That a program's root is its library's too changes nothing.
-        let files = self.files.entry(module.to_vec());
-        files.or_insert_with(|| file.into());
-        let tokens = without_tests(tokens);
-        let (mut own, mut children) = (Vec::new(), BTreeMap::new());
-        let mut rest = &tokens[..];
-        while let [first, after @ ..] = rest {
-            rest = after;
-            if let [TokenTree::Ident(name), body, after @ ..] = rest
-                && matches!(first, TokenTree::Ident(word) if word == "mod")
-            {
-                children.insert(name.to_string(), body.clone());
-                rest = after;
-            } else {
-                own.push(first.clone());
-            }
-        }
-        let named = self.named.entry(file.into()).or_default();
         let mut written = Vec::new();
-        note_paths(&own, &[], &mut written);
+        note_paths(&without_tests(tokens), &[], &mut written);
         for path in written {
-            let mut from = match path.first().map(String::as_str) {
+            let is_child = |first| files.contains_key(&[&module[..], &[first]].concat());
+            let mut named = match path.first().map(String::as_str) {
                 Some("crate") => vec![],
-                Some("self" | "super") => module.to_vec(),
-                Some(first) if children.contains_key(first) => module.to_vec(),
+                Some("self" | "super") => module.clone(),
+                Some(first) if is_child(first.to_owned()) => module.clone(),
                 // It does not lead into this crate.
                 _ => continue,
             };
-            for segment in &path {
+            for segment in path {
                 match segment.as_str() {
                     "crate" | "self" => {}
-                    "super" => drop(from.pop()),
-                    name => from.push(name.into()),
+                    "super" => drop(named.pop()),
+                    _ => named.push(segment),
                 }
             }
-            named.insert(from);
-        }
-        for (name, body) in children {
-            let path = [module, std::slice::from_ref(&name)].concat();
-            let inner = folder.join(&name);
-            if let TokenTree::Group(body) = body {
-                self.read_module(body.stream(), file, &path, &inner);
-                continue;
+            while !files.contains_key(&named) {
+                named.pop().expect("the root is a module");
             }
-            let flat = folder.join(format!("{name}.rs"));
-            let found = if flat.exists() {
-                flat
-            } else {
-                inner.join("mod.rs")
-            };
-            self.read_file(&found, &path, &inner);
+            if files[&named] != *file {
+                arrows.insert((file.clone(), files[&named].clone()));
+            }
         }
     }
-
-    /// The file in which `path` leads to an item, or to a module.
-    fn file_of(&self, path: &[String]) -> &Path {
-        let module = (0..=path.len())
-            .rev()
-            .find_map(|n| self.files.get(&path[..n]));
-        module.expect("the root is a module")
-    }
-
-    /// The files that each file names.
-    fn arrows(&self) -> BTreeMap<&Path, BTreeSet<&Path>> {
-        let arrows = self.named.iter().map(|(file, named)| {
-            let named = named.iter().map(|path| self.file_of(path));
-            (file.as_path(), named.filter(|to| *to != file).collect())
-        });
-        arrows.collect()
-    }
+    arrows
 }
 
 /// Tokens without the items that are compiled for tests alone.
@@ -186,17 +139,13 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
 }
 
 /// The arrows of circles, and between circles. All others are removed, round by round: no arrow leads to their beginning, or from their end.
-fn circles<'a>(arrows: &BTreeMap<&'a Path, BTreeSet<&'a Path>>) -> Vec<(&'a Path, &'a Path)> {
-    let all = arrows
-        .iter()
-        .flat_map(|(from, named)| named.iter().map(|to| (*from, *to)));
-    let mut left: Vec<_> = all.collect();
+fn circles(mut arrows: BTreeSet<Arrow>) -> BTreeSet<Arrow> {
     loop {
-        let (from, to): (BTreeSet<_>, BTreeSet<_>) = left.iter().copied().unzip();
-        let before = left.len();
-        left.retain(|arrow| to.contains(arrow.0) && from.contains(arrow.1));
-        if left.len() == before {
-            return left;
+        let (from, to): (BTreeSet<_>, BTreeSet<_>) = arrows.iter().cloned().unzip();
+        let before = arrows.len();
+        arrows.retain(|arrow| to.contains(&arrow.0) && from.contains(&arrow.1));
+        if arrows.len() == before {
+            return arrows;
         }
     }
 }
@@ -207,9 +156,9 @@ fn no_files_of_a_crate_form_a_circle() {
     let mut found = Vec::new();
     for folder in super::repo_rules::folders_of_crates() {
         let sources = root.join(folder).join("src");
-        for (from, to) in circles(&Crate::read(&sources).arrows()) {
+        for (from, to) in circles(arrows(&sources)) {
             let short = |file: &Path| file.strip_prefix(&root).unwrap().display().to_string();
-            found.push(format!("{} names {}", short(from), short(to)));
+            found.push(format!("{} names {}", short(&from), short(&to)));
         }
     }
     assert!(
@@ -232,7 +181,7 @@ b/c.rs: #[cfg(test)] use crate::a::{f}; pub fn h() { println!("{}", super::N) } 
     for (name, text) in files.lines().filter_map(|it| it.split_once(": ")) {
         fs::write(folder.path().join(name), text).unwrap();
     }
-    let read = Crate::read(folder.path());
     let [b, c] = ["b/mod.rs", "b/c.rs"].map(|name| folder.path().join(name));
-    assert_eq!(circles(&read.arrows()), [(&*c, &*b), (&*b, &*c)]);
+    let found = circles(arrows(folder.path()));
+    assert_eq!(found, BTreeSet::from([(c.clone(), b.clone()), (b, c)]));
 }
