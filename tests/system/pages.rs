@@ -25,7 +25,13 @@ fn pages() -> Vec<Source> {
     sources(&[".md"])
 }
 
-fn expect_none(what: &str, wrong: &[String]) {
+/// Checks that `find` finds nothing wrong in any page.
+fn check_pages(what: &str, find: impl Fn(&Source) -> Vec<String>) {
+    let mut wrong = Vec::new();
+    for page in pages() {
+        let found = find(&page).into_iter();
+        wrong.extend(found.map(|it| format!("{}: {it}", page.name)));
+    }
     assert!(wrong.is_empty(), "{what}:\n{}", wrong.join("\n"));
 }
 
@@ -61,49 +67,39 @@ fn anchors(text: &str) -> BTreeSet<String> {
 
 #[test]
 fn every_link_leads_to_a_file_and_heading_of_the_repository() {
-    let mut wrong = Vec::new();
-    for page in pages() {
-        for rest in page.text.split("](").skip(1) {
-            let Some((link, _)) = rest.split_once(')') else {
-                continue;
-            };
-            if link.contains("://") {
-                continue;
-            }
+    check_pages("links that lead nowhere", |page| {
+        let path = root().join(&page.name);
+        let leads = |link: &str| {
             let (file, anchor) = link.split_once('#').unwrap_or((link, ""));
-            let path = root().join(&page.name);
             let target = match file {
-                "" => path,
+                "" => path.clone(),
                 file => path.parent().unwrap().join(file),
             };
-            let leads = target.exists()
-                && (anchor.is_empty()
-                    || fs::read_to_string(&target)
-                        .is_ok_and(|text| anchors(&text).contains(anchor)));
-            if !leads {
-                wrong.push(format!("{}: {link}", page.name));
-            }
-        }
-    }
-    expect_none("links that lead nowhere", &wrong);
+            let has_it = |text: String| anchors(&text).contains(anchor);
+            target.exists() && (anchor.is_empty() || fs::read_to_string(&target).is_ok_and(has_it))
+        };
+        let rests = page.text.split("](").skip(1);
+        let links = rests.filter_map(|rest| rest.split_once(')').map(|it| it.0));
+        links
+            .filter(|link| !link.contains("://") && !leads(link))
+            .map(str::to_owned)
+            .collect()
+    });
 }
 
 #[test]
 fn code_blocks_are_closed_and_of_a_known_language() {
-    let mut wrong = Vec::new();
-    for page in pages() {
+    check_pages("code blocks", |page| {
         let fences = page.text.lines().filter_map(|it| it.strip_prefix("```"));
         let fences: Vec<_> = fences.collect();
+        let begun = fences.iter().step_by(2);
+        let unknown = begun.filter(|language| !LANGUAGES.contains(language));
+        let mut wrong: Vec<_> = unknown.map(|language| format!("```{language}")).collect();
         if fences.len() % 2 != 0 {
-            wrong.push(format!("{}: a block is not closed", page.name));
+            wrong.push("a block is not closed".into());
         }
-        for pair in fences.chunks(2) {
-            if !LANGUAGES.contains(&pair[0]) {
-                wrong.push(format!("{}: ```{}", page.name, pair[0]));
-            }
-        }
-    }
-    expect_none("code blocks", &wrong);
+        wrong
+    });
 }
 
 #[test]
@@ -139,20 +135,16 @@ fn the_page_of_the_protocol_has_every_key() {
 
 #[test]
 fn cells_of_tables_are_short() {
-    let mut wrong = Vec::new();
-    for page in pages() {
+    check_pages("cells of more than 12 words", |page| {
+        let mut long = Vec::new();
         for row in prose(&page.text).filter(|line| line.starts_with('|')) {
             // What stands between backticks is code, and what a link shows and names is the link's.
             let plain: String = row.split('`').step_by(2).collect();
-            for cell in plain.split('|') {
-                let words = words(&without_links(cell));
-                if words > CELL_WORDS_MAX {
-                    wrong.push(format!("{}: {words} words: {cell}", page.name));
-                }
-            }
+            let is_long = |cell: &&str| words(&without_links(cell)) > CELL_WORDS_MAX;
+            long.extend(plain.split('|').filter(is_long).map(str::to_owned));
         }
-    }
-    expect_none("cells of more than 12 words", &wrong);
+        long
+    });
 }
 
 fn without_links(text: &str) -> String {
