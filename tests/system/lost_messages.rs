@@ -16,10 +16,10 @@ use driml_actor::DeliveryLimits;
 use driml_learner::remote::batch_source::Served;
 use driml_protocol::{
     Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
-    Keyed, Keys, Leave, ReplayStatus, RunClient, RunSpec, Shutdown, codec, session,
+    Keyed, Keys, Leave, ReplayStatus, RunSpec, Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
-use driml_tests::{check_nothing_lost, connect, listen};
+use driml_tests::{TestSystem, check_nothing_lost, listen};
 use zenoh::{
     Session, Wait,
     query::{Query, Queryable},
@@ -27,7 +27,7 @@ use zenoh::{
 
 use crate::{
     synthetic::{SyntheticActor, SyntheticLearner},
-    tiny_replay,
+    system, tiny_replay,
 };
 
 /// Actors, and chunks of each.
@@ -56,36 +56,24 @@ fn batches_spec() -> RunSpec {
 struct Endpoint {
     session: Session,
     answered: Vec<Queryable<()>>,
-    name: String,
-    _folder: tempfile::TempDir,
+    system: TestSystem,
 }
 
 impl Endpoint {
     fn open() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let name = format!("unixsock-stream/{}/server.sock", folder.path().display());
+        let system = system();
         Self {
-            session: listen(&name),
+            session: listen(system.endpoint()),
             answered: Vec::new(),
-            name,
-            _folder: folder,
+            system,
         }
-    }
-
-    fn keys() -> Keys {
-        Keys::new("lossy").unwrap()
     }
 
     /// Answers messages of type `M`.
     fn answer<M: Keyed>(&mut self, answer: impl Fn(Query) + Send + Sync + 'static) {
-        let queryable = self.session.declare_queryable(Self::keys().of::<M>());
-        let queryable = queryable.callback(answer).wait();
+        let key = Keys::new("driml").unwrap().of::<M>();
+        let queryable = self.session.declare_queryable(key).callback(answer).wait();
         self.answered.push(queryable.unwrap());
-    }
-
-    /// A process of a run that asks here.
-    fn client(&self, spec: &RunSpec) -> RunClient {
-        RunClient::new(connect(&self.name), Self::keys(), spec.hash())
     }
 }
 
@@ -203,7 +191,7 @@ fn deliver_all(passes: Passes, ack_timeout: Duration, leaving: bool) -> Arc<Serv
     };
     std::thread::scope(|scope| {
         for actor in 0..ACTORS {
-            let run = endpoint.client(&spec());
+            let run = endpoint.system.run_client(&spec());
             scope.spawn(move || {
                 let stop = Shutdown::default();
                 let first = tiny_replay::header(&spec(), actor, 1, STEPS);
@@ -304,7 +292,7 @@ fn serve(shards: Vec<Replay>) -> Shards {
             let bytes = codec::encode(batches_spec().hash(), &status, &[]).unwrap();
             session::answer(&query, bytes.into());
         });
-        clients.push(endpoint.client(&batches_spec()));
+        clients.push(endpoint.system.run_client(&batches_spec()));
         replays.push(replay);
         endpoints.push(endpoint);
     }

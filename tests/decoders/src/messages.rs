@@ -10,6 +10,8 @@ use driml_protocol::{
     WeightsUpload, WeightsVersion, codec,
 };
 
+use crate::segments::mend_message;
+
 /// The hash of the run that these messages are of.
 const SPEC: u64 = 0x0123_4567_89ab_cdef;
 
@@ -125,19 +127,15 @@ pub(crate) fn messages(bytes: &[u8]) {
         return;
     };
     let (kind, read) = KINDS[usize::from(kind) % KINDS.len()];
-    let header = usize::from(u16::from_le_bytes([low, high])).min(rest.len());
-    let mut message = Vec::with_capacity(codec::PREFIX_BYTES + rest.len());
-    message.extend_from_slice(b"DRML");
+    let header = u32::from(u16::from_le_bytes([low, high]));
+    let mut message = b"DRML".to_vec();
     message.extend_from_slice(&PROTOCOL_VERSION.to_le_bytes());
     message.extend_from_slice(&(kind as u16).to_le_bytes());
     message.extend_from_slice(&SPEC.to_le_bytes());
-    message.extend_from_slice(&(header as u32).to_le_bytes());
-    message.extend_from_slice(&((rest.len() - header) as u64).to_le_bytes());
-    let mut sum = crc32fast::Hasher::new();
-    sum.update(&message);
-    sum.update(rest);
-    message.extend_from_slice(&sum.finalize().to_le_bytes());
+    message.extend_from_slice(&header.to_le_bytes());
+    message.resize(codec::PREFIX_BYTES, 0);
     message.extend_from_slice(rest);
+    mend_message(&mut message);
     read(&message);
 }
 

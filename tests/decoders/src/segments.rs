@@ -217,7 +217,8 @@ fn mend(segment: &mut [u8]) {
     }
 }
 
-fn mend_message(body: &mut [u8]) {
+/// Makes the lengths and the checksum of a message right.
+pub(crate) fn mend_message(body: &mut [u8]) {
     if body.len() < codec::PREFIX_BYTES {
         return;
     }

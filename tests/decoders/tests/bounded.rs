@@ -131,6 +131,15 @@ macro_rules! bounded {
 
 bounded!(wire messages replay state config segments);
 
+/// A seed as it is stored; `UPDATE_CORPUS=1` stores these bytes first.
+fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
+    if std::env::var_os("UPDATE_CORPUS").is_some() {
+        fs::create_dir_all(file.parent().unwrap()).unwrap();
+        fs::write(file, bytes).unwrap();
+    }
+    fs::read(file).unwrap_or_default()
+}
+
 /// Each decoder has a target, and `messages` has the seeds of `wire` (which a test of the protocol writes), without their prefix:
 /// `UPDATE_CORPUS=1` writes them.
 #[test]
@@ -146,14 +155,11 @@ fn every_decoder_has_a_target_and_seeds() {
         let sample = entry.unwrap().path();
         let bytes = forged(&fs::read(&sample).unwrap());
         let file = folder("messages").join(sample.file_name().unwrap());
-        if std::env::var_os("UPDATE_CORPUS").is_some() {
-            fs::write(&file, &bytes).unwrap();
-        }
-        let stored = fs::read(&file).unwrap_or_default();
+        let is_todays = stored(&file, &bytes) == bytes;
+        let file = file.display();
         assert!(
-            stored == bytes,
-            "{} is not today's: UPDATE_CORPUS=1 writes it",
-            file.display()
+            is_todays,
+            "{file} is not today's: UPDATE_CORPUS=1 writes it"
         );
     }
 }
@@ -171,16 +177,13 @@ fn the_states_among_the_seeds_can_be_read() {
 fn the_logs_among_the_seeds_can_be_read() {
     for (name, log) in logs() {
         let file = folder("segments").join(name);
-        if std::env::var_os("UPDATE_CORPUS").is_some() {
-            fs::create_dir_all(folder("segments")).unwrap();
-            fs::write(&file, &log).unwrap();
-        }
-        assert!(log.len() < BYTES_MAX, "{}: too long", file.display());
-        let stored = fs::read(&file).unwrap_or_default();
+        let stored = stored(&file, &log);
+        let file = file.display();
+        assert!(log.len() < BYTES_MAX, "{file}: too long");
+        let is_read = !stored.is_empty() && held(&stored) == held(&log) && held(&log) > 0;
         assert!(
-            !stored.is_empty() && held(&stored) == held(&log) && held(&log) > 0,
-            "{} cannot be read any more: UPDATE_CORPUS=1 writes it",
-            file.display()
+            is_read,
+            "{file} cannot be read any more: UPDATE_CORPUS=1 writes it"
         );
     }
 }
