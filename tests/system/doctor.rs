@@ -7,16 +7,8 @@ use crate::system;
 fn the_doctor_names_what_the_machine_has_and_ends_as_it_says() {
     let system = system();
     let ended = system.run("doctor");
-    for what in [
-        "cores",
-        "vectors",
-        "memory",
-        "shared memory",
-        "locked memory",
-        "disk",
-        "Procgen",
-        "cuda",
-    ] {
+    let facts = "cores, vectors, memory, shared memory, locked memory, disk, Procgen, cuda";
+    for what in facts.split(", ") {
         let states = ["ok", "note", "missing"].map(|state| format!("{state:<8} {what}"));
         let is_line = |line: &str| states.iter().any(|state| line.starts_with(state));
         assert!(ended.stdout.lines().any(is_line), "{what}: {ended:#?}");

@@ -16,7 +16,7 @@ use driml_actor::DeliveryLimits;
 use driml_learner::remote::batch_source::Served;
 use driml_protocol::{
     Ack, BatchReply, BatchRequest, Buffer, Chunk, ChunkHeader, ChunkPoll, Horizon, InsertReply,
-    Keyed, Keys, Leave, ReplayStatus, RunSpec, Shutdown, codec, session,
+    Keyed, Keys, Leave, ReplayStatus, Request, RunSpec, Shutdown, codec, session,
 };
 use driml_replay_server::{Config, Replay};
 use driml_tests::{TestSystem, check_nothing_lost, listen};
@@ -112,18 +112,14 @@ impl Server {
 
     /// Answers about chunks and leaves as a replay server does, but for what is lost.
     fn serve(self: &Arc<Self>, endpoint: &mut Endpoint) {
-        self.answer::<ChunkHeader>(endpoint, |server, payload| {
-            let chunk = Chunk::decode(payload, spec().hash()).unwrap();
+        self.answer::<ChunkHeader>(endpoint, |server, header, payload| {
+            let chunk = Chunk::from_payload(header, payload.to_vec().into()).unwrap();
             server.lossy(|replay| replay.insert(&chunk))
         });
-        self.answer::<ChunkPoll>(endpoint, |server, payload| {
-            let poll = codec::decode::<ChunkPoll>(payload, Some(spec().hash()));
-            let poll = poll.unwrap().0;
+        self.answer::<ChunkPoll>(endpoint, |server, poll, _| {
             server.lossy(|replay| replay.poll(&poll).expect("nothing is parked here"))
         });
-        self.answer::<Leave>(endpoint, |server, payload| {
-            let hash = spec().hash();
-            let leave = codec::decode::<Leave>(payload, Some(hash)).unwrap().0;
+        self.answer::<Leave>(endpoint, |server, leave, _| {
             let mut leaves = server.leaves.lock().unwrap();
             let tries = leaves.entry(leave.actor).or_default();
             *tries += 1;
@@ -132,30 +128,34 @@ impl Server {
                 let refused = server.replay.lock().unwrap().leave(&leave);
                 assert_eq!(refused, None);
             }
-            (*tries > 2).then(|| codec::encode(hash, &Ack, &[]).unwrap())
+            (*tries > 2).then_some(Ack)
         });
     }
 
-    fn answer<M: Keyed>(
+    fn answer<M: Request + 'static>(
         self: &Arc<Self>,
         endpoint: &mut Endpoint,
-        answer: fn(&Self, &[u8]) -> Option<Vec<u8>>,
+        answer: fn(&Self, M, &[u8]) -> Option<M::Reply>,
     ) {
-        let server = self.clone();
+        let (server, hash) = (self.clone(), spec().hash());
         endpoint.answer::<M>(move |query| {
-            let payload = query.payload().unwrap().to_bytes();
-            match answer(&server, &payload) {
-                Some(reply) => session::answer(&query, reply.into()),
+            let bytes = query.payload().unwrap().to_bytes();
+            let (message, payload) = codec::decode(&bytes, Some(hash)).unwrap();
+            match answer(&server, message, payload) {
+                Some(reply) => {
+                    let reply = codec::encode(hash, &reply, &[]).unwrap();
+                    session::answer(&query, reply.into());
+                }
                 None => server.lost.lock().unwrap().push(query),
             }
         });
     }
 
-    fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<Vec<u8>> {
+    fn lossy(&self, judge: impl FnOnce(&mut Replay) -> InsertReply) -> Option<InsertReply> {
         let message = self.messages.fetch_add(1, Ordering::Relaxed);
         let [arrives, is_answered] = (self.passes)(message);
         let reply = arrives.then(|| judge(&mut self.replay.lock().unwrap()))?;
-        is_answered.then(|| codec::encode(spec().hash(), &reply, &[]).unwrap())
+        is_answered.then_some(reply)
     }
 
     /// Checks that each actor sent `Leave` until it was answered.

@@ -108,11 +108,7 @@ impl Run {
         let planned = (inserted - WARMUP) * self.ratio / ROWS;
         assert_eq!(count("learner", "updates"), planned);
         assert_eq!(count("replay", "rows_sampled"), planned * ROWS);
-        for what in [
-            "transitions_lost",
-            "transitions_duplicated",
-            "messages_refused",
-        ] {
+        for what in "transitions_lost transitions_duplicated messages_refused".split(' ') {
             assert_eq!(count("replay", what), 0, "{what}");
         }
         for actor in self.processes.drain(2..) {
