@@ -1,29 +1,21 @@
 //! A Python that has what a test needs, if there is one. It installs nothing.
 
-use std::process::{Command, Stdio};
+use std::process::Command;
 
-use crate::{process, skipped::skip};
+use crate::{process, skipped::succeeds};
 
-/// The variable that names the Python to take; without it `python3` is tried.
-const VARIABLE: &str = "DRIML_TEST_PYTHON";
+/// Says which of the modules that it is called with are missing.
+const FIND: &str = "
+import importlib.util, sys
+missing = ', '.join(name for name in sys.argv[1:] if importlib.util.find_spec(name) is None)
+sys.exit(f'{sys.executable} has no {missing}: name one that has with DRIML_TEST_PYTHON' if missing else 0)
+";
 
-/// A Python that finds all these modules; none, and a line on stderr that names the test, if there is none.
+/// A Python that finds all these modules, which `DRIML_TEST_PYTHON` names, or `python3`; none, and a line on stderr that names the test, if
+/// there is none.
 pub fn python_with(modules: &[&str]) -> Option<String> {
-    let python = std::env::var(VARIABLE).unwrap_or_else(|_| "python3".into());
-    let find = "import importlib.util, sys; sys.exit(any(importlib.util.find_spec(m) is None for m in sys.argv[1:]))";
-    let found = Command::new(&python)
-        .args(["-c", find])
-        .args(modules)
-        .stderr(Stdio::null())
-        .status();
-    if found.is_ok_and(|status| status.success()) {
-        return Some(python);
-    }
-    skip(&format!(
-        "{python} has not all of {}: name one that has with {VARIABLE}",
-        modules.join(", ")
-    ));
-    None
+    let python = std::env::var("DRIML_TEST_PYTHON").unwrap_or_else(|_| "python3".into());
+    succeeds(Command::new(&python).args(["-c", FIND]).args(modules)).then_some(python)
 }
 
 /// What a Python prints when it runs `script` with `args`.
