@@ -24,7 +24,7 @@ pub use client::{Client, check_nothing_lost, connect, listen, new_learner, quic_
 pub use network::Network;
 pub use process::{Ended, Process, check_has};
 pub use run_folder::{EpisodeRow, Outcome, RunFolder, Summary, Table, updates_of};
-pub use skipped::{is_offline, note, skip, skipped_offline, succeeds};
+pub use skipped::{note, skip, skipped_offline, succeeds};
 pub use slow_machine::SlowMachine;
 pub use system::{Survivor, TestSystem};
 pub use waiting::{at_once, wait_for, wait_until};

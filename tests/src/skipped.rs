@@ -30,15 +30,12 @@ pub fn note(line: &str) {
         .expect("stderr is there while tests run");
 }
 
-/// Whether nothing may be fetched, such as Procgen's engine.
-pub fn is_offline() -> bool {
-    std::env::var_os("DRIML_OFFLINE").is_some_and(|value| !value.is_empty() && value != "0")
-}
-
-/// Whether a test that needs Procgen's engine is to be skipped; a line on stderr then names it.
+/// Whether a test that needs Procgen's engine, which may have to be fetched, is to be skipped; a line on stderr then names it.
 pub fn skipped_offline() -> bool {
-    if is_offline() {
+    let offline = std::env::var_os("DRIML_OFFLINE");
+    let is_offline = offline.is_some_and(|value| !value.is_empty() && value != "0");
+    if is_offline {
         skip("DRIML_OFFLINE=1");
     }
-    is_offline()
+    is_offline
 }

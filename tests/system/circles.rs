@@ -43,7 +43,7 @@ fn arrows(folder: &Path) -> BTreeSet<Arrow> {
         let mut written = Vec::new();
         note_paths(&without_tests(tokens), &[], &mut written);
         for path in written {
-            let is_child = |first| files.contains_key(&[&module[..], &[first]].concat());
+            let is_child = |first: String| files.contains_key(&[&module[..], &[first]].concat());
             let mut named = match path.first().map(String::as_str) {
                 Some("crate") => vec![],
                 Some("self" | "super") => module.clone(),

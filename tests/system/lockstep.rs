@@ -3,7 +3,7 @@
 
 use driml_envs::{ChainConfig, optimal_discounted_return};
 use driml_settings::presets::AGENTS;
-use driml_tests::{Summary, TestSystem, is_offline, note};
+use driml_tests::{Summary, TestSystem};
 use nix::sys::signal::Signal;
 
 use crate::{PRIORITISED, chain, system};
@@ -106,44 +106,6 @@ fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
     let beta = "--set replay.sampling.beta_updates=500";
     let flags = format!("--env chain --preset smoke --agent rainbow {beta}");
     continues_exactly(&flags);
-}
-
-/// N updates, saved and resumed for N more, are 2 N.
-#[test]
-fn a_run_that_is_prolonged_is_a_longer_one() {
-    let mut runs = vec![("mspacman", "driml-ada"), ("mspacman", "rainbow")];
-    if is_offline() {
-        note("a_run_that_is_prolonged_is_a_longer_one: without Procgen (DRIML_OFFLINE=1)");
-    } else {
-        runs.extend([
-            ("procgen:coinrun", "driml-ada"),
-            ("procgen:maze", "driml-ada"),
-        ]);
-    }
-    for (world, agent) in runs {
-        let system = system();
-        let mut flags = format!("--env {world} --agent {agent} --preset smoke");
-        if agent == "rainbow" {
-            // Else beta rises over a run's own length.
-            flags += " --set replay.sampling.beta_updates=60";
-        }
-        let whole = run(&system, &format!("{flags} --frames 1216"), "whole");
-        let half = run(&system, &format!("{flags} --frames 608"), "half");
-        assert_ne!(half.weights_sha256, whole.weights_sha256);
-        system
-            .run_ok("local --resume half")
-            .expect_printed("nothing is left to do");
-        if agent == "rainbow" {
-            system.refuses(
-                "local --resume half --frames 1216 --set replay.sampling.alpha=0",
-                "replay.sampling.alpha = 0, but the replay that is kept has its priorities to the power of 0.5",
-            );
-        }
-        system.run_ok("local --resume half --frames 1216");
-        let resumed = system.run_folder("half").check_finished();
-        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{world}");
-        assert_eq!(resumed.mean_return, whole.mean_return, "{world}");
-    }
 }
 
 #[test]

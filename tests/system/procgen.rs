@@ -57,6 +57,27 @@ fn a_border_that_no_convolution_reads_changes_no_bit() {
     }
 }
 
+/// N updates, saved and resumed for N more, are 2 N: the engine's state comes back.
+#[test]
+fn a_run_that_is_prolonged_is_a_longer_one() {
+    let Some(system) = with_engine() else { return };
+    for game in ["coinrun", "maze"] {
+        let flags = format!("--lockstep --env procgen:{game} --agent driml-ada --preset smoke");
+        let [whole, half] = [1216, 608].map(|frames| {
+            let run_dir = format!("{game}-{frames}");
+            system.train(&format!("{flags} --frames {frames}"), &run_dir)
+        });
+        assert_ne!(half.weights_sha256, whole.weights_sha256);
+        system
+            .run_ok(&format!("local --resume {game}-608"))
+            .expect_printed("nothing is left to do");
+        system.run_ok(&format!("local --resume {game}-608 --frames 1216"));
+        let resumed = system.run_folder(&format!("{game}-608")).check_finished();
+        assert_eq!(resumed.weights_sha256, whole.weights_sha256, "{game}");
+        assert_eq!(resumed.mean_return, whole.mean_return, "{game}");
+    }
+}
+
 #[test]
 fn an_agent_chooses_among_the_actions_that_differ() {
     let Some(system) = with_engine() else { return };

@@ -118,6 +118,8 @@ fn what_cannot_be_resumed() {
         ended.expect_printed(nothing);
     }
     system.run_ok(&format!("local --lockstep {SHORT} --run-dir step"));
+    let rainbow = "--env chain --preset smoke --agent rainbow --frames 640";
+    system.run_ok(&format!("local --lockstep {rainbow} --run-dir rainbow"));
     system.run_ok("local --resume step --frames 1600 --set learner.batch_size=32");
     let run = format!("local --agent c51 --durable {SHORT} --run-dir kept");
     system.run_ok(&run);
@@ -128,6 +130,7 @@ fn what_cannot_be_resumed() {
         local --resume run --frames 2000 --set model.atoms=31 => was saved with model.atoms = 51
         local --resume run --frames 2000 --set replay.disk_bytes_max=100000000 => in memory alone; add --durable
         local --resume step --frames 2000 --set local.actors=3 => but this run in lockstep has 1
+        local --resume rainbow --frames 1280 --set replay.sampling.alpha=0 => replay.sampling.alpha = 0, but the replay that is kept has its priorities to the power of 0.5
         local --resume kept --frames 2000 --durable => lacks what the run did later
         ",
     );
