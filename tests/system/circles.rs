@@ -138,7 +138,7 @@ fn note_paths(tokens: &[TokenTree], before: &[String], found: &mut Vec<ModulePat
     }
 }
 
-/// The arrows of circles, and between circles. All others are removed, round by round: no arrow leads to their beginning, or from their end.
+/// The arrows of circles, and between circles. All others go, round by round: no arrow leads to their beginning, or from their end.
 fn circles(mut arrows: BTreeSet<Arrow>) -> BTreeSet<Arrow> {
     loop {
         let (from, to): (BTreeSet<_>, BTreeSet<_>) = arrows.iter().cloned().unzip();

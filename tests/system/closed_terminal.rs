@@ -1,5 +1,5 @@
 //! A terminal or pipe that is closed in the middle of a run: the run drains, saves and ends as after Ctrl-C.
-//! And one that is stopped, and resumes. What Ctrl-C does is in `resume` and `failures`, what a hangup does to single processes in `by_hand`.
+//! And one that is stopped, and resumes. Ctrl-C is in `resume` and `failures`, hangups of single processes are in `by_hand`.
 
 use std::{
     fs::{File, OpenOptions},
