@@ -41,8 +41,11 @@ pub fn gpu(device: DeviceName) -> Option<String> {
     }
 }
 
-/// Every GPU that the driver finds, by its name: what it is, or why this program cannot compute there. Else why there is none.
-pub(crate) fn gpus() -> Result<Vec<(String, Result<String, String>)>, String> {
+/// A GPU's name, and what it is, or why this program cannot compute there.
+pub(crate) type Gpu = (String, Result<String, String>);
+
+/// Every GPU that the driver finds; else why there is none.
+pub(crate) fn gpus() -> Result<Vec<Gpu>, String> {
     let one = |ordinal| (format!("cuda:{ordinal}"), describe(ordinal));
     count().map(|count| (0..count).map(one).collect())
 }

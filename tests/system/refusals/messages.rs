@@ -31,8 +31,11 @@ fn chunk(client: &Client, sequence: u64) -> Chunk {
     chunk
 }
 
-/// Chunks that make no sense in this run, and why. All that makes none is tested beside the codec and the replay.
-const SENSELESS: [(&str, fn(&mut Chunk)); 4] = [
+/// Why a chunk is refused, and what makes it so.
+type Senseless = (&'static str, fn(&mut Chunk));
+
+/// Chunks that make no sense in this run. All that makes none is tested beside the codec and the replay.
+const SENSELESS: [Senseless; 4] = [
     ("do not fill", |it| it.header.steps = 4),
     ("the reward of row 5 is not finite", |it| {
         it.set(5, 0, f32::NAN, End::Running)

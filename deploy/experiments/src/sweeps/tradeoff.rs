@@ -160,10 +160,7 @@ impl Tradeoff<'_> {
             return Ok(vec![false; levels.len()]);
         }
         let runs = Runs::open(self.session.folder())?;
-        let mut budget = Budget {
-            seconds_max: left,
-            ..Budget::default()
-        };
+        let mut budget = Budget::of(left);
         let (mut chosen, mut asked) = (vec![false; levels.len()], Vec::new());
         for (of, is_chosen) in levels.iter().zip(&mut chosen).filter(|it| it.0.is_asked) {
             let [base, level] = of.points().map(|it| self.cost(&runs, it, &of.base));

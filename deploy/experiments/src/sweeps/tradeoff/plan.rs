@@ -21,6 +21,13 @@ pub(super) struct Budget {
 }
 
 impl Budget {
+    pub(super) fn of(seconds_max: f64) -> Self {
+        Self {
+            seconds_max,
+            ..Self::default()
+        }
+    }
+
     /// Takes a level with all its seeds and its base, if both fit. What costs nothing any more always fits. A level that does not fit
     /// leaves room to those after it.
     pub(super) fn takes(&mut self, base_and_level: &[Cost; 2]) -> bool {
@@ -70,10 +77,7 @@ mod tests {
             (&finished, 0.0, &[true, false], 0.0),
             (&finished, 50.0, &[true, true], 50.0),
         ] {
-            let mut budget = Budget {
-                seconds_max,
-                ..Budget::default()
-            };
+            let mut budget = Budget::of(seconds_max);
             let costs = levels.iter().map(|both| {
                 both.map(|(key, seconds)| Cost {
                     key: key.to_owned(),
