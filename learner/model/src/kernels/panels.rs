@@ -7,7 +7,7 @@ use crate::kernels::buffer::{ALIGNMENT, Buffer, Scalars};
 use crate::kernels::isa::{
     Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
 };
-use crate::kernels::rounding::{transpose, write_rows};
+use crate::kernels::rounding::write_rows;
 
 /// A matrix laid over a slice: its rows are runs of it, or its columns if it is transposed.
 #[derive(Clone, Copy)]
@@ -269,9 +269,7 @@ impl<'a, E: Element> Rows<'a, E> {
         } else {
             let mut values = Buffer::new(m * row_stride.max(steps * depth));
             if a.transposed && S::LEFT_STEPS_ADJOIN {
-                let mut turned = Buffer::new(m * k);
-                transpose(simd, a.data, k, m, &mut turned);
-                pack_rows(simd, &turned, k, row_stride, &mut values, threads);
+                pack_turned(simd, a.transposed(), row_stride, &mut values, threads);
             } else if a.transposed {
                 pack_steps(simd, a.transposed(), &mut values, threads);
             } else {
@@ -322,6 +320,65 @@ fn pack_rows<S: Simd>(
             .par_chunks_mut(rows * stride)
             .zip(data.par_chunks(rows * cols))
             .for_each(|(values, data)| pack(values, data)),
+    }
+}
+
+/// Columns of `a` [k, m] as rows of `stride`, which is a multiple of `LANES` steps, with zeros after them.
+fn pack_turned<S: Simd>(
+    simd: S,
+    a: Matrix<'_>,
+    stride: usize,
+    values: &mut [S::Element],
+    threads: Threads,
+) {
+    let rows = (TASK_LEN / stride).next_multiple_of(LANES);
+    let pack = |(part, values): (usize, &mut [S::Element])| {
+        turn(simd, a, part * rows, stride, values);
+    };
+    match threads {
+        Threads::Caller => pack((0, values)),
+        Threads::Pool => values
+            .par_chunks_mut(rows * stride)
+            .enumerate()
+            .for_each(pack),
+    }
+}
+
+vectorized! {
+    /// [`pack_turned`] of the columns from the `first` on: square blocks of steps are transposed in registers.
+    fn turn<S>(
+        simd,
+        a: Matrix<'a>,
+        first: usize,
+        stride: usize,
+        rows: &'a mut [S::Element],
+    ) {
+        let depth = S::Element::DEPTH;
+        for (first, rows) in (first..).step_by(LANES).zip(rows.chunks_mut(LANES * stride)) {
+            let cols = first..a.cols.min(first + LANES);
+            let part = |k: usize| match k < a.rows {
+                true => &a.data[k * a.stride..][cols.clone()],
+                false => &[],
+            };
+            for at in (0..stride).step_by(LANES * depth) {
+                let mut block = [[0; LANES]; LANES];
+                for (k, block) in (at..).step_by(depth).zip(&mut block) {
+                    let mut step = [S::Element::default(); 2 * LANES];
+                    let step = &mut step[..LANES * depth];
+                    S::Element::join(simd, part(k), part(k + 1), step);
+                    for (bits, step) in block.iter_mut().zip(step.chunks_exact(depth)) {
+                        *bits = S::Element::pack(step);
+                    }
+                }
+                simd.transpose(&mut block);
+                for (row, block) in rows.chunks_exact_mut(stride).zip(&block) {
+                    let row = row[at..][..LANES * depth].chunks_exact_mut(depth);
+                    for (step, &bits) in row.zip(block) {
+                        S::Element::unpack(bits, step);
+                    }
+                }
+            }
+        }
     }
 }
 

@@ -87,6 +87,9 @@ pub(crate) trait Element: Pooled + Send + Sync + std::fmt::Debug {
     /// The same of elements.
     fn steps_of<R: Rounding>(rounding: R, values: &[Self], shift: usize, steps: &mut [Self]);
 
+    /// The scalars of a step [DEPTH] as 32 bits.
+    fn pack(step: &[Self]) -> u32;
+
     /// The scalars of a step, into `step` [DEPTH].
     fn unpack(bits: u32, step: &mut [Self]);
 
@@ -150,6 +153,11 @@ impl Element for f32 {
     }
 
     #[inline(always)]
+    fn pack(step: &[Self]) -> u32 {
+        step[0].to_bits()
+    }
+
+    #[inline(always)]
     fn unpack(bits: u32, step: &mut [Self]) {
         step[0] = Self::from_bits(bits);
     }
@@ -207,7 +215,7 @@ impl Element for bf16 {
         let mut rounded = [Self::default(); 2 * LANES];
         rounding.round(values, &mut rounded);
         for (step, pair) in steps.iter_mut().zip(rounded.chunks_exact(2)) {
-            *step = u32::from(pair[0].to_bits()) | u32::from(pair[1].to_bits()) << 16;
+            *step = Self::pack(pair);
         }
     }
 
@@ -236,6 +244,11 @@ impl Element for bf16 {
         for (pair, &value) in one.chunks_exact_mut(2).zip(end) {
             (pair[0], pair[1]) = (value, Self::default());
         }
+    }
+
+    #[inline(always)]
+    fn pack(step: &[Self]) -> u32 {
+        u32::from(step[0].to_bits()) | u32::from(step[1].to_bits()) << 16
     }
 
     #[inline(always)]
