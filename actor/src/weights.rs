@@ -124,15 +124,16 @@ pub(crate) fn first(
             .as_ref()
             .err()
             .and_then(|e| e.downcast_ref::<SessionError>());
+        let mut is_recovering = false;
         if let Some(SessionError::Recovering(recovering)) = error {
-            started = Instant::now();
+            (started, is_recovering) = (Instant::now(), true);
             if recovering.progress.is_slow() && said.due().is_some() {
                 tracing::info!("waiting for weights for as long as it takes: {recovering}");
             }
         }
         match pulled {
             Ok(Some(weights)) => return Ok(Some(weights)),
-            pulled if started.elapsed() > wait_max => {
+            pulled if !is_recovering && started.elapsed() > wait_max => {
                 let none = format!(
                     "no weights within {wait_max:?}: is the learner running and connected to the same replay server?"
                 );

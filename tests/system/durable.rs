@@ -44,13 +44,15 @@ const fn killed_server(updates: u64) -> End {
 fn ends_as_planned(frames: u64, flags: &str, hold_at: u64, ends: &[End]) -> (TestSystem, Ended) {
     let system = system();
     system.hold_at(hold_at);
-    let process = system.start(&format!(
-        "local {flags} {} --actors 2 --run-dir run",
-        chain(frames)
-    ));
+    let process = system.start(&system.local(&format!("{flags} {} --actors 2", chain(frames))));
     let run = system.run_folder("run");
     for (updates, role, signal) in ends {
         run.wait_for_updates(*updates);
+        if *role == "actor" {
+            // The one before has joined.
+            let client = system.connect();
+            client.wait_for_replay("both actors", |replay| replay.actors == 2);
+        }
         end_one(&system, role, *signal);
     }
     system.let_go();

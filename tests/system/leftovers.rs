@@ -55,6 +55,23 @@ fn the_next_run_sweeps_what_killed_processes_left() {
     check_gone(&segments);
 }
 
+#[test]
+fn processes_started_by_hand_leave_no_shared_memory() {
+    let system = system();
+    let server = system.start_replay_server(&format!("--agent driml-ada {LONG}"));
+    let learner = system.start_learner("run");
+    let actor = system.start_actor(0);
+    let client = system.connect();
+    client.wait_for_updates(100);
+    let segments = shared_memory(&system);
+    // A client may hold what it has seen.
+    drop(client);
+    for process in [actor, learner, server] {
+        process.stop_ok();
+    }
+    check_gone(&segments);
+}
+
 /// The shared memory that the processes of a run have open.
 pub(crate) fn shared_memory(system: &TestSystem) -> Vec<PathBuf> {
     let mut files = Vec::new();

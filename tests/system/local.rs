@@ -51,7 +51,8 @@ fn c51_leaves_a_whole_run_folder() {
 
 #[test]
 fn driml_ada_with_two_actors_over_tcp() {
-    let system = system().at(listener().0);
+    let (endpoint, _) = listener();
+    let system = system().at(endpoint);
     // The run is not over before its second actor has started.
     system.hold_at(500);
     let longer = chain(2_560);
@@ -110,7 +111,8 @@ fn plays_with_an_actor_from_elsewhere(system: &TestSystem) {
 
 #[test]
 fn an_actor_from_elsewhere_plays_in_a_launched_run() {
-    plays_with_an_actor_from_elsewhere(&system().at(listener().0));
+    let (endpoint, _) = listener();
+    plays_with_an_actor_from_elsewhere(&system().at(endpoint));
 }
 
 /// The processes of the run meet at a unix socket.

@@ -102,6 +102,7 @@ pub(crate) fn continues_exactly(flags: &str) {
 #[test]
 fn an_interrupted_run_ends_with_the_weights_that_it_would_have_had() {
     continues_exactly("--env chain --preset smoke --agent driml-ada");
+    continues_exactly("--env mspacman --preset smoke --agent driml-ada");
     // Its noise continues, in the learner and in the actors. Else beta rises over a run's own length.
     let beta = "--set replay.sampling.beta_updates=500";
     let flags = format!("--env chain --preset smoke --agent rainbow {beta}");

@@ -135,7 +135,7 @@ fn what_cannot_be_resumed() {
         ",
     );
     // Nothing was changed.
-    for run in ["run", "step", "kept"] {
+    for run in ["run", "step", "kept", "rainbow"] {
         system.run_ok(&format!("evaluate {run} --episodes 2"));
         system.run_ok(&format!("local --resume {run} --frames 2000"));
     }

@@ -177,12 +177,12 @@ mod tests {
                 std::slice::from_raw_parts(items[item].data.cast::<u8>(), len).to_vec()
             };
             assert_eq!(items.len(), 17);
-            [bytes(0, 7), bytes(1, 11), bytes(2, 4)]
+            let texts = [bytes(0, 7), bytes(1, 11)];
+            (texts, [bytes(2, 4), bytes(8, 4)], bytes(16, 1))
         });
-        let levels = 500_i32.to_ne_bytes().to_vec();
-        assert_eq!(
-            values,
-            [b"coinrun".to_vec(), b"/somewhere/".to_vec(), levels]
-        );
+        let number = |value: i32| value.to_ne_bytes().to_vec();
+        let texts = [b"coinrun".to_vec(), b"/somewhere/".to_vec()];
+        let mode = OPTIONS.distribution_mode as i32;
+        assert_eq!(values, (texts, [number(500), number(mode)], vec![0]));
     }
 }

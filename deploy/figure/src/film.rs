@@ -58,8 +58,8 @@ impl Film {
         let mut aside = path.as_os_str().to_owned();
         aside.push(".tmp");
         let begin = || -> io::Result<_> {
-            let aside = TempPath::try_from_path(aside)?;
             let file = BufWriter::new(File::create(&aside)?);
+            let aside = TempPath::try_from_path(aside)?;
             let mut encoder = Encoder::new(file, width, height, &[]).map_err(io::Error::other)?;
             let repeated = encoder.set_repeat(Repeat::Infinite);
             repeated.map_err(io::Error::other)?;

@@ -4,12 +4,11 @@
 
 mod processes;
 
+use processes::Launch;
+pub use processes::Outside;
 pub(crate) use processes::process_names;
 
-use std::{
-    path::PathBuf,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use driml_machine::units::duration;
@@ -45,17 +44,6 @@ const LEARNER_DRAIN_MAX: Duration = Duration::from_secs(120);
 /// How long the replay server may take to end, once it is told to stop.
 const REPLAY_DRAIN_MAX: Duration = Duration::from_secs(30);
 const DRAIN_POLL: Duration = Duration::from_millis(100);
-
-/// Where the replay server is reached from outside the run.
-#[derive(Clone, Debug, Default)]
-pub struct Outside {
-    /// Where the processes meet, if not at a private unix socket; with certificates, where it listens beside that.
-    pub listen: Option<String>,
-    /// The folder of certificates.
-    pub tls_dir: Option<PathBuf>,
-    /// Whether every client that can connect is trusted.
-    pub allow_insecure: bool,
-}
 
 /// Trains with a process for each replay server, the learner and each actor, and leaves `run_dir`; a run that is `resumed` has
 /// that folder already and continues from the point given.
@@ -159,29 +147,6 @@ pub fn run(
         last_play::play(&mut summary, config, run_dir, &is_stopped);
     }
     resume::say_next(&summary, &config.world, run_dir)
-}
-
-struct Launch<'a> {
-    config: &'a RunConfig,
-    /// Whether chunks and batches go through shared memory: it is asked for, and there is enough for all processes.
-    shared_memory: bool,
-    run_dir: &'a RunFolder,
-    resume_point: ResumePoint,
-    /// Where each replay server listens, one a shard.
-    endpoints: Vec<String>,
-    outside: Outside,
-    rendezvous: Rendezvous,
-    display: Display,
-    shutdown: GracefulShutdown,
-    /// Names of all processes, and those that are started: replay servers, learner, actors.
-    names: Vec<String>,
-    processes: Vec<ManagedProcess>,
-    evaluator: Evaluator,
-    server_restarts: u32,
-    actor_restarts: u32,
-    poller: Option<Poller>,
-    /// The last that goes: no other launcher writes to the folder before.
-    recorder: RunRecorder,
 }
 
 impl Launch<'_> {

@@ -1,14 +1,22 @@
 //! The launcher's processes: the words that start each, and those that are started again when they have died.
 //! When the first are started, and how all end, is in `mod`.
 
-use std::ffi::{OsStr, OsString};
+use std::{
+    ffi::{OsStr, OsString},
+    path::PathBuf,
+};
 
 use anyhow::bail;
-use driml_protocol::session;
+use driml_protocol::{GracefulShutdown, session};
 use driml_settings::config::RunConfig;
 
-use super::Launch;
-use crate::managed_process::ManagedProcess;
+use crate::{
+    evaluator::Evaluator,
+    managed_process::ManagedProcess,
+    rendezvous::Rendezvous,
+    run_folder::{ResumePoint, RunFolder, RunRecorder},
+    view::{Display, Poller},
+};
 
 /// How often replay servers that keep their replay on disk are started again in a run, all together.
 const RESTARTS_MAX: u32 = 8;
@@ -34,6 +42,41 @@ pub(crate) fn process_names(config: &RunConfig) -> Vec<String> {
     names.push("learner".into());
     names.extend((0..config.local.actors).map(|id| format!("actor-{id}")));
     names
+}
+
+/// Where the replay server is reached from outside the run.
+#[derive(Clone, Debug, Default)]
+pub struct Outside {
+    /// Where the processes meet, if not at a private unix socket; with certificates, where it listens beside that.
+    pub listen: Option<String>,
+    /// The folder of certificates.
+    pub tls_dir: Option<PathBuf>,
+    /// Whether every client that can connect is trusted.
+    pub allow_insecure: bool,
+}
+
+/// A run that is started on one machine: its processes, and what watches and keeps it.
+pub(super) struct Launch<'a> {
+    pub(super) config: &'a RunConfig,
+    /// Whether chunks and batches go through shared memory: it is asked for, and there is enough for all processes.
+    pub(super) shared_memory: bool,
+    pub(super) run_dir: &'a RunFolder,
+    pub(super) resume_point: ResumePoint,
+    /// Where each replay server listens, one a shard.
+    pub(super) endpoints: Vec<String>,
+    pub(super) outside: Outside,
+    pub(super) rendezvous: Rendezvous,
+    pub(super) display: Display,
+    pub(super) shutdown: GracefulShutdown,
+    /// Names of all processes, and those that are started: replay servers, learner, actors.
+    pub(super) names: Vec<String>,
+    pub(super) processes: Vec<ManagedProcess>,
+    pub(super) evaluator: Evaluator,
+    pub(super) server_restarts: u32,
+    pub(super) actor_restarts: u32,
+    pub(super) poller: Option<Poller>,
+    /// The last that goes: no other launcher writes to the folder before.
+    pub(super) recorder: RunRecorder,
 }
 
 impl Launch<'_> {

@@ -129,7 +129,7 @@ impl Lockstep {
         if found != count || turn.unwanted.len() != count || turn.next_actor >= count {
             bail!("{resuming}: it holds {found} actors, and this run has {count}");
         }
-        let mut this = Self::of(config, learner, replay, turn)?;
+        let mut this = Self::of(config, learner, replay, turn).context(resuming)?;
         for (actor, state) in this.actors.iter_mut().zip(actors) {
             actor.go_on_from(state).context(resuming)?;
         }

@@ -54,13 +54,16 @@ pub(super) struct TrainingEpisodes {
 }
 
 impl TrainingEpisodes {
-    /// With what ended until the run had `frames_max` frames: nothing of one that begins. Of one that is resumed the others are set aside.
+    /// With what ended until a run that is resumed had `frames_max` frames, none of one that begins; the others are set aside.
     /// If its replay knows of them, the number of the first ones of which it does not.
     pub(super) fn open(
         folder: &RunFolder,
-        frames_max: u64,
+        frames_max: Option<u64>,
         unknown: Option<u64>,
     ) -> anyhow::Result<Self> {
+        let Some(frames_max) = frames_max else {
+            return Self::begin(folder, Table::default(), unknown);
+        };
         let path = folder.episodes();
         let mut rows = Table::read(&path)?;
         // A replay that was kept says itself how far it is, once it answers.

@@ -59,7 +59,7 @@ impl Shard {
 fn begun() -> (tempfile::TempDir, RunFolder, TrainingEpisodes) {
     let root = tempfile::tempdir().unwrap();
     let folder = RunFolder::new(root.path());
-    let episodes = TrainingEpisodes::open(&folder, 0, None).unwrap();
+    let episodes = TrainingEpisodes::open(&folder, None, None).unwrap();
     (root, folder, episodes)
 }
 
@@ -130,7 +130,7 @@ fn an_episode_of_which_a_part_was_lost_has_a_row_and_no_return() {
     assert_eq!(rows(&folder), [",10,1,4,2,,"]);
     assert_eq!(mean(&episodes), (None, 0));
     drop(episodes);
-    let episodes = TrainingEpisodes::open(&folder, 10, Some(0)).unwrap();
+    let episodes = TrainingEpisodes::open(&folder, Some(10), Some(0)).unwrap();
     assert_eq!((mean(&episodes), episodes.episode), ((None, 0), 1));
 }
 
@@ -145,7 +145,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text + "1.5,3000,91").unwrap();
 
-    let mut episodes = TrainingEpisodes::open(&folder, 2_500, None).unwrap();
+    let mut episodes = TrainingEpisodes::open(&folder, Some(2_500), None).unwrap();
     assert_eq!(mean(&episodes), (Some(34.5), 70));
     // Another server, which counts from the start; the replay fills again.
     update(&mut episodes, &[shard(1_500, 0, 40, 1_000)]);
@@ -154,7 +154,7 @@ fn a_run_that_continues_has_the_episodes_before() {
     assert_eq!(rows(&folder).last().unwrap(), "1.500,2000,110,4,2,1039,9");
 
     // A server that knows of those before, and of four more; it hands out all that it keeps. A run that ends before its answer keeps all.
-    let mut episodes = TrainingEpisodes::open(&folder, 2_500, Some(0)).unwrap();
+    let mut episodes = TrainingEpisodes::open(&folder, Some(2_500), Some(0)).unwrap();
     assert!(update(&mut episodes, &[]).is_empty());
     assert_eq!((rows(&folder).len(), episodes.so_far(0).count), (110, 110));
     update(&mut episodes, &[shard(2_600, 0, 114, 0)]);
@@ -164,12 +164,15 @@ fn a_run_that_continues_has_the_episodes_before() {
     assert_eq!(text.last().unwrap(), "1.500,2600,115,4,2,114,9");
 
     fs::remove_file(&path).unwrap();
-    let nothing = TrainingEpisodes::open(&folder, 9, None).unwrap();
+    let nothing = TrainingEpisodes::open(&folder, Some(9), None).unwrap();
     assert_eq!(mean(&nothing), (None, 0));
     fs::write(&path, "a,b,c\n1,x,3\n").unwrap();
-    let said = TrainingEpisodes::open(&folder, 9, None).unwrap_err();
+    let said = TrainingEpisodes::open(&folder, Some(9), None).unwrap_err();
     let said = said.to_string();
     assert!(said.contains("is not a row of episodes"), "{said}");
+    // A run that begins does not read what it replaces.
+    TrainingEpisodes::open(&folder, None, None).unwrap();
+    assert_eq!(rows(&folder), [] as [String; 0]);
 }
 
 /// Its replay began to count after the first thirty.
@@ -177,9 +180,9 @@ fn a_run_that_continues_has_the_episodes_before() {
 fn a_run_that_was_resumed_without_its_replay_and_then_with_it_has_each_once() {
     let (_root, folder, mut episodes) = begun();
     update(&mut episodes, &[shard(1_000, 0, 30, 0)]);
-    let mut episodes = TrainingEpisodes::open(&folder, 1_000, None).unwrap();
+    let mut episodes = TrainingEpisodes::open(&folder, Some(1_000), None).unwrap();
     update(&mut episodes, &[shard(2_000, 0, 50, 1_000)]);
-    let mut episodes = TrainingEpisodes::open(&folder, 2_000, Some(30)).unwrap();
+    let mut episodes = TrainingEpisodes::open(&folder, Some(2_000), Some(30)).unwrap();
     update(&mut episodes, &[shard(3_000, 0, 60, 1_000)]);
     assert_eq!(rows(&folder).len(), 90);
     assert_eq!(rows(&folder)[80], "1.500,3000,81,4,2,1050,9");
@@ -194,7 +197,7 @@ fn what_is_missing_of_one_shard_is_not_taken_from_another() {
         [first, Shard { actor: 1, ..second }]
     };
     update(&mut episodes, &shards(95));
-    let mut episodes = TrainingEpisodes::open(&folder, 0, Some(0)).unwrap();
+    let mut episodes = TrainingEpisodes::open(&folder, Some(0), Some(0)).unwrap();
     update(&mut episodes, &shards(100));
     let last: Vec<_> = rows(&folder).split_off(195);
     assert_eq!(last.len(), 5);

@@ -73,7 +73,7 @@ impl RunRecorder {
             Some(point) => rows_up_to(&folder.metrics(), header, point)?,
         };
         let unknown = kept.map(|it| it.episodes);
-        let episodes = TrainingEpisodes::open(folder, resume_point.frames, unknown)?;
+        let episodes = TrainingEpisodes::open(folder, resumed.map(|it| it.frames), unknown)?;
         if resumed.is_some() {
             folder.write_config(config)?;
         }

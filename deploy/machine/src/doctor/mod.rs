@@ -101,6 +101,14 @@ fn lacking(facts: &[Fact], bad: impl Fn(State) -> bool) -> String {
 mod tests {
     use super::*;
 
+    #[cfg(not(feature = "cuda"))]
+    #[test]
+    fn a_gpu_is_not_missed_where_the_program_is_built_without() {
+        let report = examine(Path::new("."), None);
+        assert_eq!(report.cuda[0].state, State::Note);
+        assert!(!report.is_ready_for_cuda());
+    }
+
     #[test]
     fn every_fact_is_a_line_and_the_verdict_follows_what_is_missing() {
         let fact = |what: &str, state, text: &str| Fact::new(what, (state, text.into()));
