@@ -65,11 +65,9 @@ impl Backward {
 pub(crate) fn summed(
     parameter: &Tensor,
     add: impl Fn(Option<Vec<f32>>) -> Vec<f32>,
-) -> Result<Option<Tensor>> {
-    if !parameter.track_op() || add_in_place(parameter, &add) {
-        return Ok(None);
-    }
-    Tensor::from_vec(add(None), parameter.shape(), parameter.device()).map(Some)
+) -> Option<Vec<f32>> {
+    let is_wanted = parameter.track_op() && !add_in_place(parameter, &add);
+    is_wanted.then(|| add(None))
 }
 
 /// Adds to the gradient of a parameter; a parameter that is not a variable has none.

@@ -79,9 +79,9 @@ impl Border {
 
 vectorized! {
     /// Rounds max(x, 0) of `floats` into `values`, which is as long.
-    fn store_active<S>(simd, floats: &'a [f32], values: &'a mut [S::Element]) {
+    pub(crate) fn store_active<S, M>(simd, floats: &'a [f32], values: &'a mut [M]) {
         for (value, &float) in values.iter_mut().zip(floats) {
-            *value = S::Element::of(relu_of(float));
+            *value = M::of(relu_of(float));
         }
     }
 }
@@ -167,12 +167,11 @@ impl<E: Element> BorderedConvolution<E> {
         simd: S,
         image: &[E],
         grad_map: &[f32],
-        weight: &mut [f32],
-        bias: &mut [f32],
+        [weight, bias]: [&mut [f32]; 2],
     ) {
         let shape = self.shape();
         let (len, shift) = (shape.image_len(), shape.shift());
-        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels::<S>(shape));
+        let (mut rooms, mut panels) = ([Room::new(), Room::new()], gradient_panels(simd, shape));
         let images = Images::Maps(&image[..len]);
         let steps = images.steps(simd, 0, (len, shift), &mut rooms);
         weight_gradient(simd, shape, steps, grad_map, &mut panels, weight, Mode::Add);

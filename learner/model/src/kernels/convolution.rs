@@ -8,9 +8,7 @@
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::images::{Images, Room};
-use crate::kernels::isa::{
-    Columns, Element, LANES, Left, Mode, Simd, multiply_tile, row_tiles, tile_vecs, vectorized,
-};
+use crate::kernels::isa::{Element, LANES, Left, Mode, Simd, row_tiles, vectorized};
 use crate::kernels::linear::{relu_gradient, relu_of};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::rounding::write_rows;
@@ -82,13 +80,9 @@ impl<E: Element> Convolution<E> {
     ) -> Self {
         let (run, out) = (shape.run(), shape.channels_out);
         let packed = shape.pack_weight(weight);
-        let padded_run = run.next_multiple_of(E::DEPTH);
-        let mut padded = vec![0.0; shape.kernel * padded_run * out];
-        let rows = padded.chunks_exact_mut(padded_run * out);
-        for (row, packed) in rows.zip(packed.chunks_exact(run * out)) {
-            row[..run * out].copy_from_slice(packed);
-        }
-        let matrix = Matrix::new(&padded, shape.kernel * padded_run, out);
+        let mut forward = Panels::new(simd, shape.kernel * run.div_ceil(E::DEPTH), out);
+        let matrix = Matrix::new(&packed, shape.kernel * run, out);
+        forward.fill(simd, matrix, run, Threads::Caller);
         let rows = packed.chunks_exact(run * out).filter(|_| backward);
         let backward = rows.map(|row| {
             let matrix = Matrix::new(row, run, out).transposed();
@@ -96,7 +90,7 @@ impl<E: Element> Convolution<E> {
         });
         Self {
             shape,
-            forward: Panels::pack(simd, matrix, Threads::Caller),
+            forward,
             backward: backward.collect(),
             bias: bias.repeat(shape.out_width()),
         }
@@ -173,114 +167,48 @@ vectorized! {
     }
 }
 
-/// Where `backward` writes gradients of parameters, and adds those of images.
-pub(crate) struct ConvGradients<'a> {
-    /// [k, k, in, out]
-    pub(crate) packed: &'a mut [f32],
-    /// [out]
-    pub(crate) bias: &'a mut [f32],
-    /// [n, height, width, in], or None if the images need none.
-    pub(crate) images: Option<&'a mut [f32]>,
-}
-
-impl<'a> ConvGradients<'a> {
-    /// Those of `shape` at the end of all layers' `sums`, which are shortened by them.
-    pub(crate) fn cut<'s: 'a>(
-        sums: &mut &'s mut [f32],
-        shape: &ConvShape,
-        images: Option<&'a mut [f32]>,
-    ) -> Self {
-        let before = sums.len() - shape.parameters_len();
-        let (left, own) = std::mem::take(sums).split_at_mut(before);
-        *sums = left;
-        let (packed, bias) = own.split_at_mut(shape.weight_len());
-        Self {
-            packed,
-            bias,
-            images,
-        }
-    }
-}
-
 /// The gradients of `forward` for `grad_maps` [n, out_h, out_w, out], one image or more, whose entries count only where `maps` is above
-/// 0, as in PyTorch. The weight's is still to be multiplied by the images' scale.
+/// 0, as in PyTorch. Those of the weight [k, k, in, out], still to be multiplied by the images' scale, and the bias [out] are written into
+/// `packed` and `bias`; the images' [n, height, width, in] are added to `grad_images`, where they are wanted.
 pub(crate) fn backward<S: Simd, M: Element>(
     simd: S,
     layer: &Convolution<S::Element>,
     images: Images<'_, S::Element>,
     maps: &[M],
     grad_maps: &[f32],
-    mut grads: ConvGradients<'_>,
+    [packed, bias]: [&mut [f32]; 2],
+    mut grad_images: Option<&mut [f32]>,
 ) {
-    let shape = &layer.shape;
-    let mut masked = Masked::new::<S>(shape);
-    grads.bias.fill(0.0);
-    let (len, mut rooms) = (shape.image_len(), [Room::new(), Room::new()]);
-    for (image, (maps, grad_maps)) in maps
-        .chunks_exact(shape.map_len())
-        .zip(grad_maps.chunks_exact(shape.map_len()))
-        .enumerate()
-    {
-        masked.mask(simd, maps, grad_maps, grads.bias);
+    let (shape, len) = (&layer.shape, layer.shape.image_len());
+    let (map_len, out) = (shape.map_len(), shape.channels_out);
+    // One image's gradients where its maps are above 0, [locations, out], and as the operands of two products.
+    let mut masked = Buffer::new(map_len);
+    let stride = out.next_multiple_of(S::Element::DEPTH);
+    let mut rows = Buffer::new(shape.locations() * stride);
+    let (mut panels, mut rooms) = (gradient_panels(simd, shape), [Room::new(), Room::new()]);
+    bias.fill(0.0);
+    let each = maps
+        .chunks_exact(map_len)
+        .zip(grad_maps.chunks_exact(map_len));
+    for (image, (maps, grad_maps)) in each.enumerate() {
+        pass_active(simd, maps, grad_maps, &mut masked);
+        add_locations(simd, &masked, bias);
         let steps = images.steps(simd, image, (len, shape.shift()), &mut rooms);
         let mode = if image == 0 { Mode::Replace } else { Mode::Add };
-        let (values, panels) = (&masked.values, &mut masked.panels);
-        weight_gradient(simd, shape, steps, values, panels, grads.packed, mode);
-        if let Some(grad_images) = &mut grads.images {
-            masked.write_rows(simd, shape.channels_out);
+        weight_gradient(simd, shape, steps, &masked, &mut panels, packed, mode);
+        if let Some(grad_images) = &mut grad_images {
+            write_rows(simd, &masked, out, stride, &mut rows);
             let pixels = &mut grad_images[image * len..(image + 1) * len];
-            image_gradient(simd, layer, &masked.rows, pixels);
+            image_gradient(simd, layer, &rows, pixels);
         }
-    }
-}
-
-/// One image's gradients where its maps are above 0, as the operands of two products.
-struct Masked<E: Element> {
-    /// [locations, out]
-    values: Buffer<f32>,
-    /// [locations, out rounded up to steps]: the left operand of the image's gradient.
-    rows: Buffer<E>,
-    /// Panels of [rows of maps * steps of windows, columns, DEPTH]: the right operand of the weight's gradient.
-    panels: Buffer<E>,
-}
-
-impl<E: Element> Masked<E> {
-    fn new<S: Simd<Element = E>>(shape: &ConvShape) -> Self {
-        let out = shape.channels_out;
-        Self {
-            values: Buffer::new(shape.map_len()),
-            rows: Buffer::new(shape.locations() * out.next_multiple_of(E::DEPTH)),
-            panels: gradient_panels::<S>(shape),
-        }
-    }
-
-    /// Masks one image's gradients, and adds them to the bias's.
-    fn mask<S: Simd, M: Element>(
-        &mut self,
-        simd: S,
-        maps: &[M],
-        grad_maps: &[f32],
-        bias: &mut [f32],
-    ) {
-        mask(simd, maps, grad_maps, &mut self.values);
-        add_locations(simd, &self.values, bias);
-    }
-
-    fn write_rows<S: Simd<Element = E>>(&mut self, simd: S, out: usize) {
-        let stride = out.next_multiple_of(E::DEPTH);
-        write_rows(simd, &self.values, out, stride, &mut self.rows);
     }
 }
 
 vectorized! {
-    fn mask<S, M>(
-        simd,
-        maps: &'a [M],
-        grad_maps: &'a [f32],
-        masked: &'a mut [f32],
-    ) {
-        for ((masked, map), &grad) in masked.iter_mut().zip(maps).zip(grad_maps) {
-            *masked = relu_gradient(map.value(), grad);
+    /// The gradients before a ReLU that gave `active`.
+    pub(crate) fn pass_active<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
+        for ((to, active), &grad) in to.iter_mut().zip(active).zip(grads) {
+            *to = relu_gradient(active.value(), grad);
         }
     }
 }
@@ -312,43 +240,10 @@ fn add_channels<const N: usize>(map: &[f32], first: usize, out: usize, sums: &mu
     sums[first..][..N].copy_from_slice(&each);
 }
 
-vectorized! {
-    fn write_panels<S>(
-        simd,
-        values: &'a [f32],
-        shape: ConvShape,
-        width: usize,
-        panels: &'a mut [S::Element],
-    ) {
-        let (out, out_width, depth) = (shape.channels_out, shape.out_width(), S::Element::DEPTH);
-        let panels = panels.chunks_exact_mut(panel_len::<S::Element>(&shape, width));
-        for (index, panel) in panels.enumerate() {
-            let cols = index * width..out.min((index + 1) * width);
-            let mut steps = panel.chunks_exact_mut(width * depth);
-            for line in values.chunks_exact(out_width * out) {
-                for windows in line.chunks(depth * out) {
-                    let second = windows.get(out..).unwrap_or_default();
-                    let second = second.get(cols.clone()).unwrap_or_default();
-                    if let Some(step) = steps.next() {
-                        S::Element::join(simd, &windows[cols.clone()], second, step);
-                    }
-                }
-            }
-        }
-    }
-}
-
-/// Scalars of a panel of masked gradients: the windows of an image, two in a step if steps are pairs, by `width` columns.
-fn panel_len<E: Element>(shape: &ConvShape, width: usize) -> usize {
-    let steps = shape.out_height() * shape.out_width().div_ceil(E::DEPTH);
-    steps * width * E::DEPTH
-}
-
 /// Memory for the panels of an image's gradients.
-pub(crate) fn gradient_panels<S: Simd>(shape: &ConvShape) -> Buffer<S::Element> {
-    let width = tile_vecs::<S>(shape.channels_out) * LANES;
-    let panels = shape.channels_out.div_ceil(width);
-    Buffer::new(panel_len::<S::Element>(shape, width) * panels)
+pub(crate) fn gradient_panels<S: Simd>(simd: S, shape: &ConvShape) -> Panels<S::Element> {
+    let steps = shape.out_height() * shape.out_width().div_ceil(S::Element::DEPTH);
+    Panels::new(simd, steps, shape.channels_out)
 }
 
 /// One image's part of the weight's gradient: windows, transposed, times the gradients `grad_map` [locations, out], for which `panels`
@@ -358,39 +253,26 @@ pub(crate) fn weight_gradient<S: Simd>(
     shape: &ConvShape,
     image: &[S::Element],
     grad_map: &[f32],
-    panels: &mut [S::Element],
+    panels: &mut Panels<S::Element>,
     packed: &mut [f32],
     mode: Mode,
 ) {
     let (depth, out) = (S::Element::DEPTH, shape.channels_out);
-    let vecs = tile_vecs::<S>(out);
-    let width = vecs * LANES;
-    write_panels(simd, grad_map, *shape, width, panels);
-    let steps = shape.out_width().div_ceil(depth);
+    let gradients = Matrix::new(grad_map, shape.locations(), out);
+    panels.fill(simd, gradients, shape.out_width(), Threads::Caller);
     for kernel_y in 0..shape.kernel {
         let rows = &mut packed[kernel_y * shape.run() * out..][..shape.run() * out];
-        for (first, count) in row_tiles::<S>(shape.run(), vecs) {
+        for (first, count) in row_tiles::<S>(shape.run(), panels.vecs()) {
             let left = Left {
                 values: image,
                 start: (kernel_y * shape.line() + first) * depth,
                 row_stride: depth,
                 step: depth * depth * shape.shift(),
-                steps,
+                steps: shape.out_width().div_ceil(depth),
                 run_stride: shape.stride * shape.line() * depth,
                 runs: shape.out_height(),
             };
-            let panels = panels.chunks_exact(panel_len::<S::Element>(shape, width));
-            for (index, panel) in panels.enumerate() {
-                let col = index * width;
-                let columns = Columns {
-                    out: &mut rows[first * out + col..],
-                    stride: out,
-                    cols: width.min(out - col),
-                    vecs,
-                    mode,
-                };
-                multiply_tile(simd, count, left, panel, columns);
-            }
+            panels.multiply(simd, count, left, mode, &mut rows[first * out..], out);
         }
     }
 }
@@ -404,15 +286,7 @@ fn image_gradient<S: Simd>(
 ) {
     let shape = &layer.shape;
     let stride = shape.channels_out.next_multiple_of(S::Element::DEPTH);
-    let left = Left {
-        values: grad_rows,
-        start: 0,
-        row_stride: stride,
-        step: S::Element::DEPTH,
-        steps: stride / S::Element::DEPTH,
-        run_stride: 0,
-        runs: 1,
-    };
+    let left = Left::rows(grad_rows, stride);
     for y in 0..shape.out_height() {
         for (kernel_y, panels) in layer.backward.iter().enumerate() {
             let line = (y * shape.stride + kernel_y) * shape.line();

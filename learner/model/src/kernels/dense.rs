@@ -53,17 +53,7 @@ impl<S: Simd> Dense<S> {
         for row in y.chunks_exact_mut(outputs) {
             row.copy_from_slice(&self.bias);
         }
-        let depth = S::Element::DEPTH;
-        let row_stride = self.inputs.next_multiple_of(depth);
-        let left = Left {
-            values: x,
-            start: 0,
-            row_stride,
-            step: depth,
-            steps: row_stride / depth,
-            run_stride: 0,
-            runs: 1,
-        };
+        let left = Left::rows(x, self.inputs.next_multiple_of(S::Element::DEPTH));
         self.weight
             .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y

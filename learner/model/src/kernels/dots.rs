@@ -3,15 +3,16 @@
 //!
 //! Products are f32 in every precision: gradients of scores that cancel each other would be lost in bf16, and they are few.
 
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::kernels::buffer::{Buffer, Scalars};
 use crate::kernels::isa::Mode;
+use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::panels::{Matrix, Threads};
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
-use crate::kernels::tensors::{floats, values_of};
+use crate::kernels::tensors::{Input, values_of};
 
 /// Dot products [L, B, B] of `psi` and `phi`, each [B, L, R], or [B, R] where one vector meets every location of the other.
 ///
@@ -35,14 +36,15 @@ pub(crate) fn dot_products(psi: &Tensor, phi: &Tensor) -> Result<Tensor> {
     if !fits {
         bail!("dot products of {:?} and {:?}", psi.shape(), phi.shape());
     }
-    let op = Dots {
-        rows: anchors.0,
-        embedding_dim: anchors.2,
+    let (rows, psi_locations, embedding_dim) = anchors;
+    let operation = Dots {
+        rows,
+        embedding_dim,
         locations,
-        psi_locations: anchors.1,
+        psi_locations,
         phi_locations: candidates.1,
     };
-    psi.contiguous()?.apply_op2(&phi.contiguous()?, op)
+    apply_to_two(operation, [psi, phi], (locations, rows, rows))
 }
 
 struct Dots {
@@ -114,19 +116,13 @@ impl Dots {
     }
 }
 
-impl CustomOp2 for Dots {
-    fn name(&self) -> &'static str {
-        "dot-products"
-    }
+impl Operation<2> for Dots {
+    const NAME: &'static str = "dot-products";
 
-    fn cpu_fwd(
-        &self,
-        psi: &CpuStorage,
-        psi_layout: &Layout,
-        phi: &CpuStorage,
-        phi_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (psi, phi) = (floats(psi, psi_layout)?, floats(phi, phi_layout)?);
+    type Kept = ();
+
+    fn forward(&self, [psi, phi]: [Input<'_>; 2]) -> Result<(Vec<f32>, ())> {
+        let (psi, phi) = (psi.floats()?, phi.floats()?);
         let (rows, embedding_dim) = (self.rows, self.embedding_dim);
         let mut dots = vec![0.0; self.locations * rows * rows];
         dots.par_chunks_exact_mut(rows * rows)
@@ -138,28 +134,20 @@ impl CustomOp2 for Dots {
                 let phi = Matrix::new(&phi, rows, embedding_dim).transposed();
                 self.product(psi, phi).write(dots, Mode::Replace);
             });
-        Ok((CpuStorage::F32(dots), (self.locations, rows, rows).into()))
+        Ok((dots, ()))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        psi: &Tensor,
-        phi: &Tensor,
+        [psi, phi]: [&Tensor; 2],
+        (): &(),
         _dots: &Tensor,
-        grad: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let grad = grad.detach().contiguous()?;
-        let grad = values_of(&grad)?;
+        grad: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 2]> {
         let (psi_values, phi_values) = (values_of(psi)?, values_of(phi)?);
         let (own, others) = (self.psi_locations, self.phi_locations);
-        let grad_psi = psi.track_op().then(|| {
-            let sum = self.gradient(&grad, false, own, &phi_values, others);
-            Tensor::from_vec(sum, psi.shape(), psi.device())
-        });
-        let grad_phi = phi.track_op().then(|| {
-            let sum = self.gradient(&grad, true, others, &psi_values, own);
-            Tensor::from_vec(sum, phi.shape(), phi.device())
-        });
-        Ok((grad_psi.transpose()?, grad_phi.transpose()?))
+        let of_psi = || self.gradient(grad, false, own, &phi_values, others);
+        let of_phi = || self.gradient(grad, true, others, &psi_values, own);
+        Ok([psi.track_op().then(of_psi), phi.track_op().then(of_phi)])
     }
 }

@@ -5,18 +5,18 @@
 //! other, so that each group is one product; sums are taken in the order in which the whole layer takes them.
 
 use std::ops::Range;
-use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
+use crate::kernels::operation::{Operation, apply_to_three};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Biases, Product};
-use crate::kernels::tensors::{floats, values_of};
+use crate::kernels::product::Product;
+use crate::kernels::tensors::{Input, values_of};
 
 /// y_r = x_r w_g^T + b_g with g = `groups[r]`, differentiable in all arguments.
 ///
@@ -53,16 +53,14 @@ pub(crate) fn grouped_linear(
             (usize::from(groups[rows[0]]), own)
         })
         .collect();
-    let op = Grouped {
+    let operation = Grouped {
         order,
         parts,
         inputs,
         out,
         precision,
-        sorted: OnceLock::new(),
     };
-    x.contiguous()?
-        .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
+    apply_to_three(operation, [x, w, b], (rows, out))
 }
 
 struct Grouped {
@@ -73,8 +71,6 @@ struct Grouped {
     inputs: usize,
     out: usize,
     precision: Precision,
-    /// x in that order: what the forward pass leaves to the backward pass.
-    sorted: OnceLock<Buffer<f32>>,
 }
 
 impl Grouped {
@@ -153,75 +149,54 @@ impl Grouped {
     }
 }
 
-impl CustomOp3 for Grouped {
-    fn name(&self) -> &'static str {
-        "grouped-linear"
-    }
+impl Operation<3> for Grouped {
+    const NAME: &'static str = "grouped-linear";
 
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        w: &CpuStorage,
-        w_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let x = self.sort(floats(x, x_layout)?);
-        let (w, b) = (floats(w, w_layout)?, floats(b, b_layout)?);
+    /// x by group.
+    type Kept = Buffer<f32>;
+
+    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Kept)> {
+        let x = self.sort(x.floats()?);
+        let (w, b) = (w.floats()?, b.floats()?);
         let mut y = Buffer::new(self.order.len() * self.out);
         self.for_each_part(&mut y, self.out, |group, rows, y| {
-            let biases = Biases {
-                values: &b[group * self.out..][..self.out],
-                outputs: self.out,
-                each: self.order.len(),
-            };
             let (x, w) = (Self::rows(&x, rows, self.inputs), self.weight(w, group));
             Product::new(self.precision, x, w.transposed())
-                .added_to(biases)
+                .added_to(&b[group * self.out..][..self.out])
                 .write(y, Mode::Replace);
         });
-        let first = self.sorted.set(x).is_ok();
-        assert!(first, "an operation passes forward once");
-        Ok((
-            CpuStorage::F32(self.unsort(&y)),
-            (self.order.len(), self.out).into(),
-        ))
+        Ok((self.unsort(&y), x))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        x: &Tensor,
-        w: &Tensor,
-        b: &Tensor,
+        [x, w, b]: [&Tensor; 3],
+        sorted: &Self::Kept,
         _y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = grad_y.detach().contiguous()?;
-        let grad = self.sort(&values_of(&grad_y)?);
-        let sorted = self.sorted.get().expect("a forward pass came before");
-
-        let grad_x = x.track_op().then(|| -> Result<Tensor> {
+        grad_y: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 3]> {
+        let grad = self.sort(grad_y);
+        let grad_x = x.track_op().then(|| -> Result<Vec<f32>> {
             let w = values_of(w)?;
             let mut grad_x = Buffer::new(self.order.len() * self.inputs);
             self.for_each_part(&mut grad_x, self.inputs, |group, rows, grad_x| {
                 let (grad, w) = (Self::rows(&grad, rows, self.out), self.weight(&w, group));
                 Product::new(self.precision, grad, w).write(grad_x, Mode::Replace);
             });
-            Tensor::from_vec(self.unsort(&grad_x), x.shape(), x.device())
+            Ok(self.unsort(&grad_x))
         });
         let zeros = |like: &Tensor| vec![0.0; like.elem_count()];
         let grad_w = gradients::summed(w, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(w));
             self.add_to_weight(&mut sum, &grad, sorted);
             sum
-        })?;
+        });
         let grad_b = gradients::summed(b, |sum| {
             let mut sum = sum.unwrap_or_else(|| zeros(b));
             self.add_to_bias(&mut sum, &grad);
             sum
-        })?;
-        Ok((grad_x.transpose()?, grad_w, grad_b))
+        });
+        Ok([grad_x.transpose()?, grad_w, grad_b])
     }
 }
 

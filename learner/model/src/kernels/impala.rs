@@ -1,21 +1,17 @@
 //! The stages of an IMPALA torso as one candle operation with gradients, its batch split over the rayon pool.
 //! It runs on the CPU only; the layer after f3 is another operation.
 
-use std::sync::OnceLock;
+use candle_core::{Result, Tensor, bail};
 
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
-use rayon::prelude::*;
-
-use crate::geometry::{STAGE_CONVOLUTIONS, stages};
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
 use crate::kernels::candle::BorderedTensors;
-use crate::kernels::conv::pixels;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
-use crate::kernels::linear::add_in_order;
+use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::precision::Precision;
-use crate::kernels::stack::{parameters_len, unpacked};
 use crate::kernels::stages::{Saved, Stages};
-use crate::kernels::tensors::{cpu, floats, values_of};
+use crate::kernels::tasks::Tasks;
+use crate::kernels::tensors::{Input, cpu, values_of};
 
 /// Images that one task takes. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_IMAGES: usize = 8;
@@ -32,15 +28,15 @@ pub(crate) fn residual_stages(
     layers: &[BorderedTensors<'_>],
     precision: Precision,
 ) -> Result<Tensor> {
-    let (_, height, width, channels) = images.dims4()?;
+    let (count, height, width, channels) = images.dims4()?;
     let input = (height, width, channels);
     let widths = layers.chunks(STAGE_CONVOLUTIONS);
     let widths: Vec<usize> = widths.map(|it| it[0].1.elem_count()).collect();
-    let fits = |((weight, bias), shape): (&BorderedTensors<'_>, &crate::geometry::ConvShape)| {
+    let fits = |((weight, bias), shape): (&BorderedTensors<'_>, &ConvShape)| {
         weight.dims() == [shape.channels_out, shape.channels_in, 3, 3]
             && bias.dims() == [shape.channels_out]
     };
-    let (shapes, _) = stages(input, &widths);
+    let (shapes, (rows, cols, width)) = stages(input, &widths);
     let is_whole = !layers.is_empty() && layers.len() == shapes.len() && images.elem_count() > 0;
     if !is_whole || !layers.iter().zip(&shapes).all(fits) {
         let weights: Vec<_> = layers.iter().map(|(weight, _)| weight.shape()).collect();
@@ -48,95 +44,73 @@ pub(crate) fn residual_stages(
     }
     let parameters = layers.iter().flat_map(|&(weight, bias)| [weight, bias]);
     let parameters: Result<Vec<_>> = parameters.map(Tensor::flatten_all).collect();
-    let (images, parameters) = (images.contiguous()?, Tensor::cat(&parameters?, 0)?);
+    let parameters = Tensor::cat(&parameters?, 0)?;
     with_simd!(AnySimd::of(precision), simd => {
-        let op = ResidualStages {
-            simd,
-            input,
-            widths,
-            saved: OnceLock::new(),
-        };
-        images.apply_op2(&parameters, op)
+        let operation = ResidualStages { simd, shapes, count };
+        apply_to_two(operation, [images, &parameters], (count, rows, cols, width))
     })
 }
 
 struct ResidualStages<S: Simd> {
     simd: S,
-    input: (usize, usize, usize),
-    widths: Vec<usize>,
-    /// Of each task, what the forward pass leaves to the backward pass.
-    saved: OnceLock<Vec<Saved<S::Element>>>,
+    shapes: Vec<ConvShape>,
+    /// Images of the batch.
+    count: usize,
 }
 
 impl<S: Simd> ResidualStages<S> {
-    fn stages(&self, parameters: &[f32], backward: bool) -> Stages<S> {
-        Stages::new(self.simd, self.input, &self.widths, parameters, backward)
+    fn tasks(&self, stages: &Stages<S>) -> Tasks {
+        Tasks {
+            count: self.count,
+            images: TASK_IMAGES,
+            image_len: stages.image_len(),
+            map_len: stages.output_len(),
+        }
     }
 }
 
-fn bytes<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [u8]> {
-    match pixels(storage, layout)? {
+fn bytes(images: Input<'_>) -> Result<&[u8]> {
+    match images.pixels()? {
         Pixels::Bytes(bytes) => Ok(bytes),
         Pixels::Floats(_) => bail!("stages take images of bytes"),
     }
 }
 
-impl<S: Simd> CustomOp2 for ResidualStages<S> {
-    fn name(&self) -> &'static str {
-        "residual-stages"
+impl<S: Simd> Operation<2> for ResidualStages<S> {
+    const NAME: &'static str = "residual-stages";
+
+    /// Of each task.
+    type Kept = Vec<Saved<S::Element>>;
+
+    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+        let images = bytes(images)?;
+        let stages = Stages::new(self.simd, &self.shapes, parameters.floats()?, false);
+        let mut f3 = vec![0.0; self.count * stages.output_len()];
+        let saved = self.tasks(&stages).forward(&mut f3, |task, f3| {
+            let mut saved = stages.saved(f3.len() / stages.output_len());
+            stages.forward(&images[task], &mut saved, f3);
+            saved
+        });
+        Ok((f3, saved))
     }
 
-    fn cpu_fwd(
+    fn backward(
         &self,
-        images: &CpuStorage,
-        images_layout: &Layout,
-        parameters: &CpuStorage,
-        parameters_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let images = bytes(images, images_layout)?;
-        let stages = self.stages(floats(parameters, parameters_layout)?, false);
-        let count = images.len() / stages.image_len();
-        let mut f3 = vec![0.0; count * stages.output_len()];
-        let tasks = images.par_chunks(TASK_IMAGES * stages.image_len());
-        let tasks = tasks.zip(f3.par_chunks_mut(TASK_IMAGES * stages.output_len()));
-        let saved: Vec<_> = tasks
-            .with_max_len(1)
-            .map(|(images, f3)| {
-                let mut saved = stages.saved(f3.len() / stages.output_len());
-                stages.forward(images, &mut saved, f3);
-                saved
-            })
-            .collect();
-        let first = self.saved.set(saved).is_ok();
-        assert!(first, "an operation passes forward once");
-        let (height, width, channels) = stages.output();
-        Ok((CpuStorage::F32(f3), (count, height, width, channels).into()))
-    }
-
-    fn bwd(
-        &self,
-        images: &Tensor,
-        parameters: &Tensor,
+        [images, parameters]: [&Tensor; 2],
+        saved: &Self::Kept,
         f3: &Tensor,
-        grad_f3: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let grad_f3 = grad_f3.contiguous()?;
-        let (images, images_layout) = images.storage_and_layout();
-        let images = bytes(cpu(&images)?, images_layout)?;
-        let (f3, grad) = (values_of(f3)?, values_of(&grad_f3)?);
-        let stages = self.stages(&values_of(parameters)?, true);
-        let saved = self.saved.get().expect("a forward pass came before");
-        let task_len = TASK_IMAGES * stages.output_len();
-        let tasks = images.par_chunks(TASK_IMAGES * stages.image_len());
-        let tasks = tasks.zip(saved.par_iter());
-        let tasks = tasks.zip(f3.par_chunks(task_len).zip(grad.par_chunks(task_len)));
-        let sums = tasks
-            .with_max_len(1)
-            .map(|((images, saved), (f3, grad))| stages.backward(images, saved, f3, grad));
-        let sums: Vec<_> = sums.collect();
-        let (shapes, _) = crate::geometry::stages(self.input, &self.widths);
-        let sum = unpacked(&shapes, &add_in_order(&sums, parameters_len(&shapes)));
-        let gradient = Tensor::from_vec(sum, parameters.shape(), parameters.device())?;
-        Ok((None, Some(gradient)))
+        grad_f3: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 2]> {
+        let (storage, layout) = images.storage_and_layout();
+        let images = bytes(Input::new(cpu(&storage)?, layout))?;
+        let f3 = values_of(f3)?;
+        let f3 = &f3[..];
+        let stages = Stages::new(self.simd, &self.shapes, &values_of(parameters)?, true);
+        let tasks = self.tasks(&stages);
+        let gradient = tasks.backward(&self.shapes, saved, &mut [], |task, saved, _| {
+            let (f3, grad_f3) = (&f3[task.maps.clone()], &grad_f3[task.maps]);
+            stages.backward(&images[task.images], saved, f3, grad_f3)
+        });
+        Ok([None, Some(gradient)])
     }
 }

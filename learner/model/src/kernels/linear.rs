@@ -5,19 +5,19 @@
 //! and its ReLU passes a gradient at exactly 0, which PyTorch's does not.
 
 use std::ops::Deref;
-use std::sync::OnceLock;
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use rayon::prelude::*;
 
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::{AnySimd, Mode, with_simd};
+use crate::kernels::operation::{Operation, apply_to_three};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Biases, Product};
+use crate::kernels::product::Product;
 use crate::kernels::rounding::transpose;
-use crate::kernels::tensors::{floats, values_of};
+use crate::kernels::tensors::{Input, floats, values_of};
 
 /// Rows that one task sums. Fixed, so that sums are taken in the same order whatever the number of threads.
 const TASK_ROWS: usize = 256;
@@ -73,16 +73,19 @@ fn apply(
             b.shape()
         );
     }
-    let op = Linear {
+    let operation = Linear {
         rows: x.elem_count() / inputs,
         inputs,
         outputs,
         maps,
         precision,
-        flat: OnceLock::new(),
     };
-    x.contiguous()?
-        .apply_op3(&w.contiguous()?, &b.contiguous()?, op)
+    let leading = match maps {
+        Some(_) => 1,
+        None => x.rank() - 1,
+    };
+    let shape = [&x.dims()[..leading], &[outputs]].concat();
+    apply_to_three(operation, [x, w, b], shape)
 }
 
 struct Linear {
@@ -92,95 +95,61 @@ struct Linear {
     /// Locations and channels of x, if it is maps [.., locations, channels] to be flattened to [.., channels * locations].
     maps: Option<(usize, usize)>,
     precision: Precision,
-    /// The flattened maps: what the forward pass leaves to the backward pass.
-    flat: OnceLock<Buffer<f32>>,
 }
 
-impl CustomOp3 for Linear {
-    fn name(&self) -> &'static str {
-        "linear"
+impl Operation<3> for Linear {
+    const NAME: &'static str = "linear";
+
+    /// The flattened maps.
+    type Kept = Option<Buffer<f32>>;
+
+    fn forward(&self, [x, w, b]: [Input<'_>; 3]) -> Result<(Vec<f32>, Self::Kept)> {
+        let x = x.floats()?;
+        let flat = self.maps.map(|(locations, channels)| {
+            let mut flat = Buffer::new(x.len());
+            transpose_each(x, locations, channels, &mut flat);
+            flat
+        });
+        let x = Matrix::new(flat.as_deref().unwrap_or(x), self.rows, self.inputs);
+        let w = Matrix::new(w.floats()?, self.outputs, self.inputs);
+        let product = Product::new(self.precision, x, w.transposed());
+        let y = product.added_to(b.floats()?).to_vec();
+        Ok((y, flat))
     }
 
-    fn cpu_fwd(
+    fn backward(
         &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        w: &CpuStorage,
-        w_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let x = floats(x, x_layout)?;
-        let w = Matrix::new(floats(w, w_layout)?, self.outputs, self.inputs);
-        let biases = Biases {
-            values: floats(b, b_layout)?,
-            outputs: self.outputs,
-            each: self.rows,
-        };
-        let product = |x| {
-            let x = Matrix::new(x, self.rows, self.inputs);
-            Product::new(self.precision, x, w.transposed()).added_to(biases)
-        };
-        let mut dims = x_layout.dims().to_vec();
-        let y = match self.maps {
-            None => product(x).to_vec(),
-            Some((locations, channels)) => {
-                let mut flat = Buffer::new(x.len());
-                transpose_each(x, locations, channels, &mut flat);
-                let y = product(&flat).to_vec();
-                let first = self.flat.set(flat).is_ok();
-                assert!(first, "an operation passes forward once");
-                dims.truncate(2);
-                y
-            }
-        };
-        if let Some(last) = dims.last_mut() {
-            *last = self.outputs;
-        }
-        Ok((CpuStorage::F32(y), dims.into()))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        w: &Tensor,
-        b: &Tensor,
+        [x, w, b]: [&Tensor; 3],
+        flat: &Self::Kept,
         _y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let grad_y = grad_y.detach().contiguous()?;
-        let grad_values = values_of(&grad_y)?;
-        let grad = Matrix::new(&grad_values, self.rows, self.outputs);
-
-        let grad_x = x.track_op().then(|| -> Result<Tensor> {
+        grad_y: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 3]> {
+        let grad = Matrix::new(grad_y, self.rows, self.outputs);
+        let grad_x = x.track_op().then(|| -> Result<Vec<f32>> {
             let w = values_of(w)?;
             let w = Matrix::new(&w, self.outputs, self.inputs);
             let product = Product::new(self.precision, grad, w);
-            let grad_x = match self.maps {
-                None => product.to_vec(),
-                Some((locations, channels)) => {
-                    let mut grad_flat = Buffer::new(self.rows * self.inputs);
-                    product.write(&mut grad_flat, Mode::Replace);
-                    let mut grad_x = vec![0.0; grad_flat.len()];
-                    transpose_each(&grad_flat, channels, locations, &mut grad_x);
-                    grad_x
-                }
+            let Some((locations, channels)) = self.maps else {
+                return Ok(product.to_vec());
             };
-            Tensor::from_vec(grad_x, x.shape(), x.device())
+            let mut grad_flat = Buffer::new(self.rows * self.inputs);
+            product.write(&mut grad_flat, Mode::Replace);
+            let mut grad_x = vec![0.0; grad_flat.len()];
+            transpose_each(&grad_flat, channels, locations, &mut grad_x);
+            Ok(grad_x)
         });
-        let x_values = values_of(x)?;
-        let x_values = self.flat.get().map_or(&x_values[..], |flat| &flat[..]);
-        let x_values = Matrix::new(x_values, self.rows, self.inputs);
-        let product = Product::new(self.precision, grad.transposed(), x_values);
-        let grad_w = gradients::summed(w, |sum| product.summed(sum))?;
-        let sums = || group_sums(&grad_values, 1, self.outputs);
-        let grad_b = gradients::summed(b, |sum| add_to(sum, sums()))?;
-        Ok((grad_x.transpose()?, grad_w, grad_b))
+        let x = values_of(x)?;
+        let x = Matrix::new(flat.as_deref().unwrap_or(&x), self.rows, self.inputs);
+        let product = Product::new(self.precision, grad.transposed(), x);
+        let grad_w = gradients::summed(w, |sum| product.summed(sum));
+        let sums = || group_sums(grad_y, 1, self.outputs);
+        let grad_b = gradients::summed(b, |sum| add_to(sum, sums()));
+        Ok([grad_x.transpose()?, grad_w, grad_b])
     }
 }
 
 /// Transposes every image [rows, cols] of a batch.
-fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
+pub(crate) fn transpose_each(values: &[f32], rows: usize, cols: usize, result: &mut [f32]) {
     // Nothing is rounded.
     with_simd!(AnySimd::of(Precision::F32), simd => {
         result

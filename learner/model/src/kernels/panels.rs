@@ -84,32 +84,50 @@ pub(crate) struct Panels<E: Element> {
 }
 
 impl<E: Element> Panels<E> {
+    /// Memory for the panels of an operand of so many steps.
+    pub(crate) fn new<S: Simd<Element = E>>(_: S, steps: usize, cols: usize) -> Self {
+        let vecs = tile_vecs::<S>(cols);
+        let width = vecs * LANES;
+        Self {
+            values: Buffer::new(steps * width * E::DEPTH * cols.div_ceil(width)),
+            steps,
+            cols,
+            vecs,
+        }
+    }
+
     /// The panels of `b` [k, n].
     pub(crate) fn pack<S: Simd<Element = E>>(simd: S, b: Matrix<'_>, threads: Threads) -> Self {
-        let vecs = tile_vecs::<S>(b.cols);
-        let (steps, width) = (b.rows.div_ceil(E::DEPTH), vecs * LANES);
-        let panel_len = steps * width * E::DEPTH;
-        let mut values = Buffer::new(panel_len * b.cols.div_ceil(width));
-        let pack = |panel: usize, values: &mut [E]| {
-            pack_panel(simd, b, panel * width, width, values);
+        let mut panels = Self::new(simd, b.rows.div_ceil(E::DEPTH), b.cols);
+        panels.fill(simd, b, b.rows, threads);
+        panels
+    }
+
+    /// Packs `b` [parts * rows, n], each of whose parts begins with a new step; of a transposed matrix there is one part.
+    pub(crate) fn fill<S: Simd<Element = E>>(
+        &mut self,
+        simd: S,
+        b: Matrix<'_>,
+        rows: usize,
+        threads: Threads,
+    ) {
+        let width = self.vecs * LANES;
+        let pack = |(panel, values): (usize, &mut [E])| {
+            pack_panel(simd, b, rows, panel * width, width, values);
         };
+        let panel_len = self.steps * width * E::DEPTH;
         match threads {
-            Threads::Caller => {
-                for (panel, values) in values.chunks_exact_mut(panel_len).enumerate() {
-                    pack(panel, values);
-                }
-            }
-            Threads::Pool => values
+            Threads::Caller => self
+                .values
+                .chunks_exact_mut(panel_len)
+                .enumerate()
+                .for_each(pack),
+            Threads::Pool => self
+                .values
                 .par_chunks_exact_mut(panel_len)
                 .with_max_len(1)
                 .enumerate()
-                .for_each(|(panel, values)| pack(panel, values)),
-        }
-        Self {
-            values,
-            steps,
-            cols: b.cols,
-            vecs,
+                .for_each(pack),
         }
     }
 
@@ -184,10 +202,11 @@ impl<E: Element> Panels<E> {
 }
 
 vectorized! {
-    /// Packs columns `first..` of `b` as one panel of this width.
+    /// Packs columns `first..` of `b`, in parts of so many rows, as one panel of this width.
     fn pack_panel<S>(
         simd,
         b: Matrix<'a>,
+        rows: usize,
         first: usize,
         width: usize,
         panel: &'a mut [S::Element],
@@ -196,13 +215,15 @@ vectorized! {
             return pack_transposed(simd, b, first, width, panel);
         }
         let (cols, depth) = (width.min(b.cols - first), S::Element::DEPTH);
-        let steps = panel.chunks_exact_mut(width * depth);
-        for (step, rows) in steps.zip(b.data.chunks(b.stride * depth)) {
-            let part = |row: usize| {
-                let row = rows.get(row * b.stride..).unwrap_or_default();
-                row.get(first..first + cols).unwrap_or_default()
-            };
-            S::Element::join(simd, part(0), part(1), step);
+        let mut steps = panel.chunks_exact_mut(width * depth);
+        for part in b.data.chunks(rows * b.stride) {
+            for (lines, step) in part.chunks(b.stride * depth).zip(&mut steps) {
+                let line = |line: usize| {
+                    let line = lines.get(line * b.stride..).unwrap_or_default();
+                    line.get(first..first + cols).unwrap_or_default()
+                };
+                S::Element::join(simd, line(0), line(1), step);
+            }
         }
     }
 }
@@ -388,7 +409,7 @@ fn pack_steps<S: Simd>(simd: S, b: Matrix<'_>, values: &mut [S::Element], thread
     let steps = (TASK_LEN / (cols * depth)).max(1);
     let pack = |values: &mut [S::Element], data: &[f32]| {
         let part = Matrix::new(data, data.len() / cols, cols);
-        pack_panel(simd, part, 0, cols, values);
+        pack_panel(simd, part, part.rows, 0, cols, values);
     };
     match threads {
         Threads::Caller => pack(values, b.data),

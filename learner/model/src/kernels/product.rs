@@ -15,26 +15,6 @@ const SPLIT_MIN: usize = 1 << 18;
 /// What a task does with its finished rows of the output: gets the number of the first one, and the rows one after the other.
 pub(crate) type RowsWork<'a> = &'a (dyn Fn(usize, &mut [f32]) + Sync);
 
-/// Biases that products are added to.
-#[derive(Clone, Copy)]
-pub(crate) struct Biases<'a> {
-    /// [groups, outputs]
-    pub(crate) values: &'a [f32],
-    pub(crate) outputs: usize,
-    /// Rows that a group serves.
-    pub(crate) each: usize,
-}
-
-impl Biases<'_> {
-    /// Writes those of the rows from the `first` on.
-    fn write(self, first: usize, rows: &mut [f32]) {
-        for (row, to) in rows.chunks_exact_mut(self.outputs).enumerate() {
-            let group = (first + row) / self.each;
-            to.copy_from_slice(&self.values[group * self.outputs..][..self.outputs]);
-        }
-    }
-}
-
 /// A product of `a` [m, k] and `b` [k, n], to be computed into rows of n scalars.
 ///
 /// Operands are rounded to `precision`. Each entry is summed in the order of k, in f32, whatever the number of threads; it is right to
@@ -45,7 +25,7 @@ pub(crate) struct Product<'a> {
     a: Matrix<'a>,
     b: Matrix<'a>,
     threads: Threads,
-    biases: Option<Biases<'a>>,
+    biases: Option<&'a [f32]>,
     after: Option<RowsWork<'a>>,
 }
 
@@ -77,8 +57,19 @@ impl<'a> Product<'a> {
         Self { threads, ..self }
     }
 
-    /// Added to `biases`, which are written in the cache of the core that multiplies.
-    pub(crate) fn added_to(self, biases: Biases<'a>) -> Self {
+    /// Added to `biases` [groups, n], each of which serves an equal share of consecutive rows. They are written in the cache of the core
+    /// that multiplies.
+    ///
+    /// # Panics
+    /// If the rows cannot be shared so.
+    pub(crate) fn added_to(self, biases: &'a [f32]) -> Self {
+        let (rows, cols) = (self.a.rows, self.b.cols);
+        let groups = biases.len() / cols;
+        assert!(
+            biases.len() == groups * cols && rows.is_multiple_of(groups),
+            "{} biases for {rows} rows of {cols}",
+            biases.len()
+        );
         let biases = Some(biases);
         Self { biases, ..self }
     }
@@ -184,7 +175,10 @@ impl<'a> Product<'a> {
             let mode = match self.biases {
                 None => mode,
                 Some(biases) => {
-                    biases.write(first, out);
+                    let each = self.a.rows / (biases.len() / stride);
+                    for (row, to) in (first..).zip(out.chunks_exact_mut(stride)) {
+                        to.copy_from_slice(&biases[row / each * stride..][..stride]);
+                    }
                     Mode::Add
                 }
             };
@@ -368,18 +362,13 @@ mod tests {
         for [m, k, n] in [[3, 2, 5], [100, 77, 64]] {
             let (a, b) = (values(m * k, 7), values(k * n, 11));
             let values: Vec<f32> = (0..m * n).map(|at| (at / n) as f32).collect();
-            let biases = Biases {
-                values: &values,
-                outputs: n,
-                each: 1,
-            };
             let after =
                 |_: usize, rows: &mut [f32]| rows.iter_mut().for_each(|value| *value *= 2.0);
             let product =
                 Product::new(Precision::F32, Matrix::new(&a, m, k), Matrix::new(&b, k, n));
             let (plain, edged) = (
                 product.to_vec(),
-                product.added_to(biases).then(&after).to_vec(),
+                product.added_to(&values).then(&after).to_vec(),
             );
             for (at, (edged, plain)) in edged.iter().zip(&plain).enumerate() {
                 let wanted = 2.0 * (plain + (at / n) as f32);

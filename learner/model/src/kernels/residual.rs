@@ -4,18 +4,17 @@
 //! As three layers, each would hand the other a gradient through candle, which adds every one of them to fresh zeros on a single thread;
 //! so would the parts of a weight that x and what is joined to it have.
 
-use std::sync::OnceLock;
-
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 
 use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
 use crate::kernels::linear::{add_to, group_sums, relu_gradient, relu_in_place};
+use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Biases, Product};
-use crate::kernels::tensors::{floats, values_of};
+use crate::kernels::product::Product;
+use crate::kernels::tensors::{Input, values_of};
 
 /// The parameters of a block on x, or on x with `joined` behind it.
 #[derive(Clone, Debug)]
@@ -81,14 +80,11 @@ pub(crate) fn residual_block(
         hidden,
         outputs,
         precision,
-        saved: OnceLock::new(),
     };
-    let x = x.contiguous()?;
-    match joined {
-        // As an argument a parameter ties the result to the backward pass, whatever x is.
-        None => x.apply_op2(&parameters.hidden_bias, block),
-        Some(joined) => x.apply_op2(&joined.contiguous()?, block),
-    }
+    let shape = [&x.dims()[..x.rank() - 1], &[outputs]].concat();
+    // As an input a parameter ties the result to the backward pass, whatever x is.
+    let second = joined.unwrap_or(&parameters.hidden_bias);
+    apply_to_two(block, [x, second], shape)
 }
 
 struct Block {
@@ -102,12 +98,7 @@ struct Block {
     hidden: usize,
     outputs: usize,
     precision: Precision,
-    /// relu(hidden([x, joined])) [rows, hidden]: what the forward pass leaves to the backward pass.
-    saved: OnceLock<Buffer<f32>>,
 }
-
-/// Gradients of x and of what is joined to it, where they are wanted.
-type Gradients = [Option<Vec<f32>>; 2];
 
 impl Block {
     const fn is_joined(&self) -> bool {
@@ -141,24 +132,48 @@ impl Block {
         biases
     }
 
-    /// [rows, outputs] of `x` and `joined`.
-    fn forward(&self, x: &[f32], joined: Option<&[f32]>) -> Result<Vec<f32>> {
+    /// The gradient of a weight, of which x's columns are the first and those of what is joined the others, added to `sum`.
+    fn of_weight(
+        &self,
+        sum: Option<Vec<f32>>,
+        grad: Matrix<'_>,
+        x: Matrix<'_>,
+        joined: Option<(Matrix<'_>, Matrix<'_>)>,
+    ) -> Vec<f32> {
+        let product = self.product(grad.transposed(), x);
+        let Some((sums, joined)) = joined else {
+            return product.summed(sum);
+        };
+        let inputs = self.features + self.joins;
+        let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols * inputs]);
+        product.add_to_columns(&mut sum, inputs, 0);
+        self.product(sums.transposed(), joined)
+            .add_to_columns(&mut sum, inputs, self.features);
+        sum
+    }
+}
+
+/// Of x, and of what is joined to it or the hidden layer's bias.
+impl Operation<2> for Block {
+    const NAME: &'static str = "residual-block";
+
+    /// relu(hidden([x, joined])) [rows, hidden].
+    type Kept = Buffer<f32>;
+
+    fn forward(&self, [x, joined]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
         let parameters = &self.parameters;
-        let each = self.rows / self.groups;
-        let x = Matrix::new(x, self.rows, self.features);
-        let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
+        let x = Matrix::new(x.floats()?, self.rows, self.features);
+        let joined = joined.floats()?;
+        let joined = self
+            .is_joined()
+            .then(|| Matrix::new(joined, self.groups, self.joins));
 
         let weight = values_of(&parameters.hidden_weight)?;
         let (weight, of_joined) = self.parts(&weight);
         let biases = self.biases(&values_of(&parameters.hidden_bias)?, joined.zip(of_joined));
-        let biases = Biases {
-            values: &biases,
-            outputs: self.hidden,
-            each,
-        };
         let mut hidden = Buffer::new(self.rows * self.hidden);
         self.product(x, weight.transposed())
-            .added_to(biases)
+            .added_to(&biases)
             .then(&|_, rows| relu_in_place(rows))
             .write(&mut hidden, Mode::Replace);
 
@@ -171,34 +186,28 @@ impl Block {
             }
         }
         let biases = self.biases(&bias, joined.zip(of_joined));
-        let biases = Biases {
-            values: &biases,
-            outputs: self.outputs,
-            each,
-        };
-        let mut y = self
-            .product(x, weight.transposed())
-            .added_to(biases)
-            .to_vec();
+        let product = self.product(x, weight.transposed());
+        let mut y = product.added_to(&biases).to_vec();
         let weight = values_of(&parameters.out_weight)?;
         let weight = Matrix::new(&weight, self.outputs, self.hidden);
         let active = Matrix::new(&hidden, self.rows, self.hidden);
         self.product(active, weight.transposed())
             .write(&mut y, Mode::Add);
-        let first = self.saved.set(hidden).is_ok();
-        assert!(first, "an operation passes forward once");
-        Ok(y)
+        Ok((y, hidden))
     }
 
-    /// Gradients of `x` and `joined` for `grad_y`; the parameters' are summed in place.
-    fn backward(&self, x: &Tensor, joined: Option<&Tensor>, grad_y: &Tensor) -> Result<Gradients> {
-        let grad_y = grad_y.detach().contiguous()?;
-        let grad_values = values_of(&grad_y)?;
-        let grad = Matrix::new(&grad_values, self.rows, self.outputs);
-        let wanted = [Some(x), joined].map(|input| input.is_some_and(Tensor::track_op));
+    /// The parameters' gradients are summed in place.
+    fn backward(
+        &self,
+        [x, joined]: [&Tensor; 2],
+        hidden: &Self::Kept,
+        _y: &Tensor,
+        grad_y: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 2]> {
+        let grad = Matrix::new(grad_y, self.rows, self.outputs);
+        let wanted = [x, joined].map(Tensor::track_op);
         let x = values_of(x)?;
         let x = Matrix::new(&x, self.rows, self.features);
-        let hidden = self.saved.get().expect("a forward pass came before");
         let parameters = &self.parameters;
         let active = Matrix::new(hidden, self.rows, self.hidden);
         let to_out = self.product(grad.transposed(), active);
@@ -223,12 +232,13 @@ impl Block {
         };
         let hidden_sums = of_groups(&grad_hidden, self.hidden);
         let hidden_sums = hidden_sums.as_deref().unwrap_or(&grad_hidden);
-        let out_sums = of_groups(&grad_values, self.outputs);
-        let out_sums = out_sums.as_deref().unwrap_or(&grad_values);
+        let out_sums = of_groups(grad_y, self.outputs);
+        let out_sums = out_sums.as_deref().unwrap_or(grad_y);
 
-        let joined = joined.map(values_of).transpose()?;
-        let joined = joined.as_deref();
-        let joined = joined.map(|joined| Matrix::new(joined, self.groups, self.joins));
+        let joined = values_of(joined)?;
+        let joined = self
+            .is_joined()
+            .then(|| Matrix::new(&joined, self.groups, self.joins));
         let hidden_weight = values_of(&parameters.hidden_weight)?;
         let skip_weight = values_of(&parameters.skip_weight)?;
         let mut gradients = [None, None];
@@ -262,66 +272,5 @@ impl Block {
             sum_in_place(bias, |sum| add_to(sum, out_bias.clone()))?;
         }
         Ok(gradients)
-    }
-
-    /// The gradient of a weight, of which x's columns are the first and those of what is joined the others, added to `sum`.
-    fn of_weight(
-        &self,
-        sum: Option<Vec<f32>>,
-        grad: Matrix<'_>,
-        x: Matrix<'_>,
-        joined: Option<(Matrix<'_>, Matrix<'_>)>,
-    ) -> Vec<f32> {
-        let product = self.product(grad.transposed(), x);
-        let Some((sums, joined)) = joined else {
-            return product.summed(sum);
-        };
-        let inputs = self.features + self.joins;
-        let mut sum = sum.unwrap_or_else(|| vec![0.0; grad.cols * inputs]);
-        product.add_to_columns(&mut sum, inputs, 0);
-        self.product(sums.transposed(), joined)
-            .add_to_columns(&mut sum, inputs, self.features);
-        sum
-    }
-}
-
-/// `values` as a tensor like `input`.
-fn like(values: Option<Vec<f32>>, input: &Tensor) -> Result<Option<Tensor>> {
-    let tensor = values.map(|values| Tensor::from_vec(values, input.shape(), input.device()));
-    tensor.transpose()
-}
-
-/// Of x, and of what is joined to it or the hidden layer's bias.
-impl CustomOp2 for Block {
-    fn name(&self) -> &'static str {
-        "residual-block"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        x_layout: &Layout,
-        joined: &CpuStorage,
-        joined_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let joined = floats(joined, joined_layout)?;
-        let y = self.forward(floats(x, x_layout)?, self.is_joined().then_some(joined))?;
-        let mut dims = x_layout.dims().to_vec();
-        if let Some(last) = dims.last_mut() {
-            *last = self.outputs;
-        }
-        Ok((CpuStorage::F32(y), dims.into()))
-    }
-
-    fn bwd(
-        &self,
-        x: &Tensor,
-        joined: &Tensor,
-        _y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let of_joined = self.is_joined().then_some(joined);
-        let [grad_x, grad_joined] = self.backward(x, of_joined, grad_y)?;
-        Ok((like(grad_x, x)?, like(grad_joined, joined)?))
     }
 }

@@ -1,61 +1,29 @@
 //! A stack of convolutions over one task's images, forward and backward, on slices.
 //! It knows no tensors; `conv` splits the batch and `convolution` computes each layer.
 
-use rayon::prelude::*;
-
 use crate::geometry::ConvShape;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{ConvGradients, Convolution, backward, forward};
+use crate::kernels::convolution::{Convolution, backward, forward};
 use crate::kernels::images::{Images, Pixels};
-use crate::kernels::isa::Simd;
+use crate::kernels::isa::{Element, Simd};
+use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
 
-/// The maps of all layers but the last, one layer after the other: what forward leaves to backward.
-pub(crate) type SavedActivations<E> = Buffer<E>;
-
-/// Scalars of all layers' parameters.
-pub(crate) fn parameters_len(shapes: &[ConvShape]) -> usize {
-    shapes.iter().map(ConvShape::parameters_len).sum()
-}
+/// The maps of each layer but the last: what forward leaves to backward.
+pub(crate) type SavedActivations<E> = Vec<Buffer<E>>;
 
 /// The layers of `parameters`: for each its weight [out, in, k, k], then its bias [out]. `images` says whether the images of the
 /// first will need a gradient; all other layers' do in a backward pass, for which `backward` stands.
 pub(crate) fn layers<S: Simd>(
     simd: S,
     shapes: &[ConvShape],
-    mut parameters: &[f32],
+    parameters: &[f32],
     backward: bool,
     images: bool,
 ) -> Vec<Convolution<S::Element>> {
-    let mut of_layers = Vec::with_capacity(shapes.len());
-    for shape in shapes {
-        let (own, rest) = parameters.split_at(shape.parameters_len());
-        of_layers.push((shape, own));
-        parameters = rest;
-    }
-    // On the pool, which all wait for.
-    let layers = of_layers.into_par_iter().enumerate();
-    let layers = layers.map(|(index, (&shape, own))| {
-        let (weight, bias) = own.split_at(shape.weight_len());
+    prepared(shapes, parameters, |index, shape, [weight, bias]| {
         let backward = backward && (index > 0 || images);
         Convolution::new(simd, shape, weight, bias, backward)
-    });
-    layers.with_max_len(1).collect()
-}
-
-/// Gradients as `stack_backward` sums them, with the weights back as [out, in, k, k].
-pub(crate) fn unpacked(shapes: &[ConvShape], sums: &[f32]) -> Vec<f32> {
-    let mut result = vec![0.0; sums.len()];
-    let (mut sums, mut free) = (sums, &mut result[..]);
-    for shape in shapes {
-        let (own, rest) = sums.split_at(shape.parameters_len());
-        let (to, free_rest) = std::mem::take(&mut free).split_at_mut(own.len());
-        let (packed, bias) = own.split_at(shape.weight_len());
-        let (weight, bias_to) = to.split_at_mut(shape.weight_len());
-        shape.unpack_weight(packed, weight);
-        bias_to.copy_from_slice(bias);
-        (sums, free) = (rest, free_rest);
-    }
-    result
+    })
 }
 
 /// Runs `images` through the layers into `maps`, the last layer's output.
@@ -69,18 +37,19 @@ pub(crate) fn stack_forward<S: Simd>(
         unreachable!("a stack has at least one layer")
     };
     let count = maps.len() / last.shape.map_len();
-    let saved_len = inner.iter().map(|layer| count * layer.shape.map_len());
-    let mut saved = Buffer::new(saved_len.sum());
-    let mut input = Images::Pixels(images);
-    let mut free = &mut saved[..];
+    let mut saved = SavedActivations::with_capacity(inner.len());
     for layer in inner {
-        let len = count * layer.shape.map_len();
-        let (output, rest) = std::mem::take(&mut free).split_at_mut(len);
-        forward(simd, layer, input, output);
-        (input, free) = (Images::Maps(output), rest);
+        let mut output = Buffer::new(count * layer.shape.map_len());
+        forward(simd, layer, input_of(images, saved.last()), &mut output);
+        saved.push(output);
     }
-    forward(simd, last, input, maps);
+    forward(simd, last, input_of(images, saved.last()), maps);
     saved
+}
+
+/// What a layer takes: the maps of the one before it, or the images.
+fn input_of<'a, E: Element>(images: Pixels<'a>, before: Option<&'a Buffer<E>>) -> Images<'a, E> {
+    before.map_or(Images::Pixels(images), |maps| Images::Maps(maps))
 }
 
 /// Gradients for `grad_maps`, the gradient of the last layer's output `maps`; `saved` is from `stack_forward`.
@@ -91,46 +60,35 @@ pub(crate) fn stack_backward<S: Simd>(
     simd: S,
     layers: &[Convolution<S::Element>],
     images: Pixels<'_>,
-    saved: &SavedActivations<S::Element>,
+    saved: &[Buffer<S::Element>],
     maps: &[f32],
     grad_maps: &[f32],
     mut grad_images: Option<&mut [f32]>,
 ) -> Buffer<f32> {
-    let lens = layers.iter().map(|layer| layer.shape.parameters_len());
-    let mut sums = Buffer::new(lens.sum());
-    let Some((first, rest)) = layers.split_first() else {
-        return sums;
-    };
-    let count = grad_maps.len() / layers[layers.len() - 1].shape.map_len();
-    let (mut sums_left, mut saved) = (&mut sums[..], &saved[..]);
-    // The output of the layer at hand, and its gradient; the last layer's are f32 and not ours.
-    let mut output: Option<&[S::Element]> = None;
+    let shapes: Vec<_> = layers.iter().map(|layer| layer.shape).collect();
+    let mut sums = Buffer::new(parameters_len(&shapes));
+    // Of the layer at hand; the last layer's is not ours.
     let mut grad_output: Option<Buffer<f32>> = None;
-    for layer in rest.iter().rev() {
-        let shape = &layer.shape;
-        let input_len = count * shape.image_len();
-        let (earlier, input) = saved.split_at(saved.len() - input_len);
-        saved = earlier;
-        let mut grad_input = Buffer::zeros(input_len);
-        let grads = ConvGradients::cut(&mut sums_left, shape, Some(&mut grad_input));
-        let images = Images::Maps(input);
-        match (output, &grad_output) {
-            (Some(output), Some(grad)) => backward(simd, layer, images, output, grad, grads),
-            _ => backward(simd, layer, images, maps, grad_maps, grads),
+    let parameters = layers.iter().zip(cut_mut(&shapes, &mut sums));
+    for (index, (layer, sums)) in parameters.enumerate().rev() {
+        let before = index.checked_sub(1).map(|before| &saved[before]);
+        let input = input_of(images, before);
+        let mut grad_input = before.map(|maps| Buffer::<f32>::zeros(maps.len()));
+        let to = match &mut grad_input {
+            Some(grad) => Some(&mut grad[..]),
+            None => grad_images.take(),
+        };
+        match (saved.get(index), &grad_output) {
+            (Some(output), Some(grad)) => backward(simd, layer, input, output, grad, sums, to),
+            // Its output is f32.
+            _ => backward(simd, layer, input, maps, grad_maps, sums, to),
         }
-        output = Some(input);
-        grad_output = Some(grad_input);
-    }
-    let images = Images::Pixels(images);
-    let scale = images.scale();
-    let grads = ConvGradients::cut(&mut sums_left, &first.shape, grad_images.take());
-    match (output, &grad_output) {
-        (Some(output), Some(grad)) => backward(simd, first, images, output, grad, grads),
-        _ => backward(simd, first, images, maps, grad_maps, grads),
+        grad_output = grad_input;
     }
     // Products with bytes that are scaled after them.
+    let scale = Images::<S::Element>::Pixels(images).scale();
     if scale != 1.0 {
-        for sum in &mut sums[..first.shape.weight_len()] {
+        for sum in &mut sums[..shapes[0].weight_len()] {
             *sum *= scale;
         }
     }

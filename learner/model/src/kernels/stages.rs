@@ -1,22 +1,19 @@
 //! The stages of an IMPALA torso over one task's images, forward and backward, on slices: a convolution, a max pool, and two residual
 //! blocks x + conv(relu(conv(relu(x)))) each. It knows no tensors; `impala` splits the batch and `bordered` computes each convolution.
 
-use rayon::prelude::*;
-
-use crate::geometry::{STAGE_CONVOLUTIONS, pooled, stages};
-use crate::kernels::bordered::{BorderedConvolution, Inside};
+use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, pooled};
+use crate::kernels::bordered::{BorderedConvolution, Inside, store_active};
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{ConvGradients, finish_row};
+use crate::kernels::convolution::{finish_row, pass_active};
 use crate::kernels::isa::{Element, Simd, vectorized};
-use crate::kernels::linear::{relu_gradient, relu_of};
+use crate::kernels::linear::relu_gradient;
 use crate::kernels::pool::{pool, unpool};
-use crate::kernels::stack::parameters_len;
+use crate::kernels::tasks::{cut_mut, parameters_len, prepared};
 
 /// Every stage with its parameters as the kernels want them.
 pub(crate) struct Stages<S: Simd> {
     simd: S,
     convolutions: Vec<BorderedConvolution<S::Element>>,
-    output: (usize, usize, usize),
 }
 
 /// What the forward pass of some images leaves to the backward pass.
@@ -29,32 +26,13 @@ pub(crate) struct Saved<E: Element> {
 }
 
 impl<S: Simd> Stages<S> {
-    /// Stages of these widths on images of (height, width, channels); `parameters` has for each convolution its weight [out, in, 3, 3],
-    /// then its bias [out]. `backward` says whether there will be a backward pass.
-    pub(crate) fn new(
-        simd: S,
-        input: (usize, usize, usize),
-        widths: &[usize],
-        mut parameters: &[f32],
-        backward: bool,
-    ) -> Self {
-        let (shapes, output) = stages(input, widths);
-        let mut each = Vec::with_capacity(shapes.len());
-        for shape in shapes {
-            let (own, rest) = parameters.split_at(shape.parameters_len());
-            each.push((shape, own.split_at(shape.weight_len())));
-            parameters = rest;
-        }
-        // On the pool, which all wait for.
-        let each = each.into_par_iter().enumerate().with_max_len(1);
-        let convolutions = each.map(|(index, (shape, (weight, bias)))| {
+    /// Stages of convolutions of these sizes; `parameters` has for each its weight [out, in, 3, 3], then its bias [out]. `backward` says
+    /// whether there will be a backward pass.
+    pub(crate) fn new(simd: S, shapes: &[ConvShape], parameters: &[f32], backward: bool) -> Self {
+        let convolutions = prepared(shapes, parameters, |index, shape, [weight, bias]| {
             BorderedConvolution::new(simd, shape, weight, bias, backward && index > 0)
         });
-        Self {
-            simd,
-            convolutions: convolutions.collect(),
-            output,
-        }
+        Self { simd, convolutions }
     }
 
     pub(crate) fn image_len(&self) -> usize {
@@ -62,13 +40,11 @@ impl<S: Simd> Stages<S> {
         (first.height - 2) * (first.width - 2) * first.channels_in
     }
 
-    /// Height, width and channels of f3.
-    pub(crate) const fn output(&self) -> (usize, usize, usize) {
-        self.output
-    }
-
-    pub(crate) const fn output_len(&self) -> usize {
-        self.output.0 * self.output.1 * self.output.2
+    /// Scalars of an image's f3.
+    pub(crate) fn output_len(&self) -> usize {
+        self.convolutions[self.convolutions.len() - 1]
+            .shape()
+            .map_len()
     }
 
     /// Memory for what the forward pass of so many images leaves.
@@ -145,7 +121,7 @@ impl<S: Simd> Stages<S> {
                 });
             }
         }
-        activate(simd, &x, f3);
+        store_active(simd, &x, f3);
     }
 
     /// The gradients of all parameters for `grad_f3`, where `saved` and `f3` are from the forward pass of `images`: for each
@@ -168,7 +144,7 @@ impl<S: Simd> Stages<S> {
             .for_each(|(((image, inputs), taken), (f3, grad_f3))| {
                 let mut grad = Buffer::new(len);
                 pass_active(self.simd, f3, grad_f3, &mut grad);
-                self.backward_one(image, inputs, taken, grad, &mut sums);
+                self.backward_one(image, inputs, taken, grad, cut_mut(&shapes, &mut sums));
             });
         // Products with bytes that are scaled after them.
         for sum in &mut sums[..shapes[0].weight_len()] {
@@ -177,20 +153,20 @@ impl<S: Simd> Stages<S> {
         sums
     }
 
-    /// Adds one image's part to `sums`; `grad` is the gradient of the last stage's output.
+    /// Adds one image's part to the `sums` of each convolution; `grad` is the gradient of the last stage's output.
     fn backward_one(
         &self,
         image: &[u8],
         mut inputs: &[S::Element],
         mut taken: &[u8],
         mut grad: Buffer<f32>,
-        mut sums: &mut [f32],
+        mut sums: Vec<[&mut [f32]; 2]>,
     ) {
         let simd = self.simd;
         let mut own_sums =
             |convolution: &BorderedConvolution<S::Element>, input: &[S::Element], grad: &[f32]| {
-                let own = ConvGradients::cut(&mut sums, convolution.shape(), None);
-                convolution.parameter_gradients(simd, input, grad, own.packed, own.bias);
+                let own = sums.pop().expect("each convolution has sums");
+                convolution.parameter_gradients(simd, input, grad, own);
             };
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate().rev() {
@@ -267,23 +243,6 @@ vectorized! {
     fn add_residual<S>(simd, row: &'a [f32], bias: &'a [f32], to: &'a mut [f32]) {
         for ((to, &value), &bias) in to.iter_mut().zip(row).zip(bias) {
             *to += value + bias;
-        }
-    }
-}
-
-vectorized! {
-    fn activate<S>(simd, x: &'a [f32], to: &'a mut [f32]) {
-        for (to, &x) in to.iter_mut().zip(x) {
-            *to = relu_of(x);
-        }
-    }
-}
-
-vectorized! {
-    /// The gradients before a ReLU that gave `active`.
-    fn pass_active<S, M>(simd, active: &'a [M], grads: &'a [f32], to: &'a mut [f32]) {
-        for ((to, &active), &grad) in to.iter_mut().zip(active).zip(grads) {
-            *to = relu_gradient(active.value(), grad);
         }
     }
 }

@@ -4,9 +4,36 @@ use std::ops::{Deref, Range};
 
 use candle_core::{CpuStorage, Layout, Result, Storage, StorageRef, Tensor, bail};
 
+use crate::kernels::images::Pixels;
+
 /// The scalars of a contiguous f32 storage.
 pub fn floats<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
     Ok(&storage.as_slice::<f32>()?[range(layout)?])
+}
+
+/// What an operation is given.
+#[derive(Clone, Copy)]
+pub(crate) struct Input<'a> {
+    storage: &'a CpuStorage,
+    layout: &'a Layout,
+}
+
+impl<'a> Input<'a> {
+    pub(crate) const fn new(storage: &'a CpuStorage, layout: &'a Layout) -> Self {
+        Self { storage, layout }
+    }
+
+    pub(crate) fn floats(self) -> Result<&'a [f32]> {
+        floats(self.storage, self.layout)
+    }
+
+    /// Contiguous images of u8 or f32.
+    pub(crate) fn pixels(self) -> Result<Pixels<'a>> {
+        match self.storage {
+            CpuStorage::U8(bytes) => Ok(Pixels::Bytes(&bytes[range(self.layout)?])),
+            _ => self.floats().map(Pixels::Floats),
+        }
+    }
 }
 
 /// The storage, which must be on the CPU.

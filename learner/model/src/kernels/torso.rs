@@ -4,20 +4,20 @@
 //! Where nothing but that layer reads the maps they are no tensor: candle would add their gradient to fresh zeros on a single thread,
 //! and they are turned into the order of the layer's weight in the cache of the core that made them.
 
-use std::sync::OnceLock;
-
-use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use candle_core::{Result, Tensor, bail};
 
 use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::candle::ConvLayerTensors;
-use crate::kernels::conv::{ConvStack, GradLayout, pixels, stack_of};
-use crate::kernels::isa::{AnySimd, Mode, Simd, with_simd};
-use crate::kernels::linear::{add_to, group_sums};
+use crate::kernels::conv::{ConvStack, stack_of};
+use crate::kernels::isa::{AnySimd, Element, Mode, Simd, with_simd};
+use crate::kernels::linear::{add_to, group_sums, transpose_each};
+use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
-use crate::kernels::product::{Biases, Product};
-use crate::kernels::tensors::{cpu, floats, values_of};
+use crate::kernels::product::Product;
+use crate::kernels::stack::{SavedActivations, stack_backward, stack_forward};
+use crate::kernels::tensors::{Input, cpu, values_of};
 
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack), to the last bit: [B, outputs] of
 /// `images` [B, H, W, C] u8.
@@ -31,35 +31,27 @@ pub(crate) fn torso(
     bias: &Tensor,
     precision: Precision,
 ) -> Result<Tensor> {
-    let outputs = weight.dims2()?.0;
     let (shapes, parameters) = stack_of(images, layers)?;
-    let images = images.contiguous()?;
+    let (count, outputs) = (images.dim(0)?, weight.dims2()?.0);
+    let inputs = shapes[shapes.len() - 1].map_len();
+    if weight.dims() != [outputs, inputs] || bias.dims() != [outputs] {
+        bail!(
+            "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
+            weight.shape(),
+            bias.shape()
+        );
+    }
     with_simd!(AnySimd::of(precision), simd => {
-        let stack = ConvStack::new(simd, shapes);
-        let inputs = stack.last().map_len();
-        if weight.dims() != [outputs, inputs] || bias.dims() != [outputs] {
-            bail!(
-                "linear layer of {inputs} inputs with weight {:?} and bias {:?}",
-                weight.shape(),
-                bias.shape()
-            );
-        }
         let torso = Torso {
-            stack,
+            stack: ConvStack { simd, shapes, count },
             weight: weight.clone(),
             bias: bias.clone(),
+            inputs,
             outputs,
             precision,
-            kept: OnceLock::new(),
         };
-        images.apply_op2(&parameters, torso)
+        apply_to_two(torso, [images, &parameters], (count, outputs))
     })
-}
-
-/// What the forward pass leaves to the backward pass: the maps, and the same flattened.
-struct Kept {
-    maps: Buffer<f32>,
-    flat: Buffer<f32>,
 }
 
 struct Torso<S: Simd> {
@@ -67,84 +59,74 @@ struct Torso<S: Simd> {
     /// Of the fully connected layer.
     weight: Tensor,
     bias: Tensor,
+    inputs: usize,
     outputs: usize,
     precision: Precision,
-    kept: OnceLock<Kept>,
 }
 
-impl<S: Simd> CustomOp2 for Torso<S> {
-    fn name(&self) -> &'static str {
-        "torso"
-    }
+/// What the forward pass leaves to the backward pass.
+struct Kept<E: Element> {
+    /// Of each task, the maps of all layers but the last, and those of the last.
+    tasks: Vec<(SavedActivations<E>, Buffer<f32>)>,
+    /// The last layer's maps, flattened.
+    flat: Buffer<f32>,
+}
 
-    fn cpu_fwd(
-        &self,
-        images: &CpuStorage,
-        images_layout: &Layout,
-        parameters: &CpuStorage,
-        parameters_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let stack = &self.stack;
-        let images = pixels(images, images_layout)?;
-        let (count, inputs) = (stack.count(images), stack.last().map_len());
-        let (mut maps, mut flat) = (Buffer::new(count * inputs), Buffer::new(count * inputs));
-        let parameters = floats(parameters, parameters_layout)?;
-        stack.forward(images, parameters, &mut maps, &mut flat, &|maps, flat| {
-            stack.flatten(maps, flat);
+impl<S: Simd> Operation<2> for Torso<S> {
+    const NAME: &'static str = "torso";
+
+    type Kept = Kept<S::Element>;
+
+    fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
+        let (stack, images) = (&self.stack, images.pixels()?);
+        let layers = stack.layers(parameters.floats()?, false, false);
+        let last = stack.last();
+        let mut flat = Buffer::new(stack.count * self.inputs);
+        let tasks = stack.tasks().forward(&mut flat, |task, flat| {
+            let mut maps = Buffer::new(flat.len());
+            let saved = stack_forward(stack.simd, &layers, images.slice(task), &mut maps);
+            transpose_each(&maps, last.locations(), last.channels_out, flat);
+            (saved, maps)
         });
 
         let (weight, bias) = (values_of(&self.weight)?, values_of(&self.bias)?);
-        let biases = Biases {
-            values: &bias,
-            outputs: self.outputs,
-            each: count,
-        };
-        let weight = Matrix::new(&weight, self.outputs, inputs);
-        let x = Matrix::new(&flat, count, inputs);
-        let y = Product::new(self.precision, x, weight.transposed())
-            .added_to(biases)
-            .to_vec();
-        let first = self.kept.set(Kept { maps, flat }).is_ok();
-        assert!(first, "an operation passes forward once");
-        Ok((CpuStorage::F32(y), (count, self.outputs).into()))
+        let weight = Matrix::new(&weight, self.outputs, self.inputs);
+        let x = Matrix::new(&flat, stack.count, self.inputs);
+        let product = Product::new(self.precision, x, weight.transposed());
+        let y = product.added_to(&bias).to_vec();
+        Ok((y, Kept { tasks, flat }))
     }
 
-    fn bwd(
+    fn backward(
         &self,
-        images: &Tensor,
-        parameters: &Tensor,
+        [images, parameters]: [&Tensor; 2],
+        kept: &Self::Kept,
         _y: &Tensor,
-        grad_y: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        grad_y: &[f32],
+    ) -> Result<[Option<Vec<f32>>; 2]> {
         let stack = &self.stack;
-        let grad_y = grad_y.detach().contiguous()?;
-        let grad_values = values_of(&grad_y)?;
-        let (count, inputs) = (grad_y.dims2()?.0, stack.last().map_len());
-        let grad = Matrix::new(&grad_values, count, self.outputs);
-        let Kept { maps, flat } = self.kept.get().expect("a forward pass came before");
-        let to_weight = Product::new(
-            self.precision,
-            grad.transposed(),
-            Matrix::new(flat, count, inputs),
-        );
+        let grad = Matrix::new(grad_y, stack.count, self.outputs);
+        let x = Matrix::new(&kept.flat, stack.count, self.inputs);
+        let to_weight = Product::new(self.precision, grad.transposed(), x);
         sum_in_place(&self.weight, |sum| to_weight.summed(sum))?;
-        let to_bias = group_sums(&grad_values, 1, self.outputs);
+        let to_bias = group_sums(grad_y, 1, self.outputs);
         sum_in_place(&self.bias, |sum| add_to(sum, to_bias))?;
 
         let weight = values_of(&self.weight)?;
-        let weight = Matrix::new(&weight, self.outputs, inputs);
-        let mut grad_flat = Buffer::new(count * inputs);
+        let weight = Matrix::new(&weight, self.outputs, self.inputs);
+        let mut grad_flat = Buffer::new(stack.count * self.inputs);
         Product::new(self.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
-        let (images, images_layout) = images.storage_and_layout();
-        let gradient = stack.backward(
-            pixels(cpu(&images)?, images_layout)?,
-            &values_of(parameters)?,
-            maps,
-            &grad_flat,
-            GradLayout::Flat,
-            &mut [],
-        );
-        let gradient = Tensor::from_vec(gradient, parameters.shape(), parameters.device())?;
-        Ok((None, Some(gradient)))
+        let (storage, layout) = images.storage_and_layout();
+        let images = Input::new(cpu(&storage)?, layout).pixels()?;
+        let layers = stack.layers(&values_of(parameters)?, true, false);
+        let (tasks, last) = (stack.tasks(), stack.last());
+        let gradient = tasks.backward(&stack.shapes, &kept.tasks, &mut [], |task, kept, _| {
+            let ((saved, maps), flat) = (kept, &grad_flat[task.maps]);
+            let mut grad_maps = Buffer::new(flat.len());
+            transpose_each(flat, last.channels_out, last.locations(), &mut grad_maps);
+            let images = images.slice(task.images);
+            stack_backward(stack.simd, &layers, images, saved, maps, &grad_maps, None)
+        });
+        Ok([None, Some(gradient)])
     }
 }

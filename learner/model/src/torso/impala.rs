@@ -97,8 +97,8 @@ impl Torso for Impala {
         let layers = layers.map(|it| [it.weight, it.bias].concat());
         let parameters = layers.collect::<Vec<_>>().concat();
         with_simd!(AnySimd::of(precision), simd => {
-            let stages = Stages::new(simd, self.input, &self.widths, &parameters, false);
-            let channels = stages.output().2;
+            let (shapes, (_, _, channels)) = stages(self.input, &self.widths);
+            let stages = Stages::new(simd, &shapes, &parameters, false);
             Box::new(ActingStages {
                 simd,
                 fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),

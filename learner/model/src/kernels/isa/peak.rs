@@ -22,7 +22,6 @@ pub fn multiply_in_first_cache(precision: Precision, times: usize) -> f64 {
 
 fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
     let rows = S::rows_max(1);
-    let depth = S::Element::DEPTH;
     let threads = rayon::current_num_threads();
     (0..threads).into_par_iter().with_max_len(1).for_each(|_| {
         let ones = |len| {
@@ -33,15 +32,7 @@ fn multiply<S: Simd>(simd: S, times: usize) -> f64 {
         let (left, panel) = (ones(rows * DEPTH), ones(DEPTH * LANES));
         let mut out = Buffer::zeros(rows * LANES);
         for _ in 0..times {
-            let left = Left {
-                values: &left,
-                start: 0,
-                row_stride: DEPTH,
-                step: depth,
-                steps: DEPTH / depth,
-                run_stride: 0,
-                runs: 1,
-            };
+            let left = Left::rows(&left, DEPTH);
             let columns = Columns {
                 out: &mut out,
                 stride: LANES,

@@ -25,7 +25,20 @@ pub(crate) struct Left<'a, E> {
     pub(crate) runs: usize,
 }
 
-impl<E: Element> Left<'_, E> {
+impl<'a, E: Element> Left<'a, E> {
+    /// Rows of a matrix, so many scalars apart, which are whole steps.
+    pub(crate) const fn rows(values: &'a [E], row_stride: usize) -> Self {
+        Self {
+            values,
+            start: 0,
+            row_stride,
+            step: E::DEPTH,
+            steps: row_stride / E::DEPTH,
+            run_stride: 0,
+            runs: 1,
+        }
+    }
+
     /// Whether so many rows lie inside the values.
     fn holds(&self, rows: usize) -> bool {
         let last = self.start

@@ -1,0 +1,150 @@
+//! What an operation of this project is, and how it becomes one of candle's: scalars in, scalars out, on the CPU.
+//! It computes nothing.
+
+use std::sync::OnceLock;
+
+use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor};
+
+use crate::kernels::tensors::{Input, values_of};
+
+/// An operation with gradients on `N` tensors, for one pass forward and then backward.
+pub(crate) trait Operation<const N: usize>: Send + Sync + 'static {
+    const NAME: &'static str;
+
+    /// What the forward pass leaves to the backward pass.
+    type Kept: Send + Sync;
+
+    fn forward(&self, inputs: [Input<'_>; N]) -> Result<(Vec<f32>, Self::Kept)>;
+
+    /// The gradients of those inputs that want one, for the gradient `grad_y` of the result `y`.
+    fn backward(
+        &self,
+        inputs: [&Tensor; N],
+        kept: &Self::Kept,
+        y: &Tensor,
+        grad_y: &[f32],
+    ) -> Result<[Option<Vec<f32>>; N]>;
+}
+
+/// The result of `operation`, which has this shape.
+pub(crate) fn apply_to_two<O: Operation<2>>(
+    operation: O,
+    [a, b]: [&Tensor; 2],
+    shape: impl Into<Shape>,
+) -> Result<Tensor> {
+    let pass = Pass::<O, 2>::new(operation, shape);
+    a.contiguous()?.apply_op2(&b.contiguous()?, pass)
+}
+
+/// As [`apply_to_two`].
+pub(crate) fn apply_to_three<O: Operation<3>>(
+    operation: O,
+    [a, b, c]: [&Tensor; 3],
+    shape: impl Into<Shape>,
+) -> Result<Tensor> {
+    let pass = Pass::<O, 3>::new(operation, shape);
+    a.contiguous()?
+        .apply_op3(&b.contiguous()?, &c.contiguous()?, pass)
+}
+
+struct Pass<O: Operation<N>, const N: usize> {
+    operation: O,
+    shape: Shape,
+    kept: OnceLock<O::Kept>,
+}
+
+impl<O: Operation<N>, const N: usize> Pass<O, N> {
+    fn new(operation: O, shape: impl Into<Shape>) -> Self {
+        Self {
+            operation,
+            shape: shape.into(),
+            kept: OnceLock::new(),
+        }
+    }
+
+    fn forward(&self, inputs: [Input<'_>; N]) -> Result<(CpuStorage, Shape)> {
+        let (y, kept) = self.operation.forward(inputs)?;
+        let first = self.kept.set(kept).is_ok();
+        assert!(first, "an operation passes forward once");
+        Ok((CpuStorage::F32(y), self.shape.clone()))
+    }
+
+    fn backward(
+        &self,
+        inputs: [&Tensor; N],
+        y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<[Option<Tensor>; N]> {
+        let grad_y = grad_y.detach().contiguous()?;
+        let grad_values = values_of(&grad_y)?;
+        let kept = self.kept.get().expect("a forward pass came before");
+        let gradients = self.operation.backward(inputs, kept, y, &grad_values)?;
+        let mut tensors: [Option<Tensor>; N] = [const { None }; N];
+        for ((tensor, gradient), input) in tensors.iter_mut().zip(gradients).zip(inputs) {
+            if let Some(gradient) = gradient {
+                let gradient = Tensor::from_vec(gradient, input.shape(), input.device())?;
+                *tensor = Some(gradient);
+            }
+        }
+        Ok(tensors)
+    }
+}
+
+impl<O: Operation<2>> CustomOp2 for Pass<O, 2> {
+    fn name(&self) -> &'static str {
+        O::NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        a: &CpuStorage,
+        a_layout: &Layout,
+        b: &CpuStorage,
+        b_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        self.forward([Input::new(a, a_layout), Input::new(b, b_layout)])
+    }
+
+    fn bwd(
+        &self,
+        a: &Tensor,
+        b: &Tensor,
+        y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        Ok(self.backward([a, b], y, grad_y)?.into())
+    }
+}
+
+impl<O: Operation<3>> CustomOp3 for Pass<O, 3> {
+    fn name(&self) -> &'static str {
+        O::NAME
+    }
+
+    fn cpu_fwd(
+        &self,
+        a: &CpuStorage,
+        a_layout: &Layout,
+        b: &CpuStorage,
+        b_layout: &Layout,
+        c: &CpuStorage,
+        c_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        self.forward([
+            Input::new(a, a_layout),
+            Input::new(b, b_layout),
+            Input::new(c, c_layout),
+        ])
+    }
+
+    fn bwd(
+        &self,
+        a: &Tensor,
+        b: &Tensor,
+        c: &Tensor,
+        y: &Tensor,
+        grad_y: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        Ok(self.backward([a, b, c], y, grad_y)?.into())
+    }
+}
