@@ -25,6 +25,7 @@ pub(crate) mod panels;
 pub(crate) mod pool;
 pub(crate) mod precision;
 pub(crate) mod product;
+mod reference;
 pub(crate) mod residual;
 pub(crate) mod rounding;
 pub(crate) mod stack;

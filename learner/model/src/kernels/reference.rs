@@ -1,0 +1,162 @@
+//! Convolutions of a task on every instruction set against candle's operations and derivatives in f64: tests of `stack` and `stages`.
+//! One layer against another library's is tested in `tests/model`.
+#![cfg(test)]
+
+use candle_core::{DType, Device, Result, Tensor, Var};
+
+use crate::geometry::{ConvLayer, ConvShape, stages};
+use crate::kernels::candle;
+use crate::kernels::images::Pixels;
+use crate::kernels::isa::{AnySimd, Simd, with_simd};
+use crate::kernels::precision::Precision;
+use crate::kernels::stack::{layers, stack_backward, stack_forward};
+use crate::kernels::stages::Stages;
+use crate::kernels::tasks::{cut, parameters_len, unpacked};
+
+/// Images of a task.
+const COUNT: usize = 3;
+
+/// The 2-norm of the difference, as a share of that of `wanted`.
+pub(crate) fn apart<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
+    assert_eq!(found.len(), wanted.len());
+    let (mut error, mut size) = (0f64, 0f64);
+    for (&found, &wanted) in found.iter().zip(wanted) {
+        let wanted: f64 = wanted.into();
+        error += (f64::from(found) - wanted).powi(2);
+        size += wanted.powi(2);
+    }
+    assert!(size > 0.0);
+    (error / size).sqrt()
+}
+
+fn values(len: usize, by: usize, scale: f32) -> Vec<f32> {
+    let value = |at: usize| ((at * by) as f64).sin() as f32 * scale;
+    (0..len).map(value).collect()
+}
+
+struct Case<'a> {
+    /// Whether the convolutions are those of residual stages.
+    is_residual: bool,
+    shapes: &'a [ConvShape],
+    images: Pixels<'a>,
+}
+
+impl Case<'_> {
+    fn parameters(&self) -> Vec<f32> {
+        let scale = if self.is_residual { 0.33 } else { 0.16 };
+        values(parameters_len(self.shapes), 383, scale)
+    }
+
+    fn grad_maps(&self) -> Vec<f32> {
+        let last = &self.shapes[self.shapes.len() - 1];
+        values(COUNT * last.map_len(), 571, 1.0)
+    }
+
+    /// Maps, and the gradients of parameters and, of plain convolutions, of images.
+    fn on<S: Simd>(&self, simd: S) -> Vec<Vec<f32>> {
+        let (shapes, parameters, grad_maps) = (self.shapes, self.parameters(), self.grad_maps());
+        let mut maps = vec![f32::NAN; grad_maps.len()];
+        if let (true, Pixels::Bytes(images)) = (self.is_residual, self.images) {
+            let stages = Stages::new(simd, shapes, &parameters, true);
+            let mut saved = stages.saved(COUNT);
+            stages.forward(images, &mut saved, &mut maps);
+            let sums = stages.backward(images, &saved, &maps, &grad_maps);
+            return vec![maps, unpacked(shapes, &sums)];
+        }
+        let (layers, images) = (layers(simd, shapes, &parameters, true, true), self.images);
+        let saved = stack_forward(simd, &layers, images, &mut maps);
+        let mut grad_images = vec![0.0; images.len()];
+        let to = Some(&mut grad_images[..]);
+        let sums = stack_backward(simd, &layers, images, &saved, &maps, &grad_maps, to);
+        vec![maps, unpacked(shapes, &sums), grad_images]
+    }
+
+    /// The same by candle, images too.
+    fn reference(&self) -> Result<Vec<Vec<f64>>> {
+        let images: Vec<f64> = match self.images {
+            Pixels::Bytes(bytes) => bytes.iter().map(|&it| f64::from(it) / 255.0).collect(),
+            Pixels::Floats(floats) => floats.iter().map(|&it| it.into()).collect(),
+        };
+        let (first, border) = (&self.shapes[0], if self.is_residual { 2 } else { 0 });
+        let (height, width) = (first.height - border, first.width - border);
+        let size = (COUNT, height, width, first.channels_in);
+        let images = Var::from_vec(images, size, &Device::Cpu)?;
+        let (mut vars, parameters) = (Vec::new(), self.parameters());
+        for (shape, [weight, bias]) in self.shapes.iter().zip(cut(self.shapes, &parameters)) {
+            let (out, inputs, side) = (shape.channels_out, shape.channels_in, shape.kernel);
+            for (part, size) in [(weight, &[out, inputs, side, side][..]), (bias, &[out])] {
+                let part: Vec<f64> = part.iter().map(|&it| it.into()).collect();
+                vars.push(Var::from_vec(part, size, &Device::Cpu)?);
+            }
+        }
+        let layers = self.shapes.iter().zip(vars.chunks(2));
+        let layers = layers.map(|(shape, it)| (it[0].as_tensor(), it[1].as_tensor(), shape.stride));
+        let maps = if self.is_residual {
+            let layers = layers.map(|(weight, bias, _)| (weight, bias));
+            candle::residual_stages(&images, &layers.collect::<Vec<_>>())?
+        } else {
+            candle::conv_stack(&images, &layers.collect::<Vec<_>>())?
+        };
+        let slope = Tensor::from_vec(self.grad_maps(), maps.dims(), &Device::Cpu)?;
+        let loss = (&maps * slope.to_dtype(DType::F64)?)?.sum_all()?;
+        let gradients = loss.backward()?;
+        let values = |of: &Tensor| of.flatten_all()?.to_vec1::<f64>();
+        let mut of_parameters = Vec::new();
+        for var in &vars {
+            of_parameters.extend(values(gradients.get(var).unwrap())?);
+        }
+        let of_images = values(gradients.get(&images).unwrap())?;
+        Ok(vec![values(&maps)?, of_parameters, of_images])
+    }
+}
+
+#[test]
+fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
+    // Sizes that fill no register: odd runs, odd numbers of windows, channels beyond a panel.
+    let mut input = (17, 23, 3);
+    let plain = [(5, 3, 2), (70, 4, 1), (9, 2, 1)].map(|(out, kernel, stride)| {
+        let shape = ConvShape::new(input, ConvLayer::new(out, kernel, stride)).unwrap();
+        input = shape.output();
+        shape
+    });
+    // Odd runs, and channels beyond a register; maps of 5 x 7 and 3 x 4.
+    let (residual, _) = stages((9, 14, 3), &[5, 18]);
+    let bytes = |len: usize| -> Vec<u8> { (0..len).map(|at| (at * 31 % 253) as u8).collect() };
+    let (large, mut small) = (bytes(COUNT * 17 * 23 * 3), bytes(COUNT * 9 * 14 * 3));
+    // The last image is flat: most windows of the pools have nine equal values.
+    small[(COUNT - 1) * 9 * 14 * 3..].fill(77);
+    let floats = values(large.len(), 37, 1.0);
+    for (is_residual, shapes, images) in [
+        (false, &plain[..], Pixels::Floats(&floats)),
+        (false, &plain, Pixels::Bytes(&large)),
+        (true, &residual, Pixels::Bytes(&small)),
+    ] {
+        let case = Case {
+            is_residual,
+            shapes,
+            images,
+        };
+        let wanted = case.reference()?;
+        for precision in Precision::ALL {
+            // What is computed is so far from the reference, and from what another instruction set gives.
+            let (tolerance, of_sets) = match (precision, is_residual) {
+                (Precision::F32, false) => (1e-5, 1e-5),
+                (Precision::F32, true) => (3e-6, 6e-6),
+                // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
+                (Precision::Bf16, false) => (0.3, 1e-2),
+                // ReLUs and pools that choose otherwise, too.
+                (Precision::Bf16, true) => (0.3, 0.6),
+            };
+            let on = |simd| with_simd!(simd, simd => case.on(simd));
+            let results: Vec<_> = AnySimd::every(precision).into_iter().map(on).collect();
+            for found in &results {
+                for ((found, first), wanted) in found.iter().zip(&results[0]).zip(&wanted) {
+                    let [error, from_first] = [apart(found, wanted), apart(found, first)];
+                    let is_close = error <= tolerance && from_first <= of_sets;
+                    assert!(is_close, "{precision}: {error}, {from_first}");
+                }
+            }
+        }
+    }
+    Ok(())
+}
