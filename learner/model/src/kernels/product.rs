@@ -244,17 +244,11 @@ mod tests {
             Precision::F32 => f64::from(x),
             Precision::Bf16 => half::bf16::from_f32(x).to_f64(),
         };
-        let mut out = Vec::with_capacity(m * n);
-        for i in 0..m {
-            for j in 0..n {
-                out.push(
-                    (0..k)
-                        .map(|at| round(a[i * k + at]) * round(b[at * n + j]))
-                        .sum(),
-                );
-            }
-        }
-        out
+        let entry = |i: usize, j: usize| {
+            let terms = (0..k).map(|at| round(a[i * k + at]) * round(b[at * n + j]));
+            terms.sum::<f64>()
+        };
+        (0..m * n).map(|at| entry(at / n, at % n)).collect()
     }
 
     fn transpose(values: &[f32], rows: usize, cols: usize) -> Vec<f32> {
@@ -263,8 +257,29 @@ mod tests {
             .collect()
     }
 
+    /// Compares a product, and what is added to by it, with `wanted` on every instruction set.
+    fn check(product: Product<'_>, wanted: &[f64]) {
+        for simd in AnySimd::every(product.precision) {
+            for (mode, start, threads) in [
+                (Mode::Replace, 0.0, Threads::Pool),
+                (Mode::Add, 2.0, Threads::Caller),
+            ] {
+                let (product, mut out) = (product.on(threads), vec![2.0; wanted.len()]);
+                with_simd!(simd, simd => {
+                    let operands = Operands::new(simd, product);
+                    product.multiply(simd, operands, &mut out, product.b.cols, mode);
+                });
+                for (got, wanted) in out.iter().zip(wanted) {
+                    let error = (f64::from(*got) - start - wanted).abs();
+                    assert!(error < 1e-3, "{got}, wanted {wanted}, start {start}");
+                }
+            }
+        }
+    }
+
     #[test]
-    fn products_of_odd_sizes_are_those_of_a_plain_loop() {
+    fn products_of_odd_sizes_are_those_of_a_plain_loop_on_every_instruction_set() {
+        // The last two are split, and the last one's operands too.
         for [m, k, n] in [
             [1, 1, 1],
             [7, 3, 17],
@@ -272,35 +287,17 @@ mod tests {
             [70, 9, 33],
             [13, 130, 129],
             [100, 77, 64],
+            [300, 260, 9],
         ] {
             let (a, b) = (values(m * k, 7), values(k * n, 11));
             let (a_t, b_t) = (transpose(&a, m, k), transpose(&b, k, n));
+            let lefts = [Matrix::new(&a, m, k), Matrix::new(&a_t, k, m).transposed()];
+            let rights = [Matrix::new(&b, k, n), Matrix::new(&b_t, n, k).transposed()];
             for precision in Precision::ALL {
                 let wanted = plain(precision, &a, &b, [m, k, n]);
-                for (mode, threads) in
-                    [(Mode::Replace, Threads::Pool), (Mode::Add, Threads::Caller)]
-                {
-                    let start = if mode == Mode::Add { 2.0 } else { 0.0 };
-                    for which in 0..4 {
-                        let left = match which & 1 {
-                            0 => Matrix::new(&a, m, k),
-                            _ => Matrix::new(&a_t, k, m).transposed(),
-                        };
-                        let right = match which & 2 {
-                            0 => Matrix::new(&b, k, n),
-                            _ => Matrix::new(&b_t, n, k).transposed(),
-                        };
-                        let mut out = vec![2.0; m * n];
-                        Product::new(precision, left, right)
-                            .on(threads)
-                            .write(&mut out, mode);
-                        for (got, wanted) in out.iter().zip(&wanted) {
-                            let error = (f64::from(*got) - start - wanted).abs();
-                            assert!(
-                                error < 1e-3,
-                                "{m}x{k}x{n} {precision} layout {which}: {got}, wanted {wanted}"
-                            );
-                        }
+                for left in lefts {
+                    for right in rights {
+                        check(Product::new(precision, left, right), &wanted);
                     }
                 }
             }

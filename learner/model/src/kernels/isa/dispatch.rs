@@ -139,28 +139,16 @@ mod tests {
     use crate::kernels::isa::element::Rounding;
     use crate::kernels::isa::{Columns, Element, LANES, Left, Mode, Simd, multiply_tile};
 
-    /// One tile of ones plus, or else, a product.
-    #[derive(Clone, Copy)]
-    struct Tile {
-        rows: usize,
-        vecs: usize,
+    /// Compares a tile of ones plus, or else, a product with a plain sum; whether the instruction set has such a tile. `rows_inside` says
+    /// whether a row's steps lie apart, and the rows side by side.
+    fn check_tile<S: Simd>(
+        simd: S,
+        [rows, vecs]: [usize; 2],
         cols: usize,
         mode: Mode,
         steps: usize,
-        /// Whether a row's steps lie apart, and the rows side by side.
         rows_inside: bool,
-    }
-
-    /// Compares the tile with a plain sum; whether the instruction set has such a tile.
-    fn check_tile<S: Simd>(simd: S, tile: Tile) -> bool {
-        let Tile {
-            rows,
-            vecs,
-            cols,
-            mode,
-            steps,
-            rows_inside,
-        } = tile;
+    ) -> bool {
         if vecs > S::VECS_MAX || rows > S::rows_max(vecs) {
             return false;
         }
@@ -223,59 +211,34 @@ mod tests {
     #[test]
     fn every_instruction_set_computes_every_size_of_tile() {
         let mut tried = 0;
-        let sizes = [1, 2, 4].into_iter().flat_map(|vecs| {
-            (1..=8)
-                .chain([16, 17, 40, 50, 64])
-                .map(move |rows| (vecs, rows))
-        });
-        for ((vecs, rows), rows_inside) in sizes.flat_map(|size| [(size, false), (size, true)]) {
+        let heights = (1..=8).chain([16, 17, 40, 50, 64]);
+        let sizes = [1, 2, 4].map(|vecs| heights.clone().map(move |rows| [rows, vecs]));
+        for [rows, vecs] in sizes.into_iter().flatten() {
             for (cols, mode, steps) in [
                 (vecs * LANES, Mode::Replace, 5),
                 (vecs * LANES - 5, Mode::Add, 1),
                 ((vecs - 1) * LANES + 1, Mode::Add, 16),
                 (vecs * LANES, Mode::Replace, 35),
             ] {
-                let tile = Tile {
-                    rows,
-                    vecs,
-                    cols,
-                    mode,
-                    steps,
-                    rows_inside,
-                };
                 for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
-                    tried += usize::from(with_simd!(simd, simd => check_tile(simd, tile)));
+                    for rows_inside in [false, true] {
+                        let is_there = with_simd!(simd, simd => {
+                            check_tile(simd, [rows, vecs], cols, mode, steps, rows_inside)
+                        });
+                        tried += usize::from(is_there);
+                    }
                 }
             }
         }
         assert!(tried >= 2 * 3 * 4, "{tried} tiles");
     }
 
-    #[test]
-    fn every_instruction_set_transposes_a_block() {
-        let number = |row: usize, col: usize| (row * 100 + col) as u32;
-        for simd in Precision::ALL.into_iter().flat_map(AnySimd::every) {
-            let mut block: [[u32; LANES]; LANES] =
-                std::array::from_fn(|row| std::array::from_fn(|col| number(row, col)));
-            with_simd!(simd, simd => simd.transpose(&mut block));
-            for (row, block) in block.iter().enumerate() {
-                for (col, &got) in block.iter().enumerate() {
-                    assert_eq!(got, number(col, row));
-                }
-            }
-        }
-    }
-
     /// Lengths that fill no register; values over the whole of the float space, subnormals and what is not finite included.
     #[test]
-    fn every_instruction_set_rounds_to_the_nearest() {
-        let mut bits = 1u32;
-        let mut draw = |_| {
-            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            f32::from_bits(bits)
-        };
+    fn every_instruction_set_rounds_to_the_nearest_and_puts_scalars_in_pairs() {
+        let nearest = |value: f32| bf16::from_f32(value).to_f32();
         let check = |got: bf16, value: f32| {
-            let (got, wanted) = (got.to_f32(), bf16::from_f32(value).to_f32());
+            let (got, wanted) = (got.to_f32(), nearest(value));
             let subnormal = value.abs() < f32::MIN_POSITIVE && got == 0.0;
             assert!(
                 got.to_bits() == wanted.to_bits()
@@ -284,53 +247,58 @@ mod tests {
                 "{value:e}: {got:e}, wanted {wanted:e}"
             );
         };
-        for len in (0..70).chain([100_000]) {
-            let first: Vec<f32> = (0..len).map(&mut draw).collect();
-            let second: Vec<f32> = (0..len).map(&mut draw).collect();
+        let nans = [0x7f80_0001, 0xffff_ffff].map(f32::from_bits);
+        let special = [0.0, -0.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY, 1e-45];
+        let mut bits = 1u32;
+        // A full-period walk over the float space.
+        let walk = std::iter::from_fn(|| {
+            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            Some(f32::from_bits(bits))
+        });
+        let mut floats = nans.into_iter().chain(special).chain(walk);
+        for len in (0..140).chain([100_000]) {
+            let [first, second] = [(); 2].map(|()| floats.by_ref().take(len).collect::<Vec<_>>());
+            for &value in &first {
+                // Exact also where it is subnormal.
+                let (got, wanted) = (bf16::of(value).to_f32(), nearest(value));
+                let is_nearest = got.to_bits() == wanted.to_bits();
+                assert!(
+                    is_nearest || got.is_nan() && value.is_nan(),
+                    "{value:e}: {got:e}"
+                );
+            }
+            let bytes = |by: usize| (0..len).map(move |at| (at * by % 256) as u8);
+            let [first_bytes, second_bytes] = [31, 7].map(|by| bytes(by).collect::<Vec<_>>());
             for simd in AnySimd::every(Precision::Bf16) {
                 // What lies beyond is left alone.
-                let mut rounded = vec![bf16::ONE; len + 3];
-                let mut pairs = vec![bf16::ONE; 2 * len + 3];
+                let [mut rounded, mut of_first, mut of_second] =
+                    [(); 3].map(|()| vec![bf16::NEG_ONE; len + 3]);
+                let [mut pairs, mut joined, mut of_bytes] =
+                    [(); 3].map(|()| vec![bf16::NEG_ONE; 2 * len + 3]);
                 with_simd!(simd, simd => {
                     simd.round(&first, &mut rounded);
                     simd.round_pairs(&first, &second, &mut pairs);
+                    simd.of_bytes(&first_bytes, &mut of_first);
+                    simd.of_bytes(&second_bytes, &mut of_second);
+                    simd.pair(&of_first[..len], &of_second[..len], &mut joined);
+                    simd.pair_bytes(&first_bytes, &second_bytes, &mut of_bytes);
                 });
                 for (at, (&first, &second)) in first.iter().zip(&second).enumerate() {
                     check(rounded[at], first);
                     check(pairs[2 * at], first);
                     check(pairs[2 * at + 1], second);
+                    let exact =
+                        [first_bytes[at], second_bytes[at]].map(|it| bf16::from_f32(it.into()));
+                    assert_eq!(of_first[at], exact[0]);
+                    assert_eq!(joined[2 * at..][..2], exact);
+                    assert_eq!(of_bytes[2 * at..][..2], exact);
                 }
-                assert_eq!(rounded[len..], [bf16::ONE; 3]);
-                assert_eq!(pairs[2 * len..], [bf16::ONE; 3]);
-            }
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_puts_scalars_in_pairs() {
-        for len in (0..140).chain([10_000]) {
-            let first: Vec<u8> = (0..len).map(|at| (at * 31 % 256) as u8).collect();
-            let second: Vec<u8> = (0..len).map(|at| (at * 7 % 255 + 1) as u8).collect();
-            for simd in AnySimd::every(Precision::Bf16) {
-                // What lies beyond is left alone.
-                let room = |len: usize| vec![bf16::NEG_ONE; len + 3];
-                let [mut bytes, mut others] = [room(len), room(len)];
-                let [mut pairs, mut of_bytes] = [room(2 * len), room(2 * len)];
-                with_simd!(simd, simd => {
-                    simd.of_bytes(&first, &mut bytes);
-                    simd.of_bytes(&second, &mut others);
-                    simd.pair(&bytes[..len], &others[..len], &mut pairs);
-                    simd.pair_bytes(&first, &second, &mut of_bytes);
-                });
-                for (at, both) in first.iter().zip(&second).enumerate() {
-                    let wanted = [*both.0, *both.1].map(|byte| bf16::from_f32(byte.into()));
-                    assert_eq!(bytes[at], wanted[0]);
-                    assert_eq!(pairs[2 * at..][..2], wanted);
-                    assert_eq!(of_bytes[2 * at..][..2], wanted);
+                for single in [rounded, of_first, of_second] {
+                    assert_eq!(single[len..], [bf16::NEG_ONE; 3]);
                 }
-                assert_eq!(bytes[len..], [bf16::NEG_ONE; 3]);
-                assert_eq!(pairs[2 * len..], [bf16::NEG_ONE; 3]);
-                assert_eq!(of_bytes[2 * len..], [bf16::NEG_ONE; 3]);
+                for double in [pairs, joined, of_bytes] {
+                    assert_eq!(double[2 * len..], [bf16::NEG_ONE; 3]);
+                }
             }
         }
     }
