@@ -272,76 +272,43 @@ impl ModelConfig {
     /// All layers in the order of [`ModelConfig::parameter_shapes`].
     pub(crate) fn layers(&self) -> Vec<LayerShape> {
         use InitialLaw::{Orthogonal, Uniform};
-        let mut layers = Vec::new();
         let torso = self.torso();
-        for convolution in torso.convolutions() {
-            layers.push(LayerShape {
-                name: convolution.name,
-                weight: convolution.weight.to_vec(),
-                bias: true,
-                initial: Orthogonal,
-                initial_scale: convolution.initial_scale,
-                noisy_sigma: None,
-            });
-        }
-        let mut layer = |name: &str, weight: Vec<usize>, bias: bool, initial: InitialLaw| {
-            layers.push(LayerShape {
-                name: name.to_owned(),
-                weight,
-                bias,
-                initial,
-                initial_scale: 1.0,
-                noisy_sigma: self.head.noisy_sigma.filter(|_| name.starts_with(HEAD)),
-            });
-        };
-        let (_, _, local_channels) = torso.local_shape();
-        let fc = vec![self.hidden, torso.fc_inputs()];
-        layer("torso.fc", fc, true, Orthogonal);
+        let mut layers = torso.convolutions();
+        let fc = [self.hidden, torso.fc_inputs()];
+        layers.push(LayerShape::new("torso.fc", &fc, Orthogonal));
         // The means of noisy layers too, as Fortunato et al. 2018 draw them.
         for (name, outputs) in self.head_layers() {
-            layer(name, vec![outputs, self.hidden], true, Uniform);
+            layers.push(LayerShape {
+                noisy_sigma: self.head.noisy_sigma,
+                // The value's weight is added to the advantage's, and that is applied.
+                locations: usize::from(name != VALUE),
+                ..LayerShape::new(name, &[outputs, self.hidden], Uniform)
+            });
         }
-
-        // A residual block; its skip matrix starts orthogonal whatever the law of its two other layers.
-        let mut block =
-            |name: &str, input: usize, hidden: usize, skip_bias: bool, initial: InitialLaw| {
-                layer(
-                    &format!("{name}.hidden"),
-                    vec![hidden, input],
-                    true,
-                    initial,
-                );
-                layer(&format!("{name}.out"), vec![hidden, hidden], true, initial);
-                let skip = format!("{name}.skip");
-                layer(&skip, vec![hidden, input], skip_bias, Orthogonal);
-            };
-        let embed = if self.dim.embeds_action() {
-            self.action_embed
-        } else {
-            0
-        };
+        let mut embed = 0;
         if self.dim.embeds_action() {
-            let (actions, width) = (self.num_actions, self.action_embed);
-            block("dim.action", actions, width, true, Orthogonal);
+            embed = self.action_embed;
+            let shape = [self.num_actions, 0, embed];
+            let mut block = LayerShape::block("dim.action", 1, shape, Orthogonal);
+            block[2].bias = true;
+            layers.extend(block);
         }
-        let heads = [
-            (
-                self.dim.psi3,
-                "dim.psi3",
-                local_channels + embed,
-                Orthogonal,
-            ),
-            (self.dim.phi3, "dim.phi3", local_channels, Orthogonal),
-            (self.dim.psi4, "dim.psi4", self.hidden + embed, Uniform),
-            (self.dim.phi4, "dim.phi4", self.hidden, Uniform),
-        ];
-        for (exists, name, input, initial) in heads {
+        let (height, width, channels) = torso.local_shape();
+        let (local, global) = ((height.saturating_mul(width), channels), (1, self.hidden));
+        for (exists, name, (locations, features), joined, initial) in [
+            (self.dim.psi3, "dim.psi3", local, embed, Orthogonal),
+            (self.dim.phi3, "dim.phi3", local, 0, Orthogonal),
+            (self.dim.psi4, "dim.psi4", global, embed, Uniform),
+            (self.dim.phi4, "dim.phi4", global, 0, Uniform),
+        ] {
             if exists {
-                block(name, input, self.embedding_dim, false, initial);
+                let shape = [features, joined, self.embedding_dim];
+                layers.extend(LayerShape::block(name, locations, shape, initial));
             }
         }
         for own in &self.loss_layers {
-            layer(&own.layer(), vec![own.outputs, own.inputs], true, Uniform);
+            let shape = [own.outputs, own.inputs];
+            layers.push(LayerShape::new(own.layer(), &shape, Uniform));
         }
         layers
     }

@@ -5,7 +5,6 @@ use safetensors::tensor::TensorView;
 
 use crate::config::ModelConfig;
 use crate::error::Result;
-use crate::heads::config::VALUE;
 use crate::stored::StoredAs;
 
 /// What one layer costs. Arithmetic is multiplications and additions, each counted as one.
@@ -38,42 +37,22 @@ impl ModelConfig {
     /// What each layer that this configuration has costs, in the order of [`ModelConfig::parameter_shapes`]. Meaningful for a valid
     /// configuration.
     pub fn layer_costs(&self) -> Vec<LayerCost> {
-        let convolutions = self.torso().convolutions();
-        let (height, width, channels) = self.local_shape();
         let layers = self.layers().into_iter().enumerate();
         let costs = layers.map(|(index, layer)| {
-            let weight_len = layer.weight.iter().product::<usize>();
-            let outputs = layer.weight[0];
-            let scalars = |of: &[(String, Vec<usize>)]| -> u64 {
-                let each = of.iter().map(|(_, shape)| shape.iter().product::<usize>());
-                each.sum::<usize>() as u64
-            };
+            let len = |shape: &[usize]| shape.iter().product::<usize>();
+            // Products of what is joined to all locations of a state, and those of each location.
+            let joined = layer.joined * layer.weight[0];
+            let products = joined + layer.locations * (len(&layer.weight) - joined);
+            let parameters = layer.parameters();
+            let scalars = parameters.iter().map(|(_, shape)| len(shape));
             let is_of = |part: &str| layer.name.starts_with(part);
-            // Products of each location, and those of what is joined to all locations of a state.
-            let products = if layer.name == VALUE {
-                // Added to the advantage's weight before any product.
-                0
-            } else if let Some(convolution) = convolutions.get(index) {
-                convolution.locations * weight_len
-            } else if is_of("dim.psi3.") || is_of("dim.phi3.") {
-                let joined = layer.weight[1].saturating_sub(channels) * outputs;
-                let features = weight_len - joined;
-                // `out` follows on `hidden`, which is as wide as embedding_dim and has nothing joined to it.
-                if is_of("dim.psi3.out") || is_of("dim.phi3.out") {
-                    height * width * weight_len
-                } else {
-                    height * width * features + joined
-                }
-            } else {
-                weight_len
-            };
             // What is made of bytes, or of an action's number, sends no gradient on.
             let is_first = index == 0 || is_of("dim.action.hidden") || is_of("dim.action.skip");
             let forward = 2 * products as u64;
             LayerCost {
                 forward,
                 backward: if is_first { forward } else { 2 * forward },
-                parameters: scalars(&layer.parameters()),
+                parameters: scalars.sum::<usize>() as u64,
                 name: layer.name,
             }
         });

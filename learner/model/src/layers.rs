@@ -26,9 +26,55 @@ pub(crate) struct LayerShape {
     pub(crate) initial_scale: f32,
     /// sigma_0 of a noisy layer, which has a mean and a sigma of weight and bias in place of these.
     pub(crate) noisy_sigma: Option<f64>,
+    /// Places of one state at which it is applied.
+    pub(crate) locations: usize,
+    /// Columns of the weight for what is joined to all locations, which are applied once.
+    pub(crate) joined: usize,
 }
 
 impl LayerShape {
+    /// A layer with a bias, applied once a state, of a weight [out, in] or [out, in, k, k].
+    pub(crate) fn new(name: impl Into<String>, weight: &[usize], initial: InitialLaw) -> Self {
+        Self {
+            name: name.into(),
+            weight: weight.to_vec(),
+            bias: true,
+            initial,
+            initial_scale: 1.0,
+            noisy_sigma: None,
+            locations: 1,
+            joined: 0,
+        }
+    }
+
+    /// The layers of a residual block on `inputs` features and those of what is `joined`; the skip has no bias, and starts orthogonal whatever
+    /// the law of the two others.
+    pub(crate) fn block(
+        name: &str,
+        locations: usize,
+        [inputs, joined, outputs]: [usize; 3],
+        initial: InitialLaw,
+    ) -> [Self; 3] {
+        let layer = |part: &str, [inputs, joined]: [usize; 2], initial| Self {
+            locations,
+            joined,
+            ..Self::new(
+                format!("{name}.{part}"),
+                &[outputs, inputs + joined],
+                initial,
+            )
+        };
+        let skip = layer("skip", [inputs, joined], InitialLaw::Orthogonal);
+        [
+            layer("hidden", [inputs, joined], initial),
+            layer("out", [outputs, 0], initial),
+            Self {
+                bias: false,
+                ..skip
+            },
+        ]
+    }
+
     /// Names and shapes of its parameters, in the order in which they are drawn.
     pub(crate) fn parameters(&self) -> Vec<(String, Vec<usize>)> {
         let name = &self.name;

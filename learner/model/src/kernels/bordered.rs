@@ -11,14 +11,6 @@ use crate::kernels::isa::{Element, Mode, Simd, vectorized};
 use crate::kernels::linear::relu_of;
 use crate::kernels::rounding::{store, store_bytes};
 
-/// Maps [height, width, channels] with a border of zeros, a pixel wide.
-#[derive(Clone, Copy)]
-pub(crate) struct Border {
-    height: usize,
-    width: usize,
-    channels: usize,
-}
-
 /// What is put into a border.
 #[derive(Clone, Copy)]
 pub(crate) enum Inside<'a> {
@@ -30,44 +22,37 @@ pub(crate) enum Inside<'a> {
     Active(&'a [f32]),
 }
 
-impl Border {
-    /// Around the input of `shape`, which is one of [`ConvShape::bordered`].
-    pub(crate) const fn of_input(shape: &ConvShape) -> Self {
-        Self {
-            height: shape.height - 2,
-            width: shape.width - 2,
-            channels: shape.channels_in,
-        }
-    }
-
-    /// Scalars in memory: where a row of a window is an odd number of them, products of pairs read a zero behind the last one.
+/// Of a shape that is one of [`ConvShape::bordered`]: its input in memory, with a border of zeros, a pixel wide.
+impl ConvShape {
+    /// Scalars of an input: where a row of a window is an odd number of them, products of pairs read a zero behind the last one.
     /// Whole lines of the cache, so that what lies behind begins with one.
-    pub(crate) const fn len<E: Element>(self) -> usize {
-        let all = (self.height + 2) * (self.width + 2) * self.channels + E::DEPTH - 1;
+    pub(crate) fn bordered_len<E: Element>(&self) -> usize {
+        let all = self.image_len() + E::DEPTH - 1;
         all.next_multiple_of(ALIGNMENT / size_of::<E>())
     }
 
-    /// Row `y` of the maps.
-    pub(crate) fn line(self, y: usize) -> std::ops::Range<usize> {
-        let start = ((y + 1) * (self.width + 2) + 1) * self.channels;
-        start..start + self.width * self.channels
+    /// Row `y` of the maps inside the border.
+    pub(crate) const fn inside(&self, y: usize) -> std::ops::Range<usize> {
+        let start = ((y + 1) * self.width + 1) * self.channels_in;
+        start..start + (self.width - 2) * self.channels_in
     }
 
-    pub(crate) fn clear<E: Element>(self, room: &mut [E]) {
+    /// Writes the zeros.
+    pub(crate) fn clear_border<E: Element>(&self, room: &mut [E]) {
         let mut end = 0;
-        for y in 0..self.height {
-            room[end..self.line(y).start].fill(E::default());
-            end = self.line(y).end;
+        for y in 0..self.height - 2 {
+            room[end..self.inside(y).start].fill(E::default());
+            end = self.inside(y).end;
         }
         room[end..].fill(E::default());
     }
 
     /// Writes the zeros, and `inside` between them.
-    pub(crate) fn put<S: Simd>(self, simd: S, inside: Inside<'_>, room: &mut [S::Element]) {
-        self.clear(room);
-        let len = self.width * self.channels;
-        for y in 0..self.height {
-            let (from, to) = (y * len..(y + 1) * len, &mut room[self.line(y)]);
+    pub(crate) fn put_inside<S: Simd>(&self, simd: S, inside: Inside<'_>, room: &mut [S::Element]) {
+        self.clear_border(room);
+        let len = (self.width - 2) * self.channels_in;
+        for y in 0..self.height - 2 {
+            let (from, to) = (y * len..(y + 1) * len, &mut room[self.inside(y)]);
             match inside {
                 Inside::Bytes(bytes) => store_bytes(simd, &bytes[from], to),
                 Inside::Maps(maps) => store(simd, &maps[from], to),
@@ -126,10 +111,6 @@ impl<E: Element> BorderedConvolution<E> {
         &self.forward.bias
     }
 
-    pub(crate) const fn border(&self) -> Border {
-        Border::of_input(self.shape())
-    }
-
     /// Convolves an image in its border, row by row: `then` gets the number of each row and its sums [width, out], without bias.
     pub(crate) fn forward<S: Simd<Element = E>>(
         &self,
@@ -153,9 +134,10 @@ impl<E: Element> BorderedConvolution<E> {
     ) {
         let backward = self.backward.as_ref();
         let backward = backward.expect("a convolution whose input has a gradient is made for it");
-        let border = Border::of_input(&backward.shape);
-        let mut room = Buffer::new(border.len::<E>());
-        border.put(simd, Inside::Maps(grad_map), &mut room);
+        let mut room = Buffer::new(backward.shape.bordered_len::<E>());
+        backward
+            .shape
+            .put_inside(simd, Inside::Maps(grad_map), &mut room);
         let mut row = Buffer::new(self.shape().out_width() * self.shape().channels_in);
         multiply_windows(simd, backward, &room, &mut row, then);
     }

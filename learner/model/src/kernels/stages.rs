@@ -59,7 +59,7 @@ impl<S: Simd> Stages<S> {
     /// Scalars of an image in the two parts of [`Saved`].
     fn saved_lens(&self) -> (usize, usize) {
         let inputs = self.convolutions[1..].iter();
-        let inputs = inputs.map(|it| it.border().len::<S::Element>());
+        let inputs = inputs.map(|it| it.shape().bordered_len::<S::Element>());
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         (
             inputs.sum(),
@@ -86,7 +86,7 @@ impl<S: Simd> Stages<S> {
         f3: &mut [f32],
     ) {
         let simd = self.simd;
-        let mut first = Buffer::new(self.convolutions[0].border().len::<S::Element>());
+        let mut first = Buffer::new(self.convolutions[0].shape().bordered_len::<S::Element>());
         let mut x = Buffer::new(0);
         let stages = self.convolutions.chunks_exact(STAGE_CONVOLUTIONS);
         for (stage, convolutions) in stages.enumerate() {
@@ -96,7 +96,7 @@ impl<S: Simd> Stages<S> {
             } else {
                 (cut_input(conv, &mut inputs), Inside::Maps(&x), 1.0)
             };
-            conv.border().put(simd, inside, input);
+            conv.shape().put_inside(simd, inside, input);
             let mut maps = Buffer::new(conv.shape().map_len());
             conv.forward(simd, input, |y, row| {
                 let to = &mut maps[y * row.len()..][..row.len()];
@@ -109,11 +109,12 @@ impl<S: Simd> Stages<S> {
             for block in blocks {
                 let (one, two) = (&block[0], &block[1]);
                 let outer = cut_input(one, &mut inputs);
-                one.border().put(simd, Inside::Active(&x), outer);
+                one.shape().put_inside(simd, Inside::Active(&x), outer);
                 let inner = cut_input(two, &mut inputs);
-                two.border().clear(inner);
+                two.shape().clear_border(inner);
                 one.forward(simd, outer, |y, row| {
-                    finish_row(simd, row, one.bias(), 1.0, &mut inner[two.border().line(y)]);
+                    let to = &mut inner[two.shape().inside(y)];
+                    finish_row(simd, row, one.bias(), 1.0, to);
                 });
                 two.forward(simd, inner, |y, row| {
                     let to = &mut x[y * row.len()..][..row.len()];
@@ -179,12 +180,12 @@ impl<S: Simd> Stages<S> {
                 let mut between = Buffer::<f32>::new(one.shape().map_len());
                 two.image_gradient(simd, &grad, |y, row| {
                     let to = &mut between[y * row.len()..][..row.len()];
-                    pass_active(simd, &inner[two.border().line(y)], row, to);
+                    pass_active(simd, &inner[two.shape().inside(y)], row, to);
                 });
                 own_sums(one, outer, &between);
                 one.image_gradient(simd, &between, |y, row| {
                     let to = &mut grad[y * row.len()..][..row.len()];
-                    add_active(simd, &outer[one.border().line(y)], row, to);
+                    add_active(simd, &outer[one.shape().inside(y)], row, to);
                 });
             }
             let before;
@@ -192,8 +193,9 @@ impl<S: Simd> Stages<S> {
             let mut grad_maps = Buffer::zeros(conv.shape().map_len());
             unpool(simd, &grad, conv.shape().output(), before, &mut grad_maps);
             if stage == 0 {
-                let mut room = Buffer::new(conv.border().len::<S::Element>());
-                conv.border().put(simd, Inside::Bytes(image), &mut room);
+                let mut room = Buffer::new(conv.shape().bordered_len::<S::Element>());
+                conv.shape()
+                    .put_inside(simd, Inside::Bytes(image), &mut room);
                 own_sums(conv, &room, &grad_maps);
                 return;
             }
@@ -214,7 +216,7 @@ fn pooled_len<E: Element>(conv: &BorderedConvolution<E>) -> usize {
 
 /// Memory for the input of `of` at the start of `inputs`, which are shortened by it.
 fn cut_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a mut [E]) -> &'a mut [E] {
-    let (own, rest) = std::mem::take(inputs).split_at_mut(of.border().len::<E>());
+    let (own, rest) = std::mem::take(inputs).split_at_mut(of.shape().bordered_len::<E>());
     *inputs = rest;
     own
 }
@@ -222,7 +224,7 @@ fn cut_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a mut [
 /// The input of `of` at the end of `inputs`, which are shortened by it.
 fn last_input<'a, E: Element>(of: &BorderedConvolution<E>, inputs: &mut &'a [E]) -> &'a [E] {
     let own;
-    (*inputs, own) = cut_last(inputs, of.border().len::<E>());
+    (*inputs, own) = cut_last(inputs, of.shape().bordered_len::<E>());
     own
 }
 

@@ -4,15 +4,17 @@
 
 use candle_core::{Result, Tensor};
 
-use super::interface::{ActingTorso, Torso, TorsoConvolution, TorsoParameters};
+use super::interface::{ActingTorso, Torso, TorsoParameters};
 use crate::compute::Kernels;
 use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
+use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
 use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
+use crate::layers::LayerShape;
 
 const NAMES: [&str; STAGE_CONVOLUTIONS] = [
     "conv",
@@ -34,23 +36,19 @@ pub(crate) struct Impala {
 }
 
 impl Torso for Impala {
-    fn convolutions(&self) -> Vec<TorsoConvolution> {
+    fn convolutions(&self) -> Vec<LayerShape> {
         let (shapes, _) = stages(self.input, &self.widths);
         let blocks = 2 * self.widths.len();
         let smaller = 1.0 / (blocks as f32).sqrt();
         let convolution = |(index, shape): (usize, &ConvShape)| {
             let name = NAMES[index % STAGE_CONVOLUTIONS];
             let is_scaled = self.scale_blocks && name.ends_with(".conv2");
-            TorsoConvolution {
-                name: format!("torso.stage{}.{name}", index / STAGE_CONVOLUTIONS + 1),
-                weight: [
-                    shape.channels_out,
-                    shape.channels_in,
-                    shape.kernel,
-                    shape.kernel,
-                ],
-                locations: shape.locations(),
+            let name = format!("torso.stage{}.{name}", index / STAGE_CONVOLUTIONS + 1);
+            let (out, inputs, side) = (shape.channels_out, shape.channels_in, shape.kernel);
+            LayerShape {
                 initial_scale: if is_scaled { smaller } else { 1.0 },
+                locations: shape.locations(),
+                ..LayerShape::new(name, &[out, inputs, side, side], InitialLaw::Orthogonal)
             }
         };
         shapes.iter().enumerate().map(convolution).collect()

@@ -8,13 +8,13 @@ use candle_core::Tensor;
 use crate::compute::Kernels;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::precision::Precision;
-use crate::layers::Layer;
+use crate::layers::{Layer, LayerShape};
 
 /// A torso of given sizes, without its parameters: frames to f3, its convolutions' map, and f4, a fully connected layer on it. It ends before
 /// f4's ReLU, because DIM sees f4 before it and the C51 head after it.
 pub(crate) trait Torso: fmt::Debug + Send + Sync {
-    /// Its convolutions in the order in which they are applied, and their initial weights drawn.
-    fn convolutions(&self) -> Vec<TorsoConvolution>;
+    /// Its convolutions, such as `torso.conv1`, in the order in which they are applied, and their initial weights drawn.
+    fn convolutions(&self) -> Vec<LayerShape>;
 
     /// Height, width and channels of f3.
     fn local_shape(&self) -> (usize, usize, usize);
@@ -47,18 +47,6 @@ pub(crate) trait Torso: fmt::Debug + Send + Sync {
 pub(crate) trait ActingTorso: Send + Sync {
     /// f4 [n, hidden] before its ReLU, of some frames [n, H, W, C], on the calling thread.
     fn f4(&self, frames: &[u8]) -> Buffer<f32>;
-}
-
-#[derive(Clone, Debug)]
-pub(crate) struct TorsoConvolution {
-    /// Such as `torso.conv1`.
-    pub(crate) name: String,
-    /// [out, in, k, k]
-    pub(crate) weight: [usize; 4],
-    /// Windows of one image.
-    pub(crate) locations: usize,
-    /// What its initial weight is multiplied by.
-    pub(crate) initial_scale: f32,
 }
 
 #[derive(Clone, Debug)]

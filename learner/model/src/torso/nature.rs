@@ -3,9 +3,10 @@
 
 use candle_core::{Result, Tensor};
 
-use super::interface::{ActingTorso, Torso, TorsoConvolution, TorsoParameters};
+use super::interface::{ActingTorso, Torso, TorsoParameters};
 use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape};
+use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::convolution::{Convolution, forward};
 use crate::kernels::dense::{Dense, whole_steps};
@@ -13,6 +14,7 @@ use crate::kernels::images::{Images, Pixels};
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::torso::torso;
+use crate::layers::LayerShape;
 
 #[derive(Debug)]
 pub(crate) struct Nature {
@@ -41,16 +43,15 @@ impl Nature {
 }
 
 impl Torso for Nature {
-    fn convolutions(&self) -> Vec<TorsoConvolution> {
+    fn convolutions(&self) -> Vec<LayerShape> {
         let mut channels_in = self.input.2;
         let layers = self.conv.iter().enumerate().map(|(index, layer)| {
             let weight = [layer.out, channels_in, layer.kernel, layer.kernel];
             channels_in = layer.out;
-            TorsoConvolution {
-                name: format!("torso.conv{}", index + 1),
-                weight,
+            let name = format!("torso.conv{}", index + 1);
+            LayerShape {
                 locations: self.shapes.get(index).map_or(0, ConvShape::locations),
-                initial_scale: 1.0,
+                ..LayerShape::new(name, &weight, InitialLaw::Orthogonal)
             }
         });
         layers.collect()
