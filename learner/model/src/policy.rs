@@ -15,9 +15,7 @@ use crate::heads::acting::ActingHead;
 use crate::heads::c51::expected_returns;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
-use crate::kernels::buffer::Buffer;
-use crate::kernels::dense::{Dense, activate};
-use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
+use crate::kernels::dense::{ActiveLayer, active_layer};
 use crate::kernels::precision::Precision;
 use crate::layers::Layer;
 use crate::parameters::{decode, is_dim};
@@ -31,7 +29,7 @@ pub struct PolicyNetwork {
     config: ModelConfig,
     support: Vec<f32>,
     precision: Precision,
-    weights: Box<dyn Weights>,
+    weights: Weights,
     values: Vec<f32>,
 }
 
@@ -44,7 +42,7 @@ impl PolicyNetwork {
     /// or shape, or not finite.
     pub fn new(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let config = config.without_dim();
-        let weights = weights(&config, safetensors, precision)?;
+        let weights = Weights::decode(&config, safetensors, precision)?;
         Ok(Self {
             support: config.atoms_support(),
             config,
@@ -56,7 +54,7 @@ impl PolicyNetwork {
 
     /// Replaces the weights. On an error the old ones stay.
     pub fn load(&mut self, safetensors: &[u8]) -> Result<()> {
-        self.weights = weights(&self.config, safetensors, self.precision)?;
+        self.weights = Weights::decode(&self.config, safetensors, self.precision)?;
         Ok(())
     }
 
@@ -71,7 +69,10 @@ impl PolicyNetwork {
 
     /// Computes with this noise of the head's noisy layers from now on, or with their means.
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
-        self.weights.set_noise(noise);
+        let weights = &mut self.weights;
+        if let Some(noisy) = &weights.noisy {
+            weights.head = active(noisy.layer(noise), self.precision);
+        }
     }
 
     /// Expected returns `values` [B, A] of `frames` [B, H, W, C].
@@ -88,16 +89,24 @@ impl PolicyNetwork {
             )));
         }
         let tasks = rayon::current_num_threads().min(batch);
-        let (weights, support) = (&*self.weights, &self.support);
+        let (weights, support) = (&self.weights, &self.support);
+        let task = |frames: &[u8], values: &mut [f32]| {
+            let frames = frames.chunks(TILE_FRAMES * frame_len);
+            for (frames, values) in frames.zip(values.chunks_mut(TILE_FRAMES * actions)) {
+                let hidden = weights.torso.f4(frames);
+                let logits = weights.head.forward_active(&hidden);
+                expected_returns(&logits, support, values);
+            }
+        };
         if tasks <= 1 {
-            weights.q_values(support, frames, values);
+            task(frames, values);
         } else {
             let share = batch.div_ceil(tasks);
             let values = values.par_chunks_mut(share * actions);
             let frames = frames.par_chunks(share * frame_len);
             values
                 .zip(frames)
-                .for_each(|(values, frames)| weights.q_values(support, frames, values));
+                .for_each(|(values, frames)| task(frames, values));
         }
         match values.iter().position(|value| !value.is_finite()) {
             Some(index) => Err(ModelError::NotFinite {
@@ -142,42 +151,17 @@ pub fn greedy(values: &[f32]) -> u8 {
     u8::try_from(best).expect("a valid configuration has at most 255 actions")
 }
 
-/// Weights as one instruction set's kernels want them.
-trait Weights: Send + Sync {
-    /// Expected returns of any number of frames, on the calling thread.
-    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]);
-
-    /// Computes with this noise of the head from now on; nothing happens where the head has none.
-    fn set_noise(&mut self, noise: Option<&HeadNoise>);
-}
-
-/// The weights in a safetensors file, for the fastest instruction set of this processor.
-fn weights(
-    config: &ModelConfig,
-    safetensors: &[u8],
-    precision: Precision,
-) -> Result<Box<dyn Weights>> {
-    Ok(with_simd!(AnySimd::of(precision), simd => {
-        Box::new(UnitWeights::decode(simd, config, safetensors, precision)?)
-    }))
-}
-
-struct UnitWeights<S: Simd> {
-    simd: S,
-    frame_len: usize,
+/// Weights for the fastest instruction set of this processor.
+struct Weights {
     torso: Box<dyn ActingTorso>,
-    head: Dense<S>,
+    head: Box<dyn ActiveLayer>,
     /// What `head` is made of, with every noise anew; there if it is noisy.
     noisy: Option<ActingHead>,
 }
 
-impl<S: Simd> UnitWeights<S> {
-    fn decode(
-        simd: S,
-        config: &ModelConfig,
-        safetensors: &[u8],
-        precision: Precision,
-    ) -> Result<Self> {
+impl Weights {
+    /// Those in a safetensors file.
+    fn decode(config: &ModelConfig, safetensors: &[u8], precision: Precision) -> Result<Self> {
         let mut parameters = decode(config, |_| true, safetensors, is_dim)?;
         let mut take = |layer: &str, part: &str| {
             let (_, values) = parameters
@@ -190,45 +174,14 @@ impl<S: Simd> UnitWeights<S> {
         let Ok(of_head) = HeadLayer::all(config, take);
         let head = ActingHead::new(of_head);
         Ok(Self {
-            simd,
-            frame_len: config.frame_len(),
             torso: torso.acting(precision, of_torso),
-            head: dense(simd, &head.layer(None)),
+            head: active(head.layer(None), precision),
             noisy: config.head.noisy_sigma.map(|_| head),
         })
-    }
-
-    fn tile_q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
-        let count = values.len() * support.len() / self.head.outputs();
-        let hidden = self.torso.f4(frames);
-        let width = self.head.inputs();
-        let stride = width.next_multiple_of(S::Element::DEPTH);
-        let mut active = Buffer::<S::Element>::new(count * stride);
-        activate(self.simd, &hidden, width, &mut active);
-        let logits = self.head.forward(self.simd, &active, count);
-        expected_returns(&logits, support, values);
     }
 }
 
 /// A layer of weight [in, out].
-fn dense<S: Simd>(simd: S, layer: &Layer<Vec<f32>>) -> Dense<S> {
-    Dense::new(simd, &layer.weight, layer.bias.clone())
-}
-
-impl<S: Simd> Weights for UnitWeights<S> {
-    fn q_values(&self, support: &[f32], frames: &[u8], values: &mut [f32]) {
-        let actions = self.head.outputs() / support.len();
-        let tiles = frames
-            .chunks(TILE_FRAMES * self.frame_len)
-            .zip(values.chunks_mut(TILE_FRAMES * actions));
-        for (frames, values) in tiles {
-            self.tile_q_values(support, frames, values);
-        }
-    }
-
-    fn set_noise(&mut self, noise: Option<&HeadNoise>) {
-        if let Some(noisy) = &self.noisy {
-            self.head = dense(self.simd, &noisy.layer(noise));
-        }
-    }
+fn active(layer: Layer<Vec<f32>>, precision: Precision) -> Box<dyn ActiveLayer> {
+    active_layer(precision, &layer.weight, layer.bias)
 }

@@ -2,23 +2,50 @@
 //! It has no gradient; `linear` is the layer with one.
 
 use crate::kernels::buffer::Buffer;
-use crate::kernels::isa::{Element, Left, Mode, Simd, vectorized};
+use crate::kernels::isa::{AnySimd, Element, Left, Mode, Simd, vectorized, with_simd};
 use crate::kernels::linear::relu_of;
 use crate::kernels::panels::{Matrix, Panels, Threads};
+use crate::kernels::precision::Precision;
 
 pub(crate) struct Dense<S: Simd> {
+    simd: S,
     /// Of [in, out].
     weight: Panels<S::Element>,
     bias: Vec<f32>,
     inputs: usize,
 }
 
+/// A layer on what passes a ReLU first, whatever multiplies it.
+pub(crate) trait ActiveLayer: Send + Sync {
+    /// [n, out] of relu(`hidden`) [n, in].
+    fn forward_active(&self, hidden: &[f32]) -> Buffer<f32>;
+}
+
+/// The layer of `weight` [in, out] and `bias` [out] for the fastest instruction set of this processor.
+pub(crate) fn active_layer(
+    precision: Precision,
+    weight: &[f32],
+    bias: Vec<f32>,
+) -> Box<dyn ActiveLayer> {
+    with_simd!(AnySimd::of(precision), simd => Box::new(Dense::new(simd, weight, bias)))
+}
+
+impl<S: Simd> ActiveLayer for Dense<S> {
+    fn forward_active(&self, hidden: &[f32]) -> Buffer<f32> {
+        let count = hidden.len() / self.inputs;
+        let mut active = Buffer::new(count * self.row_len());
+        activate(self.simd, hidden, self.inputs, &mut active);
+        self.forward(&active, count)
+    }
+}
+
 impl<S: Simd> Dense<S> {
     /// `weight` [in, out], `bias` [out].
-    pub(crate) fn new(simd: S, weight: &[f32], bias: Vec<f32>) -> Self {
+    fn new(simd: S, weight: &[f32], bias: Vec<f32>) -> Self {
         let inputs = weight.len() / bias.len();
         let weight = Matrix::new(weight, inputs, bias.len());
         Self {
+            simd,
             weight: Panels::pack(simd, weight, Threads::Caller),
             bias,
             inputs,
@@ -42,18 +69,19 @@ impl<S: Simd> Dense<S> {
         self.inputs
     }
 
-    pub(crate) const fn outputs(&self) -> usize {
-        self.bias.len()
+    /// Scalars of a row of inputs, which begins at a whole step.
+    pub(crate) fn row_len(&self) -> usize {
+        self.inputs.next_multiple_of(S::Element::DEPTH)
     }
 
-    /// [count, out] of `x` [count, in], whose rows begin at whole steps.
-    pub(crate) fn forward(&self, simd: S, x: &[S::Element], count: usize) -> Buffer<f32> {
-        let outputs = self.bias.len();
+    /// [count, out] of `x` [count, in], rows of [`Dense::row_len`].
+    pub(crate) fn forward(&self, x: &[S::Element], count: usize) -> Buffer<f32> {
+        let (outputs, simd) = (self.bias.len(), self.simd);
         let mut y = Buffer::new(count * outputs);
         for row in y.chunks_exact_mut(outputs) {
             row.copy_from_slice(&self.bias);
         }
-        let left = Left::rows(x, self.inputs.next_multiple_of(S::Element::DEPTH));
+        let left = Left::rows(x, self.row_len());
         self.weight
             .multiply_rows(simd, count, left, Mode::Add, &mut y, outputs);
         y
@@ -76,7 +104,7 @@ pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> 
 
 vectorized! {
     /// relu of `hidden` [rows, cols] as rows of whole steps.
-    pub(crate) fn activate<S>(simd, hidden: &'a [f32], cols: usize, active: &'a mut [S::Element]) {
+    fn activate<S>(simd, hidden: &'a [f32], cols: usize, active: &'a mut [S::Element]) {
         let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
         for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
             row.fill(S::Element::default());

@@ -10,7 +10,7 @@ use crate::geometry::{ConvShape, STAGE_CONVOLUTIONS, stages};
 use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
-use crate::kernels::isa::{AnySimd, Element, Simd, with_simd};
+use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
@@ -119,7 +119,7 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
         let (simd, stages, inputs) = (self.simd, &self.stages, self.fc.inputs());
         let images = frames.chunks_exact(stages.image_len());
         let count = images.len();
-        let stride = inputs.next_multiple_of(S::Element::DEPTH);
+        let stride = self.fc.row_len();
         let mut rows = Buffer::new(count * stride);
         let (mut saved, mut f3) = (stages.saved(1), Buffer::new(stages.output_len()));
         let each = rows.chunks_exact_mut(stride);
@@ -131,7 +131,7 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
                 write_rows(simd, &f3, inputs, stride, row);
             }
         }
-        self.fc.forward(simd, &rows, count)
+        self.fc.forward(&rows, count)
     }
 }
 

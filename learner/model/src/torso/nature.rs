@@ -126,6 +126,6 @@ impl<S: Simd> ActingTorso for ActingNature<S> {
             maps = output;
         }
         let rows = whole_steps(maps, self.fc.inputs());
-        self.fc.forward(simd, &rows, count)
+        self.fc.forward(&rows, count)
     }
 }
