@@ -3,7 +3,7 @@
 //!
 //! Source: Bellemare et al. 2017.
 
-use candle_core::{CpuStorage, CustomOp1, D, Layout, Shape, Tensor};
+use candle_core::{D, Tensor, bail};
 use candle_nn::ops::softmax;
 use rayon::prelude::*;
 
@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::heads::noise::HeadNoise;
 use crate::heads::streams::Streams;
 use crate::kernels::exponentials::exp_below;
-use crate::kernels::tensors::floats;
+use crate::kernels::tensors::values_of;
 use crate::layers::Layer;
 use crate::parameters::Parameters;
 
@@ -68,9 +68,7 @@ impl C51Head {
     /// Expected returns [B, A] of logits [B, A, atoms]; no gradient flows.
     pub(crate) fn q_values(&self, logits: &Tensor) -> Result<Tensor> {
         match self.kernels {
-            Kernels::Fused(_) => Ok(logits.contiguous()?.apply_op1_no_bwd(&Expectation {
-                support: self.support.clone(),
-            })?),
+            Kernels::Fused(_) => Ok(expectations(&logits.contiguous()?, &self.support)?),
             Kernels::Candle => {
                 let (v_min, spacing) = ends(&self.support);
                 let positions = Tensor::arange(0f32, self.atoms as f32, logits.device())?;
@@ -82,35 +80,18 @@ impl C51Head {
     }
 }
 
-struct Expectation {
-    support: Vec<f32>,
-}
-
-impl CustomOp1 for Expectation {
-    fn name(&self) -> &'static str {
-        "c51-expectation"
+/// [`expected_returns`] [B, A] of logits [B, A, atoms], on the pool.
+fn expectations(logits: &Tensor, support: &[f32]) -> candle_core::Result<Tensor> {
+    let (batch, actions, atoms) = logits.dims3()?;
+    if atoms != support.len() {
+        bail!("logits {:?} over {} atoms", logits.shape(), support.len());
     }
-
-    fn cpu_fwd(
-        &self,
-        logits: &CpuStorage,
-        layout: &Layout,
-    ) -> candle_core::Result<(CpuStorage, Shape)> {
-        let (batch, actions, atoms) = layout.shape().dims3()?;
-        if atoms != self.support.len() {
-            candle_core::bail!(
-                "logits {:?} over {} atoms",
-                layout.shape(),
-                self.support.len()
-            );
-        }
-        let mut values = vec![0.0; batch * actions];
-        values
-            .par_chunks_mut(TASK_DISTRIBUTIONS)
-            .zip(floats(logits, layout)?.par_chunks(TASK_DISTRIBUTIONS * atoms))
-            .for_each(|(values, logits)| expected_returns(logits, &self.support, values));
-        Ok((CpuStorage::F32(values), (batch, actions).into()))
-    }
+    let mut values = vec![0.0; batch * actions];
+    values
+        .par_chunks_mut(TASK_DISTRIBUTIONS)
+        .zip(values_of(logits)?.par_chunks(TASK_DISTRIBUTIONS * atoms))
+        .for_each(|(values, logits)| expected_returns(logits, support, values));
+    Tensor::from_vec(values, (batch, actions), logits.device())
 }
 
 /// Largest error of an expected return beside its own last place, as a share of the support's width: what sums over a thousand

@@ -8,8 +8,8 @@ use driml_model::{
 };
 
 use crate::support::{
-    assert_close, bits, floats, frames, kinds, parameters, pool, residual, rng, small, variable,
-    with_biases,
+    assert_close, assert_layer, bits, floats, frames, kinds, parameters, pool, residual, rng,
+    small, variable, with_biases,
 };
 
 /// Every output of the network for a batch, one after the other, and the gradients of their weighted sum.
@@ -243,23 +243,14 @@ fn dot_products_and_their_gradients_are_candle_s() -> Result<()> {
         (&global, &local),
         (&global, &global),
     ] {
-        let (psi, phi) = (variable(psi, rng), variable(phi, rng));
-        let ours = Kernels::FUSED.dot_products(&psi, &phi)?;
-        let theirs = Kernels::Candle.dot_products(&psi, &phi)?;
-        assert_close("dots", &ours, &theirs, 1e-6);
-        let grad = floats(ours.dims(), rng);
-        let (found, wanted) = (
-            (ours * &grad)?.sum_all()?.backward()?,
-            (theirs * &grad)?.sum_all()?.backward()?,
-        );
-        for (name, var) in [("psi", &psi), ("phi", &phi)] {
-            assert_close(
-                name,
-                found.get(var).unwrap(),
-                wanted.get(var).unwrap(),
-                1e-6,
-            );
-        }
+        assert_layer(
+            &format!("dots of {psi:?} and {phi:?}"),
+            &[variable(psi, rng), variable(phi, rng)],
+            Precision::F32,
+            rng,
+            |args| Kernels::FUSED.dot_products(&args[0], &args[1]),
+            |args| Kernels::Candle.dot_products(&args[0], &args[1]),
+        )?;
     }
     let (psi, phi) = (variable(&[5, 3, 7], rng), variable(&[5, 2, 7], rng));
     assert!(Kernels::FUSED.dot_products(&psi, &phi).is_err());
