@@ -17,7 +17,6 @@ use crate::heads::noise::HeadNoise;
 use crate::heads::streams::HeadLayer;
 use crate::kernels::dense::{ActiveLayer, active_layer};
 use crate::kernels::precision::Precision;
-use crate::layers::Layer;
 use crate::parameters::{decode, is_dim};
 use crate::torso::interface::{ActingTorso, TorsoParameters};
 
@@ -71,7 +70,7 @@ impl PolicyNetwork {
     pub fn set_noise(&mut self, noise: Option<&HeadNoise>) {
         let weights = &mut self.weights;
         if let Some(noisy) = &weights.noisy {
-            weights.head = active(noisy.layer(noise), self.precision);
+            weights.head = active_layer(self.precision, noisy.layer(noise));
         }
     }
 
@@ -175,13 +174,8 @@ impl Weights {
         let head = ActingHead::new(of_head);
         Ok(Self {
             torso: torso.acting(precision, of_torso),
-            head: active(head.layer(None), precision),
+            head: active_layer(precision, head.layer(None)),
             noisy: config.head.noisy_sigma.map(|_| head),
         })
     }
-}
-
-/// A layer of weight [in, out].
-fn active(layer: Layer<Vec<f32>>, precision: Precision) -> Box<dyn ActiveLayer> {
-    active_layer(precision, &layer.weight, layer.bias)
 }

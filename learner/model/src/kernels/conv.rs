@@ -9,11 +9,10 @@ use candle_core::{DType, Result, Tensor, bail};
 
 use crate::geometry::{ConvLayer, ConvShape};
 use crate::kernels::candle::ConvLayerTensors;
-use crate::kernels::convolution::Convolution;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::precision::Precision;
-use crate::kernels::stack::{SavedActivations, layers, stack_backward, stack_forward};
+use crate::kernels::stack::{SavedActivations, Stack};
 use crate::kernels::tasks::Tasks;
 use crate::kernels::tensors::{Input, cpu, values_of};
 
@@ -99,13 +98,9 @@ impl<S: Simd> ConvStack<S> {
         &self.shapes[self.shapes.len() - 1]
     }
 
-    pub(crate) fn layers(
-        &self,
-        parameters: &[f32],
-        backward: bool,
-        images: bool,
-    ) -> Vec<Convolution<S::Element>> {
-        layers(self.simd, &self.shapes, parameters, backward, images)
+    /// The layers of `parameters` for a pass forward, or backward; `images` says whether these will need a gradient.
+    pub(crate) fn layers(&self, parameters: &[f32], backward: bool, images: bool) -> Stack<S> {
+        Stack::new(self.simd, &self.shapes, parameters, backward, images)
     }
 
     pub(crate) fn tasks(&self) -> Tasks {
@@ -125,12 +120,11 @@ impl<S: Simd> Operation<2> for ConvStack<S> {
     type Kept = Vec<SavedActivations<S::Element>>;
 
     fn forward(&self, [images, parameters]: [Input<'_>; 2]) -> Result<(Vec<f32>, Self::Kept)> {
-        let (simd, images) = (self.simd, images.pixels()?);
+        let images = images.pixels()?;
         let layers = self.layers(parameters.floats()?, false, false);
         let mut maps = vec![0.0; self.count * self.last().map_len()];
-        let saved = self.tasks().forward(&mut maps, |task, maps| {
-            stack_forward(simd, &layers, images.slice(task), maps)
-        });
+        let of_task = |task, maps: &mut [f32]| layers.forward(images.slice(task), maps);
+        let saved = self.tasks().forward(&mut maps, of_task);
         Ok((maps, saved))
     }
 
@@ -141,7 +135,7 @@ impl<S: Simd> Operation<2> for ConvStack<S> {
         maps: &Tensor,
         grad_maps: &[f32],
     ) -> Result<[Option<Vec<f32>>; 2]> {
-        let (simd, maps) = (self.simd, values_of(maps)?);
+        let maps = values_of(maps)?;
         let maps = &maps[..];
         let wanted = images.dtype() == DType::F32 && images.track_op();
         let (storage, layout) = images.storage_and_layout();
@@ -152,7 +146,7 @@ impl<S: Simd> Operation<2> for ConvStack<S> {
         let gradient = tasks.backward(&self.shapes, saved, room, |task, saved, to| {
             let (maps, grad_maps) = (&maps[task.maps.clone()], &grad_maps[task.maps]);
             let images = images.slice(task.images);
-            stack_backward(simd, &layers, images, saved, maps, grad_maps, to)
+            layers.backward(images, saved, maps, grad_maps, to)
         });
         Ok([wanted.then_some(grad_images), Some(gradient)])
     }

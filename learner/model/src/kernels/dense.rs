@@ -6,6 +6,7 @@ use crate::kernels::isa::{AnySimd, Element, Left, Mode, Simd, vectorized, with_s
 use crate::kernels::linear::relu_of;
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
+use crate::layers::Layer;
 
 pub(crate) struct Dense<S: Simd> {
     simd: S,
@@ -21,13 +22,12 @@ pub(crate) trait ActiveLayer: Send + Sync {
     fn forward_active(&self, hidden: &[f32]) -> Buffer<f32>;
 }
 
-/// The layer of `weight` [in, out] and `bias` [out] for the fastest instruction set of this processor.
+/// A layer of weight [in, out] for the fastest instruction set of this processor.
 pub(crate) fn active_layer(
     precision: Precision,
-    weight: &[f32],
-    bias: Vec<f32>,
+    Layer { weight, bias }: Layer<Vec<f32>>,
 ) -> Box<dyn ActiveLayer> {
-    with_simd!(AnySimd::of(precision), simd => Box::new(Dense::new(simd, weight, bias)))
+    with_simd!(AnySimd::of(precision), simd => Box::new(Dense::new(simd, &weight, bias)))
 }
 
 impl<S: Simd> ActiveLayer for Dense<S> {

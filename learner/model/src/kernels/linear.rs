@@ -231,23 +231,6 @@ pub(crate) fn relu_gradient(y: f32, grad: f32) -> f32 {
     if y <= 0.0 { 0.0 } else { grad }
 }
 
-/// `grad` where `y` is above 0, else 0.
-fn masked(y: &Tensor, grad: &Tensor) -> Result<Tensor> {
-    let grad = grad.contiguous()?;
-    let (y_values, grad_values) = (values_of(y)?, values_of(&grad)?);
-    let mut result = vec![0.0; y_values.len()];
-    result
-        .par_chunks_mut(TASK_LEN)
-        .zip(y_values.par_chunks(TASK_LEN))
-        .zip(grad_values.par_chunks(TASK_LEN))
-        .for_each(|((result, y), grad)| {
-            for ((result, &y), &grad) in result.iter_mut().zip(y).zip(grad) {
-                *result = relu_gradient(y, grad);
-            }
-        });
-    Tensor::from_vec(result, y.shape(), y.device())
-}
-
 struct Relu;
 
 impl CustomOp1 for Relu {
@@ -262,6 +245,18 @@ impl CustomOp1 for Relu {
     }
 
     fn bwd(&self, _x: &Tensor, y: &Tensor, grad_y: &Tensor) -> Result<Option<Tensor>> {
-        Ok(Some(masked(&y.detach(), &grad_y.detach())?))
+        let grad_y = grad_y.detach().contiguous()?;
+        let (y_values, grad_values) = (values_of(y)?, values_of(&grad_y)?);
+        let mut result = vec![0.0; y_values.len()];
+        result
+            .par_chunks_mut(TASK_LEN)
+            .zip(y_values.par_chunks(TASK_LEN))
+            .zip(grad_values.par_chunks(TASK_LEN))
+            .for_each(|((result, y), grad)| {
+                for ((result, &y), &grad) in result.iter_mut().zip(y).zip(grad) {
+                    *result = relu_gradient(y, grad);
+                }
+            });
+        Tensor::from_vec(result, y.shape(), y.device()).map(Some)
     }
 }

@@ -9,7 +9,7 @@ use crate::kernels::candle;
 use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
-use crate::kernels::stack::{layers, stack_backward, stack_forward};
+use crate::kernels::stack::Stack;
 use crate::kernels::stages::Stages;
 use crate::kernels::tasks::{cut, parameters_len, unpacked};
 
@@ -63,11 +63,14 @@ impl Case<'_> {
             let sums = stages.backward(images, &saved, &maps, &grad_maps);
             return vec![maps, unpacked(shapes, &sums)];
         }
-        let (layers, images) = (layers(simd, shapes, &parameters, true, true), self.images);
-        let saved = stack_forward(simd, &layers, images, &mut maps);
+        let (stack, images) = (
+            Stack::new(simd, shapes, &parameters, true, true),
+            self.images,
+        );
+        let saved = stack.forward(images, &mut maps);
         let mut grad_images = vec![0.0; images.len()];
         let to = Some(&mut grad_images[..]);
-        let sums = stack_backward(simd, &layers, images, &saved, &maps, &grad_maps, to);
+        let sums = stack.backward(images, &saved, &maps, &grad_maps, to);
         vec![maps, unpacked(shapes, &sums), grad_images]
     }
 

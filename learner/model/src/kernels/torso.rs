@@ -16,7 +16,7 @@ use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
 use crate::kernels::product::Product;
-use crate::kernels::stack::{SavedActivations, stack_backward, stack_forward};
+use crate::kernels::stack::SavedActivations;
 use crate::kernels::tensors::{Input, cpu, values_of};
 
 /// [`linear_of_maps`](super::linear::linear_of_maps) of [`conv_stack`](super::conv::conv_stack), to the last bit: [B, outputs] of
@@ -84,7 +84,7 @@ impl<S: Simd> Operation<2> for Torso<S> {
         let mut flat = Buffer::new(stack.count * self.inputs);
         let tasks = stack.tasks().forward(&mut flat, |task, flat| {
             let mut maps = Buffer::new(flat.len());
-            let saved = stack_forward(stack.simd, &layers, images.slice(task), &mut maps);
+            let saved = layers.forward(images.slice(task), &mut maps);
             transpose_each(&maps, last.locations(), last.channels_out, flat);
             (saved, maps)
         });
@@ -125,7 +125,7 @@ impl<S: Simd> Operation<2> for Torso<S> {
             let mut grad_maps = Buffer::new(flat.len());
             transpose_each(flat, last.channels_out, last.locations(), &mut grad_maps);
             let images = images.slice(task.images);
-            stack_backward(stack.simd, &layers, images, saved, maps, &grad_maps, None)
+            layers.backward(images, saved, maps, &grad_maps, None)
         });
         Ok([None, Some(gradient)])
     }
