@@ -47,8 +47,8 @@ impl LayerShape {
         }
     }
 
-    /// The layers of a residual block on `inputs` features and those of what is `joined`; the skip has no bias, and starts orthogonal whatever
-    /// the law of the two others.
+    /// The layers of a residual block on `inputs` features and those of what is `joined`; the skip has no bias, and starts orthogonal
+    /// whatever the law of the two others.
     pub(crate) fn block(
         name: &str,
         locations: usize,

@@ -9,7 +9,7 @@ use half::bf16;
 /// Where a buffer begins is a multiple of so many bytes, a line of a cache: AMX takes six times as long for rows that cross lines.
 pub(crate) const ALIGNMENT: usize = 64;
 /// Buffers that the pool of each type keeps; more go back to the allocator.
-const KEPT_MAX: usize = 384;
+const KEPT_MAX: usize = 1024;
 
 /// Scalars that a pool holds.
 pub(crate) trait Pooled: Copy + Default + 'static {

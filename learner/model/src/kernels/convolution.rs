@@ -182,9 +182,9 @@ pub(crate) fn backward<S: Simd, M: Element>(
     let (shape, len) = (&layer.shape, layer.shape.image_len());
     let (map_len, out) = (shape.map_len(), shape.channels_out);
     // One image's gradients where its maps are above 0, [locations, out], and as the operands of two products.
-    let mut masked = Buffer::new(map_len);
+    let mut masked = Buffer::<f32>::new(map_len);
     let stride = out.next_multiple_of(S::Element::DEPTH);
-    let mut rows = Buffer::new(shape.locations() * stride);
+    let mut rows = Buffer::<S::Element>::new(shape.locations() * stride);
     let (mut panels, mut rooms) = (gradient_panels(simd, shape), [Room::new(), Room::new()]);
     bias.fill(0.0);
     let each = maps

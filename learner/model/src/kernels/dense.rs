@@ -33,7 +33,7 @@ pub(crate) fn active_layer(
 impl<S: Simd> ActiveLayer for Dense<S> {
     fn forward_active(&self, hidden: &[f32]) -> Buffer<f32> {
         let count = hidden.len() / self.inputs;
-        let mut active = Buffer::new(count * self.row_len());
+        let mut active = Buffer::<S::Element>::new(count * self.row_len());
         activate(self.simd, hidden, self.inputs, &mut active);
         self.forward(&active, count)
     }

@@ -1,11 +1,12 @@
 //! What the network is computed with: this project's kernels for the CPU, and the same from candle's operations for the rest.
 //!
-//! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`] and [`dots`] are operations with gradients,
-//! which [`operation`] makes candle's and which split their work over the rayon pool, images into [`tasks`].
-//! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does, with
-//! [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of [`panels`] and in
-//! tiles for an instruction set of [`isa`] with the type that it multiplies; all unsafe code of the crate is there.
-//! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`tensors`] reads candle's, [`precision`] is the setting. [`candle`] needs none of them.
+//! From the outside in: [`torso`], [`conv`], [`impala`], [`linear`], [`grouped`], [`residual`] and [`dots`] are operations with
+//! gradients, which [`operation`] makes candle's and which split their work over the rayon pool, images into [`tasks`].
+//! [`stack`] takes a task's images through all convolutions, [`convolution`] computes one of them; for an IMPALA torso [`stages`] does,
+//! with [`bordered`] and [`pool`]. [`product`] computes a matrix product, [`dense`] an actor's linear layer. All work on operands of
+//! [`panels`] and in tiles for an instruction set of [`isa`] with the type that it multiplies; all unsafe code of the crate is there.
+//! [`rounding`] makes operands, [`exponentials`] what losses are made of, [`buffer`] keeps memory, [`tensors`] reads candle's,
+//! [`precision`] is the setting. [`candle`] needs none of them.
 
 pub(crate) mod bordered;
 pub(crate) mod buffer;

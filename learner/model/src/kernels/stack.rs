@@ -44,15 +44,11 @@ impl<S: Simd> Stack<S> {
             unreachable!("a stack has at least one layer")
         };
         let count = maps.len() / last.shape.map_len();
-        let mut saved = SavedActivations::with_capacity(inner.len());
+        let mut saved: SavedActivations<S::Element> = Vec::with_capacity(inner.len());
         for layer in inner {
-            let mut output = Buffer::new(count * layer.shape.map_len());
-            forward(
-                self.simd,
-                layer,
-                input_of(images, saved.last()),
-                &mut output,
-            );
+            let input = input_of(images, saved.last());
+            let mut output = Buffer::<S::Element>::new(count * layer.shape.map_len());
+            forward(self.simd, layer, input, &mut output);
             saved.push(output);
         }
         forward(self.simd, last, input_of(images, saved.last()), maps);

@@ -81,9 +81,9 @@ impl<S: Simd> Operation<2> for Torso<S> {
         let (stack, images) = (&self.stack, images.pixels()?);
         let layers = stack.layers(parameters.floats()?, false, false);
         let last = stack.last();
-        let mut flat = Buffer::new(stack.count * self.inputs);
+        let mut flat = Buffer::<f32>::new(stack.count * self.inputs);
         let tasks = stack.tasks().forward(&mut flat, |task, flat| {
-            let mut maps = Buffer::new(flat.len());
+            let mut maps = Buffer::<f32>::new(flat.len());
             let saved = layers.forward(images.slice(task), &mut maps);
             transpose_each(&maps, last.locations(), last.channels_out, flat);
             (saved, maps)
@@ -114,7 +114,7 @@ impl<S: Simd> Operation<2> for Torso<S> {
 
         let weight = values_of(&self.weight)?;
         let weight = Matrix::new(&weight, self.outputs, self.inputs);
-        let mut grad_flat = Buffer::new(stack.count * self.inputs);
+        let mut grad_flat = Buffer::<f32>::new(stack.count * self.inputs);
         Product::new(self.precision, grad, weight).write(&mut grad_flat, Mode::Replace);
         let (storage, layout) = images.storage_and_layout();
         let images = Input::new(cpu(&storage)?, layout).pixels()?;
@@ -122,7 +122,7 @@ impl<S: Simd> Operation<2> for Torso<S> {
         let (tasks, last) = (stack.tasks(), stack.last());
         let gradient = tasks.backward(&stack.shapes, &kept.tasks, &mut [], |task, kept, _| {
             let ((saved, maps), flat) = (kept, &grad_flat[task.maps]);
-            let mut grad_maps = Buffer::new(flat.len());
+            let mut grad_maps = Buffer::<f32>::new(flat.len());
             transpose_each(flat, last.channels_out, last.locations(), &mut grad_maps);
             let images = images.slice(task.images);
             layers.backward(images, saved, maps, &grad_maps, None)
