@@ -44,15 +44,9 @@ pub(crate) fn grouped_linear(
     }
     let mut order: Vec<usize> = (0..rows).collect();
     order.sort_by_key(|&row| groups[row]);
-    let mut first = 0;
-    let parts = order
-        .chunk_by(|&a, &b| groups[a] == groups[b])
-        .map(|rows| {
-            let own = first..first + rows.len();
-            first = own.end;
-            (usize::from(groups[rows[0]]), own)
-        })
-        .collect();
+    let start = |group: usize| order.partition_point(|&row| usize::from(groups[row]) < group);
+    let parts = (0..count).map(|group| start(group)..start(group + 1));
+    let parts = parts.collect();
     let operation = Grouped {
         order,
         parts,
@@ -66,8 +60,8 @@ pub(crate) fn grouped_linear(
 struct Grouped {
     /// Rows by group, and within a group in their order.
     order: Vec<usize>,
-    /// The groups that occur, ascending, and where in `order` the rows of each are.
-    parts: Vec<(usize, Range<usize>)>,
+    /// Where in `order` the rows of each group are.
+    parts: Vec<Range<usize>>,
     inputs: usize,
     out: usize,
     precision: Precision,
@@ -94,7 +88,7 @@ impl Grouped {
         values
     }
 
-    /// Calls `each` with every group that occurs and its rows of `values`, all rows of `len` scalars, on the pool.
+    /// Calls `each` with every group and its rows of `values`, all rows of `len` scalars, on the pool.
     fn for_each_part(
         &self,
         mut values: &mut [f32],
@@ -102,14 +96,13 @@ impl Grouped {
         each: impl Fn(usize, &Range<usize>, &mut [f32]) + Sync,
     ) {
         let mut tasks = Vec::with_capacity(self.parts.len());
-        for (group, rows) in &self.parts {
+        for rows in &self.parts {
             let (own, rest) = std::mem::take(&mut values).split_at_mut(rows.len() * len);
-            tasks.push((*group, rows, own));
+            tasks.push((rows, own));
             values = rest;
         }
-        tasks
-            .into_par_iter()
-            .for_each(|(group, rows, values)| each(group, rows, values));
+        let tasks = tasks.into_par_iter().enumerate();
+        tasks.for_each(|(group, (rows, values))| each(group, rows, values));
     }
 
     /// A group's rows of a sorted matrix.
@@ -125,10 +118,8 @@ impl Grouped {
     /// Adds the gradient of the weight to `sum`.
     fn add_to_weight(&self, sum: &mut [f32], grad: &[f32], x: &[f32]) {
         sum.par_chunks_exact_mut(self.out * self.inputs)
-            .enumerate()
-            .for_each(|(group, sum)| {
-                let own = self.parts.iter().find(|(it, _)| *it == group);
-                let Some((_, rows)) = own else { return };
+            .zip(&self.parts)
+            .for_each(|(sum, rows)| {
                 let grad = Self::rows(grad, rows, self.out).transposed();
                 let x = Self::rows(x, rows, self.inputs);
                 Product::new(self.precision, grad, x).write(sum, Mode::Add);
@@ -138,8 +129,7 @@ impl Grouped {
     /// Adds the gradient of the bias to `sum`.
     fn add_to_bias(&self, sum: &mut [f32], grad: &[f32]) {
         let mut all = grad.chunks_exact(self.out);
-        for (group, rows) in &self.parts {
-            let sum = &mut sum[group * self.out..][..self.out];
+        for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.parts) {
             for row in all.by_ref().take(rows.len()) {
                 for (sum, value) in sum.iter_mut().zip(row) {
                     *sum += value;
