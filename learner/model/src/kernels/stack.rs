@@ -34,11 +34,15 @@ impl<S: Simd> Stack<S> {
         Self { simd, layers }
     }
 
+    pub(crate) fn image_len(&self) -> usize {
+        self.layers[0].shape.image_len()
+    }
+
     /// Runs `images` through the layers into `maps`, the last layer's output.
-    pub(crate) fn forward(
+    pub(crate) fn forward<M: Element>(
         &self,
         images: Pixels<'_>,
-        maps: &mut [f32],
+        maps: &mut [M],
     ) -> SavedActivations<S::Element> {
         let Some((last, inner)) = self.layers.split_last() else {
             unreachable!("a stack has at least one layer")

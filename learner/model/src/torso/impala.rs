@@ -90,20 +90,14 @@ impl Torso for Impala {
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
-        let TorsoParameters { convolutions, fc } = parameters;
-        let layers = convolutions.into_iter();
-        let layers = layers.map(|it| [it.weight, it.bias].concat());
-        let parameters = layers.collect::<Vec<_>>().concat();
-        with_simd!(AnySimd::of(precision), simd => {
-            let (shapes, (_, _, channels)) = stages(self.input, &self.widths);
-            let stages = Stages::new(simd, &shapes, &parameters, false);
-            Box::new(ActingStages {
-                simd,
-                fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
-                stages,
-                takes_mean: self.takes_mean,
-            })
-        })
+        let (layers, fc) = (parameters.in_line(), parameters.fc);
+        let (shapes, (_, _, channels)) = stages(self.input, &self.widths);
+        with_simd!(AnySimd::of(precision), simd => Box::new(ActingStages {
+            simd,
+            stages: Stages::new(simd, &shapes, &layers, false),
+            fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
+            takes_mean: self.takes_mean,
+        }))
     }
 }
 

@@ -77,3 +77,12 @@ impl<T> TorsoParameters<T> {
         })
     }
 }
+
+impl TorsoParameters<Vec<f32>> {
+    /// Those of all convolutions, of each the weight, then the bias.
+    pub(crate) fn in_line(&self) -> Vec<f32> {
+        let parts = self.convolutions.iter();
+        let parts = parts.flat_map(|it| [&it.weight[..], &it.bias]);
+        parts.collect::<Vec<_>>().concat()
+    }
+}

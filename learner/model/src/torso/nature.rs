@@ -8,11 +8,11 @@ use crate::compute::Kernels;
 use crate::geometry::{ConvLayer, ConvShape};
 use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::convolution::{Convolution, forward};
 use crate::kernels::dense::{Dense, whole_steps};
-use crate::kernels::images::{Images, Pixels};
+use crate::kernels::images::Pixels;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
 use crate::kernels::precision::Precision;
+use crate::kernels::stack::Stack;
 use crate::kernels::torso::torso;
 use crate::layers::LayerShape;
 
@@ -90,42 +90,25 @@ impl Torso for Nature {
         precision: Precision,
         parameters: TorsoParameters<Vec<f32>>,
     ) -> Box<dyn ActingTorso> {
-        let TorsoParameters { convolutions, fc } = parameters;
         let channels = self.shapes.last().map_or(1, |last| last.channels_out);
-        with_simd!(AnySimd::of(precision), simd => {
-            let layers = self.shapes.iter().zip(&convolutions);
-            let layers = layers
-                .map(|(&shape, it)| Convolution::new(simd, shape, &it.weight, &it.bias, false));
-            Box::new(ActingNature {
-                simd,
-                convolutions: layers.collect(),
-                fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
-            })
-        })
+        let (layers, fc) = (parameters.in_line(), parameters.fc);
+        with_simd!(AnySimd::of(precision), simd => Box::new(ActingNature {
+            stack: Stack::new(simd, &self.shapes, &layers, false, false),
+            fc: Dense::of_maps(simd, &fc.weight, fc.bias, channels),
+        }))
     }
 }
 
 struct ActingNature<S: Simd> {
-    simd: S,
-    convolutions: Vec<Convolution<S::Element>>,
+    stack: Stack<S>,
     fc: Dense<S>,
 }
 
 impl<S: Simd> ActingTorso for ActingNature<S> {
     fn f4(&self, frames: &[u8]) -> Buffer<f32> {
-        let simd = self.simd;
-        let count = frames.len() / self.convolutions[0].shape.image_len();
-        let mut maps = Buffer::<S::Element>::new(0);
-        for (index, layer) in self.convolutions.iter().enumerate() {
-            let mut output = Buffer::<S::Element>::new(count * layer.shape.map_len());
-            let images = match index {
-                0 => Images::Pixels(Pixels::Bytes(frames)),
-                _ => Images::Maps(&maps),
-            };
-            forward(simd, layer, images, &mut output);
-            maps = output;
-        }
-        let rows = whole_steps(maps, self.fc.inputs());
-        self.fc.forward(&rows, count)
+        let (count, inputs) = (frames.len() / self.stack.image_len(), self.fc.inputs());
+        let mut maps = Buffer::<S::Element>::new(count * inputs);
+        self.stack.forward(Pixels::Bytes(frames), &mut maps);
+        self.fc.forward(&whole_steps(maps, inputs), count)
     }
 }
