@@ -30,7 +30,7 @@ pub(crate) fn apart<T: Copy + Into<f64>>(found: &[f32], wanted: &[T]) -> f64 {
 }
 
 fn values(len: usize, by: usize, scale: f32) -> Vec<f32> {
-    let value = |at: usize| ((at * by) as f64).sin() as f32 * scale;
+    let value = |at: usize| ((at * by % 1009) as f32 / 504.0 - 1.0) * scale;
     (0..len).map(value).collect()
 }
 
@@ -43,7 +43,7 @@ struct Case<'a> {
 
 impl Case<'_> {
     fn parameters(&self) -> Vec<f32> {
-        let scale = if self.is_residual { 0.33 } else { 0.16 };
+        let scale = if self.is_residual { 0.4 } else { 0.2 };
         values(parameters_len(self.shapes), 383, scale)
     }
 
@@ -142,13 +142,11 @@ fn every_instruction_set_gives_what_candle_does_in_f64() -> Result<()> {
         let wanted = case.reference()?;
         for precision in Precision::ALL {
             // What is computed is so far from the reference, and from what another instruction set gives.
-            let (tolerance, of_sets) = match (precision, is_residual) {
-                (Precision::F32, false) => (1e-5, 1e-5),
-                (Precision::F32, true) => (3e-6, 6e-6),
-                // A sum that lands on the other side of a bf16 moves what is computed from it by its 256th part.
-                (Precision::Bf16, false) => (0.3, 1e-2),
-                // ReLUs and pools that choose otherwise, too.
-                (Precision::Bf16, true) => (0.3, 0.6),
+            let (tolerance, of_sets) = match precision {
+                Precision::F32 => (3e-6, 3e-6),
+                // ReLUs and pools choose otherwise. A sum that lands on the other side of a bf16 moves what is computed from it by its
+                // 256th part.
+                Precision::Bf16 => (0.3, 1e-2),
             };
             let on = |simd| with_simd!(simd, simd => case.on(simd));
             let results: Vec<_> = AnySimd::every(precision).into_iter().map(on).collect();
