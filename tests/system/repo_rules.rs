@@ -11,12 +11,12 @@ use walkdir::{DirEntry, WalkDir};
 
 /// Most lines of Rust in each top-level folder, tests included. A change that adds code pays for it, or its commit says what it adds.
 const LINES_MAX: [(&str, usize); 6] = [
-    ("protocol", 7_760),
-    ("actor", 11_470),
+    ("protocol", 7_730),
+    ("actor", 11_120),
     ("replay-server", 11_130),
-    ("learner", 24_200),
-    ("deploy", 32_000),
-    ("tests", 10_870),
+    ("learner", 23_900),
+    ("deploy", 31_300),
+    ("tests", 10_530),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

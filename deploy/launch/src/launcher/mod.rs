@@ -116,6 +116,9 @@ pub fn run(
         let evaluator = &mut launch.evaluator;
         evaluator.finish(&launch.display.screen, &|| launch.shutdown.ending.is_set());
     }
+    // What the sessions of this process shared is released now.
+    launch.poller = None;
+    session::sweep_shared_memory();
     // No process is left that could be reached by them; where these files stay behind, locks show it.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
         if let Err(e) = std::fs::remove_file(&path) {

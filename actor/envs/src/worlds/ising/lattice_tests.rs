@@ -154,6 +154,11 @@ fn absent_sites_stay_absent_and_have_no_bonds() {
     let aligned: Vec<i8> = present.iter().map(|&it| i8::from(it)).collect();
     lattice.set_spins(&aligned).unwrap();
     assert_eq!(lattice.energy(), -4);
+    for absent in [1, -1, i8::MIN] {
+        let mut spins = aligned.clone();
+        spins[1] = absent;
+        assert!(lattice.set_spins(&spins).is_err(), "{absent}");
+    }
 }
 
 #[test]
