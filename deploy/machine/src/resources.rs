@@ -17,6 +17,9 @@ const REPLAY_SHARE_MAX: f64 = 0.9;
 /// What a learner takes on Procgen (266 MiB measured), and some room.
 pub const LEARNER_BYTES: u64 = 512 << 20;
 
+/// The environment variable by which a sweep tells a run how many share the machine's memory.
+pub const RUNS_AT_ONCE: &str = "DRIML_RUNS_AT_ONCE";
+
 /// About the bytes that `actors` processes of 16 environments take in a world: on Procgen the engine holds its pictures (410 to 423 MiB
 /// measured; 97 MiB on Ms. PacMan).
 pub fn actors_bytes(actors: u32, world: &str) -> u64 {
@@ -32,7 +35,7 @@ pub fn actors_bytes(actors: u32, world: &str) -> u64 {
 pub struct Machine {
     /// Cores that this process may use.
     pub cores: u32,
-    /// Memory that can be taken now, bytes.
+    /// Memory that can be taken now, bytes; of a run that shares it with others, its part.
     pub memory_bytes: u64,
     /// Whether its processor multiplies faster in bf16 than in f32.
     pub fast_bf16: bool,
@@ -42,9 +45,10 @@ impl Machine {
     /// This one. Where the memory cannot be read, 4 GiB are assumed.
     pub fn this() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
+        let runs = std::env::var(RUNS_AT_ONCE).ok();
         Self {
             cores,
-            memory_bytes: free_memory_bytes().unwrap_or(4 << 30),
+            memory_bytes: part_of(free_memory_bytes().unwrap_or(4 << 30), runs.as_deref()),
             fast_bf16: driml_model::is_bf16_fast(),
         }
     }
@@ -119,6 +123,11 @@ fn processor_in(cpuinfo: &str) -> Option<&str> {
     Some(name.trim())
 }
 
+fn part_of(bytes: u64, runs: Option<&str>) -> u64 {
+    let runs = runs.and_then(|it| it.parse().ok());
+    bytes / runs.filter(|&it| it > 0).unwrap_or(1)
+}
+
 /// The kernel's estimate of available memory, or what the control groups leave, if that is less.
 fn free_memory_bytes() -> Option<u64> {
     let system = kib(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:")? << 10;
@@ -171,6 +180,12 @@ mod tests {
         let cpuinfo = "processor\t: 0\nmodel name\t: AMD EPYC 9999\nflags\t: fpu\n";
         assert_eq!(processor_in(cpuinfo), Some("AMD EPYC 9999"));
         assert_eq!(processor_in(""), None);
+    }
+
+    #[test]
+    fn runs_at_once_share_the_memory() {
+        let parts = [None, Some("1"), Some("3"), Some("0"), Some("x")].map(|it| part_of(12, it));
+        assert_eq!(parts, [12, 12, 4, 12, 12]);
     }
 
     #[test]

@@ -20,7 +20,7 @@ use driml_launch::{
 use driml_machine::{
     error::{EXIT_USAGE, usage},
     process_env,
-    resources::Machine,
+    resources::{Machine, RUNS_AT_ONCE},
 };
 use driml_protocol::lock_file;
 use driml_settings::flags::Flags;
@@ -275,7 +275,8 @@ impl Queue {
         let mut command = Command::new(process_env::program());
         command
             .args(["train", "--no-play"])
-            .args(exit_with_this_process());
+            .args(exit_with_this_process())
+            .env(RUNS_AT_ONCE, self.jobs.to_string());
         if resumed {
             command.arg("--resume").arg(&folder);
         } else {
