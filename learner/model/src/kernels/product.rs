@@ -271,7 +271,8 @@ mod tests {
                 });
                 for (got, wanted) in out.iter().zip(wanted) {
                     let error = (f64::from(*got) - start - wanted).abs();
-                    assert!(error < 1e-3, "{got}, wanted {wanted}, start {start}");
+                    let max = 1e-3 + 1e-5 * wanted.abs();
+                    assert!(error < max, "{got}, wanted {wanted}, start {start}");
                 }
             }
         }
@@ -279,7 +280,7 @@ mod tests {
 
     #[test]
     fn products_of_odd_sizes_are_those_of_a_plain_loop_on_every_instruction_set() {
-        // The last two are split, and the last one's operands too.
+        // The last three are split, and operands too. The last one's sums are longer than what a task rounds.
         for [m, k, n] in [
             [1, 1, 1],
             [7, 3, 17],
@@ -288,6 +289,7 @@ mod tests {
             [13, 130, 129],
             [100, 77, 64],
             [300, 260, 9],
+            [3, (1 << 15) + 1, 5],
         ] {
             let (a, b) = (values(m * k, 7), values(k * n, 11));
             let (a_t, b_t) = (transpose(&a, m, k), transpose(&b, k, n));

@@ -249,24 +249,29 @@ mod tests {
         };
         let nans = [0x7f80_0001, 0xffff_ffff].map(f32::from_bits);
         let special = [0.0, -0.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY, 1e-45];
+        let special = nans.into_iter().chain(special);
         let mut bits = 1u32;
         // A full-period walk over the float space.
-        let walk = std::iter::from_fn(|| {
+        let mut walk = std::iter::from_fn(|| {
             bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             Some(f32::from_bits(bits))
         });
-        let mut floats = nans.into_iter().chain(special).chain(walk);
+        for value in special.clone().chain(walk.by_ref().take(1_000_000)) {
+            // Exact also where it is subnormal.
+            let (got, wanted) = (bf16::of(value).to_f32(), nearest(value));
+            let is_nearest = got.to_bits() == wanted.to_bits();
+            assert!(
+                is_nearest || got.is_nan() && value.is_nan(),
+                "{value:e}: {got:e}"
+            );
+        }
+        for byte in 0..=255 {
+            assert_eq!(f32::of_byte(byte), f32::from(byte) * (1.0 / 255.0));
+        }
         for len in (0..140).chain([100_000]) {
-            let [first, second] = [(); 2].map(|()| floats.by_ref().take(len).collect::<Vec<_>>());
-            for &value in &first {
-                // Exact also where it is subnormal.
-                let (got, wanted) = (bf16::of(value).to_f32(), nearest(value));
-                let is_nearest = got.to_bits() == wanted.to_bits();
-                assert!(
-                    is_nearest || got.is_nan() && value.is_nan(),
-                    "{value:e}: {got:e}"
-                );
-            }
+            let first: Vec<_> = special.clone().chain(walk.by_ref()).take(len).collect();
+            let special = special.clone().rev();
+            let second: Vec<_> = special.chain(walk.by_ref()).take(len).collect();
             let bytes = |by: usize| (0..len).map(move |at| (at * by % 256) as u8);
             let [first_bytes, second_bytes] = [31, 7].map(|by| bytes(by).collect::<Vec<_>>());
             for simd in AnySimd::every(Precision::Bf16) {
