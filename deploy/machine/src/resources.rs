@@ -130,10 +130,11 @@ fn part_of(bytes: u64, runs: Option<&str>) -> u64 {
 
 /// The kernel's estimate of available memory, or what the control groups leave, if that is less.
 fn free_memory_bytes() -> Option<u64> {
-    let system = kib(&fs::read_to_string("/proc/meminfo").ok()?, "MemAvailable:")? << 10;
+    let table = fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let system = kib(&table, "MemAvailable:").map(|kib| kib << 10);
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let left = left_by_groups(Path::new("/sys/fs/cgroup"), &groups);
-    Some(left.map_or(system, |left| left.min(system)))
+    system.into_iter().chain(left).min()
 }
 
 /// Bytes that the control groups of a process leave it: the least of its own and those around it, of either version.

@@ -38,9 +38,9 @@ pub fn kib(table: &str, name: &str) -> Option<u64> {
 /// A number with three digits that matter, and all those before the point.
 pub fn number(value: f64) -> String {
     match value.abs() {
-        size if size >= 100.0 => format!("{value:.0}"),
-        size if size >= 10.0 => format!("{value:.1}"),
-        size if size >= 1.0 || size == 0.0 => format!("{value:.2}"),
+        size if size >= 99.95 => format!("{value:.0}"),
+        size if size >= 9.995 => format!("{value:.1}"),
+        size if size >= 0.9995 || size == 0.0 => format!("{value:.2}"),
         _ => format!("{value:.3}"),
     }
 }
@@ -57,6 +57,8 @@ mod tests {
         assert_eq!(texts, ["3 s", "99 s", "2 min", "60 min", "2.5 h"]);
         let texts = [0.0, 0.12345, 1.2345, 12.345, 123.45, 61_234.5].map(number);
         assert_eq!(texts, ["0.00", "0.123", "1.23", "12.3", "123", "61234"]);
+        let texts = [0.9994, 0.9996, 9.994, 9.996, 99.94, 99.96].map(number);
+        assert_eq!(texts, ["0.999", "1.00", "9.99", "10.0", "99.9", "100"]);
         assert_eq!(gib(3 << 29), "1.5 GiB");
     }
 

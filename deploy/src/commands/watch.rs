@@ -6,11 +6,12 @@ use clap::{ArgGroup, Args};
 use driml_launch::{
     console,
     endpoint::{NAMESPACE, check_endpoints},
-    run_folder::RunFolder,
+    run_folder::{RunFolder, Summary},
     view::Poller,
     watch::{self, Live, Outputs, endpoints_of},
 };
 use driml_protocol::tls::Role;
+use serde_json::json;
 
 use super::join::TlsFlags;
 
@@ -66,7 +67,7 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    let Some(poller) = args.look.open()? else {
+    let Some(poller) = args.look.open(args.json)? else {
         return Ok(());
     };
     let outputs = Outputs {
@@ -81,7 +82,7 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    let Some(mut poller) = args.look.open()? else {
+    let Some(mut poller) = args.look.open(args.json)? else {
         return Ok(());
     };
     let folder = args.look.folder();
@@ -89,23 +90,36 @@ pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
 }
 
 impl LookFlags {
-    /// A connection to the run; none if it is over, which is then printed.
-    fn open(&self) -> anyhow::Result<Option<Poller>> {
+    /// A connection to the run; none if it is over, which is then printed, `as_json` or for a person.
+    fn open(&self, as_json: bool) -> anyhow::Result<Option<Poller>> {
         check_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
         let endpoints = match self.live()? {
             None => self.connect.clone(),
             Some(Live::At(endpoints)) => endpoints,
-            Some(Live::Over(how)) => return console::print(&how).map(|()| None),
+            Some(Live::Over(how)) => return self.print_over(&how, as_json).map(|()| None),
         };
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
         // It may have ended meanwhile.
         if opened.is_err()
             && let Some(Live::Over(how)) = self.live()?
         {
-            return console::print(&how).map(|()| None);
+            return self.print_over(&how, as_json).map(|()| None);
         }
         opened.map(Some)
+    }
+
+    /// How a run stands that cannot be asked; as JSON, the first line of it, and the summary of one that has it.
+    fn print_over(&self, how: &str, as_json: bool) -> anyhow::Result<()> {
+        if !as_json {
+            return console::print(how);
+        }
+        let summary = self.folder().and_then(|it| Summary::read(&it).ok());
+        let line = how.lines().next();
+        console::print(&format!(
+            "{}\n",
+            json!({ "over": line, "summary": summary })
+        ))
     }
 
     /// How the run stands by its folder, if one was given.

@@ -16,6 +16,7 @@ use super::{
     folder::{list, read},
 };
 use crate::{
+    affinity::AffinityEstimator,
     agent::{Agent, NetworkParameters},
     progress::Progress,
     settings::LearnerSettings,
@@ -123,6 +124,14 @@ fn check_model(path: &Path, online: &[u8], model: &ModelConfig) -> Result<(), Ch
 pub fn progress(path: &Path) -> Result<(u64, Progress), CheckpointError> {
     let state = read_state(path)?;
     Ok((state.updates, state.progress))
+}
+
+/// The action affinity of the checkpoint at `path`; none of an agent that learns none.
+///
+/// # Errors
+/// A file that is missing or is not what was written.
+pub fn affinity(path: &Path) -> Result<Option<AffinityEstimator>, CheckpointError> {
+    Ok(read_state(path)?.affinity)
 }
 
 /// The caller's companion of the checkpoint at `path`, if any.

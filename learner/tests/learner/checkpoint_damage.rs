@@ -5,7 +5,7 @@ use std::fs;
 use candle_core::{Device, Tensor};
 use driml_learner::{
     AffinityEstimator, Alphabet, ExactAffinity, ExactSettings,
-    checkpoint::{CheckpointError, LearnerState},
+    checkpoint::{self, CheckpointError, LearnerState},
 };
 use driml_model::Compute;
 use tempfile::tempdir;
@@ -36,6 +36,8 @@ fn every_kind_of_damage_is_reported_with_its_file() {
             let error = load(folder.path()).expect_err(name);
             assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
             check_says(error, &[name, "remove"]);
+            let error = checkpoint::affinity(&path);
+            assert_eq!(error.is_err(), name.starts_with("state.json"), "{name}");
         };
         for cut in [0, whole.len() / 2] {
             fs::write(&file, &whole[..cut]).unwrap();

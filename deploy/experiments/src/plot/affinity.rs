@@ -1,10 +1,9 @@
 //! The action affinity A of runs as heat maps, from their newest checkpoints.
 //! It computes nothing: A is what the learner last sent to the replay server.
 
-use anyhow::Context;
 use driml_figure::{Figure, Heat, Panel};
 use driml_launch::{chosen::config_of, run_folder::RunFolder};
-use driml_learner::{AffinityEstimator, checkpoint};
+use driml_learner::checkpoint;
 use driml_machine::error::usage;
 
 use super::runs::folder_name;
@@ -33,13 +32,7 @@ fn heat(folder: &RunFolder) -> anyhow::Result<Heat> {
             folder.display()
         )
     })?;
-    let path = path.join("state.json");
-    let doing = || format!("reading {}", path.display());
-    let text = std::fs::read_to_string(&path).with_context(doing)?;
-    let mut state: serde_json::Value = serde_json::from_str(&text).with_context(doing)?;
-    let affinity: Option<AffinityEstimator> =
-        serde_json::from_value(state["affinity"].take()).with_context(doing)?;
-    let affinity = affinity
+    let affinity = checkpoint::affinity(path)?
         .ok_or_else(|| usage!("{} has no A: only driml-ada learns one", folder.display()))?;
     let side = affinity.num_actions();
     let values = affinity.matrix().into_iter().map(|a| Some(f64::from(a)));

@@ -13,7 +13,7 @@ use std::{
 
 use anyhow::Context;
 use driml_figure::{Ink, Picture, Rect};
-use driml_learner::{AffinityEstimator, checkpoint};
+use driml_learner::checkpoint;
 use driml_protocol::ReplayStatus;
 
 use self::encode::{At, Value};
@@ -118,10 +118,7 @@ impl Events {
         if self.drawn.is_some_and(|drawn| drawn >= updates) {
             return None;
         }
-        let text = fs::read(path.join("state.json")).ok()?;
-        let mut state: serde_json::Value = serde_json::from_slice(&text).ok()?;
-        let affinity: Option<AffinityEstimator> =
-            serde_json::from_value(state["affinity"].take()).ok()?;
+        let affinity = checkpoint::affinity(&path).ok()?;
         self.drawn = Some(updates);
         let affinity = affinity?;
         let picture = draw(affinity.num_actions(), &affinity.matrix()).ok()?;
