@@ -271,7 +271,7 @@ mod tests {
                 });
                 for (got, wanted) in out.iter().zip(wanted) {
                     let error = (f64::from(*got) - start - wanted).abs();
-                    let max = 1e-3 + 1e-5 * wanted.abs();
+                    let max = 1e-3 + 1e-4 * wanted.abs();
                     assert!(error < max, "{got}, wanted {wanted}, start {start}");
                 }
             }
