@@ -17,8 +17,8 @@ const REPLAY_SHARE_MAX: f64 = 0.9;
 /// What a learner takes on Procgen (266 MiB measured), and some room.
 pub const LEARNER_BYTES: u64 = 512 << 20;
 
-/// The environment variable by which a sweep tells a run how many share the machine's memory.
-pub const RUNS_AT_ONCE: &str = "DRIML_RUNS_AT_ONCE";
+/// The environment variable by which a sweep tells a run its part of the memory that was free, in bytes.
+pub const MEMORY_SHARE: &str = "DRIML_MEMORY_SHARE";
 
 /// About the bytes that `actors` processes of 16 environments take in a world: on Procgen the engine holds its pictures (410 to 423 MiB
 /// measured; 97 MiB on Ms. PacMan).
@@ -35,7 +35,7 @@ pub fn actors_bytes(actors: u32, world: &str) -> u64 {
 pub struct Machine {
     /// Cores that this process may use.
     pub cores: u32,
-    /// Memory that can be taken now, bytes; of a run that shares it with others, its part.
+    /// Memory that can be taken now, bytes; for a run of a sweep no more than its part.
     pub memory_bytes: u64,
     /// Whether its processor multiplies faster in bf16 than in f32.
     pub fast_bf16: bool,
@@ -45,10 +45,10 @@ impl Machine {
     /// This one. Where the memory cannot be read, 4 GiB are assumed.
     pub fn this() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
-        let runs = std::env::var(RUNS_AT_ONCE).ok();
+        let share = std::env::var(MEMORY_SHARE).ok();
         Self {
             cores,
-            memory_bytes: part_of(free_memory_bytes().unwrap_or(4 << 30), runs.as_deref()),
+            memory_bytes: bounded(free_memory_bytes().unwrap_or(4 << 30), share.as_deref()),
             fast_bf16: driml_model::is_bf16_fast(),
         }
     }
@@ -123,9 +123,9 @@ fn processor_in(cpuinfo: &str) -> Option<&str> {
     Some(name.trim())
 }
 
-fn part_of(bytes: u64, runs: Option<&str>) -> u64 {
-    let runs = runs.and_then(|it| it.parse().ok());
-    bytes / runs.filter(|&it| it > 0).unwrap_or(1)
+fn bounded(bytes: u64, share: Option<&str>) -> u64 {
+    let share = share.and_then(|it| it.parse().ok());
+    share.map_or(bytes, |share| bytes.min(share))
 }
 
 /// The kernel's estimate of available memory, or what the control groups leave, if that is less.
@@ -184,9 +184,9 @@ mod tests {
     }
 
     #[test]
-    fn runs_at_once_share_the_memory() {
-        let parts = [None, Some("1"), Some("3"), Some("0"), Some("x")].map(|it| part_of(12, it));
-        assert_eq!(parts, [12, 12, 4, 12, 12]);
+    fn a_share_is_a_bound() {
+        let found = [None, Some("16"), Some("64"), Some("x")].map(|share| bounded(33, share));
+        assert_eq!(found, [33, 16, 33, 33]);
     }
 
     #[test]

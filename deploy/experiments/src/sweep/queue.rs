@@ -20,7 +20,7 @@ use driml_launch::{
 use driml_machine::{
     error::{EXIT_USAGE, usage},
     process_env,
-    resources::{Machine, RUNS_AT_ONCE},
+    resources::{MEMORY_SHARE, Machine},
 };
 use driml_protocol::lock_file;
 use driml_settings::flags::Flags;
@@ -55,6 +55,7 @@ pub(crate) fn make<P>(
     let mut queue = Queue {
         runs,
         jobs,
+        memory_share: Machine::this().memory_bytes / u64::from(jobs),
         commit: commit()?,
         waiting: VecDeque::new(),
         running: Vec::new(),
@@ -116,6 +117,8 @@ fn commit() -> anyhow::Result<String> {
 struct Queue {
     runs: Runs,
     jobs: u32,
+    /// Bytes of memory for each of the runs at once.
+    memory_share: u64,
     /// Of this program.
     commit: String,
     waiting: VecDeque<Job>,
@@ -272,17 +275,7 @@ impl Queue {
             ));
         }
         self.runs.write_call(plan, &self.commit, resumed)?;
-        let mut command = Command::new(process_env::program());
-        command
-            .args(["train", "--no-play"])
-            .args(exit_with_this_process())
-            .env(RUNS_AT_ONCE, self.jobs.to_string());
-        if resumed {
-            command.arg("--resume").arg(&folder);
-        } else {
-            command.arg("--run-dir").arg(&folder);
-            command.args(self.threads()).args(plan.call.args());
-        }
+        let mut command = self.command(plan, resumed);
         command
             .stdin(Stdio::null())
             .stdout(log.try_clone().with_context(doing)?)
@@ -302,6 +295,23 @@ impl Queue {
             done,
             enough: false,
         }))
+    }
+
+    /// The call that makes a run, or resumes it with the replay and the threads that it has.
+    fn command(&self, plan: &PlannedRun, resumed: bool) -> Command {
+        let folder = self.runs.folder(plan);
+        let mut command = Command::new(process_env::program());
+        command
+            .args(["train", "--no-play"])
+            .args(exit_with_this_process());
+        if resumed {
+            command.arg("--resume").arg(folder.path());
+        } else {
+            command.arg("--run-dir").arg(folder.path());
+            command.args(self.threads()).args(plan.call.args());
+            command.env(MEMORY_SHARE, self.memory_share.to_string());
+        }
+        command
     }
 
     /// Whether what lies in the plan's folder can be resumed.
@@ -398,6 +408,7 @@ mod tests {
         let queue = Queue {
             runs,
             jobs: 1,
+            memory_share: 7,
             commit: "def".into(),
             waiting: [Job::of(plan.clone())].into(),
             running: Vec::new(),
@@ -414,6 +425,18 @@ mod tests {
         let mut progress = Progress::new(10, GracefulShutdown::default());
         assert_eq!(queue.find(&plan, &mut progress), 9);
         assert_eq!(progress.seconds_left(1.0), None);
+    }
+
+    #[test]
+    fn a_run_is_told_its_part_of_the_memory_once() {
+        let root = tempfile::tempdir().unwrap();
+        let (queue, plan) = queue(root.path());
+        let share = |resumed| {
+            let command = queue.command(&plan, resumed);
+            let mut shares = command.get_envs().filter(|(name, _)| *name == MEMORY_SHARE);
+            shares.find_map(|(_, value)| value.map(std::ffi::OsStr::to_owned))
+        };
+        assert_eq!([share(false), share(true)], [Some("7".into()), None]);
     }
 
     /// As when a run saved while this call waited for its log.

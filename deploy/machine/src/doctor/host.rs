@@ -78,7 +78,7 @@ fn vectors(at_once: Option<u32>) -> Found {
         Some(16) => (State::Ok, "AVX-512: 16 float32 at once".into()),
         Some(8) => (
             State::Ok,
-            "AVX2 and FMA: 8 float32 at once; there is no AVX-512".into(),
+            "AVX2 and FMA: 8 float32 at once; AVX-512 is missing".into(),
         ),
         Some(_) => (
             State::Note,
