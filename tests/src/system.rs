@@ -99,9 +99,10 @@ impl TestSystem {
         Certificates::at(self.path("tls"))
     }
 
-    /// Learners that are started from now on stand still after so many updates, until [`Self::let_go`]: their run is not over before a
-    /// test has seen and done what it has to, however slow the test is.
+    /// Learners that are started from now on stand still after so many updates, and report no more, until [`Self::let_go`]: their run is
+    /// not over before a test has seen and done what it has to, however slow the test is.
     pub fn hold_at(&self, updates: u64) {
+        assert!(!self.path(GO).exists(), "learners were let go before");
         self.held_at.store(updates, Ordering::Relaxed);
     }
 

@@ -1,6 +1,6 @@
 //! What a run leaves outside its folder, in the temporary folder and in shared memory: nothing, however it ended; or until the
 //! next run starts, if all its processes were killed. A killed launcher's learner saves what it has learned.
-//! Shared memory of single processes that end is looked for in `by_hand` and `failures`, too.
+//! Shared memory of single processes that end is looked for in `failures`, too.
 
 use std::{fs, path::PathBuf};
 
@@ -37,6 +37,23 @@ fn a_killed_launcher_leaves_its_checkpoints_and_nothing_else() {
     process.kill();
     system.wait_until_all_have_ended();
     assert!(system.run_folder("run").saved_updates() > 100);
+    assert_eq!(temporary(&system), [] as [PathBuf; 0]);
+    check_gone(&segments);
+}
+
+#[test]
+fn a_run_that_finishes_leaves_its_folder_alone() {
+    let system = system();
+    fs::create_dir(system.path("tmp")).unwrap();
+    system.hold_at(100);
+    let process = system.start(&local(
+        &system,
+        &format!("--agent c51 {SHORT} --run-dir run"),
+    ));
+    system.run_folder("run").wait_for_updates(50);
+    let segments = shared_memory(&system);
+    system.let_go();
+    process.wait_ok();
     assert_eq!(temporary(&system), [] as [PathBuf; 0]);
     check_gone(&segments);
 }

@@ -16,7 +16,7 @@ const LINES_MAX: [(&str, usize); 6] = [
     ("replay-server", 11_130),
     ("learner", 23_950),
     ("deploy", 31_320),
-    ("tests", 10_530),
+    ("tests", 10_540),
 ];
 /// Most lines of one file.
 const FILE_LINES_MAX: usize = 450;

@@ -99,13 +99,16 @@ fn a_run_that_is_ending_is_no_riddle() {
     system
         .run_ok("status --run run")
         .expect_printed("the run in run is stopping: all frames are stored");
+    let stopping = system.run_ok("status --json --run run").json();
+    assert_eq!(stopping["finished"], false, "{stopping}");
     process.interrupt().expect_code(0);
     system
         .run_ok("status --run run")
         .expect_printed("the run is over");
     for command in ["status --json", "watch --once --json"] {
         let over = system.run_ok(&format!("{command} --run run")).json();
-        assert_eq!(over["over"], "the run is over");
+        assert_eq!(over["finished"], true);
+        assert_eq!(over["message"], "the run is over");
         assert_eq!(over["summary"]["outcome"], "finished", "{over}");
     }
 }

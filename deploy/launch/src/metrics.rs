@@ -165,7 +165,7 @@ fn losses(it: &RunView) -> Vec<Member> {
 }
 
 impl Column {
-    /// Its numbers: one of its own name, or one for each of several things; none of words.
+    /// Its numbers: one under its name, or one for each of several things; none of a text.
     pub(crate) fn members(&self, view: &RunView) -> Vec<Member> {
         match self.value {
             Value::Counter(value) | Value::Gauge(value) => vec![(self.name.into(), value(view))],

@@ -109,17 +109,19 @@ impl LookFlags {
         opened.map(Some)
     }
 
-    /// How a run stands that cannot be asked; as JSON, the first line of it, and the summary of one that has it.
+    /// How a run stands that cannot be asked; as JSON, whether it is complete and its processes have ended, the first line, and its
+    /// summary if it has one.
     fn print_over(&self, how: &str, as_json: bool) -> anyhow::Result<()> {
         if !as_json {
             return console::print(how);
         }
-        let summary = self.folder().and_then(|it| Summary::read(&it).ok());
-        let line = how.lines().next();
-        console::print(&format!(
-            "{}\n",
-            json!({ "over": line, "summary": summary })
-        ))
+        let folder = self.folder();
+        let is_finished = |it: &RunFolder| Summary::is_finished(it) && !it.is_locked();
+        let finished = folder.as_ref().is_some_and(is_finished);
+        let summary = folder.and_then(|it| Summary::read(&it).ok());
+        let message = how.lines().next();
+        let all = json!({ "finished": finished, "message": message, "summary": summary });
+        console::print(&format!("{all}\n"))
     }
 
     /// How the run stands by its folder, if one was given.

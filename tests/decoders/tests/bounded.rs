@@ -131,7 +131,7 @@ macro_rules! bounded {
 
 bounded!(wire messages replay state config segments);
 
-/// A seed as it is stored; `UPDATE_CORPUS=1` stores these bytes first.
+/// A stored seed; `UPDATE_CORPUS=1` stores these bytes first.
 fn stored(file: &Path, bytes: &[u8]) -> Vec<u8> {
     if std::env::var_os("UPDATE_CORPUS").is_some() {
         fs::create_dir_all(file.parent().unwrap()).unwrap();

@@ -108,6 +108,7 @@ pub fn run(
     let ran = launch.start_and_watch();
     let ended = launch.end(ran);
     session::sweep_shared_memory();
+    crate::shared_memory::remove_own();
     launch.display.screen.clear();
     let outcome = ended.as_ref().map_or(Outcome::Failed, |outcome| *outcome);
     let (mut summary, written) = launch.conclude(outcome, restarts_before);
@@ -116,9 +117,6 @@ pub fn run(
         let evaluator = &mut launch.evaluator;
         evaluator.finish(&launch.display.screen, &|| launch.shutdown.ending.is_set());
     }
-    // What the sessions of this process shared is released now.
-    launch.poller = None;
-    session::sweep_shared_memory();
     // No process is left that could be reached by them; where these files stay behind, locks show it.
     for path in [run_dir.endpoints(), run_dir.rendezvous()] {
         if let Err(e) = std::fs::remove_file(&path) {

@@ -58,7 +58,7 @@ pub(super) struct Local {
 pub(super) struct Layout {
     frame: FrameShape,
     zoom: usize,
-    /// Pixels across and down of a frame as it is shown, and of all that is shown of an environment.
+    /// Pixels across and down of a frame on the screen, and of all that is shown of an environment.
     enlarged: (f64, f64),
     tile: (f64, f64),
     columns: usize,
