@@ -1,9 +1,9 @@
 //! A fully connected layer as an actor applies it, on slices, on the calling thread.
 //! It has no gradient; `linear` is the layer with one.
 
+use crate::kernels::bordered::store_active;
 use crate::kernels::buffer::Buffer;
-use crate::kernels::isa::{AnySimd, Element, Left, Mode, Simd, vectorized, with_simd};
-use crate::kernels::linear::relu_of;
+use crate::kernels::isa::{AnySimd, Element, Left, Mode, Simd, with_simd};
 use crate::kernels::panels::{Matrix, Panels, Threads};
 use crate::kernels::precision::Precision;
 use crate::layers::Layer;
@@ -102,15 +102,12 @@ pub(crate) fn whole_steps<E: Element>(rows: Buffer<E>, len: usize) -> Buffer<E> 
     padded
 }
 
-vectorized! {
-    /// relu of `hidden` [rows, cols] as rows of whole steps.
-    fn activate<S>(simd, hidden: &'a [f32], cols: usize, active: &'a mut [S::Element]) {
-        let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
-        for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
-            row.fill(S::Element::default());
-            for (value, &hidden) in row.iter_mut().zip(hidden) {
-                *value = S::Element::of(relu_of(hidden));
-            }
-        }
+/// relu of `hidden` [rows, cols] as rows of whole steps.
+fn activate<S: Simd>(simd: S, hidden: &[f32], cols: usize, active: &mut [S::Element]) {
+    let rows = active.chunks_exact_mut(cols.next_multiple_of(S::Element::DEPTH));
+    for (row, hidden) in rows.zip(hidden.chunks_exact(cols)) {
+        let (begin, end) = row.split_at_mut(cols);
+        store_active(simd, hidden, begin);
+        end.fill(S::Element::default());
     }
 }

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use crate::gradients;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
+use crate::kernels::linear::add_rows;
 use crate::kernels::operation::{Operation, apply_to_three};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
@@ -128,13 +129,8 @@ impl Grouped {
 
     /// Adds the gradient of the bias to `sum`.
     fn add_to_bias(&self, sum: &mut [f32], grad: &[f32]) {
-        let mut all = grad.chunks_exact(self.out);
         for (sum, rows) in sum.chunks_exact_mut(self.out).zip(&self.parts) {
-            for row in all.by_ref().take(rows.len()) {
-                for (sum, value) in sum.iter_mut().zip(row) {
-                    *sum += value;
-                }
-            }
+            add_rows(sum, &grad[rows.start * self.out..rows.end * self.out]);
         }
     }
 }

@@ -184,7 +184,8 @@ pub(crate) fn add_to(sum: Option<Vec<f32>>, part: Vec<f32>) -> Vec<f32> {
     sum
 }
 
-fn add_rows(sum: &mut [f32], rows: &[f32]) {
+/// Adds `rows`, one after the other, to `sum`, which is as long as each.
+pub(crate) fn add_rows(sum: &mut [f32], rows: &[f32]) {
     for row in rows.chunks_exact(sum.len()) {
         for (sum, value) in sum.iter_mut().zip(row) {
             *sum += value;

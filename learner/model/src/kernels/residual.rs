@@ -9,7 +9,7 @@ use candle_core::{Result, Tensor, bail};
 use crate::gradients::sum_in_place;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::isa::Mode;
-use crate::kernels::linear::{add_to, group_sums, relu_gradient, relu_in_place};
+use crate::kernels::linear::{add_rows, add_to, group_sums, relu_gradient, relu_in_place};
 use crate::kernels::operation::{Operation, apply_to_two};
 use crate::kernels::panels::Matrix;
 use crate::kernels::precision::Precision;
@@ -120,16 +120,14 @@ impl Block {
     }
 
     /// The biases [groups, outputs] of each row of what is joined: `bias`, and its product with its part of a weight.
-    fn biases(&self, bias: &[f32], joined: Option<(Matrix<'_>, Matrix<'_>)>) -> Buffer<f32> {
-        let mut biases = Buffer::new(self.groups * bias.len());
-        for row in biases.chunks_exact_mut(bias.len()) {
-            row.copy_from_slice(bias);
+    fn biases(&self, bias: &[f32], joined: Option<(Matrix<'_>, Matrix<'_>)>) -> Vec<f32> {
+        match joined {
+            None => bias.to_vec(),
+            Some((joined, weight)) => {
+                let product = self.product(joined, weight.transposed());
+                product.added_to(bias).to_vec()
+            }
         }
-        if let Some((joined, weight)) = joined {
-            let product = self.product(joined, weight.transposed());
-            product.write(&mut biases, Mode::Add);
-        }
-        biases
     }
 
     /// The gradient of a weight, of which x's columns are the first and those of what is joined the others, added to `sum`.
@@ -181,9 +179,7 @@ impl Operation<2> for Block {
         let (weight, of_joined) = self.parts(&weight);
         let mut bias = vec![0.0; self.outputs];
         for part in &parameters.out_biases {
-            for (bias, part) in bias.iter_mut().zip(&*values_of(part)?) {
-                *bias += part;
-            }
+            add_rows(&mut bias, &values_of(part)?);
         }
         let biases = self.biases(&bias, joined.zip(of_joined));
         let product = self.product(x, weight.transposed());

@@ -11,6 +11,7 @@ use crate::init::InitialLaw;
 use crate::kernels::buffer::Buffer;
 use crate::kernels::dense::Dense;
 use crate::kernels::isa::{AnySimd, Simd, with_simd};
+use crate::kernels::linear::add_rows;
 use crate::kernels::precision::Precision;
 use crate::kernels::rounding::write_rows;
 use crate::kernels::stages::Stages;
@@ -132,11 +133,7 @@ impl<S: Simd> ActingTorso for ActingStages<S> {
 /// The mean of `map` [locations, channels] over its locations.
 fn mean_of_locations(map: &[f32], channels: usize) -> Vec<f32> {
     let mut sums = vec![0.0; channels];
-    for location in map.chunks_exact(channels) {
-        for (sum, value) in sums.iter_mut().zip(location) {
-            *sum += value;
-        }
-    }
+    add_rows(&mut sums, map);
     let locations = (map.len() / channels) as f32;
     sums.iter().map(|sum| sum / locations).collect()
 }
