@@ -20,8 +20,8 @@ pub type Built = Result<Box<dyn Environment>, EnvError>;
 
 /// The settings of one world.
 ///
-/// They are read from TOML, where unknown keys are errors, and have no defaults. A world without variants implements the methods
-/// alone that have no body here.
+/// They are read from TOML, where unknown keys are errors, and have no defaults. A world implements the methods that have no body
+/// here, and those others that answer something else for it.
 pub trait WorldSettings {
     /// # Errors
     /// Says which setting cannot work, and what would.

@@ -15,13 +15,13 @@ pub(super) type Point = (f64, f64);
 /// An upright rectangle by its upper left corner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rect {
-    /// From the left.
+    /// Distance of its left edge from the picture's, in pixels.
     pub x: f64,
-    /// From above.
+    /// Distance of its upper edge from the picture's, in pixels.
     pub y: f64,
-    /// To its right edge.
+    /// Pixels from its left to its right edge.
     pub width: f64,
-    /// To its lower edge.
+    /// Pixels from its upper to its lower edge.
     pub height: f64,
 }
 

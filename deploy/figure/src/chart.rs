@@ -77,7 +77,7 @@ impl Axis {
         }
     }
 
-    /// Its range for these values, with slack; none if there is no value.
+    /// Its range for these values, with slack; none without values.
     fn scale(&self, values: impl Iterator<Item = f64>, slack: f64) -> Option<Scale<'_>> {
         let all = values.chain(self.shows.iter().copied());
         let kept = all.filter(|value| self.keeps(*value));

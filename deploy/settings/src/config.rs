@@ -146,7 +146,7 @@ impl RunConfig {
         start.updates + (rows / f64::from(self.learner.batch_size)) as u64
     }
 
-    /// These settings, if they pass each component's checks of its own table, then those that span two tables.
+    /// These settings, if they pass the checks of each component, then those that span two tables.
     pub(crate) fn checked(self) -> Result<Self, Usage> {
         fn said(e: impl std::fmt::Display) -> Usage {
             Usage(e.to_string())

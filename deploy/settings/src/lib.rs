@@ -23,3 +23,5 @@ pub mod memory;
 pub mod menu;
 mod overrides;
 pub mod presets;
+
+pub use overrides::leaves;

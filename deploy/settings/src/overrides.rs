@@ -109,7 +109,7 @@ impl Override {
 }
 
 /// All values that are not tables, by their dotted paths.
-pub(crate) fn leaves(table: &Table) -> Vec<(String, &Value)> {
+pub fn leaves(table: &Table) -> Vec<(String, &Value)> {
     let mut found = Vec::new();
     for (key, value) in table {
         match value {

@@ -9,6 +9,7 @@ use std::{
 use anyhow::Context;
 use driml_launch::run_folder::{RunFolder, Table};
 use driml_machine::error::{Usage, nearest, usage};
+use driml_settings::leaves;
 
 /// The column with the standard deviation of k; runs recorded by older programs lack it.
 pub(super) const SPREAD_OF_K: &str = "sd_k";
@@ -170,15 +171,7 @@ fn settings(path: &Path) -> Option<(Settings, Option<i64>)> {
 
 /// Every setting of a table.
 pub(super) fn flat(table: &toml::Table) -> Settings {
-    let mut all = Settings::new();
-    for (key, value) in table {
-        if let toml::Value::Table(inner) = value {
-            let inner = flat(inner).into_iter();
-            all.extend(inner.map(|(name, text)| (format!("{key}.{name}"), text)));
-        } else {
-            let text = value.as_str().map(str::to_owned);
-            all.insert(key.clone(), text.unwrap_or_else(|| value.to_string()));
-        }
-    }
-    all
+    let text = |it: &toml::Value| it.as_str().map_or_else(|| it.to_string(), str::to_owned);
+    let all = leaves(table).into_iter();
+    all.map(|(name, value)| (name, text(value))).collect()
 }

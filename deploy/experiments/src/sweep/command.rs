@@ -176,7 +176,7 @@ fn folder_name(axes: &[Axis], cell: &Cell, at: usize) -> String {
     letters.take(NAME_LETTERS).collect()
 }
 
-/// What came out, a row a cell, with empty cells where there is no number; the point of a run is its cell's number.
+/// What came out, a row a cell, with empty cells where a number is missing; the point of a run is its cell's number.
 fn rows(cells: &[Cell], made: &[Made<usize>]) -> Vec<Vec<String>> {
     let row = |(at, cell): (usize, &Cell)| {
         let here = made.iter().filter(|it| it.point == at);

@@ -43,7 +43,7 @@ impl Game {
             pellets_left: MAZE.pellets,
             episode_step: 0,
             episodes,
-            background: render::background(),
+            background: render::BACKGROUND.clone(),
         }
     }
 

@@ -1,6 +1,8 @@
 //! How Ms. PacMan looks: one pixel a cell, [21, 19, 3] RGB.
 //! It does not enlarge frames; what a frame cannot show (a ghost's mode, the boost's remaining steps) stays hidden.
 
+use std::sync::LazyLock;
+
 use super::maze::{GHOSTS, HEIGHT, Item, MAZE, Place, WIDTH};
 
 /// Bytes a pixel.
@@ -22,7 +24,9 @@ pub(crate) const GHOST: [Colour; GHOSTS] = [[255, 0, 0], [0, 255, 255], [255, 12
 pub(crate) const FUCHSIA: Colour = [255, 0, 255];
 
 /// A frame [21, 19, 3] of walls, floor and all the food.
-pub(crate) fn background() -> Vec<u8> {
+pub(crate) static BACKGROUND: LazyLock<Vec<u8>> = LazyLock::new(background);
+
+fn background() -> Vec<u8> {
     let mut frame = WALL.repeat(HEIGHT * WIDTH);
     for (place, item) in MAZE.places().zip(&MAZE.items) {
         let colour = match item {

@@ -261,7 +261,7 @@ fn levels(mut dials: Vec<Dial>, world: WorldName, names: &[String]) -> Result<Ve
     let known: Vec<_> = dials.iter().map(|dial| dial.name.as_str()).collect();
     if let Some(unknown) = names.iter().find(|name| !known.contains(&name.as_str())) {
         return Err(usage!(
-            "there is no dial {unknown:?} in this world{}; --dials takes {}",
+            "unknown dial {unknown:?} in this world{}; --dials takes {}",
             nearest(unknown, known.iter().copied()),
             known.join(", ")
         ));
