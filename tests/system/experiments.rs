@@ -37,7 +37,7 @@ fn check_page(folder: &Path, sections: &[&str], files: &str) -> String {
         "smoke length",
         "**Claim.**",
         "**Command.** `driml experiment",
-        "**Got.**",
+        "**Results.**",
         "**Differences from the paper.**",
     ];
     check_has(&page, &of_all);
@@ -107,7 +107,7 @@ fn procgen_without_the_engine() {
     system.run_ok(call);
     let folder = system.path("experiments/procgen");
     let files = "curves.png curves.svg table.csv";
-    let page = check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
+    let page = check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
     let words = page.split_whitespace().count();
     assert!(words <= 500, "{words} words");
     let first = data(&folder);
@@ -127,7 +127,8 @@ fn procgen_without_the_engine() {
     system.run_ok(call);
     assert_eq!(data(&folder), first);
 
-    // A run that failed is moved aside and made anew, and played anew; the others stay. What was played before is made recognisable.
+    // A run that failed before its first checkpoint is moved aside and made anew, and played anew; the others stay. What was played before
+    // is made recognisable.
     let pieces = folder.join("pieces");
     for name in ["chain-c51-seed1-greedy", "chain-c51-seed2-greedy"] {
         let path = pieces.join(format!("{name}.json"));
@@ -140,6 +141,7 @@ fn procgen_without_the_engine() {
     let text = fs::read_to_string(summary("chain-c51-seed2")).unwrap();
     let failed = text.replace(": \"finished\"", ": \"failed\"");
     fs::write(summary("chain-c51-seed2"), failed).unwrap();
+    fs::remove_dir_all(folder.join("runs/chain-c51-seed2/checkpoints")).unwrap();
     // Runs of programs that did not note their commit are adopted.
     fs::remove_file(folder.join("runs/chain-c51-seed1.commit")).unwrap();
     system
@@ -180,7 +182,7 @@ fn pacman() {
     system.run_ok("experiment pacman --smoke");
     let folder = system.path("experiments/pacman");
     let files = "fig3.png fig3.svg final_loss.csv ghosts.csv loss.csv noise.csv";
-    check_page(&folder, &["**Got.**\n\n* ", "| --- |"], files);
+    check_page(&folder, &["**Results.**\n\n* ", "| --- |"], files);
     let config = |name: &str| {
         let path = folder.join("runs").join(name).join("config.toml");
         fs::read_to_string(path).unwrap()
@@ -296,9 +298,9 @@ fn a_grid_makes_every_combination_once() {
     system.refuses(&format!("{call} --report"), "there is nothing to report");
 
     let printed = system.run_ok(&format!("{call} --jobs 2")).stdout;
-    let folder = system.path("experiments/grid");
-    assert!(printed.ends_with("grid.svg\n"), "{printed}");
-    let table = || system.run_folder("experiments/grid").table("grid.csv");
+    let folder = system.path("experiments/sweep");
+    assert!(printed.ends_with("sweep.svg\n"), "{printed}");
+    let table = || system.run_folder("experiments/sweep").table("sweep.csv");
     let columns = ["env", "agent", "learner.update.adam.lr", "seeds"];
     assert_eq!(table().header[..4], columns);
     let rows = table().rows;

@@ -147,7 +147,7 @@ pub struct SweepArgs {
     /// Only write table and plot of finished runs
     #[arg(long)]
     pub(crate) report: bool,
-    /// Folder for runs, table and plot [default: experiments/grid]; a stopped sweep resumes there
+    /// Folder for runs, table and plot [default: experiments/sweep]; a stopped sweep resumes there
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     axes::{Axis, Cell, cells},
-    plan::{Call, Made, PlannedRun},
+    plan::{Call, Made, PlannedRun, install},
     queue,
     runs::SEEDS_FOUND_MAX,
 };
@@ -20,7 +20,7 @@ use crate::{
 };
 
 /// Names the default folder, the table and the plot: what is made is a grid.
-const NAME: &str = "grid";
+const NAME: &str = "sweep";
 /// Most letters of a cell in the name of a run's folder.
 const NAME_LETTERS: usize = 80;
 /// Columns of the table behind the axes.
@@ -66,7 +66,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<()> {
         }));
     }
     plans.sort_by_key(|(_, plan)| plan.call.seed);
-    queue::install(&plans, args.report)?;
+    install(&plans, args.report)?;
     let mut session = Session::open(NAME, &flags, &settings, 0, args.report)?;
     let made = queue::make(&mut session, plans, args.jobs)?;
     session.progress().clear();

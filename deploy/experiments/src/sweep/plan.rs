@@ -1,8 +1,15 @@
 //! What a sweep plans and gets: runs at the points of its axes, and the calls that make them.
-//! It touches no disk and starts nothing.
+//! It knows no folder and starts no run.
 
-use driml_launch::run_folder::{RunFolder, Summary};
-use driml_machine::{error::Usage, resources::Machine};
+use anyhow::ensure;
+use driml_launch::{
+    console,
+    run_folder::{RunFolder, Summary},
+};
+use driml_machine::{
+    error::{Usage, usage},
+    resources::Machine,
+};
 use driml_settings::{
     config::RunConfig,
     flags::{Flags, RunFlags, resolve},
@@ -94,4 +101,37 @@ pub(crate) struct Made<P> {
     pub(crate) point: P,
     pub(crate) plan: PlannedRun,
     pub(crate) run: FinishedRun,
+}
+
+/// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
+/// called before anything is written, so that a corrected call can have the same folder.
+pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
+    let mut known: Vec<Call> = Vec::new();
+    let plans = if report { &[] } else { plans };
+    for (_, plan) in plans {
+        let call = Call {
+            seed: 1,
+            ..plan.call.clone()
+        };
+        if !known.contains(&call) {
+            let config = call.config();
+            let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
+            for (is_other, key, flag) in [
+                (config.run.seed != 1, "run.seed", "--seeds"),
+                (
+                    config.frames() != plan.frames,
+                    "the number of frames",
+                    "--frames",
+                ),
+            ] {
+                ensure!(
+                    !is_other,
+                    usage!("--set changes {key} of {}: use {flag}", plan.name)
+                );
+            }
+            config.world.install(&mut console::line)?;
+            known.push(call);
+        }
+    }
+    Ok(())
 }

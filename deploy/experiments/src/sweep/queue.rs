@@ -12,7 +12,6 @@ use std::{
 
 use anyhow::Context;
 use driml_launch::{
-    console,
     managed_process::exit_with_this_process,
     resume::{self, Found},
     run_folder::{Progress as RunProgress, progress as how_far},
@@ -30,7 +29,7 @@ use nix::{
 };
 
 use super::{
-    plan::{Call, Made, Planned, PlannedRun},
+    plan::{Made, Planned, PlannedRun},
     runs::{Runs, move_aside},
 };
 use crate::{cache::Session, progress::Progress};
@@ -83,26 +82,6 @@ pub(crate) fn make<P>(
     Ok(made)
 }
 
-/// Resolves the settings of each call once, whatever its seed, and installs what its world needs; for a report it does nothing. To be
-/// called before anything is written, so that a corrected call can have the same folder.
-pub(crate) fn install<P>(plans: &[Planned<P>], report: bool) -> anyhow::Result<()> {
-    let mut known: Vec<Call> = Vec::new();
-    let plans = if report { &[] } else { plans };
-    for (_, plan) in plans {
-        let call = Call {
-            seed: 1,
-            ..plan.call.clone()
-        };
-        if !known.contains(&call) {
-            let config = call.config();
-            let config = config.map_err(|e| usage!("the run {}: {e}", plan.name))?;
-            config.world.install(&mut console::line)?;
-            known.push(call);
-        }
-    }
-    Ok(())
-}
-
 /// The commit that this program was built from, as its `--version` says in brackets.
 fn commit() -> anyhow::Result<String> {
     let mut command = Command::new(process_env::program());
@@ -130,8 +109,8 @@ struct Job {
     plan: PlannedRun,
     /// How often it was started.
     tried: u32,
-    /// Whether it was resumed the last time. Its checkpoint may be what fails, so that the next try starts anew.
-    resumed: bool,
+    /// The updates after which it was resumed the last time. That checkpoint may be what fails, so that it is not resumed from it again.
+    resumed_at: Option<u64>,
 }
 
 impl Job {
@@ -139,7 +118,7 @@ impl Job {
         Self {
             plan,
             tried: 0,
-            resumed: false,
+            resumed_at: None,
         }
     }
 }
@@ -234,7 +213,7 @@ impl Queue {
         }
         let (name, words) = (&plan.name, self.runs.last_words(plan));
         // Settings that cannot work will not work for the others either.
-        if status.code() == Some(EXIT_USAGE.into()) && !ended.job.resumed {
+        if status.code() == Some(EXIT_USAGE.into()) && ended.job.resumed_at.is_none() {
             return Err(usage!("the run {name} cannot be made:\n{words}").into());
         }
         let (failed, then) = match *tried < TRIES {
@@ -265,8 +244,16 @@ impl Queue {
             return Ok(None);
         }
         log.set_len(0).with_context(doing)?;
+        let resumed_at = match self.resumes_at(&job, progress) {
+            Ok(updates) => updates,
+            Err(e) => {
+                progress.line(&format!("the run {} is left out: {e:#}", plan.name));
+                progress.find(plan.units);
+                return Ok(None);
+            }
+        };
         let folder = self.runs.folder(plan).path().to_owned();
-        let resumed = folder.exists() && !job.resumed && self.is_resumable(plan, progress)?;
+        let resumed = resumed_at.is_some();
         if !resumed && let Some(aside) = move_aside(&folder)? {
             progress.line(&format!(
                 "{} was not finished, or is of another call: it is now {}, and the run starts anew",
@@ -286,7 +273,7 @@ impl Queue {
         let found = resumed.then(|| self.find(plan, progress));
         let done = found.unwrap_or(0);
         job.tried += 1;
-        job.resumed = resumed;
+        job.resumed_at = resumed_at;
         Ok(Some(Running {
             job,
             child,
@@ -312,21 +299,31 @@ impl Queue {
         command
     }
 
-    /// Whether what lies in the plan's folder can be resumed.
-    fn is_resumable(&self, plan: &PlannedRun, progress: &mut Progress) -> anyhow::Result<bool> {
-        let folder = self.runs.folder(plan);
-        resume::wait_until_free(&folder)?;
-        if !self.runs.is_made_by(plan) {
-            return Ok(false);
+    /// The updates after which what lies in the plan's folder is resumed; none if the run starts anew.
+    fn resumes_at(&self, job: &Job, progress: &mut Progress) -> anyhow::Result<Option<u64>> {
+        let (plan, folder) = (&job.plan, self.runs.folder(&job.plan));
+        if !folder.path().exists() {
+            return Ok(None);
         }
-        let found = resume::find(&folder, &Flags::default(), &Machine::this());
-        let run = folder.display();
-        progress.line(&match &found {
-            Ok(Found::Nothing(sentence)) => sentence.clone(),
-            Ok(Found::Resumed(_)) => format!("{run} resumes from its checkpoint"),
-            Err(e) => format!("{run} cannot be resumed: {e:#}"),
-        });
-        Ok(matches!(found, Ok(Found::Resumed(_))))
+        resume::wait_until_free(&folder)?;
+        let newest = resume::newest_updates(&folder);
+        let is_resumable = newest > job.resumed_at
+            && self.runs.is_made_by(plan)
+            && resume::is_resumable(&plan.call.config()?.world, &folder);
+        if !is_resumable {
+            return Ok(None);
+        }
+        match resume::find(&folder, &Flags::default(), &Machine::this())? {
+            Found::Nothing(sentence) => {
+                progress.line(&sentence);
+                Ok(None)
+            }
+            Found::Resumed(_) => {
+                let run = folder.display();
+                progress.line(&format!("{run} resumes from its checkpoint"));
+                Ok(newest)
+            }
+        }
     }
 
     /// The cores shared out among the runs at once, so that their learners do not get in each other's way.
@@ -395,7 +392,7 @@ mod tests {
     use driml_protocol::GracefulShutdown;
 
     use super::*;
-    use crate::sweep::runs::tests::finish;
+    use crate::sweep::{plan::Call, runs::tests::finish};
 
     /// A queue in `root`, where the run of its only plan is finished.
     fn queue(root: &Path) -> (Queue, PlannedRun) {
@@ -435,6 +432,23 @@ mod tests {
             shares.next().map(|(_, value)| value == Some("7".as_ref()))
         };
         assert_eq!([share(false), share(true)], [Some(true), None]);
+    }
+
+    #[test]
+    fn a_checkpoint_is_resumed_from_once_and_kept_while_it_cannot_be() {
+        let root = tempfile::tempdir().unwrap();
+        let (queue, plan) = queue(root.path());
+        let folder = queue.runs.folder(&plan);
+        std::fs::write(folder.config(), "").unwrap();
+        let checkpoint = folder.checkpoints().join("checkpoint-000000000005");
+        std::fs::create_dir_all(checkpoint).unwrap();
+        let mut progress = Progress::new(10, GracefulShutdown::default());
+        let mut job = Job::of(plan);
+        for (resumed_at, is_tried) in [(None, true), (Some(4), true), (Some(5), false)] {
+            job.resumed_at = resumed_at;
+            let found = queue.resumes_at(&job, &mut progress);
+            assert_eq!(found.is_err(), is_tried, "{found:?}");
+        }
     }
 
     /// As when a run saved while this call waited for its log.

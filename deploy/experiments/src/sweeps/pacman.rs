@@ -13,7 +13,11 @@ use self::{
     results::{LOSSES, Results, Trace},
     settings::{EPISODE_FRAMES_MAX, NAME, PART_NAMES, PARTS},
 };
-use crate::{cache::Session, flags::PacmanArgs, sweep::queue};
+use crate::{
+    cache::Session,
+    flags::PacmanArgs,
+    sweep::{plan::install, queue},
+};
 
 const PANELS: [&str; PARTS] = ["(b)", "(c)"];
 
@@ -22,7 +26,7 @@ pub(crate) fn run(args: &PacmanArgs) -> anyhow::Result<()> {
     let plans = (1..=settings.seeds).flat_map(|seed| settings.plans(seed));
     let plans: Vec<_> = plans.collect();
     let report = args.queue.report;
-    queue::install(&plans, report)?;
+    install(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, 0, report)?;
     let made = queue::make(&mut session, plans, settings.jobs)?;
     session.check_any(&made)?;

@@ -22,7 +22,7 @@ use crate::{
         over_games::{Scores, improvement, iqm},
     },
     sweep::{
-        plan::{FinishedRun, Made, PlannedRun},
+        plan::{FinishedRun, Made, PlannedRun, install},
         queue,
     },
     sweeps::published::{normalised, paper},
@@ -43,7 +43,7 @@ pub(crate) fn run(args: &ProcgenArgs) -> anyhow::Result<()> {
     // Each run's agent plays, and a random policy beside it.
     let units = plans.len() as u64 * 2 * play.units;
     let report = args.queue.report;
-    queue::install(&plans, report)?;
+    install(&plans, report)?;
     let mut session = Session::open(NAME, &args.flags, &settings, units, report)?;
     let made = queue::make(&mut session, plans, settings.jobs)?;
     session.check_any(&made)?;

@@ -33,7 +33,7 @@ use crate::{
     plot::Run,
     stats::Spread,
     sweep::{
-        plan::{FinishedRun, Made, Planned},
+        plan::{FinishedRun, Made, Planned, install},
         queue,
         results::Played,
         runs::{Runs, SEEDS_FOUND_MAX},
@@ -240,7 +240,7 @@ impl Tradeoff<'_> {
     fn make(&mut self, chosen: &[bool]) -> anyhow::Result<Results> {
         let wanted = self.wanted(chosen)?;
         let (units, report_only) = (self.piece_units(), self.args.queue.report);
-        queue::install(&wanted, report_only)?;
+        install(&wanted, report_only)?;
         // Each run plays, and a random policy once.
         let plays = wanted.len() as u64 + 1;
         self.session.progress().again(units * plays);

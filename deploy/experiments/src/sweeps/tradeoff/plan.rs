@@ -45,12 +45,12 @@ impl Budget {
     }
 }
 
-/// Frames of a run: `full`, or a half or a quarter of it, so that at least the first level fits into the budget with its base.
+/// Frames of a run: `full`, or a half or a quarter of it if the first level fits into the budget with its base only so.
 /// `seconds` is what these two take with all seeds and `full` frames.
 pub(super) fn frames(full: u64, seconds: f64, budget_seconds: f64) -> u64 {
     let lengths = [full, full / 2, full / 4];
     let fits = |frames: &u64| seconds * *frames as f64 / full as f64 <= budget_seconds;
-    lengths.into_iter().find(fits).unwrap_or(full / 4)
+    lengths.into_iter().find(fits).unwrap_or(full)
 }
 
 #[cfg(test)]
@@ -96,6 +96,6 @@ mod tests {
     #[test]
     fn a_small_budget_makes_shorter_runs() {
         let found = [400.0, 200.0, 80.0, 1.0].map(|budget| frames(40_000, 300.0, budget));
-        assert_eq!(found, [40_000, 20_000, 10_000, 10_000]);
+        assert_eq!(found, [40_000, 20_000, 10_000, 40_000]);
     }
 }

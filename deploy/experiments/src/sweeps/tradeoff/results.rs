@@ -56,8 +56,10 @@ const fn measure(name: &'static str, of: fn(&SeedResult) -> Option<f64>) -> Meas
 pub(super) const GREEDY: Measure = measure("greedy_return", |it| mean(&it.greedy));
 /// Mean of the last 100 training episodes.
 pub(super) const TRAINING: Measure = measure("training_return", |it| it.ran.summary.mean_return);
+/// None of a run that was resumed: it has filled its replay and started its processes again.
 pub(super) const FRAMES_PER_SECOND: Measure = measure("frames_per_second", |it| {
-    Some(it.ran.summary.frames_per_second)
+    let summary = &it.ran.summary;
+    (summary.resumed_after_updates == 0).then_some(summary.frames_per_second)
 });
 /// All measures, in the order of the data.
 pub(super) const MEASURES: [Measure; 7] = [
