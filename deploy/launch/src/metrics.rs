@@ -26,7 +26,7 @@ pub struct Column {
 /// How a metric is taken from a view of a run; none where it is not known yet.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Value {
-    /// A number that rises until the run is started anew.
+    /// A number that rises, until the run is started anew; those of faults and waits, until it is resumed without its replay.
     Counter(fn(&RunView) -> Option<f64>),
     /// A number that may fall.
     Gauge(fn(&RunView) -> Option<f64>),

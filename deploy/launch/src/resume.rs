@@ -47,6 +47,12 @@ pub fn is_resumable(world: &WorldConfig, folder: &RunFolder) -> bool {
         })
 }
 
+/// The updates of the newest checkpoint of the run in `folder`, if it has one.
+pub fn newest_updates(folder: &RunFolder) -> Option<u64> {
+    let saved = checkpoint::list(&folder.checkpoints()).unwrap_or_default();
+    saved.last().map(|(updates, _)| *updates)
+}
+
 /// Prints how to resume a run that was interrupted or failed, if it can be.
 pub fn say_how(world: &WorldConfig, folder: &RunFolder) {
     if is_resumable(world, folder) {

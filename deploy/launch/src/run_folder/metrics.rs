@@ -41,6 +41,8 @@ pub(crate) struct Uncounted {
     pub(crate) episodes: u64,
     /// Of those rows.
     pub(crate) k: Option<Spread>,
+    /// That the run had taken when it was last resumed, with or without its replay: rows of metrics that were set aside tell it no more.
+    pub(crate) seconds: f64,
 }
 
 impl Uncounted {

@@ -61,8 +61,14 @@ impl RunRecorder {
         let lock = folder.lock()?;
         let header = header(config, &processes);
         let resume_point = resumed.unwrap_or_default();
+        let earlier = Uncounted::read(folder);
+        let summarised = Summary::read(folder).map_or(0.0, |it| it.wall_seconds);
+        let seconds_before = earlier
+            .as_ref()
+            .map_or(0.0, |it| it.seconds)
+            .max(summarised);
         let kept = resume_point.replay_is_kept;
-        let kept = kept.then(|| Uncounted::read(folder)).transpose()?;
+        let kept = kept.then_some(earlier).transpose()?;
         let (rows, seconds) = match resumed {
             None => {
                 // First: by its settings a folder in which nothing was learned is known as a run's.
@@ -72,18 +78,21 @@ impl RunRecorder {
             }
             Some(point) => rows_up_to(&folder.metrics(), header, point)?,
         };
+        let seconds = seconds.max(seconds_before);
         let unknown = kept.map(|it| it.episodes);
         let episodes = TrainingEpisodes::open(folder, resumed.map(|it| it.frames), unknown)?;
         if resumed.is_some() {
             folder.write_config(config)?;
         }
         Summary::remove(folder)?;
-        let uncounted = kept.unwrap_or_else(|| Uncounted {
+        let mut uncounted = kept.unwrap_or_else(|| Uncounted {
             after_updates: resume_point.after_updates,
             rows: resume_point.rows,
             episodes: rows.last("episodes").unwrap_or(0).max(episodes.episode),
             k: (rows.last("mean_k").zip(rows.last("sd_k"))).map(|(mean, sd)| Spread { mean, sd }),
+            seconds: 0.0,
         });
+        uncounted.seconds = seconds;
         if resumed.is_some() {
             uncounted.write(folder)?;
         }

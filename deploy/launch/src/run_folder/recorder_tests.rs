@@ -142,8 +142,14 @@ fn a_resumed_run_continues_in_its_metrics() {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, format!("{text}9.0,40")).unwrap();
 
+    let summary = Summary {
+        wall_seconds: 50.0,
+        ..summary
+    };
+    summary.write(&run).unwrap();
     let mut recorder = open(&run, &processes, Some(point(31))).unwrap();
     assert!(!run.summary().exists());
+    assert!(recorder.seconds() >= 50.0);
     // While the replay fills again nothing is new.
     recorder.record(&mut after(2_000, 31, 1, k_before), &[]);
     let mut resumed = after(2_100, 62, 2, k_since);
@@ -217,9 +223,10 @@ fn rows_past_a_resume_point_are_set_aside_and_good_ones_stay() {
         assert_eq!(summary.frames, 2_000, "{what}");
         drop(recorder);
 
-        // A run resumed twice from there sets aside beside what was set aside before.
+        // A run resumed twice from there sets aside beside what was set aside before, and remembers the time.
         fs::write(run.episodes(), episodes).unwrap();
-        open(&run, &["actor-0"], Some(point(31))).unwrap();
+        let recorder = open(&run, &["actor-0"], Some(point(31))).unwrap();
+        assert!(recorder.seconds() >= seconds, "{what}");
         assert_eq!(rows("episodes.aside-2.csv"), 1, "{what}");
     }
 }
