@@ -104,7 +104,7 @@ fn recovering(system: &TestSystem) -> Option<Value> {
     if recovering.is_null() {
         return None;
     }
-    assert_eq!(answer["well"], false);
+    assert_eq!(answer["healthy"], false);
     Some(recovering)
 }
 

@@ -1,6 +1,8 @@
 //! `driml status`: what it prints of a run in which a process is missing, gone, suspended or done.
 //! What processes log while they wait is here too.
 
+use std::fs;
+
 use driml_tests::{TestSystem, check_has, wait_for, wait_until};
 use nix::sys::signal::Signal;
 
@@ -61,7 +63,7 @@ fn missing_processes_are_named_with_what_to_do() {
     assert_eq!(processes[0]["who"], "Learner");
     assert_eq!(processes[0]["connected"], false);
     assert_eq!(processes[2]["who"]["Actor"], 5);
-    assert_eq!(answer["to_go_on"].as_array().unwrap().len(), 2);
+    assert_eq!(answer["actions_needed"].as_array().unwrap().len(), 2);
 
     // A suspended server is reported within seconds, too.
     server.signal(Signal::SIGSTOP);
@@ -80,7 +82,15 @@ fn a_run_folder_is_asked_while_it_is_alive_and_read_afterwards() {
         let ended = system.run("status --run run");
         ended.code == Some(0) && ended.stdout.contains("learns")
     });
+    let watched = system.start("status --run run --watch --json");
     process.interrupt().expect_code(130);
+    watched.wait_ok();
+    system
+        .run("watch --once --run run --prometheus run.prom")
+        .expect_code(1)
+        .expect_error("no process of it runs");
+    let file = fs::read_to_string(system.path("run.prom")).unwrap();
+    assert!(file.ends_with("\ndriml_up 0\n"), "{file}");
     system
         .run_ok("status --run run")
         .expect_printed("no process runs in run, which holds")
@@ -96,6 +106,8 @@ fn a_run_that_is_ending_is_no_riddle() {
         "local --agent c51 {SHORT} --eval-interval 1000 --eval-episodes 1000000 --run-dir run"
     ));
     process.wait_for_stderr("playing the last checkpoint");
+    let config = fs::read_to_string(system.path("run/config.toml")).unwrap();
+    check_has(&config, &["checkpoint_period_updates = 50"]);
     system
         .run_ok("status --run run")
         .expect_printed("the run in run is stopping: all frames are stored");

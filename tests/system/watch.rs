@@ -115,8 +115,8 @@ fn a_silent_process_is_named_and_a_restarted_server_found_again() {
 }
 
 /// The fields of `--once --json` beside the metrics, which deploy/docs/src/reference/run-folder.md describes.
-const FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers to_go_on \
-    updates_planned waits well world";
+const FIELDS: &str = "actors_planned agent finished frames_planned learner replay replay_ratio_planned run_spec seed servers actions_needed \
+    updates_planned waiting_for healthy world";
 
 #[test]
 fn one_look_tells_scripts_and_monitors_how_a_run_is() {
@@ -140,7 +140,7 @@ fn one_look_tells_scripts_and_monitors_how_a_run_is() {
     assert_eq!(names, fields);
     assert_eq!(said["frames"], 1280);
     assert_eq!(said["updates"], 540);
-    assert_eq!(said["well"], true);
+    assert_eq!(said["healthy"], true);
     assert_eq!(said["finished"], true);
     assert_eq!(said["losses"].as_object().unwrap().len(), 1);
     // The page for persons is that of `driml status`.

@@ -2,16 +2,15 @@
 
 use std::path::PathBuf;
 
+use anyhow::ensure;
 use clap::{ArgGroup, Args};
 use driml_launch::{
-    console,
     endpoint::{NAMESPACE, check_endpoints},
-    run_folder::{RunFolder, Summary},
+    run_folder::RunFolder,
     view::Poller,
-    watch::{self, Live, Outputs, endpoints_of},
+    watch::{self, Live, Outputs, Over, endpoints_of},
 };
 use driml_protocol::tls::Role;
-use serde_json::json;
 
 use super::join::TlsFlags;
 
@@ -67,8 +66,23 @@ pub(crate) struct StatusArgs {
 }
 
 pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
-    let Some(poller) = args.look.open(args.json)? else {
-        return Ok(());
+    let opened = args.look.open();
+    if !matches!(opened, Ok(Ok(_)))
+        && let Some(path) = &args.prometheus
+    {
+        watch::write_down(path)?;
+    }
+    let poller = match opened? {
+        Ok(poller) => poller,
+        Err(over) => {
+            over.print(args.json)?;
+            let is_well = over.is_well || !args.once;
+            ensure!(
+                is_well,
+                "the run needs attention: it is not finished and no process of it runs"
+            );
+            return Ok(());
+        }
     };
     let outputs = Outputs {
         run_dir: args.run_dir.as_ref().map(RunFolder::new),
@@ -82,46 +96,33 @@ pub(crate) fn run(args: &WatchArgs) -> anyhow::Result<()> {
 }
 
 pub(crate) fn status(args: &StatusArgs) -> anyhow::Result<()> {
-    let Some(mut poller) = args.look.open(args.json)? else {
-        return Ok(());
-    };
-    let folder = args.look.folder();
-    watch::look(&mut poller, folder.as_ref(), args.watch, args.json)
+    match args.look.open()? {
+        Ok(mut poller) => {
+            let folder = args.look.folder();
+            watch::look(&mut poller, folder.as_ref(), args.watch, args.json)
+        }
+        Err(over) => over.print(args.json),
+    }
 }
 
 impl LookFlags {
-    /// A connection to the run; none if it is over, which is then printed, `as_json` or for a person.
-    fn open(&self, as_json: bool) -> anyhow::Result<Option<Poller>> {
+    /// A connection to the run, or how it stands if it cannot be asked.
+    fn open(&self) -> anyhow::Result<Result<Poller, Box<Over>>> {
         check_endpoints(&self.connect, self.tls.is_set())?;
         let credentials = self.tls.credentials(Role::Observer)?;
         let endpoints = match self.live()? {
             None => self.connect.clone(),
             Some(Live::At(endpoints)) => endpoints,
-            Some(Live::Over(how)) => return self.print_over(&how, as_json).map(|()| None),
+            Some(Live::Over(over)) => return Ok(Err(over)),
         };
         let opened = Poller::open(&endpoints, &self.namespace, credentials.as_deref());
         // It may have ended meanwhile.
         if opened.is_err()
-            && let Some(Live::Over(how)) = self.live()?
+            && let Some(Live::Over(over)) = self.live()?
         {
-            return self.print_over(&how, as_json).map(|()| None);
+            return Ok(Err(over));
         }
-        opened.map(Some)
-    }
-
-    /// How a run stands that cannot be asked; as JSON, whether it is complete and its processes have ended, the first line, and its
-    /// summary if it has one.
-    fn print_over(&self, how: &str, as_json: bool) -> anyhow::Result<()> {
-        if !as_json {
-            return console::print(how);
-        }
-        let folder = self.folder();
-        let is_finished = |it: &RunFolder| Summary::is_finished(it) && !it.is_locked();
-        let finished = folder.as_ref().is_some_and(is_finished);
-        let summary = folder.and_then(|it| Summary::read(&it).ok());
-        let message = how.lines().next();
-        let all = json!({ "finished": finished, "message": message, "summary": summary });
-        console::print(&format!("{all}\n"))
+        opened.map(Ok)
     }
 
     /// How the run stands by its folder, if one was given.

@@ -19,7 +19,7 @@ use crate::{
 struct Answer<'a> {
     #[serde(flatten)]
     plan: &'a Plan,
-    well: bool,
+    healthy: bool,
     finished: bool,
     #[serde(flatten)]
     metrics: BTreeMap<&'static str, serde_json::Value>,
@@ -27,23 +27,23 @@ struct Answer<'a> {
     replay: &'a ReplayStatus,
     learner: Option<&'a LearnerStatus>,
     /// Which side waits and since when, in sentences.
-    waits: Vec<String>,
+    waiting_for: Vec<String>,
     /// What is missing and what to do about it, in sentences.
-    to_go_on: Vec<String>,
+    actions_needed: Vec<String>,
 }
 
 pub(crate) fn json(view: &RunView) -> serde_json::Result<String> {
-    let to_go_on = needed(view);
+    let actions_needed = needed(view);
     let answer = Answer {
         plan: &view.plan,
-        well: to_go_on.is_empty(),
+        healthy: actions_needed.is_empty(),
         finished: view.is_finished(),
         metrics: metrics::json(view),
         servers: &view.servers,
         replay: &view.replay,
         learner: view.learner_status(),
-        waits: waits(view),
-        to_go_on,
+        waiting_for: waits(view),
+        actions_needed,
     };
     Ok(serde_json::to_string(&answer)? + "\n")
 }
@@ -93,12 +93,12 @@ fn prometheus(view: &RunView) -> String {
         page.gauge("frames_planned", "Frames of the whole run.", planned[0]);
         page.gauge("updates_planned", "Updates of the whole run.", planned[1]);
         let is_so = [view.is_finished(), needed(view).is_empty()].map(f64::from);
-        let [finished, well] = [
+        let [finished, healthy] = [
             "Whether everything is learned and saved.",
             "Whether no process of the run is missing.",
         ];
         page.gauge("finished", finished, is_so[0]);
-        page.gauge("well", well, is_so[1]);
+        page.gauge("healthy", healthy, is_so[1]);
     }
     page.text
 }

@@ -3,11 +3,12 @@
 
 mod watched;
 
-use std::time::Duration;
+use std::{path::Path, time::Duration};
 
 use anyhow::{Context, bail};
 use driml_machine::error::{Interrupted, usage};
-use driml_protocol::{LogLimiter, Shutdown, reach};
+use driml_protocol::{LogLimiter, Shutdown, atomic_write, reach};
+use serde::Serialize;
 
 pub use self::watched::Outputs;
 use self::watched::Watched;
@@ -42,10 +43,10 @@ pub fn look(
     }
     loop {
         let view = poller.ask();
-        if let Some(folder) = folder.filter(|_| view.is_gone() && !as_json)
-            && let Live::Over(how) = endpoints_of(folder)?
+        if let Some(folder) = folder.filter(|_| view.is_gone())
+            && let Live::Over(over) = endpoints_of(folder)?
         {
-            return console::print(&how);
+            return over.print(as_json);
         }
         match as_json {
             true => console::print(&json(view)?)?,
@@ -74,6 +75,15 @@ pub fn once(mut poller: Poller, outputs: &Outputs, as_json: bool) -> anyhow::Res
         needed if needed.is_empty() => Ok(()),
         needed => bail!("the run needs attention: {}", needed.join("; ")),
     }
+}
+
+/// Writes into the file for Prometheus that the run does not answer.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn write_down(path: &Path) -> anyhow::Result<()> {
+    let written = atomic_write::write(path, b"# TYPE driml_up gauge\ndriml_up 0\n");
+    written.with_context(|| format!("writing {}", path.display()))
 }
 
 /// Waits for replay servers that read their replay back from disk, as long as it takes, and says how far they are.
@@ -162,8 +172,36 @@ pub fn run(mut poller: Poller, outputs: &Outputs) -> anyhow::Result<()> {
 pub enum Live {
     /// The endpoints of its replay servers.
     At(Vec<String>),
-    /// No process can be asked: how it ended and how to resume it, for a person.
-    Over(String),
+    /// No process can be asked.
+    Over(Box<Over>),
+}
+
+/// How a run stands that cannot be asked.
+#[derive(Serialize)]
+pub struct Over {
+    /// Whether it is complete and its processes have ended.
+    finished: bool,
+    message: String,
+    summary: Option<Summary>,
+    /// What follows the message for a person.
+    #[serde(skip)]
+    details: String,
+    /// Whether it is finished, or will be without anybody's help.
+    #[serde(skip)]
+    pub is_well: bool,
+}
+
+impl Over {
+    /// Prints it, as one line of JSON or for a person.
+    ///
+    /// # Errors
+    /// The output cannot be written to.
+    pub fn print(&self, as_json: bool) -> anyhow::Result<()> {
+        console::print(&match as_json {
+            true => format!("{}\n", serde_json::to_string(self)?),
+            false => format!("{}\n{}", self.message, self.details),
+        })
+    }
 }
 
 /// Looks into the folder of a run.
@@ -178,32 +216,39 @@ pub fn endpoints_of(folder: &RunFolder) -> anyhow::Result<Live> {
     if lines.any(|it| reach::look(it).is_ok()) {
         return Ok(Live::At(endpoints.lines().map(str::to_owned).collect()));
     }
+    let run = folder.display();
     // A launcher that runs there holds the lock.
-    if !endpoints.is_empty() && folder.is_locked() {
+    let is_locked = !endpoints.is_empty() && folder.is_locked();
+    let mut over = Box::new(Over {
+        finished: !is_locked && Summary::is_finished(folder),
+        message: "the run is over".into(),
+        summary: Summary::read(folder).ok(),
+        details: String::new(),
+        is_well: true,
+    });
+    if is_locked {
         let frames = progress(folder).map_or(0, |it| it.frames);
         let how = match frames >= config.frames() {
             true => "is stopping: all frames are stored and its replay server has exited",
             false => "is starting or stopping: no replay server listens",
         };
-        let folder = folder.display();
-        return Ok(Live::Over(format!(
-            "the run in {folder} {how}. Its launcher still runs; retry in a moment\n"
-        )));
+        over.message =
+            format!("the run in {run} {how}. Its launcher still runs; retry in a moment");
+    } else if let Some(summary) = over.summary.as_ref().filter(|_| over.finished) {
+        over.details = summary.describe(folder);
+    } else {
+        let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
+        let so_far = progress(folder).map_or("nothing".into(), counts);
+        let next = match resume::is_resumable(&config.world, folder) {
+            true => format!("`driml train --resume {run}` resumes it"),
+            false => "it has no checkpoint to resume from".into(),
+        };
+        over.is_well = false;
+        over.message = format!(
+            "no process runs in {run}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT"
+        );
     }
-    if Summary::is_finished(folder) {
-        let summary = Summary::read(folder)?.describe(folder);
-        return Ok(Live::Over(format!("the run is over\n{summary}")));
-    }
-    let counts = |it: Progress| format!("{} frames and {} episodes", it.frames, it.episodes);
-    let so_far = progress(folder).map_or("nothing".into(), counts);
-    let next = match resume::is_resumable(&config.world, folder) {
-        true => format!("`driml train --resume {}` resumes it", folder.display()),
-        false => "it has no checkpoint to resume from".into(),
-    };
-    Ok(Live::Over(format!(
-        "no process runs in {}, which holds {so_far}: {next}. A run whose processes were started by hand is asked with --connect ENDPOINT\n",
-        folder.display()
-    )))
+    Ok(Live::Over(over))
 }
 
 #[cfg(test)]
@@ -225,7 +270,7 @@ mod tests {
         std::fs::write(folder.endpoints(), &endpoint).unwrap();
         let found = || match endpoints_of(&folder).unwrap() {
             Live::At(endpoints) => endpoints.join(" "),
-            Live::Over(how) => how,
+            Live::Over(over) => over.message,
         };
         let listener = UnixListener::bind(&socket).unwrap();
         assert_eq!(found(), endpoint);
