@@ -40,9 +40,9 @@ pub(crate) fn page(template: &str, values: Value, smoke: bool, time: &str) -> St
     })
 }
 
-/// What came out, for the terminal: the list below "Got".
+/// What came out, for the terminal: the list below "Results".
 pub(crate) fn summary(page: &str) -> String {
-    let list = page.split("**Got.**\n\n").nth(1).unwrap_or_default();
+    let list = page.split("**Results.**\n\n").nth(1).unwrap_or_default();
     list.split("\n\n").next().unwrap_or_default().to_owned() + "\n"
 }
 
@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn the_page_has_its_parts_and_says_when_it_is_a_smoke_test() {
-        let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Got.**\n\n* {{ got }}\n{% for it in more %}\n\
+        let template = "# T\n\n{{ smoke }}\n\n**Command.** `{{ command }}`\n\n**Time.** {{ time }}\n\n**Results.**\n\n* {{ got }}\n{% for it in more %}\n\
                         * {{ it }}\n{% endfor %}\n{% if no %}\n* no\n{% endif %}\n\ns_{t+1}:\n\n{{ figure('fig', 'A ' ~ got) }}\n";
         let command = "driml experiment t";
         let values = context! { got => 0.5, more => ["1", "2"], no => false, command };
@@ -158,7 +158,7 @@ mod tests {
             "smoke length",
             "**Command.** `driml experiment t`",
             "**Time.** 2 min on a machine with 64 cores.\n",
-            "**Got.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
+            "**Results.**\n\n* 0.5\n* 1\n* 2\n\ns_{t+1}:\n\n",
             "![A 0.5](fig.png)\n\nA 0.5 ([SVG](fig.svg))\n",
         ] {
             assert!(text.contains(part), "{part}\n{text}");

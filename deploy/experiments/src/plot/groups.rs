@@ -16,6 +16,8 @@ use crate::stats::{Spread, interval};
 const GRID_POINTS: usize = 240;
 /// Most points of a single run's curve; of a longer one every second, third, ... is drawn.
 const POINTS_MAX: usize = 600;
+/// Runs that lie no further apart are drawn together: as a share of x. Seeds' evaluations are some frames apart.
+const APART_MAX: f64 = 0.05;
 /// k is an environment step or more.
 const K_MIN: f64 = 1.0;
 
@@ -146,14 +148,18 @@ fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     points.iter().step_by(step).chain(last).copied().collect()
 }
 
-/// Mean and band of several curves, over the x that all of them have.
+/// Mean and band of several curves, over the x that all of them have, or at the x between curves that end and begin close to each other.
 fn together(curves: &[&Vec<(f64, f64)>], band: Band) -> Curve {
     let starts = curves.iter().map(|curve| curve[0].0);
     let ends = curves.iter().map(|curve| curve[curve.len() - 1].0);
-    let start = starts.fold(f64::NEG_INFINITY, f64::max);
-    let end = ends.fold(f64::INFINITY, f64::min);
-    if start > end {
+    let mut start = starts.fold(f64::NEG_INFINITY, f64::max);
+    let mut end = ends.fold(f64::INFINITY, f64::min);
+    if start > end * (1.0 + APART_MAX) {
         return Curve::default();
+    }
+    if start > end {
+        end = f64::midpoint(start, end);
+        start = end;
     }
     let last = if start == end { 0 } else { GRID_POINTS };
     let means = (0..=last).map(|i| {
@@ -199,7 +205,9 @@ mod tests {
             let (_, found_low, found_high) = curve.band[0];
             assert!((found_low - low).abs() < 1e-3 && (found_high - high).abs() < 1e-3);
         }
-        let apart = [vec![(0.0, 1.0)], vec![(5.0, 1.0)]];
-        assert!(together(&apart.each_ref(), Band::Sd).points.is_empty());
+        for (later, points) in [(104.0, &[(102.0, 2.0)][..]), (150.0, &[])] {
+            let apart = [vec![(100.0, 1.0)], vec![(later, 3.0)]];
+            assert_eq!(together(&apart.each_ref(), Band::Sd).points, points);
+        }
     }
 }

@@ -199,7 +199,7 @@ fn notes(args: &PlotArgs, groups: &[Group<'_>], columns: &[String]) -> Vec<Strin
     let mut notes = Vec::new();
     if groups.iter().any(|group| group.runs.len() > 1) {
         notes.push(format!(
-            "Runs that differ in their seed alone are one line, their mean; the band is {}.",
+            "Seeds are one line, their mean where all have values; the band is {}.",
             match args.band {
                 Band::Range => "their smallest and largest value",
                 Band::Sd => "one standard deviation to each side",
@@ -239,18 +239,19 @@ fn absent(column: &str, runs: &[Run]) -> impl Iterator<Item = String> {
     })
 }
 
-/// What a random policy earns in each of the runs' worlds, by the world's name.
+/// What a random policy earns in each of the runs' worlds, with the world's name.
 fn at_random(runs: &[Run], episodes: usize) -> anyhow::Result<Vec<(String, f64)>> {
-    let mut worlds: Vec<(String, f64)> = Vec::new();
+    let (mut known, mut found) = (Vec::new(), Vec::new());
     for run in runs {
         let config = config_of(&run.folder)?;
-        let world = &config.run.world;
-        if !worlds.iter().any(|(known, _)| known == world) {
+        let task = (config.world.clone(), config.actor.actions);
+        if !known.contains(&task) {
             let (mean, _) = mean_and_deviation(&random_returns(&config, episodes, 0)?);
-            worlds.push((world.clone(), mean));
+            found.push((config.run.world.clone(), mean));
+            known.push(task);
         }
     }
-    Ok(worlds)
+    Ok(found)
 }
 
 /// Level lines from the start to where the longest curve ends; those of several worlds in colours that no run has.
