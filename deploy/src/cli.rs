@@ -18,7 +18,7 @@ Examples:
   driml train --env procgen:starpilot --frames 1e6 --seed 3 --run-dir runs/starpilot
   driml train --resume runs/starpilot
 
-`driml presets --game starpilot --agent c51` prints what a preset sets: every setting with its source.";
+`driml presets --env starpilot --agent c51` prints what a preset sets: every setting with its source.";
 
 /// The version, and the commit that the program was built from.
 const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("DRIML_COMMIT"), ")");

@@ -122,7 +122,7 @@ fn settings() -> String {
     let base = root().join("deploy/settings/presets/base.toml");
     let mut page = format!("# Settings\n\n{GENERATED}\n\n");
     page += "Settings are layered: base, world, preset, agent, then the flags and `--set`. The result stands in the run's `config.toml`.\n\
-        `driml presets --game bigfish --agent driml-fix` prints it with the source of every value.\n\n\
+        `driml presets --env bigfish --agent driml-fix` prints it with the source of every value.\n\n\
         ## Base\n\n```toml\n";
     page += &fs::read_to_string(base).unwrap();
     page += "```\n\n## Presets\n\n* `paper`: base, world and agent alone.\n";

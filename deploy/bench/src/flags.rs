@@ -95,7 +95,7 @@ pub struct BenchLearnerArgs {
 /// What `driml bench replay` takes.
 #[derive(Clone, Debug, Args)]
 pub struct BenchReplayArgs {
-    /// Compare a replay on disk in this folder, which is emptied, with one in memory instead; also measures reading it back
+    /// Compare a replay on disk, in DIR/driml-bench, with one in memory instead; also measures reading it back
     #[arg(long, value_name = "DIR")]
     pub(crate) replay_dir: Option<PathBuf>,
     /// Measure uniform and prioritised sampling instead, without transport

@@ -38,7 +38,9 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
         folder: None,
     };
     let tcp = wire("tcp", &format!("tcp/{}", free_port()?));
-    let wires = match (&args.replay_dir, &args.tls_dir) {
+    // It is emptied before and after.
+    let dir = args.replay_dir.as_ref().map(|it| it.join("driml-bench"));
+    let wires = match (&dir, &args.tls_dir) {
         (Some(dir), _) => {
             let mut on_disk = wire("on disk", &socket);
             on_disk.folder = Some((REPLAY_DIR, dir.display().to_string()));
@@ -55,11 +57,10 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
             vec![shared_memory, unix_socket, tcp]
         }
     };
-    let rounds = args.replay_dir.as_ref().map_or(1, |_| ROUNDS_ON_DISK);
+    let rounds = dir.as_ref().map_or(1, |_| ROUNDS_ON_DISK);
     for _ in 0..args.rounds.unwrap_or(rounds) {
         for wire in &wires {
-            let dir = args.replay_dir.as_deref();
-            let on_disk = dir.filter(|_| wire.name == "on disk");
+            let on_disk = dir.as_deref().filter(|_| wire.name == "on disk");
             on_disk.map_or(Ok(()), empty)?;
             let mut server = Server::start(wire, folder.path())?;
             rates(&mut server, &recording, bench)?;
@@ -69,7 +70,7 @@ pub(super) fn measure(args: &BenchReplayArgs, bench: &mut Bench<'_>) -> anyhow::
             }
             on_disk.map_or(Ok(()), empty)?;
         }
-        if args.replay_dir.is_none() && args.tls_dir.is_none() {
+        if dir.is_none() && args.tls_dir.is_none() {
             in_process::assembling(&recording, bench)?;
         }
     }

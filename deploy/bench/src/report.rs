@@ -113,8 +113,8 @@ pub(super) fn publish(
     match json {
         Some(path) if path == Path::new("-") => print(&text),
         Some(path) => {
-            fs::write(path, text).with_context(|| format!("writing {}", path.display()))?;
-            print(table)
+            print(table)?;
+            fs::write(path, text).with_context(|| format!("writing {}", path.display()))
         }
         None => print(table),
     }

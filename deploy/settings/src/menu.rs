@@ -52,7 +52,7 @@ pub fn menu() -> Result<String, Usage> {
     text += "--set model.torso=impala                         a residual torso: fewer frames, ten times the arithmetic; impoola: with a mean before f4\n";
     text += "\nof rainbow alone, for any agent\n";
     text += "--set 'model.head={dueling=true,noisy_sigma=0.5}'  two streams of the C51 head; noisy layers (then --set actor.epsilon_start=0 too)\n";
-    text += "\nEvery setting of one of them with its source: driml presets --game bigfish --agent driml-fix\n";
+    text += "\nEvery setting of one of them with its source: driml presets --env bigfish --agent driml-fix\n";
     Ok(text)
 }
 

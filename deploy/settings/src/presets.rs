@@ -79,9 +79,9 @@ presets! {
     "split" for "procgen": "`paper` with one of 500 Procgen levels per episode, and unseen levels to test on";
     "exact": "`paper` with products, weights and frames as exact as the program can compute them";
     "balanced": "`exact` in the learner; bf16 arithmetic and f16 weights in the actors",
-        "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md";
+        "balanced: bf16 actors and f16 weights (another greedy action in up to 6% and 0.2% of states), see deploy/docs/src/results/tradeoff.md";
     "fast": "bf16 in learner and actors, f16 weights sent to actors",
-        "fast: bf16 learner (gradients off by up to 15%), bf16 actors and f16 weights (another greedy action in up to 6% and 1% of states), see deploy/docs/src/results/tradeoff.md";
+        "fast: bf16 learner (gradients off by up to 15% with DIM), bf16 actors and f16 weights (another greedy action in up to 6% and 0.2% of states), see deploy/docs/src/results/tradeoff.md";
     "smoke": "a tiny network, batch and replay: shows within a minute that all processes work together";
 }
 

@@ -8,8 +8,8 @@ use driml_settings::{flags, menu, presets};
 #[derive(Debug, Args)]
 pub(crate) struct PresetsArgs {
     /// Print the settings for this game of Procgen, or another world [default: coinrun]
-    #[arg(long, value_name = "GAME")]
-    pub(crate) game: Option<String>,
+    #[arg(long, value_name = "ENV")]
+    pub(crate) env: Option<String>,
     /// Print the settings of this agent [default: driml-ada]
     #[arg(long, value_name = "AGENT")]
     pub(crate) agent: Option<String>,
@@ -20,11 +20,11 @@ pub(crate) struct PresetsArgs {
 
 /// Prints the menu, or the settings of a game and an agent as TOML that `driml train --config` takes.
 pub(crate) fn run(args: &PresetsArgs) -> anyhow::Result<()> {
-    if args.game.is_none() && args.agent.is_none() && args.preset.is_none() {
+    if args.env.is_none() && args.agent.is_none() && args.preset.is_none() {
         return print(&menu::menu()?);
     }
-    let game = args.game.as_deref().unwrap_or(flags::ENV);
-    let world = presets::world(game).map_err(|e| usage!("--game: {e}"))?;
+    let env = args.env.as_deref().unwrap_or(flags::ENV);
+    let world = presets::world(env).map_err(|e| usage!("--env: {e}"))?;
     let preset = presets::preset_or_default(args.preset.as_deref(), world)?;
     let agent = presets::agent(args.agent.as_deref().unwrap_or(flags::AGENT))?;
     print(&menu::sourced(preset, world, agent)?)

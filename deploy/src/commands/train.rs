@@ -47,7 +47,7 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) tensorboard: bool,
     /// Play a checkpoint every so many updates, in a separate process that takes a core, and keep the best; writes evaluations.csv.
-    /// `driml evaluate RUN --checkpoint best` plays it
+    /// Unless it is a multiple of 1,000, it is also the period of checkpoints. `driml evaluate RUN --checkpoint best` plays the best
     #[arg(long, alias = "evaluate-every", value_name = "UPDATES", allow_negative_numbers = true, value_parser = whole_number::within(1..=u64::MAX))]
     pub(crate) eval_interval: Option<u64>,
     /// Episodes per evaluation
@@ -73,6 +73,9 @@ pub(crate) struct TrainArgs {
     pub(crate) exit_with_parent: Option<u32>,
 }
 
+/// The presets' `learner.checkpoint_period_updates`, but for `smoke`, whose is a divisor of it.
+const CHECKPOINT_PERIOD: u64 = 1_000;
+
 pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     let machine = Machine::this();
     let sets = &mut args.run.over.sets;
@@ -86,8 +89,10 @@ pub(crate) fn run(mut args: TrainArgs) -> anyhow::Result<()> {
     }
     if let Some(every) = args.eval_interval {
         let episodes = args.eval_episodes;
-        // Before what the user sets: checkpoints may be more frequent.
-        sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
+        if !every.is_multiple_of(CHECKPOINT_PERIOD) {
+            // Before what the user sets: checkpoints may be more frequent.
+            sets.insert(0, format!("learner.checkpoint_period_updates={every}"));
+        }
         sets.push(format!(
             "local.evaluation={{every_updates={every},episodes={episodes}}}"
         ));

@@ -21,7 +21,7 @@ pub(super) const KEY: &str = "key.safetensors";
 pub const AVERAGE: &str = "average.safetensors";
 pub(super) const OPTIMIZER: &str = "optimizer.safetensors";
 /// The companion that the caller keeps with the checkpoint, if any.
-pub(super) const COMPANION: &str = "companion.bin";
+pub(super) const COMPANION: &str = "lockstep.bin";
 pub(super) const STATE: &str = "state.json";
 /// The SHA-256 of [`STATE`], which has those of the other files.
 pub(super) const STATE_SUM: &str = "state.json.sha256";

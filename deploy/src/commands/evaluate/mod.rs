@@ -57,7 +57,7 @@ pub(crate) struct EvaluateArgs {
     #[arg(long, value_enum)]
     pub(crate) weights: Option<Weights>,
     /// Write the weights as f16, with the run's settings, into this file, and play nothing
-    #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["epsilon", "keep", "exact", "returns", "json", "record"])]
+    #[arg(long, value_name = "FILE.safetensors", conflicts_with_all = ["episodes", "levels", "seed", "epsilon", "keep", "exact", "returns", "json", "record"])]
     pub(crate) export: Option<PathBuf>,
     /// Add the mean return to the run's evaluations.csv, and keep the checkpoint if it is the best
     #[arg(long, conflicts_with_all = ["levels", "seed", "epsilon", "weights", "exact", "returns", "json", "record"])]
@@ -131,6 +131,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
     });
     let table = table.transpose()?;
     let world = levels(&player.config.world, args.levels)?;
+    let shutdown = Shutdown::on_signals(None).context("listening for signals")?;
     let mut film = Recording::begin(&args.film, &player, args.episodes)?;
     let spec = &player.config.run;
     let on = match args.levels {
@@ -158,11 +159,17 @@ pub(crate) fn run(args: &EvaluateArgs) -> anyhow::Result<()> {
         let watch = &mut |step: &Step<'_>, returns: &[f64]| {
             screen.show(returns.len() as u64, |_| progress(name, returns, episodes));
             film.iter_mut().for_each(|film| film.see(step));
-            ControlFlow::Continue(())
+            match shutdown.is_set() {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            }
         };
         let returns = player.play_watched(who, &world, episodes, args.seed, watch);
         screen.clear();
         let returns = returns?;
+        if shutdown.is_set() {
+            return Err(Interrupted.into());
+        }
         // Only the agent is filmed.
         if let Some(film) = film.take() {
             said(&film.finish()?)?;
