@@ -276,7 +276,13 @@ fn a_film_changes_nothing_that_is_played() {
     system.run_ok(film);
     let again = fs::read(system.path("play.gif")).unwrap();
     assert!(bytes == again, "the same play is the same film");
-    assert!(!system.path("play.gif.tmp").exists());
+    let unfinished = system.path("play.gif.tmp");
+    assert!(!unfinished.exists());
+    let process = system.start("evaluate run --episodes 1000000 --record play.gif");
+    wait_until("a film that has begun", || unfinished.exists());
+    process.interrupt().expect_code(130);
+    assert!(!unfinished.exists());
+    assert!(fs::read(system.path("play.gif")).unwrap() == bytes);
 }
 
 /// An evaluation plays the weights that actors of the run get, rounded as these are, unless it is told otherwise.
